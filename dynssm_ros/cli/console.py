@@ -1,0 +1,46 @@
+"""What all subcommands share: the consoles, the common options and the progress bar."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from dynssm_ros.signals.signal_map import Commands
+
+console = Console(highlight=False)
+errors = Console(stderr=True, highlight=False)
+
+VehicleOption = Annotated[
+    str, typer.Option("--vehicle", help="Vehicle: name of a shipped one (orca, av21, ...) or a file.")
+]
+SignalsOption = Annotated[str, typer.Option("--signals", help="Signal map: name of a shipped one or a file.")]
+CommandsOption = Annotated[
+    Commands | None,
+    typer.Option("--commands", help="Source of the command inputs; the signal map's or recording's own if not given."),
+]
+JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the result as JSON.", dir_okay=False)]
+
+
+@contextmanager
+def progress_bar(description: str) -> Iterator[Callable[[int, int], None]]:
+    """Shows a progress bar on stderr; yields the function that is told (done, total)."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f} %"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=errors, transient=True) as progress:
+        task = progress.add_task(description, total=None)
+
+        def update(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        yield update

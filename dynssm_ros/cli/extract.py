@@ -1,0 +1,40 @@
+"""``dynssm extract``: race logs to a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dynssm_ros.cli.console import CommandsOption, SignalsOption, console, progress_bar
+from dynssm_ros.signals.extraction import extract as extract_bags
+from dynssm_ros.signals.signal_map import load_signal_map
+
+
+def extract(
+    bags: Annotated[
+        list[Path],
+        typer.Argument(help="rosbag2 folders or .mcap/.db3 files, in the order of driving.", metavar="BAG..."),
+    ],
+    signals: SignalsOption,
+    rate: Annotated[float, typer.Option(help="Rate of the uniform time grid (Hz).", min=1.0, max=1000.0)],
+    out: Annotated[Path, typer.Option(help="Recording to write (Parquet).", dir_okay=False)],
+    commands: CommandsOption = None,
+    drop_bad: Annotated[
+        bool,
+        typer.Option("--drop-bad", help="Leave out samples that are not finite or out of order instead of stopping."),
+    ] = False,
+) -> None:
+    """Turn race logs into a recording: named SI signals on a uniform time grid."""
+    signal_map = load_signal_map(signals).with_commands(commands)
+    with progress_bar("reading") as progress:
+        recording = extract_bags(bags, signal_map, rate, drop_bad, progress)
+    recording.save(out)
+    for note in recording.info.notes:
+        console.print(f"note: {note}")
+    segments = int(recording.segment[-1]) + 1
+    console.print(
+        f"{out}: {len(recording)} rows at {rate:g} Hz, {recording.duration:.1f} s in {segments} "
+        f"segment{'s' if segments > 1 else ''}, commands: {recording.info.commands}"
+    )

@@ -1,0 +1,43 @@
+"""Entry point of ``dynssm``: registers the subcommands and turns user errors into one line and exit status 1."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+from rich.markup import escape
+
+from dynssm_ros import __version__
+from dynssm_ros.cli.console import errors
+from dynssm_ros.cli.extract import extract
+from dynssm_ros.errors import UserError
+
+app = typer.Typer(
+    name="dynssm",
+    help="Learn a race car's dynamics from rosbags, predict live on ROS 2, and see what the model gets wrong.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for command in (extract,):
+    app.command()(command)
+
+
+def _print_version(value: bool) -> None:
+    if value:
+        print(f"dynssm {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True)) -> None:
+    """Options before the subcommand."""
+
+
+def main() -> None:
+    """Runs the command line."""
+    try:
+        app()
+    except UserError as error:
+        errors.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True, highlight=False)
+        sys.exit(1)

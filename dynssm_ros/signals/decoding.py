@@ -1,0 +1,80 @@
+"""Messages to named SI values: the one place where a message is taken apart, for bags and live topics alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from dynssm_ros.errors import BagError
+from dynssm_ros.signals.signal_map import Accessor, SignalMap, compile_field
+
+
+@dataclass(frozen=True)
+class _Reading:
+    signal: str
+    field: str
+    read: Accessor
+    scale: float
+    offset: float
+
+
+class TopicDecoder:
+    """Reads all mapped signals of one topic out of its messages."""
+
+    def __init__(self, topic: str, msgtype: str, signal_map: SignalMap) -> None:
+        self.topic = topic
+        self.msgtype = msgtype
+        self._readings = [
+            _Reading(name, source.field, compile_field(source.field), source.scale, source.offset)
+            for name, source in signal_map.active_signals().items()
+            if source.topic == topic
+        ]
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the signals that this topic carries."""
+        return tuple(reading.signal for reading in self._readings)
+
+    def decode(self, message: Any) -> dict[str, float]:
+        """The signals present in ``message`` in SI units; a joint that it does not name is left out.
+
+        Raises:
+            BagError: the message type has no such field, or the field is not a number.
+        """
+        values: dict[str, float] = {}
+        for reading in self._readings:
+            try:
+                raw = reading.read(message)
+            except AttributeError as error:
+                raise BagError(
+                    f"topic {self.topic}: {self.msgtype} has no field '{reading.field}' for signal {reading.signal} "
+                    f"(at '{error.name}'; there: {_public_fields(error.obj)})"
+                ) from error
+            except (TypeError, ValueError) as error:
+                raise BagError(
+                    f"topic {self.topic}: field '{reading.field}' for signal {reading.signal} is not a number ({error})"
+                ) from error
+            if raw is not None:
+                values[reading.signal] = reading.scale * raw + reading.offset
+        return values
+
+
+def decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
+    """A decoder for each topic of the map, actuators first so that a node serves them before the odometry."""
+    types = {source.topic: source.type for source in signal_map.active_signals().values()}
+    order = sorted(types, key=lambda topic: topic == signal_map.odometry_topic)
+    return {topic: TopicDecoder(topic, types[topic], signal_map) for topic in order}
+
+
+def header_stamp_ns(message: Any) -> int | None:
+    """The header stamp in integer nanoseconds, or ``None`` where the message has no header."""
+    header = getattr(message, "header", None)
+    if header is None:
+        return None
+    stamp = header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def _public_fields(message: Any) -> str:
+    names = getattr(message, "__slots__", None) or vars(message)
+    return ", ".join(sorted(name.lstrip("_") for name in names if not name.startswith(("__", "_check")))) or "nothing"

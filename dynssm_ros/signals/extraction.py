@@ -1,0 +1,133 @@
+"""Race logs to a recording: what ``dynssm extract`` does."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dynssm_ros.errors import BagError
+from dynssm_ros.signals.bags import Bag, open_bag
+from dynssm_ros.signals.decoding import decoders, header_stamp_ns
+from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
+from dynssm_ros.signals.resampling import Stream, resample
+from dynssm_ros.signals.signal_map import REQUIRED_SIGNALS, SignalMap
+
+Progress = Callable[[int, int], None]
+"""Called with the number of messages done and the number of all."""
+
+
+def extract(
+    bags: Sequence[str | Path],
+    signal_map: SignalMap,
+    rate: float,
+    drop_bad: bool = False,
+    progress: Progress | None = None,
+) -> Recording:
+    """Reads bags and brings their signals onto a uniform grid.
+
+    Args:
+        bags: rosbag2 folders or storage files of one car, in the order in which they shall be joined.
+        signal_map: where the signals are.
+        rate: of the grid (Hz).
+        drop_bad: leave out samples that are not finite or whose stamps repeat or run backwards, instead of raising.
+        progress: told of each message.
+
+    Raises:
+        BagError: unreadable, topics missing or of another type, bad samples.
+        RecordingError: the signals never overlap in time.
+    """
+    recordings = []
+    for path in bags:
+        with open_bag(path) as bag:
+            streams, notes = read_streams(bag, signal_map, drop_bad, progress)
+        info = RecordingInfo(
+            sampling_time=1 / rate,
+            commands=signal_map.commands,
+            source=(Path(path).name,),
+            signal_map=signal_map.name,
+            notes=tuple(notes),
+        )
+        recordings.append(resample(streams, rate, signal_map.max_gap, signal_map.commands, info))
+    return concatenate(recordings)
+
+
+def read_streams(
+    bag: Bag, signal_map: SignalMap, drop_bad: bool = False, progress: Progress | None = None
+) -> tuple[dict[str, Stream], list[str]]:
+    """Reads the samples of every mapped signal; memory holds these and one message at a time.
+
+    Stamps are header stamps, and log times only where a message has no header.
+
+    Returns:
+        The streams by signal name, and notes on what was recovered or dropped.
+
+    Raises:
+        BagError: a topic or field is missing, or samples are bad and ``drop_bad`` is off.
+    """
+    by_topic = decoders(signal_map)
+    for topic, decoder in by_topic.items():
+        bag.require(topic, decoder.msgtype)
+    stamps = {name: array("q") for name in signal_map.active_signals()}
+    values = {name: array("d") for name in signal_map.active_signals()}
+    total = sum(bag.counts[topic] for topic in by_topic)
+    for done, (topic, log_time, raw) in enumerate(bag.messages(list(by_topic)), 1):
+        message = bag.decode(topic, raw)
+        stamp = header_stamp_ns(message)
+        for name, value in by_topic[topic].decode(message).items():
+            stamps[name].append(log_time if stamp is None else stamp)
+            values[name].append(value)
+        if progress is not None:
+            progress(done, total)
+    notes = list(bag.notes)
+    streams: dict[str, Stream] = {}
+    for name, source in signal_map.active_signals().items():
+        if not stamps[name]:
+            if name not in REQUIRED_SIGNALS and bag.counts[source.topic] > 0:
+                notes.append(f"{name}: topic {source.topic} never carries '{source.field}'")
+                continue
+            what = f"never carries '{source.field}'" if bag.counts[source.topic] else "has no messages"
+            raise BagError(f"{bag.path}: topic {source.topic} {what}, needed for {name}")
+        stream = Stream(np.frombuffer(stamps[name], dtype=np.int64), np.frombuffer(values[name], dtype=np.float64))
+        streams[name], note = clean(stream, f"{bag.path}: topic {source.topic}: {name}", drop_bad)
+        if note:
+            notes.append(f"{name}: {note}")
+    return streams, notes
+
+
+def clean(stream: Stream, where: str, drop_bad: bool) -> tuple[Stream, str]:
+    """Checks a stream for values that are not finite and for stamps that repeat or run backwards.
+
+    Returns:
+        The stream, without bad samples if ``drop_bad``, and a note of what was dropped (empty if nothing).
+
+    Raises:
+        BagError: a bad sample and ``drop_bad`` is off; names the first.
+    """
+    stamps, values = stream.stamps, stream.values
+    newest = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(stamps)[:-1]])
+    finite = np.isfinite(values)
+    kinds = {
+        "not finite": ~finite,
+        "with a repeated stamp": finite & (stamps == newest),
+        "with a stamp that runs backwards": finite & (stamps < newest),
+    }
+    dropped: list[str] = []
+    for kind, bad in kinds.items():
+        if not bad.any():
+            continue
+        k = int(np.flatnonzero(bad)[0])
+        if not drop_bad:
+            raise BagError(
+                f"{where}: sample {k} at {stamps[k] / 1e9:.3f} s, value {values[k]:g}, is {kind} ({bad.sum()} such); "
+                f"expected finite values at increasing stamps (--drop-bad leaves such samples out)"
+            )
+        dropped.append(f"{bad.sum()} samples {kind}")
+    if not dropped:
+        return stream, ""
+    keep = ~np.logical_or.reduce(list(kinds.values()))
+    if not keep.any():
+        raise BagError(f"{where}: no good sample is left ({', '.join(dropped)})")
+    return Stream(stamps[keep], values[keep]), "dropped " + ", ".join(dropped)

@@ -1,0 +1,188 @@
+"""The live counterpart of resampling: raw samples in ring buffers, a window on the model's grid at any instant.
+
+The window is sampled back from a given stamp at ``T_s``, so odometry of any rate and jitter works. Between samples it
+interpolates linearly as the extractor does; what is newer than a signal's last sample is not known yet, and that last
+sample is held.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.signals.inputs import model_inputs
+from dynssm_ros.signals.signal_map import STATE_SIGNALS, SignalMap
+
+Vector = npt.NDArray[np.float64]
+_BRIDGE = 1e-6  # fraction of T_s by which float rounding may miss the first sample of a window
+
+
+class Refusal(Enum):
+    """Why there is no prediction; the value says it in words for `/diagnostics`."""
+
+    FILLING = "the window is filling"
+    MISSING = "a signal has not been received"
+    STALE = "a signal is older than max_age"
+    NOT_FINITE = "a sample is not finite"
+    REPEATED = "a stamp repeats or is older than the newest"
+    JUMPED_BACK = "time jumped back; the window starts anew"
+    BAD_PREDICTION = "the model's output is not finite"
+
+
+class RingBuffer:
+    """The newest samples of one signal, in order, without allocation while running.
+
+    Everything is stored twice, one capacity apart, so that the newest ``n`` samples are always one contiguous view.
+    Times are nanoseconds since an epoch as floats, exact for 104 days.
+    """
+
+    def __init__(self, capacity: int = 256) -> None:
+        self._times = np.empty(2 * capacity)
+        self._values = np.empty(2 * capacity)
+        self._capacity = capacity
+        self._next = 0
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def times(self) -> Vector:
+        """Times (ns since the epoch) of all stored samples, oldest first; a view."""
+        end = self._next + self._capacity
+        return self._times[end - self._count : end]
+
+    @property
+    def values(self) -> Vector:
+        """Values of all stored samples, oldest first; a view."""
+        end = self._next + self._capacity
+        return self._values[end - self._count : end]
+
+    @property
+    def newest(self) -> float:
+        """Time of the newest sample (ns since the epoch), ``-inf`` if empty."""
+        return float(self._times[self._next + self._capacity - 1]) if self._count else -np.inf
+
+    def append(self, time: float, value: float, span: float) -> None:
+        """Adds a sample newer than all others, growing if the buffer would forget samples younger than ``span`` ns."""
+        if self._count == self._capacity and time - self.times[1] < span:
+            self._grow()
+        k = self._next
+        self._times[k] = self._times[k + self._capacity] = time
+        self._values[k] = self._values[k + self._capacity] = value
+        self._next = (k + 1) % self._capacity
+        self._count = min(self._count + 1, self._capacity)
+
+    def clear(self) -> None:
+        """Forgets all samples."""
+        self._next = self._count = 0
+
+    def _grow(self) -> None:
+        times, values, count = self.times.copy(), self.values.copy(), self._count
+        self.__init__(2 * self._capacity)  # type: ignore[misc]
+        for buffer, old in ((self._times, times), (self._values, values)):
+            buffer[:count] = buffer[self._capacity : self._capacity + count] = old
+        self._next = self._count = count
+
+
+class History:
+    """The raw signals of the recent past and the model's window on them.
+
+    Args:
+        signal_map: which signals there are; its ``max_gap`` restarts the window after a hole in the data.
+        T_s: sampling time of the window (s).
+        H: number of rows of the window.
+        max_age: how much older than the requested instant the newest sample of a signal may be (s).
+        jump_back: stamps that step back by more than this mean that time was set back, not disorder (s).
+    """
+
+    def __init__(self, signal_map: SignalMap, T_s: float, H: int, max_age: float = 0.2, jump_back: float = 0.5) -> None:
+        self.H = H
+        self.names = tuple(signal_map.active_signals())
+        self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
+        self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
+        self._offsets = -np.arange(H - 1, -1, -1, dtype=np.float64) * (T_s * 1e9)
+        self._span = (H * T_s + max_age + signal_map.max_gap) * 1e9
+        self._max_gap = float(signal_map.max_gap_ns)
+        self._max_age = max_age * 1e9
+        self._jump_back = jump_back * 1e9
+        self._slack = _BRIDGE * T_s * 1e9
+        self._epoch: int | None = None
+        self._window = np.empty((H, 7))
+
+    def add(self, stamp: int, values: dict[str, float]) -> Refusal | None:
+        """Takes the samples of one message.
+
+        Args:
+            stamp: header stamp (ns).
+            values: by signal name, SI units; signals that are not part of the window are ignored.
+
+        Returns:
+            ``None`` if they were taken, else why not. After ``JUMPED_BACK`` the older samples are forgotten and these
+            are the first of the new window.
+        """
+        if self._epoch is None:
+            self._epoch = stamp
+        time = float(stamp - self._epoch)
+        refusal: Refusal | None = None
+        for name, value in values.items():
+            buffer = self._buffers.get(name)
+            if buffer is None:
+                continue
+            if not np.isfinite(value):
+                refusal = Refusal.NOT_FINITE
+                continue
+            newest = buffer.newest
+            if time <= newest:
+                if newest - time <= self._jump_back:
+                    refusal = refusal or Refusal.REPEATED
+                    continue
+                self.clear()
+                self._epoch, time, newest = stamp, 0.0, -np.inf
+                refusal = Refusal.JUMPED_BACK
+            if time - newest > self._max_gap:
+                self._unbroken[name] = time
+            buffer.append(time, value, self._span)
+        return refusal
+
+    def clear(self) -> None:
+        """Forgets everything, as after a jump of time."""
+        for buffer in self._buffers.values():
+            buffer.clear()
+        self._unbroken = dict.fromkeys(self._buffers, -np.inf)
+        self._epoch = None
+
+    def window(self, stamp: int) -> Vector | Refusal:
+        """The ``(H, 7)`` window in the order of ``WINDOW_COLUMNS`` whose last row is at ``stamp`` (ns).
+
+        The array is reused by the next call. Instead of a window, the reason is returned if a signal is missing, older
+        than ``max_age``, or does not reach back without a gap.
+        """
+        if self._epoch is None:
+            return Refusal.MISSING
+        now = float(stamp - self._epoch)
+        first = now + self._offsets[0] + self._slack
+        reason: Refusal | None = None
+        for name, buffer in self._buffers.items():
+            if len(buffer) == 0:
+                return Refusal.MISSING
+            if now - buffer.newest > self._max_age:
+                return Refusal.STALE
+            if self._unbroken[name] > first or buffer.times[0] > first:
+                reason = Refusal.FILLING
+        if reason is not None:
+            return reason
+        grid = now + self._offsets
+        sampled = {name: np.interp(grid, buffer.times, buffer.values) for name, buffer in self._buffers.items()}
+        for column, name in enumerate(STATE_SIGNALS):
+            self._window[:, column] = sampled[name]
+        for column, values in enumerate(model_inputs(sampled), len(STATE_SIGNALS)):
+            self._window[:, column] = values
+        return self._window
+
+    def ages(self, stamp: int) -> dict[str, float]:
+        """Age of the newest sample of each signal at ``stamp`` (s); infinite where none was received."""
+        now = 0.0 if self._epoch is None else float(stamp - self._epoch)
+        return {name: (now - buffer.newest) / 1e9 for name, buffer in self._buffers.items()}

@@ -1,0 +1,57 @@
+"""Raw actuator signals to the model's inputs: signed throttle, and commands as increments on top of the feedback.
+
+This is the only place where absolute commands become increments (applied = feedback + command) and where the brake is
+merged; the extractor and the live window both call it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Vector = npt.NDArray[np.float64]
+
+WINDOW_COLUMNS = ("v_x", "v_y", "omega", "r_fb", "delta_fb", "r_cmd", "delta_cmd")
+"""One row of the model's input: ``x_t = [v_x, v_y, omega, r_fb, delta_fb]`` and ``u_t = [r_cmd, delta_cmd]``."""
+
+
+class ModelInputs(NamedTuple):
+    """Feedback and command increments, each of shape ``(N,)``: fraction, rad, fraction, rad."""
+
+    r_fb: Vector
+    delta_fb: Vector
+    r_cmd: Vector
+    delta_cmd: Vector
+
+
+def model_inputs(signals: Mapping[str, Any]) -> ModelInputs:
+    """Merges brakes and turns absolute commands into increments; without commands the increments are zero.
+
+    Args:
+        signals: sampled signals by name, each of shape ``(N,)``.
+    """
+    r_fb = signed_throttle(signals["throttle_feedback"], signals.get("brake_feedback"))
+    delta_fb = signals["steering_feedback"]
+    if "throttle_command" not in signals:
+        return ModelInputs(r_fb, delta_fb, np.zeros_like(r_fb), np.zeros_like(delta_fb))
+    r = signed_throttle(signals["throttle_command"], signals.get("brake_command"))
+    return ModelInputs(r_fb, delta_fb, r - r_fb, signals["steering_command"] - delta_fb)
+
+
+def signed_throttle(throttle: Vector, brake: Vector | None) -> Vector:
+    """One signed throttle in [-1, 1]: minus the brake where it is pressed, else the throttle."""
+    return throttle if brake is None else np.where(brake > 0.0, -brake, throttle)
+
+
+def lookahead_commands(feedback: Vector, segment: npt.NDArray[np.int32]) -> Vector:
+    """The increment to the next feedback sample, ``u_t = fb_{t+1} - fb_t``; zero in the last row of a segment.
+
+    This looks ahead in time. It repeats the protocol of the published data sets and is never used live.
+    """
+    command = np.zeros_like(feedback)
+    inside = segment[1:] == segment[:-1]
+    command[:-1][inside] = np.diff(feedback)[inside]
+    return command

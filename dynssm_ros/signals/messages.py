@@ -1,0 +1,65 @@
+"""The standard messages that bags written by this package hold (see the topics of the README)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rosbags.typesys import Stores, get_typestore
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+ODOMETRY_TOPIC = "/vehicle/odometry"
+FEEDBACK_TOPIC = "/vehicle/actuator_feedback"
+COMMAND_TOPIC = "/vehicle/actuator_command"
+PREDICTION_TOPIC = "/dynssm/prediction"
+PARAMETERS_TOPIC = "/dynssm/parameters"
+HORIZON_TOPIC = "/dynssm/horizon"
+
+_TYPES = get_typestore(Stores.ROS2_JAZZY).types
+Vector = npt.NDArray[np.float64]
+
+
+def odometry(
+    stamp: int,
+    pose: tuple[float, float, float],
+    state: tuple[float, float, float],
+    twist_covariance: Vector | None = None,
+    frame_id: str = "map",
+    child_frame_id: str = "base_link",
+) -> Any:
+    """An Odometry message.
+
+    Args:
+        stamp: header stamp (ns).
+        pose: ``x, y`` (m) and heading ``theta`` (rad) in ``frame_id``.
+        state: ``v_x, v_y`` (m/s) and ``omega`` (rad/s) in ``child_frame_id``.
+        twist_covariance: row-major 6 x 6, shape ``(36,)``; zeros (unknown) if not given.
+    """
+    x, y, theta = pose
+    v_x, v_y, omega = state
+    vector, point = _TYPES["geometry_msgs/msg/Vector3"], _TYPES["geometry_msgs/msg/Point"]
+    quaternion = _TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2))
+    body = _TYPES["geometry_msgs/msg/Pose"](point(float(x), float(y), 0.0), quaternion)
+    twist = _TYPES["geometry_msgs/msg/Twist"](vector(float(v_x), float(v_y), 0.0), vector(0.0, 0.0, float(omega)))
+    covariance = np.zeros(36) if twist_covariance is None else twist_covariance
+    return _TYPES[ODOMETRY](
+        _header(stamp, frame_id),
+        child_frame_id,
+        _TYPES["geometry_msgs/msg/PoseWithCovariance"](body, np.zeros(36)),
+        _TYPES["geometry_msgs/msg/TwistWithCovariance"](twist, covariance),
+    )
+
+
+def joint_state(stamp: int, values: Mapping[str, float]) -> Any:
+    """A JointState message with a position for each name; ``stamp`` in ns."""
+    position = np.array(list(values.values()), dtype=np.float64)
+    return _TYPES[JOINT_STATE](_header(stamp, ""), list(values), position, np.zeros(0), np.zeros(0))
+
+
+def _header(stamp: int, frame_id: str) -> Any:
+    seconds, nanoseconds = divmod(int(stamp), 1_000_000_000)
+    return _TYPES["std_msgs/msg/Header"](_TYPES["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame_id)

@@ -1,0 +1,213 @@
+"""Recordings: named SI columns on a uniform grid, in segments without gaps; on disk as Parquet with metadata."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import Field, ValidationError
+
+from dynssm_ros.configuration import StrictModel
+from dynssm_ros.errors import RecordingError
+from dynssm_ros.files import replacing
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
+from dynssm_ros.signals.signal_map import POSE_SIGNALS, Commands
+
+Vector = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+METADATA_KEY = b"dynssm"
+COLUMN_UNITS = {
+    "v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "r_fb": "1", "delta_fb": "rad", "r_cmd": "1", "delta_cmd": "rad",
+    "x": "m", "y": "m", "theta": "rad",
+}  # fmt: skip
+
+
+class RecordingInfo(StrictModel):
+    """What a recording says of itself."""
+
+    version: int = Field(default=1, le=1, description="format version")
+    sampling_time: float = Field(gt=0, description="T_s (s)")
+    commands: Commands = Field(description="where u_t comes from")
+    source: tuple[str, ...] = Field(default=(), description="names of the bags or simulations")
+    signal_map: str = ""
+    notes: tuple[str, ...] = Field(default=(), description="what was recovered, dropped or bridged")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Signals of a run on a uniform time grid.
+
+    Attributes:
+        info: sampling time, source and history.
+        time: header-stamp time of each row (int64 ns), shape ``(N,)``; uniform inside a segment.
+        segment: number of the gap-free stretch a row belongs to, non-decreasing, shape ``(N,)``.
+        columns: ``WINDOW_COLUMNS`` and, where known, the pose ``x y theta`` (m, m, rad unwrapped), each ``(N,)``.
+    """
+
+    info: RecordingInfo
+    time: npt.NDArray[np.int64]
+    segment: npt.NDArray[np.int32]
+    columns: dict[str, Vector] = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __getitem__(self, column: str) -> Vector:
+        return self.columns[column]
+
+    @property
+    def T_s(self) -> float:
+        """Sampling time (s)."""
+        return self.info.sampling_time
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether ``x y theta`` were recorded."""
+        return all(name in self.columns for name in POSE_SIGNALS)
+
+    @property
+    def duration(self) -> float:
+        """Recorded time without the gaps (s)."""
+        return len(self) * self.T_s
+
+    @property
+    def matrix(self) -> Vector:
+        """The model's input rows, shape ``(N, 7)`` in the order of ``WINDOW_COLUMNS``."""
+        return np.stack([self.columns[name] for name in WINDOW_COLUMNS], axis=1)
+
+    def window_ends(self, H: int, horizon: int = 1, min_speed: float = -np.inf) -> Indices:
+        """Rows ``t`` such that rows ``t-H+1 .. t+horizon`` lie in one segment and nowhere below ``min_speed``.
+
+        Windows are formed from these by indexing; no ``(N, H, 7)`` array is ever stored.
+        """
+        rows = np.arange(H - 1, len(self) - horizon)
+        if len(rows) == 0:
+            return rows
+        slow = np.concatenate([[0], np.cumsum(self.columns["v_x"] < min_speed)])
+        first, last = rows - H + 1, rows + horizon
+        usable = (self.segment[first] == self.segment[last]) & (slow[last + 1] == slow[first])
+        selected: Indices = rows[usable]
+        return selected
+
+    def select(self, rows: slice | npt.NDArray[np.bool_] | Indices) -> Recording:
+        """The given rows; a segment that the selection cuts apart becomes several."""
+        index = np.arange(len(self))[rows]
+        cut = np.flatnonzero((np.diff(index) != 1) | (np.diff(self.segment[index]) != 0)) + 1
+        segment = np.zeros(len(index), dtype=np.int32)
+        segment[cut] = 1
+        return replace(
+            self,
+            time=self.time[index],
+            segment=np.cumsum(segment, dtype=np.int32),
+            columns={name: values[index] for name, values in self.columns.items()},
+        )
+
+    def split_last(self, fraction: float) -> tuple[Recording, Recording]:
+        """Splits off the last ``fraction`` of the rows as one block (blocked split): ``(first, last)``."""
+        cut = len(self) - round(len(self) * fraction)
+        return self.select(slice(None, cut)), self.select(slice(cut, None))
+
+    def with_commands(self, commands: Commands | None) -> Recording:
+        """The same recording under another command protocol; ``None`` keeps it.
+
+        Raises:
+            RecordingError: ``topics`` asked of a recording without them.
+        """
+        if commands is None or commands == self.info.commands:
+            return self
+        if commands == "topics":
+            raise RecordingError(
+                f"recording {', '.join(self.info.source)}: commands 'topics' asked for, but it was extracted with "
+                f"'{self.info.commands}'; extract the bag again with --commands topics"
+            )
+        columns = dict(self.columns)
+        for feedback, command in (("r_fb", "r_cmd"), ("delta_fb", "delta_cmd")):
+            columns[command] = (
+                lookahead_commands(columns[feedback], self.segment)
+                if commands == "lookahead"
+                else np.zeros_like(columns[feedback])
+            )
+        return replace(self, info=self.info.model_copy(update={"commands": commands}), columns=columns)
+
+    def save(self, path: str | Path) -> None:
+        """Writes Parquet with the metadata inside, atomically."""
+        arrays = {"time": pa.array(self.time), "segment": pa.array(self.segment)}
+        arrays |= {name: pa.array(values) for name, values in self.columns.items()}
+        fields = [
+            pa.field(
+                name, array.type, metadata={b"unit": COLUMN_UNITS.get(name, "ns" if name == "time" else "").encode()}
+            )
+            for name, array in arrays.items()
+        ]
+        schema = pa.schema(fields, metadata={METADATA_KEY: self.info.model_dump_json().encode()})
+        with replacing(path) as aside:
+            pq.write_table(pa.table(list(arrays.values()), schema=schema), aside, compression="zstd")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Recording:
+        """Reads a recording.
+
+        Raises:
+            RecordingError: missing, not Parquet, not a recording, or damaged.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise RecordingError(f"{path}: no such recording; `dynssm extract` makes one from a bag")
+        try:
+            table = pq.read_table(path)
+        except (pa.ArrowException, OSError) as error:
+            raise RecordingError(f"{path}: not a readable Parquet file ({' '.join(str(error).split())})") from error
+        raw = (table.schema.metadata or {}).get(METADATA_KEY)
+        if raw is None:
+            raise RecordingError(f"{path}: Parquet, but not a dynssm recording (no '{METADATA_KEY.decode()}' metadata)")
+        try:
+            info = RecordingInfo.model_validate_json(raw)
+        except ValidationError as error:
+            raise RecordingError(f"{path}: metadata not understood ({error.errors()[0]['msg']})") from error
+        missing = [name for name in ("time", "segment", *WINDOW_COLUMNS) if name not in table.column_names]
+        if missing:
+            raise RecordingError(f"{path}: column {missing[0]} is missing")
+        columns = {name: table[name].to_numpy() for name in COLUMN_UNITS if name in table.column_names}
+        for name, values in columns.items():
+            bad = np.flatnonzero(~np.isfinite(values))
+            if len(bad):
+                raise RecordingError(f"{path}: column {name}, row {bad[0]}: {values[bad[0]]}; expected a finite number")
+        return cls(info, table["time"].to_numpy(), table["segment"].to_numpy(), columns)
+
+
+def concatenate(recordings: Sequence[Recording]) -> Recording:
+    """Joins recordings of one car, one after the other; segments stay apart.
+
+    Raises:
+        RecordingError: sampling times or command protocols differ, or nothing to join.
+    """
+    if not recordings:
+        raise RecordingError("no recording given")
+    first = recordings[0]
+    for other in recordings[1:]:
+        for name in ("sampling_time", "commands"):
+            have, want = getattr(other.info, name), getattr(first.info, name)
+            if have != want:
+                raise RecordingError(
+                    f"recording {', '.join(other.info.source)}: {name} {have}, but {', '.join(first.info.source)} "
+                    f"has {want}; expected the same"
+                )
+    names = [name for name in first.columns if all(name in other.columns for other in recordings)]
+    offsets = np.cumsum([0] + [int(r.segment[-1]) + 1 if len(r) else 0 for r in recordings[:-1]])
+    info = first.info.model_copy(
+        update={
+            "source": tuple(s for r in recordings for s in r.info.source),
+            "notes": tuple(n for r in recordings for n in r.info.notes),
+        }
+    )
+    return Recording(
+        info,
+        np.concatenate([r.time for r in recordings]),
+        np.concatenate([r.segment + offset for r, offset in zip(recordings, offsets, strict=True)]).astype(np.int32),
+        {name: np.concatenate([r.columns[name] for r in recordings]) for name in names},
+    )

@@ -1,0 +1,153 @@
+"""The signal map: which field of which topic is which signal, shared by extractor, node, player and replay."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from dynssm_ros import configuration
+from dynssm_ros.configuration import StrictModel
+
+Commands = Literal["topics", "lookahead", "none"]
+"""Where ``u_t`` comes from: recorded command topics, the next feedback sample (offline only), or nowhere (zero)."""
+
+STATE_SIGNALS = ("v_x", "v_y", "omega")
+POSE_SIGNALS = ("x", "y", "theta")
+REQUIRED_SIGNALS = (*STATE_SIGNALS, "throttle_feedback", "steering_feedback")
+COMMAND_SIGNALS = ("throttle_command", "steering_command")
+SIGNALS = (*REQUIRED_SIGNALS, *POSE_SIGNALS, *COMMAND_SIGNALS, "brake_feedback", "brake_command")
+
+Accessor = Callable[[Any], float | None]
+_PATH = r"[A-Za-z_]\w*(?:\[\w+\])?(?:\.[A-Za-z_]\w*(?:\[\w+\])?)*"
+_FIELD = re.compile(rf"^(?:yaw\((?P<yaw>{_PATH})\)|(?P<path>{_PATH}))$")
+
+
+class Source(StrictModel):
+    """Where one signal comes from; its value is ``scale * field + offset`` in SI units."""
+
+    topic: str = Field(pattern=r"^/[\w/]*\w$", description="absolute topic name")
+    type: str = Field(pattern=r"^\w+/msg/\w+$", description="message type, package/msg/Name")
+    field: str = Field(description="dotted path; position[steering] picks by name or index; yaw(path) of a quaternion")
+    scale: float = 1.0
+    offset: float = 0.0
+
+    @field_validator("field")
+    @classmethod
+    def _parses(cls, value: str) -> str:
+        if not _FIELD.match(value):
+            raise ValueError("expected a dotted path such as twist.twist.linear.x, position[steering] or yaw(pose)")
+        return value
+
+
+class SignalMap(StrictModel):
+    """All signals of a car's stack."""
+
+    name: str
+    commands: Commands = "topics"
+    max_gap: float = Field(default=0.25, gt=0, description="longest time between samples that is bridged (s)")
+    signals: dict[str, Source]
+
+    @model_validator(mode="after")
+    def _known_and_complete(self) -> SignalMap:
+        unknown = [name for name in self.signals if name not in SIGNALS]
+        if unknown:
+            raise ValueError(f"signals: unknown '{unknown[0]}'; expected {' '.join(SIGNALS)}")
+        needed = REQUIRED_SIGNALS + (COMMAND_SIGNALS if self.commands == "topics" else ())
+        missing = [name for name in needed if name not in self.signals]
+        if missing:
+            raise ValueError(f"signals: missing {', '.join(missing)} (commands: {self.commands})")
+        types: dict[str, str] = {}
+        for source in self.signals.values():
+            if types.setdefault(source.topic, source.type) != source.type:
+                raise ValueError(f"signals: topic {source.topic} is given two types")
+        return self
+
+    @property
+    def odometry_topic(self) -> str:
+        """The topic whose messages trigger predictions and anchor the time grid: the one that carries ``v_x``."""
+        return self.signals["v_x"].topic
+
+    @property
+    def max_gap_ns(self) -> int:
+        """``max_gap`` in integer nanoseconds."""
+        return round(self.max_gap * 1e9)
+
+    def with_commands(self, commands: Commands | None) -> SignalMap:
+        """The same map with another source of commands; ``None`` keeps it.
+
+        Raises:
+            ConfigurationError: ``topics`` asked of a map without command signals.
+        """
+        if commands is None:
+            return self
+        content = self.model_dump() | {"commands": commands}
+        return configuration.validate(SignalMap, content, f"signal map {self.name}")
+
+    def active_signals(self) -> dict[str, Source]:
+        """The signals that are read: command topics only where ``commands: topics``."""
+        skipped = () if self.commands == "topics" else (*COMMAND_SIGNALS, "brake_command")
+        return {name: source for name, source in self.signals.items() if name not in skipped}
+
+
+def load_signal_map(name_or_path: str | Path) -> SignalMap:
+    """Reads a signal map by shipped name or path.
+
+    Raises:
+        ConfigurationError: not found, malformed, or with unknown or missing signals.
+    """
+    return configuration.load(SignalMap, "signals", name_or_path)
+
+
+def compile_field(field: str) -> Accessor:
+    """Turns a field path into a function of the message.
+
+    The function returns ``None`` where a joint name or index is not in this message (a partial JointState is legal)
+    and raises ``AttributeError`` where the message type has no such field.
+    """
+    match = _FIELD.match(field)
+    if match is None:
+        raise ValueError(f"not a field path: {field}")
+    steps = [_compile_step(part) for part in (match["yaw"] or match["path"]).split(".")]
+
+    def value(message: Any) -> float | None:
+        for step in steps:
+            message = step(message)
+            if message is None:
+                return None
+        return float(message)
+
+    def yaw(message: Any) -> float | None:
+        for step in steps:
+            message = step(message)
+        q = message
+        return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+
+    return yaw if match["yaw"] else value
+
+
+def _compile_step(part: str) -> Callable[[Any], Any]:
+    name, _, key = part.rstrip("]").partition("[")
+    if not key:
+        return lambda message: getattr(message, name)
+    if key.isdigit():
+        index = int(key)
+
+        def by_index(message: Any) -> Any:
+            values = getattr(message, name)
+            return values[index] if index < len(values) else None
+
+        return by_index
+
+    def by_name(message: Any) -> Any:
+        values, names = getattr(message, name), message.name
+        for position, candidate in enumerate(names):
+            if candidate == key and position < len(values):
+                return values[position]
+        return None
+
+    return by_name

@@ -1,0 +1,160 @@
+"""The vehicle file: constants, coefficients with bounds and knowledge, input limits, effects.
+
+Names and units are the paper's (Table I); a file is checked completely when it is read, so inside the package a
+:class:`Vehicle` is trusted.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from pydantic import Field, model_validator
+
+from dynssm_ros import configuration
+from dynssm_ros.configuration import StrictModel
+from dynssm_ros.files import replacing
+from dynssm_ros.vehicle.effects import Effect, build_effect
+from dynssm_ros.vehicle.single_track import Coefficients
+
+COEFFICIENT_UNITS: dict[str, str] = {
+    "B_f": "1/rad", "C_f": "1", "D_f": "N", "E_f": "1",
+    "B_r": "1/rad", "C_r": "1", "D_r": "N", "E_r": "1",
+    "S_hf": "rad", "S_vf": "N", "S_hr": "rad", "S_vr": "N",
+    "C_m1": "N", "C_m2": "N s/m", "C_r0": "N", "C_r2": "N s^2/m^2", "I_z": "kg m^2",
+}  # fmt: skip
+COEFFICIENTS: tuple[str, ...] = Coefficients._fields
+assert tuple(COEFFICIENT_UNITS) == COEFFICIENTS
+
+Vector = npt.NDArray[np.float64]
+
+
+class Coefficient(StrictModel):
+    """One entry of theta: its nominal value, admissible range, and how well it is known."""
+
+    nominal: float = Field(description="best known value")
+    bounds: tuple[float, float] = Field(description="admissible range [min, max]")
+    std: float | None = Field(
+        default=None, ge=0, description="standard deviation of the nominal value; null: known by its bounds only"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Coefficient:
+        lower, upper = self.bounds
+        if not lower < upper:
+            raise ValueError(f"bounds [{lower:g}, {upper:g}] must be [min, max] with min < max")
+        if not lower <= self.nominal <= upper:
+            raise ValueError(f"nominal {self.nominal:g} is outside its bounds [{lower:g}, {upper:g}]")
+        return self
+
+
+class VehicleConstants(StrictModel):
+    """Mass and geometry, known and not adapted."""
+
+    m: float = Field(gt=0, description="mass (kg)")
+    l_f: float = Field(gt=0, description="centre of gravity to front axle (m)")
+    l_r: float = Field(gt=0, description="centre of gravity to rear axle (m)")
+    h_cg: float = Field(ge=0, description="height of the centre of gravity (m)")
+    F_z0: float = Field(gt=0, description="nominal axle load (N) at which D and S_v hold")
+    load_transfer: bool = Field(description="scale lateral forces with the axle loads")
+
+
+class InputLimits(StrictModel):
+    """What the actuators can do."""
+
+    throttle: tuple[float, float] = Field(description="range of the signed throttle (fraction, negative brakes)")
+    steering: tuple[float, float] = Field(description="range of the road-wheel angle (rad)")
+    steering_rate: float = Field(gt=0, description="largest steering speed (rad/s)")
+
+
+class EffectEntry(StrictModel):
+    """An effect by name, with its parameters."""
+
+    name: str
+    parameters: dict[str, float] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _buildable(self) -> EffectEntry:
+        build_effect(self.name, self.parameters)
+        return self
+
+
+class Vehicle(StrictModel):
+    """A car as the whole package knows it."""
+
+    name: str
+    description: str = ""
+    constants: VehicleConstants
+    sampling_time: float = Field(gt=0, le=1, description="T_s (s)")
+    inputs: InputLimits
+    coefficients: dict[str, Coefficient]
+    effects: tuple[EffectEntry, ...] = ()
+
+    @model_validator(mode="after")
+    def _complete(self) -> Vehicle:
+        missing = [name for name in COEFFICIENTS if name not in self.coefficients]
+        unknown = [name for name in self.coefficients if name not in COEFFICIENTS]
+        if missing:
+            raise ValueError(f"coefficients: missing {', '.join(missing)}; all of {' '.join(COEFFICIENTS)} are needed")
+        if unknown:
+            raise ValueError(f"coefficients: unknown {', '.join(unknown)}; expected {' '.join(COEFFICIENTS)}")
+        return self
+
+    @property
+    def nominal(self) -> Vector:
+        """theta_0, shape ``(17,)``, in the order of ``COEFFICIENTS``."""
+        return np.array([self.coefficients[name].nominal for name in COEFFICIENTS])
+
+    @property
+    def lower(self) -> Vector:
+        """theta_min, shape ``(17,)``."""
+        return np.array([self.coefficients[name].bounds[0] for name in COEFFICIENTS])
+
+    @property
+    def upper(self) -> Vector:
+        """theta_max, shape ``(17,)``."""
+        return np.array([self.coefficients[name].bounds[1] for name in COEFFICIENTS])
+
+    @property
+    def active_effects(self) -> tuple[Effect, ...]:
+        """The effects of the file, ready to act."""
+        return tuple(build_effect(entry.name, entry.parameters) for entry in self.effects)
+
+    def with_nominal(self, nominal: Vector, std: Vector | None = None) -> Vehicle:
+        """The same car with other nominal values and, if given, what is known of them."""
+        coefficients = {
+            name: self.coefficients[name].model_copy(
+                update={"nominal": float(nominal[k])} | ({} if std is None else {"std": float(std[k])})
+            )
+            for k, name in enumerate(COEFFICIENTS)
+        }
+        return self.model_copy(update={"coefficients": coefficients})
+
+    def with_effect(self, name: str, parameters: dict[str, float]) -> Vehicle:
+        """The same car with one more effect.
+
+        Raises:
+            ConfigurationError: no such effect, or a parameter outside its bounds.
+        """
+        entry = configuration.validate(EffectEntry, {"name": name, "parameters": parameters}, f"effect {name}")
+        return self.model_copy(update={"effects": (*self.effects, entry)})
+
+
+def load_vehicle(name_or_path: str | Path) -> Vehicle:
+    """Reads a vehicle file by shipped name or path.
+
+    Raises:
+        ConfigurationError: not found, malformed, incomplete or out of bounds.
+    """
+    return configuration.load(Vehicle, "vehicles", name_or_path)
+
+
+def save_vehicle(vehicle: Vehicle, path: str | Path, comment: str = "") -> None:
+    """Writes a vehicle file, atomically; ``comment`` goes to its head."""
+    content: dict[str, Any] = vehicle.model_dump(mode="json")
+    head = "".join(f"# {line}\n" for line in comment.splitlines())
+    with replacing(path) as aside:
+        aside.write_text(head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110))
