@@ -37,7 +37,8 @@ def config_directories() -> Iterator[Path]:
     for prefix in prefixes:
         yield Path(prefix) / "share" / PACKAGE / "config"
     # colcon without an activated workspace: <prefix>/lib/pythonX.Y/site-packages/dynssm_ros/configuration.py
-    yield Path(__file__).resolve().parents[4] / "share" / PACKAGE / "config"
+    for prefix_path in Path(__file__).resolve().parents[4:5]:
+        yield prefix_path / "share" / PACKAGE / "config"
 
 
 def config_root() -> Path:
@@ -76,10 +77,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
         ConfigurationError: unreadable, not YAML, or not a mapping.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506 - derived from the safe loader
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: cannot be read ({error})") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date that does not exist is a ValueError
         raise ConfigurationError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
         raise ConfigurationError(f"{path}: expected a mapping of fields, got {type(content).__name__}")
@@ -95,19 +96,36 @@ def validate(schema: type[_Model], content: dict[str, Any], source: str | Path) 
     try:
         return schema.model_validate(content)
     except ValidationError as error:
-        problems = error.errors(include_url=False, include_context=False)
-        first = problems[0]
-        field = ".".join(str(part) for part in first["loc"]) or "(whole file)"
-        value = "" if first["type"] == "missing" else f" (got {_short(first['input'])})"
-        more = f"; {len(problems) - 1} more" if len(problems) > 1 else ""
-        message = first["msg"].removeprefix("Value error, ")
-        raise ConfigurationError(f"{source}: {field}: {message}{value}{more}") from error
+        raise ConfigurationError(f"{source}: {describe(error)}") from error
+
+
+def describe(error: ValidationError) -> str:
+    """The first violation in one line: field, what is wrong, the value, and how many more there are."""
+    problems = error.errors(include_url=False, include_context=False)
+    first = problems[0]
+    field = ".".join(str(part) for part in first["loc"])
+    message = " ".join(first["msg"].removeprefix("Value error, ").split())
+    if field and first["type"] != "missing":
+        message += f" (got {_short(first['input'])})"
+    more = f"; {len(problems) - 1} more" if len(problems) > 1 else ""
+    return f"{field}: {message}{more}" if field else f"{message}{more}"
 
 
 def load(schema: type[_Model], kind: str, name_or_path: str | Path) -> _Model:
     """Finds, reads and validates a configuration file of ``kind``."""
     path = find_config(kind, name_or_path)
     return validate(schema, read_yaml(path), path)
+
+
+class _Loader(yaml.SafeLoader):
+    """The safe loader, which here refuses a field that is given twice instead of taking the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise yaml.constructor.ConstructorError(None, None, f"'{twice[0]}' is given twice", node.start_mark)
+        return super().construct_mapping(node, deep)
 
 
 def _short(value: object) -> str:

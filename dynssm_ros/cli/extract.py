@@ -10,6 +10,7 @@ import typer
 from dynssm_ros.cli.console import CommandsOption, SignalsOption, console, progress_bar
 from dynssm_ros.signals.extraction import extract as extract_bags
 from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.signals.standard import recording_to_bag
 
 
 def extract(
@@ -20,6 +21,12 @@ def extract(
     signals: SignalsOption,
     rate: Annotated[float, typer.Option(help="Rate of the uniform time grid (Hz).", min=1.0, max=1000.0)],
     out: Annotated[Path, typer.Option(help="Recording to write (Parquet).", dir_okay=False)],
+    bag: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also write the grid as a rosbag2 with the standard topics, to play it without its own types."
+        ),
+    ] = None,
     commands: CommandsOption = None,
     drop_bad: Annotated[
         bool,
@@ -31,10 +38,14 @@ def extract(
     with progress_bar("reading") as progress:
         recording = extract_bags(bags, signal_map, rate, drop_bad, progress)
     recording.save(out)
+    if bag is not None:
+        recording_to_bag(recording, bag)
     for note in recording.info.notes:
-        console.print(f"note: {note}")
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
     segments = int(recording.segment[-1]) + 1
     console.print(
         f"{out}: {len(recording)} rows at {rate:g} Hz, {recording.duration:.1f} s in {segments} "
-        f"segment{'s' if segments > 1 else ''}, commands: {recording.info.commands}"
+        f"segment{'s' if segments > 1 else ''}, commands: {recording.info.commands}",
+        markup=False,
+        soft_wrap=True,
     )

@@ -8,8 +8,15 @@ import typer
 from rich.markup import escape
 
 from dynssm_ros import __version__
+from dynssm_ros.cli.bench import bench
+from dynssm_ros.cli.calibrate import calibrate
 from dynssm_ros.cli.console import errors
+from dynssm_ros.cli.demo import demo
+from dynssm_ros.cli.evaluate import evaluate
 from dynssm_ros.cli.extract import extract
+from dynssm_ros.cli.replay import replay
+from dynssm_ros.cli.simulate import simulate
+from dynssm_ros.cli.train import train
 from dynssm_ros.errors import UserError
 
 app = typer.Typer(
@@ -19,7 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (extract,):
+for command in (demo, simulate, extract, calibrate, train, evaluate, replay, bench):
     app.command()(command)
 
 

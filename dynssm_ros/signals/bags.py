@@ -1,7 +1,8 @@
 """rosbag2 folders and single files (MCAP and SQLite3), any message type that the bag describes.
 
-Reading is rosbags' work. What is added here: one clear error per kind of damage, and the rescue of bags that were cut
-off while being written - a killed recorder leaves no metadata and no index, and what lies before the cut is still good.
+Reading is rosbags' work. What is added here: one clear error per kind of damage, and the way around it where there is
+one - bags that were cut off (:mod:`dynssm_ros.signals.rescue`), that lack their metadata or index, or some of whose
+files are lost.
 """
 
 from __future__ import annotations
@@ -9,23 +10,24 @@ from __future__ import annotations
 import sqlite3
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import apsw
-from mcap.reader import NonSeekingReader
-from mcap.writer import Writer as McapFileWriter
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.files import replacing
+from dynssm_ros.signals.rescue import is_unindexed, log_left, merge_log, rescue, unpack, unpacked_message
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
+_NO_INDEX = "it has no index"
+_LOG_LEFT = "its recorder was killed"
 _TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -45,7 +47,7 @@ class Bag:
     reader: AnyReader
     notes: list[str] = field(default_factory=list)
 
-    @property
+    @cached_property
     def types(self) -> dict[str, str]:
         """Message type of each topic."""
         return {c.topic: c.msgtype for c in self.reader.connections}
@@ -71,6 +73,15 @@ class Bag:
             )
         if types[topic] != msgtype:
             raise BagError(f"{self.path}: topic {topic} has type {types[topic]}; the signal map expects {msgtype}")
+        if msgtype not in self.typestore(msgtype).types:
+            raise BagError(
+                f"{self.path}: topic {topic}: the bag does not describe {msgtype}, and it is no common type of ROS 2; "
+                f"record it as MCAP, which stores descriptions"
+            )
+
+    def typestore(self, msgtype: str) -> Any:
+        """The descriptions that hold for ``msgtype``: the bag's own or, where it has none, those of ROS 2 Jazzy."""
+        return self.reader.typestore if msgtype in self.reader.typestore.types else _TYPESTORE
 
     def messages(self, topics: Sequence[str]) -> Iterator[BagMessage]:
         """Yields the messages of ``topics`` in the order in which they were recorded.
@@ -83,8 +94,8 @@ class Bag:
             return
         try:
             for connection, log_time, raw in self.reader.messages(wanted):
-                yield BagMessage(connection.topic, log_time, bytes(raw))
-        except (AnyReaderError, apsw.Error, ValueError, EOFError, AssertionError) as error:
+                yield BagMessage(connection.topic, log_time, unpacked_message(bytes(raw)))
+        except Exception as error:  # rosbags lets through what its decoders raise: struct, codec, SQLite, index errors
             raise BagError(f"{self.path}: damaged, reading stopped ({_one_line(error)})") from error
 
     def decode(self, topic: str, raw: bytes) -> Any:
@@ -95,7 +106,9 @@ class Bag:
         """
         msgtype = self.types[topic]
         try:
-            return self.reader.deserialize(raw, msgtype)
+            if msgtype in self.reader.typestore.types:
+                return self.reader.deserialize(raw, msgtype)
+            return _TYPESTORE.deserialize_cdr(raw, msgtype)
         except Exception as error:  # rosbags raises struct, index, key and unicode errors here
             raise BagError(f"{self.path}: topic {topic}: a message is not a {msgtype} ({_one_line(error)})") from error
 
@@ -112,109 +125,109 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         raise BagError(f"{path}: no such bag")
     with ExitStack() as stack:
         notes: list[str] = []
-        reader = _try_open(path)
-        if reader is None:
+        try:
+            reader = _open([path])
+        except BagError as damage:
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dynssm-")))
-            reader = _open_files(path, scratch, notes)
+            reader = _open_files(path, scratch, str(damage), notes)
         stack.callback(reader.close)
         yield Bag(path, reader, notes)
 
 
-def _try_open(path: Path) -> AnyReader | None:
-    """Opens an undamaged bag, else ``None``."""
-    if path.is_dir() and not (path / "metadata.yaml").is_file():
-        return None
+def _open(paths: list[Path]) -> AnyReader:
+    """Opens what rosbags reads rightly as it is.
+
+    Raises:
+        BagError: there is more to do; says why.
+    """
+    if any(path.is_dir() and not (path / "metadata.yaml").is_file() for path in paths):
+        raise BagError("there is no metadata.yaml")
     try:
-        reader = AnyReader([path], default_typestore=_TYPESTORE)
+        files = [file for path in paths for file in _storage_files(path)]
+        if any(log_left(file) for file in files):
+            raise BagError(_LOG_LEFT)
+        if any(is_unindexed(file) for file in files):
+            raise BagError(_NO_INDEX)
+        reader = AnyReader(paths, default_typestore=_TYPESTORE)
         reader.open()
-    except (AnyReaderError, OSError, apsw.Error, ValueError, KeyError, AssertionError, EOFError):
-        return None
+    except Exception as error:  # rosbags lets through what its decoders raise: struct, codec, YAML, index, type errors
+        raise BagError(_one_line(error)) from error
     return reader
 
 
-def _open_files(path: Path, scratch: Path, notes: list[str]) -> AnyReader:
-    """Opens the storage files one by one, rescuing those that were cut off."""
-    files = sorted(p for p in path.iterdir() if p.suffix in STORAGE_SUFFIXES) if path.is_dir() else [path]
-    if not files or files[0].suffix not in STORAGE_SUFFIXES:
-        raise BagError(f"{path}: not a bag; expected a rosbag2 folder, or a .mcap or .db3 file")
-    good: list[Path] = []
-    for file in files:
-        if _readable(file):
-            good.append(file)
-            continue
-        rescued = scratch / file.name
-        count = _rescue_mcap(file, rescued) if file.suffix == ".mcap" else _rescue_sqlite(file, rescued)
-        if count == 0 or not _readable(rescued):
-            raise BagError(f"{file}: not a bag, or cut off before its first message; nothing could be recovered")
-        notes.append(f"{file.name} is cut off: recovered {count} messages up to the cut")
-        good.append(rescued)
-    if path.is_dir() and not (path / "metadata.yaml").is_file():
-        notes.append(f"{path.name} has no metadata.yaml: its storage files were read directly")
+def _storage_files(path: Path) -> list[Path]:
+    """The storage files of a folder, or the file itself; what is there packed and unpacked counts once."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return [
+        file
+        for file in files
+        if file.suffix in STORAGE_SUFFIXES
+        or (file.suffix == ".zstd" and Path(file.stem).suffix in STORAGE_SUFFIXES and file.with_suffix("") not in files)
+    ]
+
+
+def _open_files(path: Path, scratch: Path, damage: str, notes: list[str]) -> AnyReader:
+    """Opens the storage files of a bag one by one and, where one is cut off, what ``scratch`` can hold of it.
+
+    Raises:
+        BagError: there are none, or nothing could be recovered.
+    """
     try:
-        reader = AnyReader(good, default_typestore=_TYPESTORE)
-        reader.open()
-    except AnyReaderError as error:
+        files = _storage_files(path)
+        if path.is_dir() and damage not in (_NO_INDEX, _LOG_LEFT):
+            notes.append(f"{path.name}: read file by file ({damage})")
+        found = [_usable_file(file, scratch / str(number), notes) for number, file in enumerate(files)]
+    except (OSError, sqlite3.Error) as error:
         raise BagError(f"{path}: cannot be read ({_one_line(error)})") from error
-    return reader
-
-
-def _readable(file: Path) -> bool:
-    reader = _try_open(file)
-    if reader is None:
-        return False
-    reader.close()
-    return True
-
-
-def _rescue_mcap(damaged: Path, rescued: Path) -> int:
-    """Copies the messages before the cut to a new file; returns their number."""
-    count = 0
-    with damaged.open("rb") as source, rescued.open("wb") as sink:
-        writer = McapFileWriter(sink)
-        writer.start(profile="ros2")
-        schemas: dict[int, int] = {}
-        channels: dict[int, int] = {}
-        with suppress(Exception):  # the cut may surface as any decoder's error (struct, zstd, lz4, MCAP); stop there
-            for schema, channel, message in NonSeekingReader(source).iter_messages(log_time_order=False):
-                if channel.id not in channels:
-                    if schema is not None and schema.id not in schemas:
-                        schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    channels[channel.id] = writer.register_channel(
-                        channel.topic,
-                        channel.message_encoding,
-                        schemas[schema.id] if schema is not None else 0,
-                        channel.metadata,
-                    )
-                writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-                count += 1
-        writer.finish()  # type: ignore[no-untyped-call]
-    return count
-
-
-def _rescue_sqlite(damaged: Path, rescued: Path) -> int:
-    """Copies the rows before the cut to a new database; returns the number of messages."""
-    count = 0
-    source = sqlite3.connect(f"file:{damaged}?immutable=1", uri=True)
-    sink = sqlite3.connect(rescued)
+    if not files:
+        raise BagError(f"{path}: not a bag; expected a rosbag2 folder, or a .mcap or .db3 file ({damage})")
+    usable = [file for file in found if file is not None]
+    if not usable:
+        raise BagError(f"{path}: nothing could be recovered; {notes[-1]}")
     try:
-        # SQLite refuses a file shorter than its header says, except with a writable schema
-        source.execute("PRAGMA writable_schema = ON")
-        for (statement,) in source.execute(
-            "SELECT sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
-        ):
-            sink.execute(statement)
-        for table in ("schema", "metadata", "topics", "message_definitions", "messages"):
-            with suppress(sqlite3.Error):  # older schemas lack some tables; the cut ends one of them
-                for row in source.execute(f"SELECT * FROM {table}"):  # noqa: S608 - fixed names
-                    sink.execute(f"INSERT INTO {table} VALUES ({','.join('?' * len(row))})", row)  # noqa: S608
-                    count += table == "messages"
-    except sqlite3.Error:
-        count = 0
-    finally:
-        sink.commit()
-        sink.close()
-        source.close()
-    return count
+        return _open(usable)
+    except BagError as error:
+        raise BagError(f"{path}: cannot be read ({error})") from error
+
+
+def _usable_file(file: Path, scratch: Path, notes: list[str]) -> Path | None:
+    scratch.mkdir()
+    if file.suffix == ".zstd":
+        source = scratch / f"unpacked{Path(file.stem).suffix}"
+        unpack(file, source)
+    elif log_left(file):
+        source = scratch / "merged.db3"
+        merge_log(file, source)
+        notes.append(f"{file.name}: its recorder was killed; merged with the log that it left")
+    else:
+        source = scratch / f"link{file.suffix}"  # SQLite does not find a path with '#', '?' or '%' as rosbags asks
+        source.symlink_to(file.resolve())
+    damage = _damage(source)
+    if damage is None:
+        return source
+    damage = damage.replace(str(source), file.name)
+    rescued = scratch / f"rescued{source.suffix}"
+    messages, complete = rescue(source, rescued)
+    if messages == 0:
+        notes.append(f"{file.name} holds nothing: not a bag, or cut off before its first message ({damage})")
+        return None
+    if (left := _damage(rescued)) is not None:
+        notes.append(f"{file.name} cannot be read ({left.replace(str(rescued), file.name)})")
+        return None
+    if not complete:
+        notes.append(f"{file.name} is cut off ({damage}): recovered {messages} messages up to the cut")
+    elif damage != _NO_INDEX:
+        notes.append(f"{file.name} cannot be read as it is ({damage}): all its {messages} messages were copied")
+    return rescued
+
+
+def _damage(file: Path) -> str | None:
+    """Why rosbags cannot read a storage file as it is; ``None`` if it can."""
+    try:
+        _open([file]).close()
+    except BagError as error:
+        return str(error)
+    return None
 
 
 @contextmanager
@@ -253,9 +266,14 @@ class BagWriter:
 
 
 def copy_topics(source: Bag, sink: BagWriter) -> None:
-    """Declares all topics of ``source`` in ``sink`` with the types that the bag describes."""
+    """Declares all topics of ``source`` in ``sink`` with the types that the bag describes.
+
+    Raises:
+        BagError: a type that the bag does not describe.
+    """
     for topic, msgtype in source.types.items():
-        sink.add_topic(topic, msgtype, source.reader.typestore)
+        source.require(topic, msgtype)
+        sink.add_topic(topic, msgtype, source.typestore(msgtype))
 
 
 def _one_line(error: BaseException) -> str:

@@ -50,7 +50,7 @@ class TopicDecoder:
                     f"topic {self.topic}: {self.msgtype} has no field '{reading.field}' for signal {reading.signal} "
                     f"(at '{error.name}'; there: {_public_fields(error.obj)})"
                 ) from error
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise BagError(
                     f"topic {self.topic}: field '{reading.field}' for signal {reading.signal} is not a number ({error})"
                 ) from error
@@ -68,13 +68,12 @@ def decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
 
 def header_stamp_ns(message: Any) -> int | None:
     """The header stamp in integer nanoseconds, or ``None`` where the message has no header."""
-    header = getattr(message, "header", None)
-    if header is None:
+    stamp: Any = getattr(getattr(message, "header", None), "stamp", None)
+    if not hasattr(stamp, "sec"):
         return None
-    stamp = header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def _public_fields(message: Any) -> str:
-    names = getattr(message, "__slots__", None) or vars(message)
+    names: Any = getattr(message, "__slots__", None) or getattr(message, "__dict__", ())
     return ", ".join(sorted(name.lstrip("_") for name in names if not name.startswith(("__", "_check")))) or "nothing"

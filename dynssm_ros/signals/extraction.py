@@ -13,7 +13,7 @@ from dynssm_ros.signals.bags import Bag, open_bag
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import Stream, resample
-from dynssm_ros.signals.signal_map import REQUIRED_SIGNALS, SignalMap
+from dynssm_ros.signals.signal_map import POSE_SIGNALS, SignalMap
 
 Progress = Callable[[int, int], None]
 """Called with the number of messages done and the number of all."""
@@ -76,7 +76,11 @@ def read_streams(
     for done, (topic, log_time, raw) in enumerate(bag.messages(list(by_topic)), 1):
         message = bag.decode(topic, raw)
         stamp = header_stamp_ns(message)
-        for name, value in by_topic[topic].decode(message).items():
+        try:
+            present = by_topic[topic].decode(message)
+        except BagError as error:
+            raise BagError(f"{bag.path}: {error}") from error
+        for name, value in present.items():
             stamps[name].append(log_time if stamp is None else stamp)
             values[name].append(value)
         if progress is not None:
@@ -84,16 +88,19 @@ def read_streams(
     notes = list(bag.notes)
     streams: dict[str, Stream] = {}
     for name, source in signal_map.active_signals().items():
-        if not stamps[name]:
-            if name not in REQUIRED_SIGNALS and bag.counts[source.topic] > 0:
-                notes.append(f"{name}: topic {source.topic} never carries '{source.field}'")
-                continue
-            what = f"never carries '{source.field}'" if bag.counts[source.topic] else "has no messages"
-            raise BagError(f"{bag.path}: topic {source.topic} {what}, needed for {name}")
         stream = Stream(np.frombuffer(stamps[name], dtype=np.int64), np.frombuffer(values[name], dtype=np.float64))
-        streams[name], note = clean(stream, f"{bag.path}: topic {source.topic}: {name}", drop_bad)
-        if note:
-            notes.append(f"{name}: {note}")
+        where = f"{bag.path}: topic {source.topic}"
+        stream, dropped = clean(stream, f"{where}: {name}", drop_bad)
+        if dropped:
+            notes.append(f"{name}: dropped {dropped}")
+        if len(stream.stamps):
+            streams[name] = stream
+            continue
+        counted = bag.counts[source.topic]
+        lack = f"has no good sample of '{source.field}'" if dropped else f"never carries '{source.field}'"
+        if name not in POSE_SIGNALS or not counted:
+            raise BagError(f"{where} {lack if counted else 'has no messages'}, needed for {name}")
+        notes.append(f"{name}: topic {source.topic} {lack}; left out")
     return streams, notes
 
 
@@ -101,14 +108,15 @@ def clean(stream: Stream, where: str, drop_bad: bool) -> tuple[Stream, str]:
     """Checks a stream for values that are not finite and for stamps that repeat or run backwards.
 
     Returns:
-        The stream, without bad samples if ``drop_bad``, and a note of what was dropped (empty if nothing).
+        The stream, without bad samples if ``drop_bad``, and what was dropped (empty if nothing).
 
     Raises:
         BagError: a bad sample and ``drop_bad`` is off; names the first.
     """
     stamps, values = stream.stamps, stream.values
-    newest = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(stamps)[:-1]])
     finite = np.isfinite(values)
+    oldest = np.iinfo(np.int64).min
+    newest = np.maximum.accumulate(np.concatenate([[oldest], np.where(finite, stamps, oldest)]))[:-1]
     kinds = {
         "not finite": ~finite,
         "with a repeated stamp": finite & (stamps == newest),
@@ -125,9 +133,5 @@ def clean(stream: Stream, where: str, drop_bad: bool) -> tuple[Stream, str]:
                 f"expected finite values at increasing stamps (--drop-bad leaves such samples out)"
             )
         dropped.append(f"{bad.sum()} samples {kind}")
-    if not dropped:
-        return stream, ""
     keep = ~np.logical_or.reduce(list(kinds.values()))
-    if not keep.any():
-        raise BagError(f"{where}: no good sample is left ({', '.join(dropped)})")
-    return Stream(stamps[keep], values[keep]), "dropped " + ", ".join(dropped)
+    return Stream(stamps[keep], values[keep]), ", ".join(dropped)

@@ -8,6 +8,7 @@ sample is held.
 from __future__ import annotations
 
 from enum import Enum
+from math import isfinite
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +36,8 @@ class RingBuffer:
     """The newest samples of one signal, in order, without allocation while running.
 
     Everything is stored twice, one capacity apart, so that the newest ``n`` samples are always one contiguous view.
-    Times are nanoseconds since an epoch as floats, exact for 104 days.
+    Times are nanoseconds since an epoch as floats: exact for 104 days, and to 0.3 us even since 1970 (an epoch set by a
+    first message without a stamp).
     """
 
     def __init__(self, capacity: int = 256) -> None:
@@ -99,17 +101,20 @@ class History:
     """
 
     def __init__(self, signal_map: SignalMap, T_s: float, H: int, max_age: float = 0.2, jump_back: float = 0.5) -> None:
-        self.H = H
         self.names = tuple(signal_map.active_signals())
         self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
         self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
-        self._offsets = -np.arange(H - 1, -1, -1, dtype=np.float64) * (T_s * 1e9)
-        self._span = (H * T_s + max_age + signal_map.max_gap) * 1e9
         self._max_gap = float(signal_map.max_gap_ns)
         self._max_age = max_age * 1e9
         self._jump_back = jump_back * 1e9
-        self._slack = _BRIDGE * T_s * 1e9
         self._epoch: int | None = None
+        self.resize(T_s, H)
+
+    def resize(self, T_s: float, H: int) -> None:
+        """Changes the grid of the window; the samples are kept, so a longer window fills on from what is there."""
+        self._offsets = -np.arange(H - 1, -1, -1, dtype=np.float64) * (T_s * 1e9)
+        self._span = H * T_s * 1e9 + self._max_age + self._max_gap
+        self._slack = _BRIDGE * T_s * 1e9
         self._window = np.empty((H, 7))
 
     def add(self, stamp: int, values: dict[str, float]) -> Refusal | None:
@@ -131,8 +136,8 @@ class History:
             buffer = self._buffers.get(name)
             if buffer is None:
                 continue
-            if not np.isfinite(value):
-                refusal = Refusal.NOT_FINITE
+            if not isfinite(value):
+                refusal = refusal or Refusal.NOT_FINITE
                 continue
             newest = buffer.newest
             if time <= newest:
@@ -180,6 +185,11 @@ class History:
             self._window[:, column] = sampled[name]
         for column, values in enumerate(model_inputs(sampled), len(STATE_SIGNALS)):
             self._window[:, column] = values
+        return self._window
+
+    @property
+    def current(self) -> Vector:
+        """The window cut last, shape ``(H, 7)``; reused by the next."""
         return self._window
 
     def ages(self, stamp: int) -> dict[str, float]:

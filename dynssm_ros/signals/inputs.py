@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dynssm_ros.vehicle.single_track import Applied
+
 Vector = npt.NDArray[np.float64]
 
 WINDOW_COLUMNS = ("v_x", "v_y", "omega", "r_fb", "delta_fb", "r_cmd", "delta_cmd")
@@ -55,3 +57,12 @@ def lookahead_commands(feedback: Vector, segment: npt.NDArray[np.int32]) -> Vect
     inside = segment[1:] == segment[:-1]
     command[:-1][inside] = np.diff(feedback)[inside]
     return command
+
+
+def applied_inputs(rows: Any) -> Applied:
+    """Applied throttle and steering of window rows, applied = feedback + command, Eq. (16).
+
+    Args:
+        rows: columns ``WINDOW_COLUMNS`` along the first axis, shape ``(7, ...)``.
+    """
+    return Applied(rows[3] + rows[5], rows[4] + rows[6])

@@ -38,6 +38,8 @@ def odometry(
         pose: ``x, y`` (m) and heading ``theta`` (rad) in ``frame_id``.
         state: ``v_x, v_y`` (m/s) and ``omega`` (rad/s) in ``child_frame_id``.
         twist_covariance: row-major 6 x 6, shape ``(36,)``; zeros (unknown) if not given.
+        frame_id: frame of the pose.
+        child_frame_id: frame of the twist.
     """
     x, y, theta = pose
     v_x, v_y, omega = state
@@ -63,3 +65,10 @@ def joint_state(stamp: int, values: Mapping[str, float]) -> Any:
 def _header(stamp: int, frame_id: str) -> Any:
     seconds, nanoseconds = divmod(int(stamp), 1_000_000_000)
     return _TYPES["std_msgs/msg/Header"](_TYPES["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame_id)
+
+
+def twist_covariance(variances: Vector) -> Vector:
+    """Row-major 6 x 6 twist covariance ``(36,)`` from the variances of ``v_x, v_y, omega``, shape ``(3,)``."""
+    covariance = np.zeros(36)
+    covariance[[0, 7, 35]] = variances
+    return covariance

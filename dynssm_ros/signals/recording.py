@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import Field, ValidationError
 
-from dynssm_ros.configuration import StrictModel
+from dynssm_ros.configuration import StrictModel, describe
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.files import replacing
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
@@ -30,7 +31,7 @@ COLUMN_UNITS = {
 class RecordingInfo(StrictModel):
     """What a recording says of itself."""
 
-    version: int = Field(default=1, le=1, description="format version")
+    version: int = Field(default=1, ge=1, le=1, description="format version")
     sampling_time: float = Field(gt=0, description="T_s (s)")
     commands: Commands = Field(description="where u_t comes from")
     source: tuple[str, ...] = Field(default=(), description="names of the bags or simulations")
@@ -159,7 +160,7 @@ class Recording:
         if not path.is_file():
             raise RecordingError(f"{path}: no such recording; `dynssm extract` makes one from a bag")
         try:
-            table = pq.read_table(path)
+            table = pq.read_table(path, partitioning=None)  # a folder named a=b is no column
         except (pa.ArrowException, OSError) as error:
             raise RecordingError(f"{path}: not a readable Parquet file ({' '.join(str(error).split())})") from error
         raw = (table.schema.metadata or {}).get(METADATA_KEY)
@@ -168,16 +169,28 @@ class Recording:
         try:
             info = RecordingInfo.model_validate_json(raw)
         except ValidationError as error:
-            raise RecordingError(f"{path}: metadata not understood ({error.errors()[0]['msg']})") from error
+            raise RecordingError(f"{path}: metadata not understood: {describe(error)}") from error
         missing = [name for name in ("time", "segment", *WINDOW_COLUMNS) if name not in table.column_names]
         if missing:
             raise RecordingError(f"{path}: column {missing[0]} is missing")
-        columns = {name: table[name].to_numpy() for name in COLUMN_UNITS if name in table.column_names}
+        if table.num_rows == 0:
+            raise RecordingError(f"{path}: the recording is empty")
+        time, segment = (_column(table, name, kind, path) for name, kind in (("time", "int64"), ("segment", "int32")))
+        columns = {name: _column(table, name, "double", path) for name in COLUMN_UNITS if name in table.column_names}
         for name, values in columns.items():
             bad = np.flatnonzero(~np.isfinite(values))
             if len(bad):
                 raise RecordingError(f"{path}: column {name}, row {bad[0]}: {values[bad[0]]}; expected a finite number")
-        return cls(info, table["time"].to_numpy(), table["segment"].to_numpy(), columns)
+        return cls(info, time, segment, columns)
+
+
+def _column(table: pa.Table, name: str, kind: str, path: Path) -> npt.NDArray[Any]:
+    column = table[name]
+    if str(column.type) != kind or column.null_count:
+        have = f"{column.null_count} empty rows" if column.null_count else str(column.type)
+        raise RecordingError(f"{path}: column {name}: {have}; expected {kind} in every row")
+    values: npt.NDArray[Any] = column.to_numpy()
+    return values
 
 
 def concatenate(recordings: Sequence[Recording]) -> Recording:

@@ -15,6 +15,7 @@ from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, Commands
 
 Vector = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
+_ROUNDING = 1e-6  # periods by which a float may miss the last instant of a stretch
 
 
 @dataclass(frozen=True)
@@ -25,20 +26,36 @@ class Stream:
     values: Vector
 
 
-def interpolate(stream: Stream, grid: Stamps, max_gap: int) -> tuple[Vector, npt.NDArray[np.bool_]]:
-    """Linear interpolation at ``grid`` (int64 ns), and where it is bridged by samples at most ``max_gap`` ns apart.
+def interpolate(stream: Stream, grid: Stamps, max_gap: int) -> tuple[Vector, npt.NDArray[np.int64]]:
+    """Linear interpolation at ``grid`` (int64 ns) inside the stream's stretches.
 
-    A grid instant on a sample is covered by that sample alone.
+    A stretch is a run of samples that are at most ``max_gap`` ns apart; a lone sample is one too.
+
+    Returns:
+        The values, and for each the number of the stretch it lies in; -1, and a value of no meaning, where it lies in
+        none.
     """
     t = stream.stamps
     origin = t[0]
     values = np.interp((grid - origin).astype(np.float64), (t - origin).astype(np.float64), stream.values)
-    right = np.searchsorted(t, grid, side="left")
-    inside = (grid >= t[0]) & (grid <= t[-1])
-    right = np.clip(right, 0, len(t) - 1)
-    left = np.clip(right - 1, 0, len(t) - 1)
-    covered = inside & ((t[right] == grid) | (t[right] - t[left] <= max_gap))
-    return values, covered
+    number = np.concatenate([[0], np.cumsum(np.diff(t) > max_gap)])
+    after = np.minimum(np.searchsorted(t, grid, side="left"), len(t) - 1)
+    before = np.maximum(np.searchsorted(t, grid, side="right") - 1, 0)
+    inside = (grid >= t[0]) & (grid <= t[-1]) & (number[before] == number[after])
+    return values, np.where(inside, number[after], -1)
+
+
+def uniform_grid(anchor: Stamps, period: float, max_gap: int) -> Stamps:
+    """The instants ``anchor[0] + k * period`` (ns) that lie inside the stretches of ``anchor``.
+
+    Laid stretch by stretch: a first message with an unset stamp must not make a grid of 50 years.
+    """
+    cuts = np.flatnonzero(np.diff(anchor) > max_gap)
+    first = (anchor[np.concatenate([[0], cuts + 1])] - anchor[0]) / period
+    last = (anchor[np.concatenate([cuts, [len(anchor) - 1]])] - anchor[0]) / period
+    steps = [np.arange(np.ceil(a - _ROUNDING), np.floor(b + _ROUNDING) + 1) for a, b in zip(first, last, strict=True)]
+    grid: Stamps = anchor[0] + np.round(np.concatenate(steps) * period).astype(np.int64)
+    return grid
 
 
 def resample(
@@ -46,8 +63,8 @@ def resample(
 ) -> Recording:
     """Brings all signals onto a grid of ``rate`` Hz that starts at the first ``v_x`` stamp.
 
-    Rows that some signal does not cover are left out; where rows are missing, a new segment begins. Angles are
-    unwrapped before they are interpolated. Brakes are merged and commands become increments here.
+    Rows that some signal does not cover are left out; where rows are missing or a signal has a gap, a new segment
+    begins. Angles are unwrapped before they are interpolated. Brakes are merged and commands become increments here.
 
     Args:
         streams: by signal name.
@@ -59,21 +76,23 @@ def resample(
     Raises:
         RecordingError: the streams never overlap.
     """
-    anchor = streams["v_x"].stamps
-    period = 1e9 / rate
-    count = int((anchor[-1] - anchor[0]) / period + 1e-6) + 1
-    grid = anchor[0] + np.round(np.arange(count) * period).astype(np.int64)
-    covered = np.ones(count, dtype=bool)
+    bridged, period = round(max_gap * 1e9), 1e9 / rate
+    grid = uniform_grid(streams["v_x"].stamps, period, bridged)
     sampled: dict[str, Vector] = {}
+    stretches: list[npt.NDArray[np.int64]] = []
     for name, stream in streams.items():
         smooth = Stream(stream.stamps, np.unwrap(stream.values)) if name == "theta" else stream
-        sampled[name], here = interpolate(smooth, grid, round(max_gap * 1e9))
-        covered &= here
-    if not covered.any():
+        sampled[name], stretch = interpolate(smooth, grid, bridged)
+        stretches.append(stretch)
+    numbers = np.stack(stretches)
+    rows = np.flatnonzero((numbers >= 0).all(axis=0))
+    if len(rows) == 0:
         spans = "; ".join(f"{n} {s.stamps[0] / 1e9:.3f}..{s.stamps[-1] / 1e9:.3f} s" for n, s in streams.items())
-        raise RecordingError(f"no instant is covered by all signals within {max_gap:g} s: {spans}")
-    rows = np.flatnonzero(covered)
-    segment = np.concatenate([[0], np.cumsum(np.diff(rows) > 1)]).astype(np.int32)
+        raise RecordingError(
+            f"{', '.join(info.source)}: no instant is covered by all signals within {max_gap:g} s: {spans}"
+        )
+    apart = (np.diff(grid[rows]) > 1.5 * period) | (np.diff(numbers[:, rows], axis=1) != 0).any(axis=0)
+    segment = np.concatenate([[0], np.cumsum(apart)]).astype(np.int32)
     sampled = {name: values[rows] for name, values in sampled.items()}
     inputs = model_inputs(sampled)
     columns = {name: sampled[name] for name in STATE_SIGNALS} | inputs._asdict()

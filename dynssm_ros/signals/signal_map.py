@@ -23,8 +23,9 @@ COMMAND_SIGNALS = ("throttle_command", "steering_command")
 SIGNALS = (*REQUIRED_SIGNALS, *POSE_SIGNALS, *COMMAND_SIGNALS, "brake_feedback", "brake_command")
 
 Accessor = Callable[[Any], float | None]
-_PATH = r"[A-Za-z_]\w*(?:\[\w+\])?(?:\.[A-Za-z_]\w*(?:\[\w+\])?)*"
-_FIELD = re.compile(rf"^(?:yaw\((?P<yaw>{_PATH})\)|(?P<path>{_PATH}))$")
+_STEP = r"[A-Za-z_]\w*(?:\[[^\[\]().]+\])?"
+_PATH = rf"{_STEP}(?:\.{_STEP})*"
+_FIELD = re.compile(rf"^(?:yaw\((?P<yaw>{_PATH})\)|(?P<path>{_PATH}))\Z")
 
 
 class Source(StrictModel):
@@ -124,8 +125,10 @@ def compile_field(field: str) -> Accessor:
     def yaw(message: Any) -> float | None:
         for step in steps:
             message = step(message)
-        q = message
-        return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+            if message is None:
+                return None
+        q = message  # of any length: some drivers publish quaternions that are not quite unit
+        return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
 
     return yaw if match["yaw"] else value
 
@@ -134,7 +137,7 @@ def _compile_step(part: str) -> Callable[[Any], Any]:
     name, _, key = part.rstrip("]").partition("[")
     if not key:
         return lambda message: getattr(message, name)
-    if key.isdigit():
+    if key.isdecimal():
         index = int(key)
 
         def by_index(message: Any) -> Any:

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import yaml
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.files import replacing
-from dynssm_ros.vehicle.effects import Effect, build_effect
+from dynssm_ros.vehicle.effects import EFFECTS, Effect, build_effect
 from dynssm_ros.vehicle.single_track import Coefficients
 
 COEFFICIENT_UNITS: dict[str, str] = {
@@ -69,6 +69,13 @@ class InputLimits(StrictModel):
     steering: tuple[float, float] = Field(description="range of the road-wheel angle (rad)")
     steering_rate: float = Field(gt=0, description="largest steering speed (rad/s)")
 
+    @field_validator("throttle", "steering")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not value[0] < value[1]:
+            raise ValueError(f"[{value[0]:g}, {value[1]:g}] must be [min, max] with min < max")
+        return value
+
 
 class EffectEntry(StrictModel):
     """An effect by name, with its parameters."""
@@ -93,15 +100,25 @@ class Vehicle(StrictModel):
     coefficients: dict[str, Coefficient]
     effects: tuple[EffectEntry, ...] = ()
 
-    @model_validator(mode="after")
-    def _complete(self) -> Vehicle:
-        missing = [name for name in COEFFICIENTS if name not in self.coefficients]
-        unknown = [name for name in self.coefficients if name not in COEFFICIENTS]
+    @field_validator("coefficients")
+    @classmethod
+    def _complete(cls, value: dict[str, Coefficient]) -> dict[str, Coefficient]:
+        missing = [name for name in COEFFICIENTS if name not in value]
+        unknown = [name for name in value if name not in COEFFICIENTS]
         if missing:
-            raise ValueError(f"coefficients: missing {', '.join(missing)}; all of {' '.join(COEFFICIENTS)} are needed")
+            raise ValueError(f"missing {', '.join(missing)}; all of {' '.join(COEFFICIENTS)} are needed")
         if unknown:
-            raise ValueError(f"coefficients: unknown {', '.join(unknown)}; expected {' '.join(COEFFICIENTS)}")
-        return self
+            raise ValueError(f"unknown {', '.join(unknown)}; expected {' '.join(COEFFICIENTS)}")
+        return {name: value[name] for name in COEFFICIENTS}
+
+    @field_validator("effects")
+    @classmethod
+    def _one_memory_each(cls, value: tuple[EffectEntry, ...]) -> tuple[EffectEntry, ...]:
+        names = [entry.name for entry in value if EFFECTS[entry.name].MEMORY]
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise ValueError(f"effect {twice[0]} has a state of its own and can be listed only once")
+        return value
 
     @property
     def nominal(self) -> Vector:
@@ -137,10 +154,12 @@ class Vehicle(StrictModel):
         """The same car with one more effect.
 
         Raises:
-            ConfigurationError: no such effect, or a parameter outside its bounds.
+            ConfigurationError: no such effect, a parameter outside its bounds, or an effect that the car already has.
         """
-        entry = configuration.validate(EffectEntry, {"name": name, "parameters": parameters}, f"effect {name}")
-        return self.model_copy(update={"effects": (*self.effects, entry)})
+        entry = {"name": name, "parameters": parameters}
+        content = self.model_dump()
+        content["effects"] = [*content["effects"], entry]
+        return configuration.validate(Vehicle, content, f"vehicle {self.name} with {name}")
 
 
 def load_vehicle(name_or_path: str | Path) -> Vehicle:
@@ -156,5 +175,6 @@ def save_vehicle(vehicle: Vehicle, path: str | Path, comment: str = "") -> None:
     """Writes a vehicle file, atomically; ``comment`` goes to its head."""
     content: dict[str, Any] = vehicle.model_dump(mode="json")
     head = "".join(f"# {line}\n" for line in comment.splitlines())
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
     with replacing(path) as aside:
-        aside.write_text(head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110))
+        aside.write_text(head + text, encoding="utf-8")

@@ -1,0 +1,92 @@
+"""``dynssm calibrate``: nominal parameters by nonlinear least squares, with confidence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from dynssm_ros.cli.console import CommandsOption, JsonOption, VehicleOption, console, progress_bar
+from dynssm_ros.files import write_json
+from dynssm_ros.learning.calibration import Calibration, Loss
+from dynssm_ros.learning.calibration import calibrate as fit
+from dynssm_ros.signals.recording import Recording, concatenate
+from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, load_vehicle, save_vehicle
+
+
+def calibrate(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings of one car.", metavar="R.parquet...")],
+    vehicle: VehicleOption,
+    out: Annotated[Path, typer.Option(help="Vehicle file to write.", dir_okay=False)],
+    steps: Annotated[
+        int, typer.Option(help="Steps ahead that are predicted; more weigh slow errors higher.", min=1)
+    ] = 1,
+    loss: Annotated[Loss, typer.Option(help="Robust loss of the errors.")] = "soft_l1",
+    min_speed: Annotated[float, typer.Option(help="Leave out slower rows (m/s).", min=0.0)] = 0.0,
+    holdout: Annotated[
+        float, typer.Option(help="Leave the last fraction of each recording out.", min=0.0, max=0.9)
+    ] = 0.0,
+    starts: Annotated[int, typer.Option(help="Starting points of the search.", min=1)] = 3,
+    seed: Annotated[int, typer.Option(help="Of the random starting points.", min=0)] = 0,
+    commands: CommandsOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Fit the nominal parameters of a vehicle to measured laps, within their bounds."""
+    car = load_vehicle(vehicle)
+    data = concatenate([Recording.load(path).with_commands(commands).split_last(holdout)[0] for path in recordings])
+    with progress_bar("calibrating") as progress:
+        result = fit(data, car, steps, loss, min_speed, starts, seed, progress)
+    source = ", ".join(data.info.source)
+    save_vehicle(
+        result.vehicle,
+        out,
+        f"Calibrated on {source} (commands {data.info.commands}, {result.steps} steps ahead, loss {loss}, "
+        f"{result.rows} rows, seed {seed}).",
+    )
+    if json is not None:
+        write_json(json, as_json(result))
+    console.print(coefficient_table(result))
+    before, after = result.rmse_before, result.rmse_after
+    for name, unit, was, now in zip(("v_x", "v_y", "omega"), ("m/s", "m/s", "rad/s"), before, after, strict=True):
+        console.print(f"one-step RMSE {name}: {was:.3g} -> {now:.3g} {unit}")
+    if result.on_bound:
+        console.print(f"on a bound: {', '.join(result.on_bound)} - the data want more than the vehicle file admits")
+    for combination in result.unidentified:
+        terms = " ".join(f"{weight:+g} {name}" for name, weight in combination.items())
+        console.print(f"not determined by these data: {terms} (in units of their ranges)")
+    console.print(f"{out} written")
+
+
+def coefficient_table(result: Calibration) -> Table:
+    """Nominal values with standard deviations and bounds."""
+    table = Table("coefficient", "value", "std", "bounds", "unit")
+    for k, name in enumerate(COEFFICIENTS):
+        lower, upper = result.vehicle.coefficients[name].bounds
+        mark = " *" if name in result.on_bound else ""
+        table.add_row(
+            name + mark,
+            f"{result.theta[k]:.4g}",
+            f"{result.std[k]:.1g}",
+            f"{lower:g} .. {upper:g}",
+            COEFFICIENT_UNITS[name],
+        )
+    return table
+
+
+def as_json(result: Calibration) -> dict[str, Any]:
+    """The calibration for programs."""
+    channels = ("v_x", "v_y", "omega")
+    return {
+        "coefficients": {
+            name: {"value": float(result.theta[k]), "std": float(result.std[k]), "unit": COEFFICIENT_UNITS[name]}
+            for k, name in enumerate(COEFFICIENTS)
+        },
+        "on_bound": list(result.on_bound),
+        "unidentified": list(result.unidentified),
+        "rmse_before": dict(zip(channels, result.rmse_before.tolist(), strict=True)),
+        "rmse_after": dict(zip(channels, result.rmse_after.tolist(), strict=True)),
+        "rows": result.rows,
+        "steps": result.steps,
+    }

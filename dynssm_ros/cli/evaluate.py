@@ -1,0 +1,104 @@
+"""``dynssm evaluate``: models on a recording, one step ahead and over a horizon."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dynssm_ros.cli.console import CommandsOption, JsonOption, console, progress_bar
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.evaluation.open_loop import Evaluation, shared_commands
+from dynssm_ros.evaluation.open_loop import evaluate as evaluate_models
+from dynssm_ros.evaluation.open_loop_report import markdown, open_loop_report, summary_table, verdict
+from dynssm_ros.evaluation.tables import percent
+from dynssm_ros.files import replacing, write_json
+from dynssm_ros.runtime.models import WindowModel, load_model
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import Vehicle, load_vehicle
+
+
+def evaluate(
+    recording: Annotated[Path, typer.Argument(help="Recording to score on (Parquet).", metavar="R.parquet")],
+    model: Annotated[
+        list[str],
+        typer.Option(
+            help="Model folder, persistence or single_track (needs --vehicle); repeat to compare.",
+            metavar="NAME_OR_DIR",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for report.html, results.json and results.md.", file_okay=False)],
+    vehicle: Annotated[
+        str | None, typer.Option(help="Vehicle of single_track: name of a shipped one (orca, av21, ...) or a file.")
+    ] = None,
+    holdout: Annotated[
+        float | None, typer.Option(help="Score only this last fraction of the recording, as one block.", max=1.0)
+    ] = None,
+    commands: CommandsOption = None,
+    min_speed: Annotated[
+        float | None,
+        typer.Option(
+            help="Leave out stretches below this speed (m/s).",
+            show_default="5 if the recording exceeds 10 m/s as full-size cars do, else 0",
+        ),
+    ] = None,
+    horizon: Annotated[
+        float | None,
+        typer.Option(help="Length of the rollouts (s).", show_default="0.3 up to T_s = 0.02 s, else 0.6", min=0.0),
+    ] = None,
+    stride: Annotated[int, typer.Option(help="Start a rollout at every n-th row.", min=1)] = 1,
+    json: JsonOption = None,
+) -> None:
+    """Score models on a recording: one-step errors, rollouts, displacement, latency; with an HTML report."""
+    log = Recording.load(recording)
+    car = None if vehicle is None else load_vehicle(vehicle)
+    models = _load_models(model, car)
+    wanted = commands or shared_commands(models)
+    if commands is None and wanted not in (None, log.info.commands):
+        console.print(
+            f"note: commands '{wanted}' as the models were trained, not the recording's '{log.info.commands}'"
+        )
+    log, split = _hold_out(log.with_commands(wanted), holdout)
+    with progress_bar("evaluating") as progress:
+        evaluation = evaluate_models(
+            log,
+            models,
+            name=recording.name,
+            split=split,
+            min_speed=min_speed,
+            horizon_s=horizon,
+            stride=stride,
+            progress=progress,
+        )
+    _write(evaluation, car, out, json)
+    console.print(summary_table(evaluation).brief.rich())
+    console.print(verdict(evaluation), markup=False)
+    console.print(f"{out / 'report.html'}: figures and how to read them", markup=False)
+
+
+def _write(evaluation: Evaluation, vehicle: Vehicle | None, out: Path, json: Path | None) -> None:
+    """Writes the report, then what programs read."""
+    open_loop_report(evaluation, vehicle).save(out / "report.html")
+    with replacing(out / "results.md") as aside:
+        aside.write_text(markdown(evaluation), encoding="utf-8")
+    results = evaluation.to_json()
+    for path in (out / "results.json", json):
+        if path is not None:
+            write_json(path, results)
+
+
+def _load_models(names: list[str], vehicle: Vehicle | None) -> dict[str, WindowModel]:
+    """Opens the models; where two folders hold models of the same name, the folders tell them apart."""
+    opened = {name: load_model(name, vehicle) for name in names}
+    called = [model.name for model in opened.values()]
+    return {given if called.count(model.name) > 1 else model.name: model for given, model in opened.items()}
+
+
+def _hold_out(log: Recording, fraction: float | None) -> tuple[Recording, str]:
+    """The part of the recording to score, and its description."""
+    if fraction is None:
+        return log, "whole recording"
+    if fraction <= 0:
+        raise ConfigurationError(f"--holdout {fraction:g}: expected a fraction above 0 and up to 1")
+    return log.split_last(fraction)[1], f"last {percent(fraction)} of the recording, as one block"

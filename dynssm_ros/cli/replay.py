@@ -1,0 +1,32 @@
+"""``dynssm replay``: offline prediction into a new bag, the same as the node live."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.predictor import Predictor
+from dynssm_ros.runtime.replay import replay_to_bag
+from dynssm_ros.signals.signal_map import load_signal_map
+
+
+def replay(
+    bag: Annotated[Path, typer.Argument(help="rosbag2 folder or file.")],
+    model: Annotated[Path, typer.Option(help="Model folder.")],
+    out: Annotated[Path, typer.Option(help="rosbag2 folder to write.")],
+    signals: Annotated[str, typer.Option(help="Signal map: name of a shipped one or a file.")] = "default",
+    max_age: Annotated[float, typer.Option(help="Oldest actuator sample that a prediction may rest on (s).")] = 0.2,
+) -> None:
+    """Predict offline what the node would have published for a bag."""
+    predictor = Predictor(OnnxModel(open_artifact(model)), load_signal_map(signals), max_age)
+    with progress_bar("replaying") as progress:
+        count, refusals, notes = replay_to_bag(bag, predictor, out, progress)
+    for note in notes:
+        console.print(f"note: {note}")
+    reasons = ", ".join(f"{number} x {refusal.value}" for refusal, number in refusals.items())
+    console.print(f"{out}: {count} predictions" + (f"; none for: {reasons}" if reasons else ""), soft_wrap=True)

@@ -1,0 +1,78 @@
+"""``dynssm train``: recordings to a model folder; continues where a kill left it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from dynssm_ros.cli.console import CommandsOption, VehicleOption, console, errors
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.signals.recording import Recording, concatenate
+from dynssm_ros.vehicle import load_vehicle
+
+
+def train(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings of one car.", metavar="R.parquet...")],
+    model: Annotated[str, typer.Option(help="Model: name of a shipped one (dynssm_av21, ridge_av21, ...) or a file.")],
+    vehicle: VehicleOption,
+    out: Annotated[Path, typer.Option(help="Model folder to write.", file_okay=False)],
+    holdout: Annotated[
+        float,
+        typer.Option(help="Leave the last fraction of each recording out, for `evaluate --holdout`.", min=0.0, max=0.9),
+    ] = 0.0,
+    commands: CommandsOption = None,
+    seed: Annotated[int | None, typer.Option(help="Instead of the model file's.", min=0)] = None,
+    epochs: Annotated[int | None, typer.Option(help="Instead of the model file's.", min=1)] = None,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+) -> None:
+    """Train a model on recordings and write its folder: card, weights, ONNX, metrics, loss picture."""
+    import torch
+
+    from dynssm_ros.evaluation.figures import loss_components
+    from dynssm_ros.learning.configuration import load_model_config
+    from dynssm_ros.learning.export import save_artifact
+    from dynssm_ros.learning.training import train as fit
+
+    if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
+        raise ConfigurationError(
+            f"--device {device}: not available here; expected cpu" + (" or cuda" if torch.cuda.is_available() else "")
+        )
+    config = load_model_config(model)
+    given = {key: value for key, value in (("seed", seed), ("epochs", epochs)) if value is not None}
+    config = config.model_copy(update={"training": config.training.model_copy(update=given)})
+    data = concatenate([Recording.load(path).with_commands(commands).split_last(holdout)[0] for path in recordings])
+    checkpoint = out.with_name(f"{out.name}.checkpoint.pt")
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total} epochs, {task.description}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=errors, transient=True) as progress:
+        task = progress.add_task("", total=config.training.epochs)
+
+        def show(done: int, total: int, words: str) -> None:
+            progress.update(task, completed=done, total=total, description=words)
+
+        try:
+            trained = fit(data, config, load_vehicle(vehicle), checkpoint, device, show)
+        except KeyboardInterrupt:
+            errors.print(f"interrupted; the same command continues from {checkpoint.name}")
+            raise typer.Exit(130) from None
+    artifact = save_artifact(trained, out, {"holdout": holdout, "device": device})
+    if trained.history:
+        loss_components(trained.history, trained.best_epoch).savefig(out / "losses.png", dpi=150)
+    checkpoint.unlink(missing_ok=True)
+    if trained.resumed_from:
+        console.print(f"continued from epoch {trained.resumed_from}")
+    v_x, v_y, omega = trained.validation_rmse
+    console.print(
+        f"{out}: {artifact.card.parameters} parameters, best epoch {trained.best_epoch}, seed {config.training.seed}; "
+        f"one-step RMSE on {trained.windows[1]} validation windows: v_x {v_x:.4g} m/s, v_y {v_y:.4g} m/s, "
+        f"omega {omega:.3g} rad/s (commands: {data.info.commands})",
+        soft_wrap=True,
+    )

@@ -1,0 +1,1 @@
+"""What a model is worth, for people and for programs: error measures, tables, figures, HTML reports."""

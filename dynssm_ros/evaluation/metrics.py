@@ -1,0 +1,125 @@
+"""One step ahead: predictions over a whole recording, their errors, their stated uncertainty, their cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from statistics import NormalDist
+from time import perf_counter_ns
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.runtime.models import WindowModel, WindowPrediction
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+
+Vector = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+Tick = Callable[[int], None]
+"""Told how many predictions were just made."""
+
+CHANNELS = STATE_SIGNALS
+BATCH = 4096
+
+
+def silent(predictions: int) -> None:
+    """The :data:`Tick` that tells nobody."""
+
+
+def gather(matrix: Vector, rows: Indices, before: int, after: int = 0) -> Vector:
+    """Copies the stretch ``t - before .. t + after`` around each row ``t``.
+
+    Args:
+        matrix: rows of a recording, shape ``(N, C)``.
+        rows: ``t`` of each stretch, shape ``(M,)``.
+        before: number of earlier rows.
+        after: number of later rows.
+
+    Returns:
+        Shape ``(M, before + 1 + after, C)``.
+    """
+    stretches: Vector = matrix[rows[:, None] + np.arange(-before, after + 1)]
+    return stretches
+
+
+def predict_rows(
+    model: WindowModel, matrix: Vector, rows: Indices, batch: int = BATCH, tick: Tick = silent
+) -> WindowPrediction:
+    """The model's predictions of the rows that follow ``rows``; windows exist only for one batch at a time.
+
+    Args:
+        model: reads windows of ``model.H`` rows.
+        matrix: the recording's model inputs, shape ``(N, 7)``.
+        rows: last row of each window, shape ``(M,)``, ``M > 0``.
+        batch: windows per call.
+        tick: told of progress.
+    """
+    parts = []
+    for start in range(0, len(rows), batch):
+        chunk = rows[start : start + batch]
+        parts.append(model.predict(gather(matrix, chunk, model.H - 1)))
+        tick(len(chunk))
+    return WindowPrediction(
+        np.concatenate([part.state for part in parts]),
+        _join([part.theta for part in parts]),
+        _join([part.physics for part in parts]),
+    )
+
+
+def rmse(errors: Vector) -> Vector:
+    """Root mean square over the rows of ``errors`` ``(N, 3)``, one value per channel and in its unit."""
+    root: Vector = np.sqrt(np.mean(errors**2, axis=0))
+    return root
+
+
+def max_error(errors: Vector) -> Vector:
+    """Largest absolute error of each channel, shape ``(3,)``."""
+    largest: Vector = np.abs(errors).max(axis=0)
+    return largest
+
+
+def explained(increments: Vector, predicted: Vector) -> Vector:
+    """Share of the measured increments that is predicted, ``1 - sum(e^2) / sum(ds^2)``, shape ``(3,)``.
+
+    1 is perfect, 0 is as good as persistence, below 0 is worse; NaN for a channel that never changes.
+    """
+    total = np.sum(increments**2, axis=0)
+    left = np.sum((increments - predicted) ** 2, axis=0)
+    share: Vector = 1.0 - np.divide(left, total, out=np.full(len(total), np.nan), where=total > 0)
+    return share
+
+
+def coverage(errors: Vector, covariance: Vector, level: float = 0.9) -> Vector:
+    """Share of the errors inside the central Gaussian interval of ``level``; equals ``level`` for honest variances.
+
+    Args:
+        errors: one-step errors, shape ``(N, 3)``.
+        covariance: stated one-step error variances, shape ``(3,)``.
+        level: probability of the interval.
+    """
+    z = NormalDist().inv_cdf(0.5 + level / 2)
+    share: Vector = np.mean(np.abs(errors) <= z * np.sqrt(covariance), axis=0)
+    return share
+
+
+def latency_us(model: WindowModel, windows: Vector, calls: int = 200, warm_up: int = 20) -> Vector:
+    """Wall-clock time of single predictions (us), shape ``(calls,)``, after ``warm_up`` unmeasured ones.
+
+    Args:
+        model: the model to time.
+        windows: real windows to cycle through, shape ``(M, H, 7)``.
+        calls: measured predictions.
+        warm_up: predictions before the first measured one.
+    """
+    single = [np.ascontiguousarray(window[None]) for window in windows]
+    samples = np.empty(warm_up + calls)
+    for call in range(len(samples)):
+        window = single[call % len(single)]
+        begin = perf_counter_ns()
+        model.predict(window)
+        samples[call] = perf_counter_ns() - begin
+    return samples[warm_up:] / 1e3
+
+
+def _join(parts: list[Vector | None]) -> Vector | None:
+    known = [part for part in parts if part is not None]
+    return np.concatenate(known) if known else None

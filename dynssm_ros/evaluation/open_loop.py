@@ -1,0 +1,282 @@
+"""Scoring models on a recording: the same rows for all of them, one step ahead and over a horizon."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dynssm_ros.errors import ArtifactError, RecordingError
+from dynssm_ros.evaluation.metrics import (
+    BATCH,
+    CHANNELS,
+    Indices,
+    Tick,
+    Vector,
+    coverage,
+    explained,
+    gather,
+    latency_us,
+    max_error,
+    predict_rows,
+    rmse,
+)
+from dynssm_ros.evaluation.rollout import Rollout, default_horizon, score_rollouts
+from dynssm_ros.runtime.models import WindowModel
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.signal_map import Commands
+
+FULL_SIZE_SPEED = 10.0  # a recording that exceeds this speed (m/s) is of a full-size car
+FULL_SIZE_MIN_SPEED = 5.0  # m/s; the published evaluations of full-size cars leave out slower rows
+
+
+@dataclass(frozen=True)
+class Score:
+    """What one model is worth on a recording.
+
+    Attributes:
+        model: what was scored.
+        state: its one-step predictions of the rows after :attr:`Evaluation.rows`, shape ``(N, 3)``.
+        theta: its adapted coefficients, shape ``(N, 17)``; ``None`` if it has none.
+        rmse: one-step root mean square error by channel, shape ``(3,)`` (m/s, m/s, rad/s); so are the next two.
+        max_error: largest absolute one-step error.
+        explained: share of the measured increments that it predicts; 0 for persistence, 1 for a perfect model.
+        coverage_90: share of errors inside the model's own 90 % interval; ``None`` if it states no covariance.
+        rollout: errors over the horizon.
+        latency_us: wall-clock samples of single predictions (us).
+    """
+
+    model: WindowModel
+    state: Vector
+    theta: Vector | None
+    rmse: Vector
+    max_error: Vector
+    explained: Vector
+    coverage_90: Vector | None
+    rollout: Rollout
+    latency_us: Vector
+
+    @property
+    def adapts(self) -> bool:
+        """Whether its coefficients change from row to row."""
+        return self.theta is not None and bool((self.theta != self.theta[0]).any())
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry of one model in ``results.json``; what is not finite becomes ``None``."""
+        p50, p99 = np.percentile(self.latency_us, [50, 99])
+        return {
+            "rmse": by_channel(self.rmse),
+            "max_error": by_channel(self.max_error),
+            "ade": finite(self.rollout.ade),
+            "fde": finite(self.rollout.fde),
+            "parameters": self.model.parameters,
+            "flops": self.model.flops,
+            "latency_us": {"p50": finite(p50), "p99": finite(p99)},
+            "coverage_90": None if self.coverage_90 is None else by_channel(self.coverage_90),
+            "explained": by_channel(self.explained),
+            "rollout": {
+                "time_s": [finite(t) for t in self.rollout.time],
+                "rmse": {name: [finite(v) for v in self.rollout.rmse[:, k]] for k, name in enumerate(CHANNELS)},
+                "displacement": [finite(v) for v in self.rollout.displacement],
+            },
+        }
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of several models on the same rows of a recording.
+
+    Attributes:
+        recording: what was scored on, after selection and with the commands in use.
+        name: of the recording, for people.
+        split: which part of it was scored, for people.
+        min_speed: slower stretches were left out (m/s).
+        rows: last row of each window; the predicted rows are ``rows + 1``.
+        scores: by model name, in the order in which the models were given.
+    """
+
+    recording: Recording
+    name: str
+    split: str
+    min_speed: float
+    rows: Indices
+    scores: dict[str, Score]
+
+    @property
+    def current(self) -> Vector:
+        """Measured states of :attr:`rows`, shape ``(N, 3)``."""
+        return self.recording.matrix[self.rows, :3]
+
+    @property
+    def measured(self) -> Vector:
+        """Measured states of the predicted rows, shape ``(N, 3)``."""
+        return self.recording.matrix[self.rows + 1, :3]
+
+    @property
+    def persistence_rmse(self) -> Vector:
+        """RMSE of the prediction that nothing changes: the RMS of the increments, shape ``(3,)``."""
+        return rmse(self.measured - self.current)
+
+    @property
+    def horizon_s(self) -> float:
+        """Length of the rollouts (s)."""
+        return float(next(iter(self.scores.values())).rollout.time[-1])
+
+    @property
+    def starts(self) -> int:
+        """Number of rollouts."""
+        return next(iter(self.scores.values())).rollout.starts
+
+    def to_json(self) -> dict[str, Any]:
+        """``results.json``: the contract's fields, and more."""
+        return {
+            "recording": self.name,
+            "commands": self.recording.info.commands,
+            "horizon_s": round(self.horizon_s, 9),
+            "models": {name: score.to_json() for name, score in self.scores.items()},
+            "split": self.split,
+            "sampling_time": self.recording.T_s,
+            "min_speed": finite(self.min_speed),
+            "rows": len(self.rows),
+            "starts": self.starts,
+            "persistence_rmse": by_channel(self.persistence_rmse),
+        }
+
+
+def evaluate(
+    recording: Recording,
+    models: Mapping[str, WindowModel],
+    name: str = "",
+    split: str = "whole recording",
+    min_speed: float | None = None,
+    horizon_s: float | None = None,
+    stride: int = 1,
+    batch: int = BATCH,
+    calls: int = 200,
+    progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:
+    """Scores ``models`` on ``recording``.
+
+    Args:
+        recording: with the commands in use.
+        models: by the name to show; not empty.
+        name: of the recording, for people; its sources if empty.
+        split: which part of it this is, for people.
+        min_speed: stretches below are left out (m/s); :func:`default_min_speed` if ``None``.
+        horizon_s: length of the rollouts (s); :func:`default_horizon` if ``None``.
+        stride: a rollout starts at every ``stride``-th usable row.
+        batch: windows per call of a model.
+        calls: single predictions timed per model.
+        progress: told of the predictions done and all that will be made.
+
+    Raises:
+        ArtifactError: a model is for another sampling time or command protocol.
+        RecordingError: the recording holds no usable window.
+    """
+    for model in models.values():
+        check_fit(model, recording)
+    T_s = recording.T_s
+    steps = horizon_steps(default_horizon(T_s) if horizon_s is None else horizon_s, T_s)
+    H = max(model.H for model in models.values())
+    speed = default_min_speed(recording) if min_speed is None else min_speed
+    rows = recording.window_ends(H, 1, speed)
+    starts = recording.window_ends(H, steps, speed)[::stride]
+    if len(starts) == 0:
+        raise RecordingError(
+            f"recording {name or ', '.join(recording.info.source)} ({split}): no stretch of {H + steps} rows "
+            f"(window {H}, horizon {steps}) without a gap at {speed:g} m/s or more among its {len(recording)} rows"
+        )
+    total, done = len(models) * (len(rows) + len(starts) * steps), 0
+
+    def tick(predictions: int) -> None:
+        nonlocal done
+        done += predictions
+        if progress is not None:
+            progress(done, total)
+
+    scores = {
+        label: _score(model, recording, rows, starts, steps, batch, calls, tick) for label, model in models.items()
+    }
+    return Evaluation(recording, name or ", ".join(recording.info.source), split, speed, rows, scores)
+
+
+def _score(
+    model: WindowModel,
+    recording: Recording,
+    rows: Indices,
+    starts: Indices,
+    steps: int,
+    batch: int,
+    calls: int,
+    tick: Tick,
+) -> Score:
+    matrix = recording.matrix
+    increments = matrix[rows + 1, :3] - matrix[rows, :3]
+    with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
+        predicted = predict_rows(model, matrix, rows, batch, tick)
+        errors = predicted.state - matrix[rows + 1, :3]
+        return Score(
+            model=model,
+            state=predicted.state,
+            theta=predicted.theta,
+            rmse=rmse(errors),
+            max_error=max_error(errors),
+            explained=explained(increments, increments + errors),
+            coverage_90=None if model.covariance is None else coverage(errors, model.covariance),
+            rollout=score_rollouts(model, matrix, starts, steps, recording.T_s, batch, tick),
+            latency_us=latency_us(model, gather(matrix, rows[:50], model.H - 1), calls),
+        )
+
+
+def default_min_speed(recording: Recording) -> float:
+    """Speed (m/s) below which rows are not scored: 5 for full-size cars as in the literature, none for small ones."""
+    return FULL_SIZE_MIN_SPEED if recording["v_x"].max(initial=0.0) > FULL_SIZE_SPEED else 0.0
+
+
+def horizon_steps(horizon_s: float, T_s: float) -> int:
+    """Number of steps in a horizon of ``horizon_s`` seconds, at least one."""
+    return max(1, round(horizon_s / T_s))
+
+
+def shared_commands(models: Mapping[str, WindowModel]) -> Commands | None:
+    """The command protocol that the models were trained with; ``None`` if any of them will do.
+
+    Raises:
+        ArtifactError: they were trained with different ones, so no recording serves all.
+    """
+    trained = {label: model.commands for label, model in models.items() if model.commands is not None}
+    if len(set(trained.values())) > 1:
+        listed = ", ".join(f"{label}: {commands}" for label, commands in trained.items())
+        raise ArtifactError(f"models trained with different commands ({listed}); expected the same for one evaluation")
+    return next(iter(trained.values()), None)
+
+
+def check_fit(model: WindowModel, recording: Recording) -> None:
+    """Checks that a model is for recordings like this one.
+
+    Raises:
+        ArtifactError: the sampling time or the command protocol differs.
+    """
+    where = f"model {model.name} on recording {', '.join(recording.info.source)}"
+    if model.T_s > 0 and not math.isclose(model.T_s, recording.T_s, rel_tol=1e-3):
+        raise ArtifactError(
+            f"{where}: sampling time {recording.T_s:g} s, but the model is for {model.T_s:g} s; "
+            f"extract the bag at {1 / model.T_s:g} Hz"
+        )
+    if model.commands not in (None, recording.info.commands):
+        raise ArtifactError(
+            f"{where}: commands '{recording.info.commands}', but the model was trained with '{model.commands}'"
+        )
+
+
+def finite(value: float) -> float | None:
+    """``value`` as JSON has it: ``None`` for NaN and infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def by_channel(values: Vector) -> dict[str, float | None]:
+    """Names the entries of a ``(3,)`` array."""
+    return {name: finite(value) for name, value in zip(CHANNELS, values, strict=True)}

@@ -1,0 +1,147 @@
+"""Tables that look the same on the terminal, in Markdown and in HTML: rows of values, and columns that know how."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import rich.box
+import rich.table
+from rich.markup import escape
+
+Value = float | int | str | None
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Attributes:
+        title: as shown.
+        unit: shown behind the title; empty if there is none.
+        group: columns side by side of one group share a heading.
+        best: which value is marked, if any.
+        brief: shown on the terminal too, where there is little room.
+    """
+
+    title: str
+    unit: str = ""
+    group: str = ""
+    best: Literal["min", "max"] | None = None
+    brief: bool = False
+
+    @property
+    def heading(self) -> str:
+        """Title and unit."""
+        return f"{self.title} ({self.unit})" if self.unit else self.title
+
+    @property
+    def full_heading(self) -> str:
+        """Group, title and unit, for formats without grouped columns."""
+        return f"{self.group} {self.heading}".strip()
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A value as shown."""
+
+    text: str
+    best: bool
+    numeric: bool
+
+
+@dataclass(frozen=True)
+class Table:
+    """Values in rows. ``None``, NaN and infinity show as a dash; numbers have three significant digits."""
+
+    columns: tuple[Column, ...]
+    rows: Sequence[Sequence[Value]]
+    caption: str = ""
+
+    @property
+    def cells(self) -> list[list[Cell]]:
+        """The rows as shown, the best value of each column marked."""
+        best = [self._best(k) for k in range(len(self.columns))]
+        return [
+            [
+                Cell(text(value), best[k] is not None and value == best[k], not isinstance(value, str))
+                for k, value in enumerate(row)
+            ]
+            for row in self.rows
+        ]
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """Headings over columns side by side: ``(group, number of columns)``; empty if no column has a group."""
+        spans: list[tuple[str, int]] = []
+        for column in self.columns:
+            if spans and column.group and spans[-1][0] == column.group:
+                spans[-1] = (column.group, spans[-1][1] + 1)
+            else:
+                spans.append((column.group, 1))
+        return spans if any(group for group, _ in spans) else []
+
+    @property
+    def brief(self) -> Table:
+        """The same table with its brief columns only."""
+        kept = [k for k, column in enumerate(self.columns) if column.brief]
+        rows = [[row[k] for k in kept] for row in self.rows]
+        return Table(tuple(self.columns[k] for k in kept), rows, self.caption)
+
+    def rich(self) -> rich.table.Table:
+        """The table for the terminal."""
+        shown = rich.table.Table(
+            box=rich.box.SIMPLE_HEAD, caption=self.caption or None, caption_justify="left", header_style="bold"
+        )
+        group = ""
+        for k, column in enumerate(self.columns):
+            heading = "\n".join(["" if column.group == group else column.group, column.title, column.unit])
+            group = column.group
+            if self._numeric(k):
+                shown.add_column(escape(heading), justify="right", no_wrap=True)
+            else:
+                shown.add_column(escape(heading), overflow="fold")
+        for row in self.cells:
+            shown.add_row(*(f"[bold green]{escape(c.text)}[/]" if c.best else escape(c.text) for c in row))
+        return shown
+
+    def markdown(self) -> str:
+        """The table as Markdown, best values in bold."""
+        head = [column.full_heading for column in self.columns]
+        rule = ["---:" if self._numeric(k) else "---" for k in range(len(head))]
+        body = [[f"**{_plain(c.text)}**" if c.best else _plain(c.text) for c in row] for row in self.cells]
+        lines = ["| " + " | ".join(row) + " |" for row in ([_plain(h) for h in head], rule, *body)]
+        return "\n".join(lines) + (f"\n\n{self.caption}" if self.caption else "") + "\n"
+
+    def _numeric(self, k: int) -> bool:
+        return any(not isinstance(row[k], str) for row in self.rows)
+
+    def _best(self, k: int) -> Value:
+        goal = self.columns[k].best
+        values = [row[k] for row in self.rows]
+        known = [v for v in values if isinstance(v, (int, float)) and math.isfinite(v)]
+        if goal is None or len(known) < 2:
+            return None
+        return min(known) if goal == "min" else max(known)
+
+
+def text(value: Value) -> str:
+    """A value as shown: integers and large numbers in full, others with three significant digits."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "–"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:#.3g}".rstrip(".")
+
+
+def percent(share: float) -> str:
+    """A share in whole percent."""
+    return f"{100 * share:.0f} %"
+
+
+def _plain(cell: str) -> str:
+    return cell.replace("|", "\\|")

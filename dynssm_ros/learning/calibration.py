@@ -1,0 +1,230 @@
+"""Calibration: the nominal coefficients by bounded nonlinear least squares on prediction errors.
+
+Errors of one or several steps ahead are minimised rather than differentiated noisy states. Everything is computed in
+coordinates where each coefficient's admissible range is [0, 1]; the bounds act as weak knowledge (a uniform
+distribution's variance), so that what the data cannot tell comes out as "known by its bounds only" and not as a wild
+value with a wild error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+
+from dynssm_ros.errors import RecordingError
+from dynssm_ros.signals.inputs import applied_inputs
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.effects import initial_memory
+from dynssm_ros.vehicle.single_track import Integrator, step_with_memory
+
+Vector = npt.NDArray[np.float64]
+Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
+Progress = Callable[[int, int], None]
+
+_UNIFORM_PRECISION = 12.0  # inverse variance of a uniform distribution on [0, 1]
+_ON_BOUND = 1e-3  # fraction of the range
+_BLOCK = 2.0  # s; errors closer than this are treated as correlated
+_MAX_RESIDUALS = 40_000
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the data say of the coefficients.
+
+    Attributes:
+        vehicle: the vehicle with calibrated nominal values and their standard deviations.
+        theta: coefficients ``(17,)``; ``std`` their standard deviations.
+        on_bound: names of coefficients that the data push against a bound.
+        unidentified: combinations that the data do not determine better than the bounds do, as
+            ``{coefficient: weight}`` in units of the ranges.
+        rmse_before: one-step RMSE ``(3,)`` with the former nominal values; ``rmse_after`` with the calibrated ones.
+        rows: number of prediction errors used per channel; ``steps`` ahead.
+    """
+
+    vehicle: Vehicle
+    theta: Vector
+    std: Vector
+    on_bound: tuple[str, ...]
+    unidentified: tuple[dict[str, float], ...]
+    rmse_before: Vector
+    rmse_after: Vector
+    rows: int
+    steps: int
+
+
+class PredictionErrors:
+    """Errors of ``steps``-step predictions from every usable row, as a function of the coefficients."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        vehicle: Vehicle,
+        steps: int = 1,
+        min_speed: float = 0.0,
+        integrator: Integrator = "euler",
+        substeps: int = 1,
+    ) -> None:
+        starts = recording.window_ends(1, horizon=steps, min_speed=min_speed)
+        stride = max(1, -(-len(starts) * steps // _MAX_RESIDUALS))
+        self.starts = starts[::stride]
+        if len(self.starts) * 3 < 10 * len(COEFFICIENTS):
+            raise RecordingError(
+                f"recording {', '.join(recording.info.source)}: only {len(self.starts)} usable rows at {min_speed:g} m/s or "
+                f"more; expected at least {10 * len(COEFFICIENTS) // 3 + 1} to calibrate {len(COEFFICIENTS)} coefficients"
+            )
+        self.vehicle, self.steps = vehicle, steps
+        self._integrator: Integrator = integrator
+        self._substeps = substeps
+        self._effects = vehicle.active_effects
+        rows = recording.matrix.T
+        self._rows = [rows[:, self.starts + k] for k in range(steps)]
+        self._target = np.stack([rows[:3, self.starts + k + 1] for k in range(steps)], axis=1)
+        # an error of k steps is measured against what the state does in k steps
+        self.scale = np.stack([(self._target[:, k] - rows[:3, self.starts]).std(axis=1) for k in range(steps)], axis=1)
+        self.blocks = recording.time[self.starts] // round(_BLOCK * 1e9)
+
+    def __call__(self, theta: Vector) -> Vector:
+        """Errors ``(3, steps, N)`` in m/s, m/s, rad/s for coefficients ``(17,)``."""
+        state = State(*self._rows[0][:3])
+        memory = initial_memory(self._effects, self._rows[0][3], self._rows[0][4])
+        predicted = np.empty_like(self._target)
+        for k in range(self.steps):
+            state, memory = step_with_memory(
+                np,
+                state,
+                memory,
+                applied_inputs(self._rows[k]),
+                Coefficients(*theta),
+                self.vehicle.constants,
+                self.vehicle.sampling_time,
+                self._effects,
+                self._integrator,
+                self._substeps,
+            )
+            predicted[:, k] = state
+        return predicted - self._target
+
+    def one_step_rmse(self, theta: Vector) -> Vector:
+        """RMSE of the first step, ``(3,)``."""
+        rmse: Vector = np.sqrt((self(theta)[:, 0] ** 2).mean(axis=1))
+        return rmse
+
+
+def calibrate(
+    recording: Recording,
+    vehicle: Vehicle,
+    steps: int = 1,
+    loss: Loss = "soft_l1",
+    min_speed: float = 0.0,
+    starts: int = 4,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Fits the nominal coefficients within their bounds.
+
+    Args:
+        recording: measured or simulated laps.
+        vehicle: start values and bounds; its effects are part of the model.
+        steps: steps ahead that are predicted; more weigh slow errors higher.
+        loss: robust loss of scipy's ``least_squares``.
+        min_speed: rows that are slower are left out (m/s).
+        starts: starting points: the nominal values, the middle of the bounds, then seeded random ones.
+        seed: of the random starting points.
+        progress: told after each starting point.
+
+    Raises:
+        RecordingError: another sampling time than the vehicle's, or too few rows.
+    """
+    if abs(recording.T_s - vehicle.sampling_time) > 1e-9:
+        raise RecordingError(
+            f"recording {', '.join(recording.info.source)}: sampling time {recording.T_s:g} s, but vehicle "
+            f"{vehicle.name} has {vehicle.sampling_time:g} s; extract with --rate {1 / vehicle.sampling_time:g}"
+        )
+    errors = PredictionErrors(recording, vehicle, steps, min_speed)
+    lower, width = vehicle.lower, vehicle.upper - vehicle.lower
+    scale = np.maximum(errors.scale, 1e-12)
+
+    def residuals(p: Vector) -> Vector:
+        weighted: Vector = (errors(lower + p * width) / scale[:, :, None]).ravel()
+        return np.nan_to_num(weighted, copy=False, nan=1e6, posinf=1e6, neginf=-1e6)
+
+    random = np.random.default_rng(seed)
+    points = [(vehicle.nominal - lower) / width, np.full(len(lower), 0.5)]
+    points += [random.uniform(0.1, 0.9, len(lower)) for _ in range(starts - 2)]
+    fits = []
+    for number, point in enumerate(points[:starts], 1):
+        inside = np.clip(point, 1e-6, 1 - 1e-6)
+        fits.append(_fit(residuals, inside, loss, tolerance=1e-5, evaluations=40))
+        if progress is not None:
+            progress(number, starts + 1)
+    # weigh each channel by its own error now that it is known, and polish
+    best = min(fits, key=lambda fit: float(fit.cost)).x
+    left = errors(lower + best * width)
+    scale = np.maximum(1.4826 * np.median(np.abs(left), axis=2), 1e-9 * errors.scale + 1e-15)
+    final = _fit(residuals, best, loss, tolerance=1e-15, evaluations=100)
+    if progress is not None:
+        progress(starts + 1, starts + 1)
+    theta = lower + final.x * width
+    free = (final.x > _ON_BOUND) & (final.x < 1 - _ON_BOUND)
+    covariance, unidentified = _knowledge(final.jac, residuals(final.x), np.tile(errors.blocks, 3 * steps), free)
+    std = np.where(free, np.sqrt(np.diag(covariance)), np.sqrt(1 / _UNIFORM_PRECISION)) * width
+    return Calibration(
+        vehicle.with_nominal(np.clip(theta, vehicle.lower, vehicle.upper), std),
+        theta,
+        std,
+        tuple(name for name, inside in zip(COEFFICIENTS, free, strict=True) if not inside),
+        unidentified,
+        errors.one_step_rmse(vehicle.nominal),
+        errors.one_step_rmse(theta),
+        len(errors.starts),
+        steps,
+    )
+
+
+def _fit(residuals: Callable[[Vector], Vector], start: Vector, loss: Loss, tolerance: float, evaluations: int) -> Any:
+    """Runs scipy's trust-region reflective least squares on [0, 1]; at most ``evaluations`` Jacobians."""
+    return least_squares(
+        residuals,
+        start,
+        bounds=(0.0, 1.0),
+        loss=loss,
+        x_scale="jac",
+        xtol=tolerance,
+        ftol=tolerance,
+        gtol=tolerance,
+        max_nfev=evaluations,
+    )
+
+
+def _knowledge(
+    jacobian: Vector, residuals: Vector, blocks: npt.NDArray[np.int64], free: npt.NDArray[np.bool_]
+) -> tuple[Vector, tuple[dict[str, float], ...]]:
+    """Covariance in unit coordinates, and the directions that the data leave open.
+
+    Neighbouring errors are correlated, so the scores are summed over blocks in time (cluster-robust "sandwich").
+    """
+    size = jacobian.shape[1]
+    spread = max(float(np.std(residuals)), 1e-300)
+    information = jacobian.T @ jacobian / spread**2
+    scores = jacobian * (residuals / spread**2)[:, None]
+    _, index = np.unique(blocks, return_inverse=True)
+    summed = np.zeros((index.max() + 1, size))
+    np.add.at(summed, index, scores)
+    keep = np.flatnonzero(free)
+    part = np.ix_(keep, keep)
+    meat = summed[:, keep].T @ summed[:, keep]
+    bread = np.linalg.inv(information[part] + _UNIFORM_PRECISION * np.eye(len(keep)))
+    covariance = np.zeros((size, size))
+    covariance[part] = bread @ (meat + _UNIFORM_PRECISION * np.eye(len(keep))) @ bread
+    values, vectors = np.linalg.eigh(information[part])
+    open_directions = tuple(
+        {COEFFICIENTS[keep[k]]: round(float(v), 2) for k, v in enumerate(vectors[:, d]) if abs(v) > 0.25}
+        for d in np.flatnonzero(values < _UNIFORM_PRECISION)
+    )
+    return covariance, open_directions

@@ -1,0 +1,86 @@
+"""Windows of a recording as tensors, and the blocked split into training and validation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from dynssm_ros.errors import RecordingError
+from dynssm_ros.learning.configuration import TrainingConfig
+from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.signals.recording import Recording
+
+Indices = npt.NDArray[np.intp]
+_CONSTANT = 1e-9  # a column that varies less than this is not scaled
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows that end at ``ends`` in the rows ``matrix`` ``(N, 7)``; formed batch by batch, never stored."""
+
+    matrix: Tensor
+    ends: Tensor
+    H: int
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    def batch(self, index: Tensor | slice) -> tuple[Tensor, Tensor]:
+        """Windows ``(B, H, 7)`` and their measured increments ``s_{t+1} - s_t`` ``(B, 3)``."""
+        ends = self.ends[index]
+        rows = ends[:, None] + torch.arange(1 - self.H, 1, device=ends.device)
+        return self.matrix[rows], self.matrix[ends + 1, :3] - self.matrix[ends, :3]
+
+    def to(self, device: torch.device) -> Windows:
+        """The same windows on ``device``."""
+        return Windows(self.matrix.to(device), self.ends.to(device), self.H)
+
+
+def split_windows(recording: Recording, H: int, config: TrainingConfig) -> tuple[Windows, Windows]:
+    """Training and validation windows from alternating blocks in time; no row serves both.
+
+    Raises:
+        RecordingError: too little motion to train on.
+    """
+    block = max(1, round(config.validation_block / recording.T_s))
+    blocks = np.arange(len(recording)) // block
+    validation = (blocks % config.validation_every == config.validation_every - 1).astype(np.intp)
+    ends = recording.window_ends(H, min_speed=config.min_speed)
+    cumulated = np.concatenate([[0], np.cumsum(validation)])
+    inside = cumulated[ends + 2] - cumulated[ends - H + 1]
+    training, held = ends[inside == 0], ends[inside == H + 1]
+    if len(training) < config.batch_size or len(held) == 0:
+        raise RecordingError(
+            f"recording {', '.join(recording.info.source)}: {len(training)} training and {len(held)} validation windows "
+            f"of {H} rows at {config.min_speed:g} m/s or more; expected at least {config.batch_size} and 1 - "
+            "more driving is needed"
+        )
+    matrix = torch.tensor(recording.matrix, dtype=torch.float32)
+    return Windows(matrix, torch.tensor(training), H), Windows(matrix, torch.tensor(held), H)
+
+
+def normalisation(recording: Recording, windows: Windows) -> Normalisation:
+    """Scales from the training windows.
+
+    Raises:
+        RecordingError: a state never changes.
+    """
+    ends = windows.ends.numpy()
+    rows = recording.matrix[ends]
+    increments = recording.matrix[ends + 1, :3] - rows[:, :3]
+    std = rows.std(axis=0)
+    for name, spread in zip(("v_x", "v_y", "omega"), increments.std(axis=0), strict=True):
+        if spread < _CONSTANT:
+            raise RecordingError(
+                f"recording {', '.join(recording.info.source)}: {name} never changes; expected a car that drives corners"
+            )
+    return Normalisation(
+        input_mean=tuple(rows.mean(axis=0).tolist()),
+        input_std=tuple(np.where(std < _CONSTANT, 1.0, std).tolist()),
+        state_scale=tuple(std[:3].tolist()),
+        increment_scale=tuple(increments.std(axis=0).tolist()),
+    )

@@ -1,0 +1,192 @@
+"""DynSSM: physics with adapted coefficients and a gated residual, Section III of the paper."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from dynssm_ros.learning.configuration import ModelConfig, PhysicsConfig
+from dynssm_ros.learning.encoders import Fusion
+from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
+from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.effects import initial_memory
+from dynssm_ros.vehicle.single_track import step_with_memory
+
+INPUTS = len(WINDOW_COLUMNS)
+
+
+class Output(NamedTuple):
+    """What a model computes for ``B`` windows; all increments are ``s_{t+1} - s_t``."""
+
+    increment: Tensor
+    """Final prediction, Eq. (33), as an increment ``(B, 3)``."""
+    physics: Tensor | None
+    """The physics' increment, Eq. (29), ``(B, 3)``."""
+    theta: Tensor | None
+    """Adapted coefficients, Eq. (21), ``(B, 17)``."""
+    deviation: Tensor | None
+    """Normalised parameter deviation, Eq. (23), ``(B, 17)``."""
+    correction: Tensor | None
+    """Normalised output of the residual network, Eq. (31), ``(B, 3)``."""
+
+
+class PhysicsLayer(nn.Module):
+    """f_dyn: the one single-track source under torch, from window rows and coefficients to the state increment."""
+
+    def __init__(self, vehicle: Vehicle, config: PhysicsConfig) -> None:
+        super().__init__()
+        self.vehicle = vehicle
+        self.config = config
+        self.effects = vehicle.active_effects
+
+    def forward(self, latest: Tensor, theta: Tensor) -> Tensor:
+        """Raw last rows ``(B, 7)`` and coefficients ``(B, 17)`` to increments ``(B, 3)``."""
+        rows = latest.unbind(-1)
+        now = State(*rows[:3])
+        following, _ = step_with_memory(
+            torch,
+            now,
+            initial_memory(self.effects, rows[3], rows[4]),
+            applied_inputs(rows),
+            Coefficients(*theta.unbind(-1)),
+            self.vehicle.constants,
+            self.vehicle.sampling_time,
+            self.effects,
+            self.config.integrator,
+            self.config.substeps,
+        )
+        return torch.stack([after - before for after, before in zip(following, now, strict=True)], dim=-1)
+
+
+class ParameterHead(nn.Module):
+    """Bounded adaptation: theta = clip(theta_0 + alpha tanh(g(z, h)) range), Eq. (19) to (21)."""
+
+    lower: Tensor
+    upper: Tensor
+    nominal: Tensor
+
+    def __init__(self, config: ModelConfig, vehicle: Vehicle, latent: int) -> None:
+        super().__init__()
+        assert config.adaptation is not None
+        assert config.physics is not None
+        self.alpha = config.adaptation.alpha
+        self.condition = nn.Sequential(nn.Linear(latent + INPUTS, config.adaptation.hidden), nn.SiLU())
+        self.deviate = nn.Linear(config.adaptation.hidden, len(COEFFICIENTS))
+        nn.init.normal_(self.deviate.weight, std=1e-3)  # training starts from the nominal car
+        nn.init.zeros_(self.deviate.bias)
+        self.register_buffer("lower", torch.tensor(vehicle.lower, dtype=torch.float32))
+        self.register_buffer("upper", torch.tensor(vehicle.upper, dtype=torch.float32))
+        self.register_buffer("nominal", nominal_parameters(config.physics, vehicle))
+
+    def forward(self, latent: Tensor, latest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """``z_t`` and the latest normalised input to ``(theta, normalised deviation, c_t)``."""
+        conditioned = self.condition(torch.cat([latent, latest], dim=-1))
+        admissible = self.upper - self.lower
+        shift = self.alpha * torch.tanh(self.deviate(conditioned)) * admissible
+        theta = torch.clamp(self.nominal + shift, self.lower, self.upper)
+        return theta, (theta - self.nominal) / admissible, conditioned
+
+
+class GatedResidual(nn.Module):
+    """lambda_r s_delta * sigmoid(gate(q)) * r(q), Eq. (30) to (32)."""
+
+    def __init__(self, features: int, hidden: tuple[int, ...], scale: float) -> None:
+        super().__init__()
+        self.scale = scale
+        sizes = (features, *hidden)
+        layers = [module for a, b in pairwise(sizes) for module in (nn.Linear(a, b), nn.SiLU())]
+        self.network = nn.Sequential(*layers, nn.Linear(hidden[-1], 3))
+        self.gate = nn.Linear(features, 3)
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.normal_(last.weight, std=1e-3)  # training starts from the physics alone
+        nn.init.zeros_(last.bias)
+
+    def forward(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """``q_t`` to the correction in units of ``s_delta`` and the network's output, each ``(B, 3)``."""
+        r: Tensor = self.network(q)
+        return self.scale * torch.sigmoid(self.gate(q)) * r, r
+
+
+class DynSSM(nn.Module):
+    """The whole model; components whose configuration is left out are absent (the paper's ablations)."""
+
+    mean: Tensor
+    std: Tensor
+    increment_scale: Tensor
+    nominal: Tensor
+
+    def __init__(self, config: ModelConfig, vehicle: Vehicle, normalisation: Normalisation) -> None:
+        super().__init__()
+        assert config.fusion is not None
+        self.config = config
+        latent = config.fusion.latent
+        self.register_buffer("mean", torch.tensor(normalisation.input_mean))
+        self.register_buffer("std", torch.tensor(normalisation.input_std))
+        self.register_buffer("increment_scale", torch.tensor(normalisation.increment_scale))
+        self.fusion = Fusion(INPUTS, config.ssm, config.gru, config.fusion)
+        self.physics = PhysicsLayer(vehicle, config.physics) if config.physics else None
+        self.head = ParameterHead(config, vehicle, latent) if config.adaptation else None
+        conditioned = config.adaptation.hidden if config.adaptation else latent
+        self.residual = None
+        if config.residual:
+            features = conditioned + INPUTS
+            features += len(COEFFICIENTS) if self.head else 0
+            features += 6 if self.physics else 0
+            self.residual = GatedResidual(features, config.residual.hidden, config.residual.scale)
+        if config.physics and not config.adaptation:
+            self.register_buffer("nominal", nominal_parameters(config.physics, vehicle))
+
+    def forward(self, window: Tensor) -> Output:
+        """Raw windows ``(B, H, 7)`` to predictions."""
+        normalised = (window - self.mean) / self.std
+        latest = normalised[:, -1]
+        raw = window[:, -1]
+        conditioned = self.fusion(normalised)
+        theta = deviation = increment = None
+        if self.head is not None:
+            theta, deviation, conditioned = self.head(conditioned, latest)
+        elif self.physics is not None:
+            theta = self.nominal.expand(len(window), -1)
+        if self.physics is not None:
+            increment = self.physics(raw, theta)
+        if self.residual is None:
+            assert increment is not None
+            return Output(increment, increment, theta, deviation, None)
+        q = self._residual_input(conditioned, deviation, raw, latest, increment)
+        scaled, correction = self.residual(q)
+        added = self.increment_scale * scaled
+        return Output(added if increment is None else increment + added, increment, theta, deviation, correction)
+
+    def _residual_input(
+        self, conditioned: Tensor, deviation: Tensor | None, raw: Tensor, latest: Tensor, increment: Tensor | None
+    ) -> Tensor:
+        """``q_t = [c_t, normalised deviation, h_t, physics state, physics increment]``, Eq. (30)."""
+        assert self.config.residual is not None
+        standardised = self.config.residual.inputs == "normalised"
+        parts = [conditioned, latest if standardised else raw]
+        if deviation is not None:
+            parts.append(deviation)
+        if increment is not None:
+            predicted = raw[:, :3] + increment
+            if standardised:
+                parts += [(predicted - self.mean[:3]) / self.std[:3], increment / self.increment_scale]
+            else:
+                parts += [predicted, increment]
+        return torch.cat(parts, dim=-1)
+
+    def for_deployment(self) -> DynSSM:
+        """Switches the state-space layers to their recurrence; returns itself."""
+        if self.fusion.ssm is not None:
+            self.fusion.ssm.recurrent = True
+        return self.eval()
+
+
+def nominal_parameters(config: PhysicsConfig, vehicle: Vehicle) -> Tensor:
+    """theta_0 after the configuration: the vehicle's nominal values or the middle of the bounds, ``(17,)``."""
+    values = vehicle.nominal if config.nominal == "vehicle" else (vehicle.lower + vehicle.upper) / 2
+    return torch.tensor(values, dtype=torch.float32)

@@ -1,0 +1,115 @@
+"""The neural memory branch: state-space and recurrent encoders of the history window, and their fusion."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dynssm_ros.learning.configuration import FusionConfig, GruConfig, SsmConfig
+
+
+class DiagonalSsm(nn.Module):
+    """Diagonal linear state-space layer, discretised by zero-order hold.
+
+    Per channel: ``x' = A x + u``, ``y = C x + D u`` with real ``A < 0`` of ``states`` entries, so that
+
+        x_k = exp(dt A) x_{k-1} + (exp(dt A) - 1) / A u_k.
+
+    The same map is evaluated as a convolution with its impulse response (parallel in time, for training) or as the
+    recurrence itself (one multiply-add per step, for deployment).
+    """
+
+    def __init__(self, channels: int, states: int) -> None:
+        super().__init__()
+        self.channels = channels
+        # time constants from two steps to many windows, as a real diagonal initialisation A_n = -(n + 1) spreads them
+        self.log_dt = nn.Parameter(torch.empty(channels).uniform_(math.log(0.01), math.log(0.5)))
+        self.log_a = nn.Parameter(torch.log(torch.arange(1, states + 1).float()).repeat(channels, 1))
+        self.C = nn.Parameter(torch.randn(channels, states) / math.sqrt(states))
+        self.D = nn.Parameter(torch.ones(channels))
+
+    def discretised(self) -> tuple[Tensor, Tensor]:
+        """``(dt A, B_bar)`` of shape ``(channels, states)``: exponent per step and zero-order-hold input gain."""
+        a = -torch.exp(self.log_a)
+        exponent = torch.exp(self.log_dt)[:, None] * a
+        # exp(x) - 1 without loss of digits, by operators that ONNX has
+        return exponent, 2 * torch.exp(exponent / 2) * torch.sinh(exponent / 2) / a
+
+    def convolution(self, u: Tensor) -> Tensor:
+        """``(B, L, channels)`` to the same shape, by a causal convolution with the impulse response."""
+        length = u.shape[1]
+        exponent, b = self.discretised()
+        powers = torch.exp(exponent[:, :, None] * torch.arange(length, device=u.device))
+        kernel = torch.einsum("cn,cnl->cl", self.C * b, powers)
+        # windows are short: the convolution is a product with the lower-triangular Toeplitz matrix of the response
+        lag = torch.arange(length, device=u.device)[:, None] - torch.arange(length, device=u.device)
+        toeplitz = kernel[:, lag.clamp(min=0)] * (lag >= 0)
+        y: Tensor = torch.einsum("cts,bsc->btc", toeplitz, u) + self.D * u
+        return y
+
+    def recurrence(self, u: Tensor) -> Tensor:
+        """``(B, L, channels)`` to the same shape, step by step."""
+        exponent, b = self.discretised()
+        decay = torch.exp(exponent)
+        driven = u[..., None] * b
+        x = driven[:, 0]
+        states = [x]
+        for k in range(1, u.shape[1]):
+            x = decay * x + driven[:, k]
+            states.append(x)
+        return (torch.stack(states, dim=1) * self.C).sum(-1) + self.D * u
+
+
+class SsmEncoder(nn.Module):
+    """phi_SSM: projection, state-space layers with skip connections, the features of the last instant."""
+
+    def __init__(self, inputs: int, config: SsmConfig) -> None:
+        super().__init__()
+        self.features = config.channels
+        self.project = nn.Linear(inputs, config.channels)
+        self.layers = nn.ModuleList(DiagonalSsm(config.channels, config.states) for _ in range(config.layers))
+        self.recurrent = False  # deployment switches to the recurrence
+
+    def forward(self, window: Tensor) -> Tensor:
+        """``(B, H, inputs)`` normalised to ``(B, channels)``."""
+        u: Tensor = self.project(window)
+        for layer in self.layers:
+            assert isinstance(layer, DiagonalSsm)
+            u = u + functional.silu(layer.recurrence(u) if self.recurrent else layer.convolution(u))
+        return u[:, -1]
+
+
+class GruEncoder(nn.Module):
+    """phi_GRU: the last hidden state of a gated recurrent unit."""
+
+    def __init__(self, inputs: int, config: GruConfig) -> None:
+        super().__init__()
+        self.features = config.hidden
+        self.gru = nn.GRU(inputs, config.hidden, config.layers, batch_first=True)
+
+    def forward(self, window: Tensor) -> Tensor:
+        """``(B, H, inputs)`` normalised to ``(B, hidden)``."""
+        _, last = self.gru(window)
+        return torch.as_tensor(last[-1])
+
+
+class Fusion(nn.Module):
+    """phi_fuse: both memories and the latest normalised input to the latent memory ``z_t``, Eq. (18)."""
+
+    def __init__(self, inputs: int, ssm: SsmConfig | None, gru: GruConfig | None, config: FusionConfig) -> None:
+        super().__init__()
+        self.ssm = SsmEncoder(inputs, ssm) if ssm else None
+        self.gru = GruEncoder(inputs, gru) if gru else None
+        features = inputs + sum(encoder.features for encoder in (self.ssm, self.gru) if encoder is not None)
+        self.mix = nn.Sequential(
+            nn.Linear(features, config.hidden), nn.SiLU(), nn.Linear(config.hidden, config.latent), nn.SiLU()
+        )
+
+    def forward(self, window: Tensor) -> Tensor:
+        """``(B, H, inputs)`` normalised to ``z_t`` of shape ``(B, latent)``."""
+        parts = [encoder(window) for encoder in (self.ssm, self.gru) if encoder is not None]
+        mixed: Tensor = self.mix(torch.cat([*parts, window[:, -1]], dim=-1))
+        return mixed

@@ -1,0 +1,166 @@
+"""A trained model to its artifact: weights, ONNX graph checked against torch, card, metrics."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import warnings
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from dynssm_ros.errors import ArtifactError
+from dynssm_ros.files import replacing
+from dynssm_ros.learning.configuration import ModelConfig
+from dynssm_ros.learning.dataset import Windows
+from dynssm_ros.learning.dynssm import DynSSM
+from dynssm_ros.learning.ridge import Ridge
+from dynssm_ros.learning.training import Trained
+from dynssm_ros.runtime.artifact import METRICS, ONNX, WEIGHTS, Artifact, ModelCard, checksum, open_artifact, write_card
+
+TOLERANCE = 1e-5
+"""Largest difference between ONNX and torch, in units of each state's scale."""
+
+
+class _Deployed(nn.Module):
+    """The outputs that are deployed, as a flat tuple."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model.for_deployment() if isinstance(model, DynSSM) else model.eval()
+
+    def forward(self, window: Tensor) -> tuple[Tensor, ...]:
+        output = self.model(window)
+        return tuple(value for value in (output.increment, output.theta, output.physics) if value is not None)
+
+
+def save_artifact(trained: Trained, out: Path, training: dict[str, object] | None = None) -> Artifact:
+    """Writes the model folder, atomically; an older one of the same name is replaced.
+
+    Args:
+        trained: outcome of :func:`dynssm_ros.learning.training.train`.
+        out: the folder.
+        training: what to note about how it was trained.
+
+    Raises:
+        ArtifactError: ``out`` is something else, or the exported graph differs from the trained model.
+    """
+    if out.exists() and not (out / "model.yaml").is_file():
+        raise ArtifactError(f"{out}: exists and is not a model folder; not replaced")
+    model, config = trained.model, trained.config
+    sample = _sample_windows(trained)
+    with replacing(out) as folder:
+        folder.mkdir()
+        save_file({name: value.contiguous() for name, value in model.state_dict().items()}, folder / WEIGHTS)
+        export_onnx(model, sample, folder / ONNX)
+        difference = check_export(model, sample, folder / ONNX, np.array(trained.normalisation.state_scale))
+        metrics = {
+            "validation_rmse": dict(zip(("v_x", "v_y", "omega"), trained.validation_rmse, strict=True)),
+            "windows": dict(zip(("training", "validation"), trained.windows, strict=True)),
+            "best_epoch": trained.best_epoch,
+            "onnx_difference": difference,
+            "history": trained.history,
+        }
+        (folder / METRICS).write_text(json.dumps(metrics, indent=1), encoding="utf-8")
+        physics = config.physics
+        card = ModelCard(
+            name=config.name,
+            kind=config.kind,
+            architecture=config.model_dump(mode="json"),
+            vehicle=trained.vehicle,
+            sampling_time=trained.vehicle.sampling_time,
+            window=config.H,
+            commands=trained.recording.info.commands,
+            integrator=physics.integrator if physics else "euler",
+            substeps=physics.substeps if physics else 1,
+            normalisation=trained.normalisation,
+            covariance=tuple(value**2 for value in trained.validation_rmse),
+            parameters=sum(p.numel() for p in model.parameters() if p.requires_grad),
+            flops=count_flops(model, config.H),
+            training={"recordings": list(trained.recording.info.source), "seed": config.training.seed}
+            | (training or {}),
+            checksums={name: checksum(folder / name) for name in (WEIGHTS, ONNX, METRICS)},
+        )
+        write_card(card, folder)
+    return open_artifact(out)
+
+
+def export_onnx(model: nn.Module, sample: Tensor, file: Path) -> None:
+    """Writes the deployed graph: input ``window`` (N, H, 7), outputs ``increment``, and ``theta``, ``physics`` if any."""
+    deployed = _Deployed(model)
+    with torch.no_grad():
+        output = deployed.model(sample[:1])
+    names = [
+        n
+        for n, v in (("increment", output.increment), ("theta", output.theta), ("physics", output.physics))
+        if v is not None
+    ]
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")  # the exporter's own deprecations are not the user's concern
+        torch.onnx.export(
+            deployed,
+            (sample[:2],),
+            file,
+            input_names=["window"],
+            output_names=names,
+            dynamic_axes={name: {0: "N"} for name in ("window", *names)},
+            opset_version=17,
+            dynamo=False,
+        )
+
+
+def check_export(model: nn.Module, sample: Tensor, file: Path, scale: np.ndarray) -> float:
+    """Compares ONNX Runtime with torch on ``sample``.
+
+    Returns:
+        The largest difference of the predicted state in units of ``scale``.
+
+    Raises:
+        ArtifactError: it exceeds ``TOLERANCE``.
+    """
+    session = ort.InferenceSession(file, providers=["CPUExecutionProvider"])
+    with torch.no_grad():
+        expected = model(sample).increment.numpy()
+    found = session.run(["increment"], {"window": sample.numpy()})[0]
+    difference = float((np.abs(found - expected) / scale).max())
+    if not difference <= TOLERANCE:
+        raise ArtifactError(
+            f"{file.name}: differs from torch by {difference:.1e} of a state's scale (at most {TOLERANCE:g})"
+        )
+    return difference
+
+
+def count_flops(model: nn.Module, H: int) -> int:
+    """Floating-point operations of one prediction's matrix products, counted by torch."""
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        model(torch.zeros(1, H, 7))
+    return int(counter.get_total_flops())
+
+
+def load_torch(artifact: Artifact) -> nn.Module:
+    """The trained model back in torch, for comparison and further training."""
+    card = artifact.card
+    config = ModelConfig.model_validate(card.architecture)
+    model = (
+        Ridge(config.H, card.normalisation)
+        if card.kind == "ridge"
+        else DynSSM(config, card.vehicle, card.normalisation)
+    )
+    model.load_state_dict(load_file(artifact.weights))
+    return model.eval()
+
+
+def _sample_windows(trained: Trained, count: int = 256) -> Tensor:
+    """Windows spread over the training data."""
+    matrix = torch.tensor(trained.recording.matrix, dtype=torch.float32)
+    ends = trained.recording.window_ends(trained.config.H, min_speed=trained.config.training.min_speed)
+    chosen = torch.tensor(ends[np.linspace(0, len(ends) - 1, count).astype(int)])
+    return Windows(matrix, chosen, trained.config.H).batch(slice(None))[0]

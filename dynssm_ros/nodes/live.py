@@ -1,0 +1,220 @@
+"""A live run end to end: the predictor in its own process, a bag played to it through DDS, its answers collected.
+
+The demo, the benchmark and the tests use it. Times are ``time.monotonic()`` of one process, so that the latency from
+odometry published to prediction received needs no clock synchronisation.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from dynssm_ros.errors import UserError
+from dynssm_ros.nodes.player import MATCH_TIMEOUT, Playback
+from dynssm_ros.nodes.support import SENSOR_QOS
+from dynssm_ros.signals.decoding import header_stamp_ns
+from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC
+
+_DRAIN = 2.0  # s without an answer after the last message before the run counts as over
+
+
+@dataclass
+class LiveRun:
+    """What went in and what came out.
+
+    Attributes:
+        sent: time at which each odometry message was published, by its stamp (ns).
+        predicted: predicted ``[v_x, v_y, omega]`` by the stamp of the predicted instant (ns).
+        received: time at which that prediction arrived.
+        parameters: adapted coefficients by the same stamp.
+        diagnostics: level, message and values of each status, in order.
+        T_s: from input stamp to predicted stamp (ns).
+    """
+
+    T_s: int
+    sent: dict[int, float] = field(default_factory=dict)
+    predicted: dict[int, tuple[float, float, float]] = field(default_factory=dict)
+    received: dict[int, float] = field(default_factory=dict)
+    parameters: dict[int, list[float]] = field(default_factory=dict)
+    diagnostics: list[tuple[int, str, dict[str, str]]] = field(default_factory=list)
+
+    @property
+    def latencies(self) -> npt.NDArray[np.float64]:
+        """Odometry published to prediction received (s), in the order of the predictions."""
+        return np.array(
+            [self.received[s] - self.sent[s - self.T_s] for s in sorted(self.received) if s - self.T_s in self.sent]
+        )
+
+    def missing(self) -> list[int]:
+        """Stamps of odometry messages after the first prediction that got none (ns)."""
+        if not self.predicted:
+            return sorted(self.sent)
+        first = min(self.predicted) - self.T_s
+        return sorted(stamp for stamp in self.sent if stamp >= first and stamp + self.T_s not in self.predicted)
+
+
+class Collector(Node):
+    """Keeps everything that the predictor publishes."""
+
+    def __init__(self, run: LiveRun, context: Context) -> None:
+        super().__init__("collector", context=context)
+        self._run = run
+        self.create_subscription(Odometry, PREDICTION_TOPIC, self._on_prediction, SENSOR_QOS)
+        self.create_subscription(JointState, PARAMETERS_TOPIC, self._on_parameters, SENSOR_QOS)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self.changed = threading.Condition()
+
+    def _on_prediction(self, message: Odometry) -> None:
+        now = time.monotonic()
+        stamp = header_stamp_ns(message)
+        assert stamp is not None
+        twist = message.twist.twist
+        with self.changed:
+            self._run.received[stamp] = now
+            self._run.predicted[stamp] = (twist.linear.x, twist.linear.y, twist.angular.z)
+            self.changed.notify_all()
+
+    def _on_parameters(self, message: JointState) -> None:
+        stamp = header_stamp_ns(message)
+        assert stamp is not None
+        self._run.parameters[stamp] = list(message.position)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        with self.changed:
+            for status in message.status:
+                values = {pair.key: pair.value for pair in status.values}
+                self._run.diagnostics.append((status.level[0], status.message, values))
+            self.changed.notify_all()
+
+    def wait_for(self, condition: Callable[[], bool], timeout: float) -> bool:
+        """Waits until ``condition`` holds after some message; returns whether it came true within ``timeout`` s."""
+        with self.changed:
+            return self.changed.wait_for(condition, timeout)
+
+
+def isolated_environment() -> dict[str, str]:
+    """The environment with a random ROS domain on this host only, so that parallel runs do not hear each other."""
+    return os.environ | {
+        "ROS_DOMAIN_ID": str(random.SystemRandom().randrange(1, 101)),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+
+
+@contextmanager
+def predictor_process(
+    model: Path, parameters: Mapping[str, object] | None = None, environment: Mapping[str, str] | None = None
+) -> Iterator[subprocess.Popen[str]]:
+    """Starts the predictor node as a process of its own; interrupts it in the end.
+
+    Args:
+        model: model folder.
+        parameters: further ROS parameters of the node.
+        environment: of the process.
+    """
+    arguments = [f"{name}:={value}" for name, value in {"model": model, **(parameters or {})}.items()]
+    command = [sys.executable, "-m", "dynssm_ros.nodes.predictor", "--ros-args"]
+    command += [part for argument in arguments for part in ("-p", argument)]
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)  # noqa: S603 - own module
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.communicate(timeout=10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+
+
+@contextmanager
+def collecting(run: LiveRun) -> Iterator[Collector]:
+    """A collector that is served by a thread of its own for as long as the context lasts."""
+    context = Context()
+    rclpy.init(context=context)
+    collector = Collector(run, context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(collector)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    try:
+        yield collector
+    finally:
+        executor.shutdown()
+        thread.join(5.0)
+        collector.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
+def run_live(
+    model: Path,
+    bag: Path,
+    T_s: float,
+    rate: float = 1.0,
+    duration: float = float("inf"),
+    odometry_topic: str = ODOMETRY_TOPIC,
+    parameters: Mapping[str, object] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> LiveRun:
+    """Starts the predictor, plays ``bag`` to it in real time and collects its answers.
+
+    Args:
+        model: model folder.
+        bag: with the topics that the predictor listens to, in installed message types.
+        T_s: sampling time of the model (s).
+        rate: speed factor.
+        duration: of the recording that is played (s).
+        odometry_topic: whose messages are answered.
+        parameters: further ROS parameters of the predictor.
+        progress: told of seconds played and to be played.
+
+    Raises:
+        UserError: the predictor does not start; carries its own words.
+    """
+    os.environ.update(isolated_environment())
+    run = LiveRun(round(T_s * 1e9))
+    with predictor_process(model, parameters, os.environ.copy()) as process, collecting(run) as collector:
+        playback = Playback(collector, bag)
+        deadline = time.monotonic() + 3 * MATCH_TIMEOUT
+        while playback.wait_for_listeners(time.sleep, timeout=0.2):
+            if process.poll() is not None:
+                assert process.stderr is not None
+                raise UserError(f"the predictor stopped: {process.stderr.read().strip() or 'no message'}")
+            if time.monotonic() > deadline:
+                raise UserError("the predictor did not subscribe to the bag's topics within 30 s")
+        collector.wait_for(lambda: collector.count_publishers(PREDICTION_TOPIC) > 0, MATCH_TIMEOUT)
+        first: int | None = None
+        for message, sent in playback.play(rate, duration):
+            if message.topic == odometry_topic:
+                stamp = _stamp_of(message.raw)
+                run.sent[stamp] = sent
+                first = first or message.log_time
+                if progress is not None and len(run.sent) % 25 == 0:
+                    progress(round((message.log_time - first) / 1e9), round(min(duration, 1e6)))
+        last = max(run.sent, default=0) + run.T_s
+        collector.wait_for(lambda: last in run.predicted, _DRAIN)
+    return run
+
+
+def _stamp_of(raw: bytes) -> int:
+    """Header stamp (ns) at the head of a serialised stamped message: CDR header, int32 s, uint32 ns."""
+    seconds, nanoseconds = np.frombuffer(raw, dtype="<u4", count=2, offset=4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)

@@ -1,0 +1,137 @@
+"""Plays a bag on DDS in real time: ``ros2 run dynssm_ros player --ros-args -p bag:=BAG -p rate:=1.0``.
+
+Messages go out as they were recorded, byte for byte, in their recorded order and rhythm. Before the first one it waits
+until somebody listens, because DDS matching takes a moment and best-effort messages sent before it are lost.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+from dynssm_ros.errors import BagError, UserError
+from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class
+from dynssm_ros.signals.bags import BagMessage, open_bag
+
+MATCH_TIMEOUT = 10.0  # s
+_SPIN_BELOW = 1e-3  # s; shorter waits are not worth a sleep
+
+
+class Playback:
+    """Publishers for the topics of a bag, and their messages in time.
+
+    Args:
+        node: that publishes.
+        bag: rosbag2 folder or file.
+        topics: to publish; all of the bag if empty.
+
+    Raises:
+        BagError: unreadable, or a topic is missing.
+        ConfigurationError: a message type is not installed.
+    """
+
+    def __init__(self, node: Node, bag: str | Path, topics: tuple[str, ...] = ()) -> None:
+        self.bag = Path(bag)
+        with open_bag(bag) as opened:
+            types = opened.types
+        for topic in topics:
+            if topic not in types:
+                raise BagError(f"{bag}: topic {topic} is missing; the bag has {', '.join(sorted(types))}")
+        self.topics = topics or tuple(types)
+        self._publishers = {
+            topic: node.create_publisher(message_class(types[topic]), topic, SENSOR_QOS) for topic in self.topics
+        }
+
+    def wait_for_listeners(self, spin: Callable[[float], None], timeout: float = MATCH_TIMEOUT) -> tuple[str, ...]:
+        """Waits until every topic has a subscription.
+
+        Args:
+            spin: lets the middleware work for that many seconds.
+            timeout: at most this long (s).
+
+        Returns:
+            The topics that still have none.
+        """
+        end = time.monotonic() + timeout
+        while True:
+            waiting = tuple(t for t, publisher in self._publishers.items() if publisher.get_subscription_count() == 0)
+            if not waiting or time.monotonic() > end:
+                return waiting
+            spin(0.05)
+
+    def play(self, rate: float = 1.0, duration: float = float("inf")) -> Iterator[tuple[BagMessage, float]]:
+        """Publishes message after message at ``rate`` times real time; yields each with the time it went out.
+
+        Args:
+            rate: speed factor.
+            duration: of the recording that is played (s).
+
+        Yields:
+            The message, and ``time.monotonic()`` just before it was published.
+        """
+        with open_bag(self.bag) as opened:
+            begin: float | None = None
+            first = 0
+            for message in opened.messages(self.topics):
+                if begin is None:
+                    begin, first = time.monotonic(), message.log_time
+                elapsed = (message.log_time - first) * 1e-9
+                if elapsed > duration:
+                    return
+                _wait_until(begin + elapsed / rate)
+                sent = time.monotonic()
+                self._publishers[message.topic].publish(message.raw)
+                yield message, sent
+
+
+def _wait_until(due: float) -> None:
+    remaining = due - time.monotonic()
+    if remaining > _SPIN_BELOW:
+        time.sleep(remaining)
+
+
+class PlayerNode(Node):
+    """Parameters of the player as a ROS node."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("player", **options)
+        bag = describe(self, "bag", "", "rosbag2 folder or file to play.", read_only=True)
+        self.rate = describe(self, "rate", 1.0, "Speed factor.", (0.01, 100.0), read_only=True)
+        self.loop = describe(self, "loop", False, "Begin again at the end.", read_only=True)
+        if not bag:
+            raise BagError("parameter bag: not set; expected a rosbag2 folder, e.g. -p bag:=out/laps")
+        self.playback = Playback(self, bag)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Plays until the end of the bag or an interrupt; a user error is one line and exit status 1."""
+    rclpy.init(args=args)
+    try:
+        node = PlayerNode()
+        unheard = node.playback.wait_for_listeners(lambda seconds: rclpy.spin_once(node, timeout_sec=seconds))
+        if unheard:
+            node.get_logger().warning(f"nobody listens to {', '.join(unheard)}")
+        while True:
+            for _ in node.playback.play(node.rate):
+                if not rclpy.ok():
+                    return
+            if not node.loop:
+                return
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

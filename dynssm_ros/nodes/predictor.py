@@ -1,0 +1,194 @@
+"""The live predictor: ``ros2 run dynssm_ros predictor --ros-args -p model:=DIR``.
+
+Every odometry message gets a prediction of the next state once the window is full; topics and parameters are those of
+the README. All thinking is in :mod:`dynssm_ros.runtime`; this node converts, calls and publishes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from functools import partial
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry, Path
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+
+from dynssm_ros.errors import ConfigurationError, UserError
+from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class, run
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.health import Health
+from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.predictor import Pose, Prediction, Predictor
+from dynssm_ros.signals.decoding import TopicDecoder, decoders, header_stamp_ns
+from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, twist_covariance
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.vehicle import COEFFICIENTS
+
+
+class PredictorNode(Node):
+    """Subscribes to the topics of the signal map and publishes the predicted state and the adapted coefficients."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("dynssm", **options)
+        path = describe(self, "model", "", "Model folder; setting it anew swaps the model after it was checked.")
+        signals = describe(self, "signals", "default", "Signal map: shipped name or file.", read_only=True)
+        max_age = describe(
+            self,
+            "max_age",
+            0.2,
+            "Oldest actuator sample that a prediction may rest on (s).",
+            (0.01, 10.0),
+            read_only=True,
+        )
+        self._horizon = describe(
+            self, "horizon", 0.0, "Length of the rollout on /dynssm/horizon (s); 0 switches it off.", (0.0, 10.0)
+        )
+        period = describe(
+            self, "diagnostics_period", 1.0, "Time between /diagnostics (s).", (0.1, 60.0), read_only=True
+        )
+        if not path:
+            raise ConfigurationError("parameter model: not set; expected a model folder, e.g. -p model:=out/model")
+        self._predictor = Predictor(OnnxModel(open_artifact(path)), load_signal_map(signals), max_age)
+        self._swap: OnnxModel | None = None
+
+        self._prediction = Odometry()
+        self._adapted = JointState(name=list(COEFFICIENTS))
+        self._set_covariance()
+        self._publish_prediction = self.create_publisher(Odometry, PREDICTION_TOPIC, SENSOR_QOS).publish
+        self._publish_parameters = self.create_publisher(JointState, PARAMETERS_TOPIC, SENSOR_QOS).publish
+        self._publish_horizon = self.create_publisher(Path, HORIZON_TOPIC, SENSOR_QOS).publish
+        self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
+
+        signal_map = self._predictor.signal_map
+        by_topic = decoders(signal_map)
+        self._health = Health(tuple(by_topic), max(max_age, signal_map.max_gap))
+        # actuators come first: when several messages wait, the executor serves subscriptions in this order
+        for topic, decoder in by_topic.items():
+            receive = self._on_odometry if topic == signal_map.odometry_topic else self._on_actuator
+            self.create_subscription(message_class(decoder.msgtype), topic, partial(receive, decoder), SENSOR_QOS)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+        self.create_timer(period, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        model = self._predictor.model
+        self.get_logger().info(
+            f"{model.name} ({model.parameters} parameters): {model.H} rows of {model.T_s:g} s, commands {model.commands}"
+        )
+
+    def _on_actuator(self, decoder: TopicDecoder, message: Any) -> None:
+        now = time.monotonic()
+        self._health.arrived(decoder.topic, now)
+        refusal = self._predictor.observe(self._stamp(message), decoder.decode(message))
+        if refusal is not None:
+            self._health.refused(refusal, now)
+
+    def _on_odometry(self, decoder: TopicDecoder, message: Any) -> None:
+        now = time.monotonic()
+        self._health.arrived(decoder.topic, now)
+        stamp = self._stamp(message)
+        outcome = self._predictor.predict(stamp, decoder.decode(message))
+        if not isinstance(outcome, Prediction):
+            self._health.refused(outcome, now)
+            return
+        self._publish(outcome, message)
+        done = time.monotonic()
+        self._health.predicted(done - now, outcome.residual_share, done)
+
+    def _publish(self, prediction: Prediction, message: Any) -> None:
+        odometry, seconds = self._prediction, divmod(prediction.stamp, 1_000_000_000)
+        odometry.header.stamp.sec, odometry.header.stamp.nanosec = seconds
+        if isinstance(message, Odometry):
+            odometry.header.frame_id, odometry.child_frame_id = message.header.frame_id, message.child_frame_id
+        twist = odometry.twist.twist
+        twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in prediction.state)
+        if prediction.pose is not None:
+            _fill_pose(odometry.pose.pose, prediction.pose)
+        self._publish_prediction(odometry)
+        if prediction.theta is not None:
+            self._adapted.header.stamp = odometry.header.stamp
+            self._adapted.position = prediction.theta.tolist()
+            self._publish_parameters(self._adapted)
+        if self._horizon > 0:
+            self._publish_horizon(self._path(prediction))
+
+    def _path(self, prediction: Prediction) -> Path:
+        period = self._predictor.model.T_s
+        path = Path(header=self._prediction.header)
+        for k, pose in enumerate(self._predictor.horizon(prediction, max(1, round(self._horizon / period)))):
+            stamped = PoseStamped()
+            stamped.header.frame_id = path.header.frame_id
+            seconds = divmod(prediction.stamp + round(k * period * 1e9), 1_000_000_000)
+            stamped.header.stamp.sec, stamped.header.stamp.nanosec = seconds
+            _fill_pose(stamped.pose, pose)
+            path.poses.append(stamped)
+        return path
+
+    def _stamp(self, message: Any) -> int:
+        stamp = header_stamp_ns(message)
+        return int(self.get_clock().now().nanoseconds) if stamp is None else stamp
+
+    def _set_covariance(self) -> None:
+        variances = self._predictor.model.covariance
+        self._prediction.twist.covariance = twist_covariance(np.zeros(3) if variances is None else variances)
+
+    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Opens a new model before it is accepted; a bad one changes nothing."""
+        for parameter in parameters:
+            if parameter.name == "model":
+                try:
+                    model = OnnxModel(open_artifact(parameter.value))
+                    self._predictor.check_swap(model)
+                except UserError as error:
+                    self.get_logger().error(str(error))
+                    return SetParametersResult(successful=False, reason=str(error))
+                self._swap = model
+        return SetParametersResult(successful=True)
+
+    def _apply_parameters(self, parameters: list[Parameter]) -> None:
+        for parameter in parameters:
+            if parameter.name == "horizon":
+                self._horizon = parameter.value
+        if self._swap is not None:
+            self._predictor.swap(self._swap)
+            self._swap = None
+            self._set_covariance()
+            self.get_logger().info(
+                f"model swapped: {self._predictor.model.name} from {self._predictor.model.artifact.path}"
+            )
+
+    def _diagnose(self) -> None:
+        now = time.monotonic()
+        level, words = self._health.verdict(now)
+        values = {"model": self._predictor.model.name, "model folder": str(self._predictor.model.artifact.path)}
+        status = DiagnosticStatus(
+            level=bytes([level]),
+            name=f"{self.get_fully_qualified_name()}: prediction",
+            message=words,
+            hardware_id=self._predictor.model.artifact.card.vehicle.name,
+            values=[KeyValue(key=key, value=value) for key, value in (values | self._health.values(now)).items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._publish_diagnostics(array)
+
+
+def _fill_pose(pose: Any, at: Pose) -> None:
+    x, y, theta = at
+    pose.position.x, pose.position.y = x, y
+    pose.orientation.z, pose.orientation.w = math.sin(theta / 2), math.cos(theta / 2)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Runs the node; a user error is one line and exit status 1."""
+    run(PredictorNode, args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+"""What the nodes share: message classes by name, quality of service, parameter declaration, a clean main."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from dynssm_ros.errors import ConfigurationError, UserError
+
+# sensor data, but deep enough that a pause of the process (a model swap, a busy core) loses nothing
+SENSOR_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=100)
+
+
+def message_class(msgtype: str) -> Any:
+    """The Python class of ``package/msg/Name``.
+
+    Raises:
+        ConfigurationError: the message package is not installed.
+    """
+    package, _, name = msgtype.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigurationError(
+            f"message type {msgtype} is not installed here; source the workspace that builds {package}, or convert the bag "
+            "to the standard topics with `dynssm extract ... --bag`"
+        ) from error
+
+
+def describe(
+    node: Node,
+    name: str,
+    default: Any,
+    description: str,
+    bounds: tuple[float, float] | None = None,
+    read_only: bool = False,
+) -> Any:
+    """Declares a described, typed, bounded parameter and returns its value."""
+    ranges = [FloatingPointRange(from_value=bounds[0], to_value=bounds[1])] if bounds else []
+    descriptor = ParameterDescriptor(description=description, floating_point_range=ranges, read_only=read_only)
+    return node.declare_parameter(name, default, descriptor).value
+
+
+def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
+    """Starts rclpy, spins the node until it is interrupted, and turns user errors into one line and exit status 1."""
+    rclpy.init(args=args)
+    node: Node | None = None
+    try:
+        node = make_node()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.spin()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()

@@ -1,0 +1,1 @@
+"""The deployed predictor: model folder in, history window in, prediction out. numpy and ONNX Runtime, no torch."""

@@ -1,0 +1,165 @@
+"""Models behind one interface: windows in, next states out. The trained ones run in ONNX Runtime."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import onnxruntime as ort
+
+from dynssm_ros.errors import ArtifactError, ConfigurationError
+from dynssm_ros.runtime.artifact import Artifact, open_artifact
+from dynssm_ros.signals.inputs import applied_inputs
+from dynssm_ros.signals.signal_map import Commands
+from dynssm_ros.vehicle import Coefficients, State, Vehicle
+from dynssm_ros.vehicle.effects import initial_memory
+from dynssm_ros.vehicle.single_track import Integrator, step_with_memory
+
+Vector = npt.NDArray[np.float64]
+
+
+class WindowPrediction(NamedTuple):
+    """What a model says of each of ``N`` windows."""
+
+    state: Vector
+    """Predicted next state ``s_{t+1}``, shape ``(N, 3)`` (m/s, m/s, rad/s)."""
+    theta: Vector | None
+    """Adapted coefficients in the order of ``COEFFICIENTS``, shape ``(N, 17)``; ``None`` if the model has none."""
+    physics: Vector | None
+    """The physics' part of the prediction, shape ``(N, 3)``; ``None`` if the model has no physics."""
+
+
+class WindowModel(Protocol):
+    """Any model that predicts one step ahead from a history window."""
+
+    name: str
+    T_s: float
+    """Sampling time it is for (s); 0 if any."""
+    H: int
+    """Rows of the window that it reads."""
+    commands: Commands | None
+    """Command protocol that it was trained with; ``None`` if any."""
+    parameters: int
+    flops: int
+    covariance: Vector | None
+    """One-step error variances ``(3,)`` from validation data, if known."""
+
+    def predict(self, windows: Vector) -> WindowPrediction:
+        """Predicts from ``windows`` of shape ``(N, H, 7)``, columns ``WINDOW_COLUMNS``."""
+
+
+class Persistence:
+    """The next state is the present one: the mark that every model must pass."""
+
+    name = "persistence"
+    T_s = 0.0
+    H = 1
+    commands: Commands | None = None
+    parameters = 0
+    flops = 0
+    covariance: Vector | None = None
+
+    def predict(self, windows: Vector) -> WindowPrediction:
+        """Returns the last state of each window."""
+        return WindowPrediction(windows[:, -1, :3].copy(), None, None)
+
+
+class SingleTrack:
+    """The nominal single-track model of a vehicle file, without learning."""
+
+    name = "single_track"
+    H = 1
+    commands: Commands | None = None
+    parameters = 0
+    covariance: Vector | None = None
+
+    def __init__(self, vehicle: Vehicle, integrator: Integrator = "euler", substeps: int = 1) -> None:
+        self.vehicle = vehicle
+        self.T_s = vehicle.sampling_time
+        self.flops = 90 * substeps * (4 if integrator == "rk4" else 1)  # operations of the stages, counted by hand
+        self._theta = vehicle.nominal
+        self._effects = vehicle.active_effects
+        self._integrator: Integrator = integrator
+        self._substeps = substeps
+
+    def predict(self, windows: Vector) -> WindowPrediction:
+        """Steps the physics from the last row of each window."""
+        now = windows[:, -1, :].T
+        memory = initial_memory(self._effects, now[3], now[4])
+        state, _ = step_with_memory(
+            np,
+            State(*now[:3]),
+            memory,
+            applied_inputs(now),
+            Coefficients(*self._theta),
+            self.vehicle.constants,
+            self.T_s,
+            self._effects,
+            self._integrator,
+            self._substeps,
+        )
+        predicted = np.stack(state, axis=1)
+        return WindowPrediction(predicted, np.tile(self._theta, (len(windows), 1)), predicted)
+
+
+class OnnxModel:
+    """A trained model, run by ONNX Runtime on one core.
+
+    The graph computes the increment ``s_{t+1} - s_t`` in single precision; it is added to the state in double.
+    """
+
+    def __init__(self, artifact: Artifact) -> None:
+        card = artifact.card
+        self.artifact = artifact
+        self.name = card.name
+        self.T_s = card.sampling_time
+        self.H = card.window
+        self.commands: Commands | None = card.commands
+        self.parameters = card.parameters
+        self.flops = card.flops
+        self.covariance: Vector | None = np.array(card.covariance)
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.log_severity_level = 3
+        try:
+            self._session = ort.InferenceSession(artifact.onnx, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime raises its own unrelated classes
+            raise ArtifactError(f"{artifact.onnx}: ONNX Runtime refuses it ({' '.join(str(error).split())})") from error
+        self._outputs = [output.name for output in self._session.get_outputs()]
+
+    def predict(self, windows: Vector) -> WindowPrediction:
+        """Runs the graph on ``windows``."""
+        results = self._session.run(self._outputs, {"window": windows.astype(np.float32)})
+        by_name = dict(zip(self._outputs, results, strict=True))
+        now = windows[:, -1, :3]
+        theta, physics = by_name.get("theta"), by_name.get("physics")
+        return WindowPrediction(
+            now + by_name["increment"],
+            None if theta is None else theta.astype(np.float64),
+            None if physics is None else now + physics,
+        )
+
+
+def load_model(name_or_dir: str | Path, vehicle: Vehicle | None = None) -> WindowModel:
+    """Opens a model folder, or one of the models that need no training.
+
+    Args:
+        name_or_dir: a model folder, ``persistence`` or ``single_track``.
+        vehicle: needed for ``single_track``.
+
+    Raises:
+        ArtifactError: the folder is not a usable model.
+        ConfigurationError: no such model, or the vehicle is missing.
+    """
+    if Path(name_or_dir).is_dir():
+        return OnnxModel(open_artifact(name_or_dir))
+    if name_or_dir == "persistence":
+        return Persistence()
+    if name_or_dir == "single_track":
+        if vehicle is None:
+            raise ConfigurationError("model single_track: needs --vehicle")
+        return SingleTrack(vehicle)
+    raise ConfigurationError(f"model '{name_or_dir}': neither a model folder nor one of persistence, single_track")

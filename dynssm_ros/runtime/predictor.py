@@ -1,0 +1,160 @@
+"""The one predictor: the live node, the offline replay and the benchmark all call it.
+
+Messages go in as decoded samples; whenever odometry came in, the window is sampled back from its stamp and the model
+predicts one sampling time ahead. Bad data never yields a prediction but a :class:`~dynssm_ros.signals.history.Refusal`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.errors import ArtifactError
+from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.signals.history import History, Refusal
+from dynssm_ros.signals.signal_map import SignalMap
+
+Vector = npt.NDArray[np.float64]
+Pose = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The predicted instant.
+
+    Attributes:
+        stamp: input stamp + T_s (ns).
+        state: predicted ``v_x, v_y, omega``, shape ``(3,)``.
+        pose: propagated ``x, y, theta`` in the odometry frame; ``None`` if the pose is not mapped.
+        theta: adapted coefficients in the order of ``COEFFICIENTS``, shape ``(17,)``; ``None`` if the model has none.
+        residual_share: part of the increment that the residual adds to the physics, in [0, 1]; 0 without physics.
+    """
+
+    stamp: int
+    state: Vector
+    pose: Pose | None
+    theta: Vector | None
+    residual_share: float
+
+
+class Predictor:
+    """A model with the history it needs, for one car.
+
+    Args:
+        model: the trained model.
+        signal_map: where its inputs come from.
+        max_age: how old the newest sample of a signal may be when odometry arrives (s).
+
+    Raises:
+        ArtifactError: the model was trained with commands that do not exist live.
+        ConfigurationError: the model needs command topics and the signal map has none.
+    """
+
+    def __init__(self, model: OnnxModel, signal_map: SignalMap, max_age: float = 0.2) -> None:
+        self.signal_map = live_signal_map(model, signal_map)
+        self.history = History(self.signal_map, model.T_s, model.H, max_age)
+        self._set_model(model)
+
+    def check_swap(self, model: OnnxModel) -> None:
+        """Checks that ``model`` can take the place of the present one.
+
+        Raises:
+            ArtifactError: it needs other commands.
+        """
+        if model.commands != self.model.commands:
+            raise ArtifactError(
+                f"{model.artifact.path}: trained with commands '{model.commands}', but the node runs with "
+                f"'{self.model.commands}'; restart it with this model"
+            )
+
+    def swap(self, model: OnnxModel) -> None:
+        """Exchanges the model between two predictions; the samples received so far are kept."""
+        self.check_swap(model)
+        self.history.resize(model.T_s, model.H)
+        self._set_model(model)
+
+    def _set_model(self, model: OnnxModel) -> None:
+        self.model = model
+        self._scale = np.array(model.artifact.card.normalisation.increment_scale)
+        self._period = round(model.T_s * 1e9)
+
+    def observe(self, stamp: int, values: dict[str, float]) -> Refusal | None:
+        """Takes the samples of one message; see :meth:`History.add`."""
+        return self.history.add(stamp, values)
+
+    def predict(self, stamp: int, values: dict[str, float]) -> Prediction | Refusal:
+        """Takes the odometry sample ``values`` at ``stamp`` (ns) and predicts the instant ``stamp + T_s``."""
+        refusal = self.history.add(stamp, values)
+        if refusal is not None:
+            return refusal
+        window = self.history.window(stamp)
+        if isinstance(window, Refusal):
+            return window
+        state, theta, physics = self.model.predict(window[None])
+        if not np.isfinite(state).all() or (theta is not None and not np.isfinite(theta).all()):
+            return Refusal.BAD_PREDICTION
+        now = window[-1, :3]
+        return Prediction(
+            stamp + self._period,
+            state[0],
+            propagate_pose(values, now, state[0], self.model.T_s),
+            None if theta is None else theta[0],
+            0.0 if physics is None else self._residual_share(now, state[0], physics[0]),
+        )
+
+    def horizon(self, prediction: Prediction, steps: int) -> list[Pose]:
+        """Poses of a rollout with the last command held: the predicted one and ``steps - 1`` more.
+
+        Call it right after :meth:`predict`; it continues the window of that prediction. The actuators reach the held
+        command within one step, so that from then on feedback is the command and the increment is zero.
+        """
+        if prediction.pose is None:
+            return []
+        window = self.history.current.copy()
+        poses, state = [prediction.pose], prediction.state
+        for _ in range(steps - 1):
+            row = window[-1].copy()
+            row[:3], row[3:5], row[5:7] = state, row[3:5] + row[5:7], 0.0
+            window = np.concatenate([window[1:], row[None]])
+            following = self.model.predict(window[None]).state[0]
+            x, y, theta = poses[-1]
+            pose = propagate_pose({"x": x, "y": y, "theta": theta}, state, following, self.model.T_s)
+            if pose is None or not np.isfinite(following).all():
+                break
+            poses.append(pose)
+            state = following
+        return poses
+
+    def _residual_share(self, now: Vector, state: Vector, physics: Vector) -> float:
+        residual = float(np.abs((state - physics) / self._scale).sum())
+        explained = float(np.abs((physics - now) / self._scale).sum())
+        return residual / (residual + explained) if residual > 0 else 0.0
+
+
+def live_signal_map(model: OnnxModel, signal_map: SignalMap) -> SignalMap:
+    """The signal map with the commands that the model was trained with.
+
+    Raises:
+        ArtifactError: the model was trained with ``lookahead``, which does not exist live.
+        ConfigurationError: it needs command topics and the map has none.
+    """
+    if model.commands == "lookahead":
+        raise ArtifactError(
+            f"{model.artifact.path}: trained with commands 'lookahead', which look into the future and do not exist "
+            "live; train with --commands none or topics"
+        )
+    return signal_map.with_commands(model.commands)
+
+
+def propagate_pose(values: dict[str, float], now: Vector, following: Vector, T_s: float) -> Pose | None:
+    """The pose one step on, by the mean velocity of the step at its middle heading; ``None`` without a pose."""
+    try:
+        x, y, theta = values["x"], values["y"], values["theta"]
+    except KeyError:
+        return None
+    v_x, v_y, omega = (float(v) for v in (now + following) / 2)
+    heading = theta + omega * T_s / 2
+    c, s = np.cos(heading), np.sin(heading)
+    return float(x + T_s * (v_x * c - v_y * s)), float(y + T_s * (v_x * s + v_y * c)), float(theta + omega * T_s)

@@ -1,0 +1,92 @@
+"""Offline replay: the live predictor fed from a bag, message by message in recorded order."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dynssm_ros.runtime.predictor import Prediction, Predictor
+from dynssm_ros.signals.bags import Bag, open_bag, write_bag
+from dynssm_ros.signals.decoding import decoders, header_stamp_ns
+from dynssm_ros.signals.history import Refusal
+from dynssm_ros.signals.messages import (
+    JOINT_STATE,
+    ODOMETRY,
+    PARAMETERS_TOPIC,
+    PREDICTION_TOPIC,
+    joint_state,
+    odometry,
+    twist_covariance,
+)
+from dynssm_ros.vehicle import COEFFICIENTS
+
+
+class Replayed(NamedTuple):
+    """The answer to one odometry message."""
+
+    log_time: int  # ns
+    stamp: int  # ns, of the odometry
+    outcome: Prediction | Refusal
+    frames: tuple[str, str]
+    """``frame_id`` and ``child_frame_id`` of the odometry, empty where it has none."""
+
+
+def replay(bag: Bag, predictor: Predictor, progress: Callable[[int, int], None] | None = None) -> Iterator[Replayed]:
+    """Feeds the messages of ``bag`` to ``predictor`` as the node would receive them.
+
+    Yields:
+        The outcome for each odometry message.
+
+    Raises:
+        BagError: a topic is missing, of another type, or a message damaged.
+    """
+    by_topic = decoders(predictor.signal_map)
+    for topic, decoder in by_topic.items():
+        bag.require(topic, decoder.msgtype)
+    total = sum(bag.counts[topic] for topic in by_topic)
+    for done, (topic, log_time, raw) in enumerate(bag.messages(list(by_topic)), 1):
+        message = bag.decode(topic, raw)
+        stamp = header_stamp_ns(message)
+        stamp = log_time if stamp is None else stamp
+        values = by_topic[topic].decode(message)
+        if topic == predictor.signal_map.odometry_topic:
+            header = getattr(message, "header", None)
+            frames = (getattr(header, "frame_id", ""), getattr(message, "child_frame_id", ""))
+            yield Replayed(log_time, stamp, predictor.predict(stamp, values), frames)
+        else:
+            predictor.observe(stamp, values)
+        if progress is not None:
+            progress(done, total)
+
+
+def replay_to_bag(
+    bag: Path, predictor: Predictor, out: Path, progress: Callable[[int, int], None] | None = None
+) -> tuple[int, Counter[Refusal], list[str]]:
+    """Writes the predictions for ``bag`` into a new bag with the node's output topics.
+
+    Returns:
+        The number of predictions, the refusals by reason, and notes on a bag that had to be recovered.
+    """
+    refusals: Counter[Refusal] = Counter()
+    count = 0
+    covariance = twist_covariance(np.zeros(3) if predictor.model.covariance is None else predictor.model.covariance)
+    with open_bag(bag) as source, write_bag(out) as sink:
+        sink.add_topic(PREDICTION_TOPIC, ODOMETRY)
+        sink.add_topic(PARAMETERS_TOPIC, JOINT_STATE)
+        for log_time, _, outcome, frames in replay(source, predictor, progress):
+            if not isinstance(outcome, Prediction):
+                refusals[outcome] += 1
+                continue
+            count += 1
+            v_x, v_y, omega = outcome.state.tolist()
+            message = odometry(outcome.stamp, outcome.pose or (0.0, 0.0, 0.0), (v_x, v_y, omega), covariance, *frames)
+            sink.write(PREDICTION_TOPIC, log_time, message)
+            if outcome.theta is not None:
+                values = dict(zip(COEFFICIENTS, outcome.theta.tolist(), strict=True))
+                sink.write(PARAMETERS_TOPIC, log_time, joint_state(outcome.stamp, values))
+        notes = list(source.notes)
+    return count, refusals, notes

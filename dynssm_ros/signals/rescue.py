@@ -1,0 +1,271 @@
+"""What lies before the cut of a storage file that a killed recorder or an interrupted copy left behind.
+
+Such a file has no index, or one that points behind the cut, so its records are found one by one and copied to a new
+file that any reader opens. Nothing is guessed: a record that the cut goes through is left out.
+"""
+
+from __future__ import annotations
+
+import io
+import mmap
+import shutil
+import sqlite3
+import struct
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import IO, NamedTuple, TypeVar
+from urllib.parse import quote
+
+import pyarrow as pa
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, DataEnd, Message, Schema
+from mcap.writer import Writer as McapWriter
+
+SQLITE_LOGS = ("-wal", "-journal")
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_TABLE_LEAF = 0x0D
+_TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
+_T = TypeVar("_T")
+
+
+class Rescued(NamedTuple):
+    """How many messages were copied, and whether the end was reached without meeting a cut."""
+
+    messages: int
+    complete: bool
+
+
+def rescue(damaged: Path, rescued: Path) -> Rescued:
+    """Copies the messages before the cut of a ``.mcap`` or ``.db3`` file to ``rescued``, with an index.
+
+    Raises:
+        OSError: ``damaged`` cannot be read or ``rescued`` not be written.
+    """
+    return _rescue_mcap(damaged, rescued) if damaged.suffix == ".mcap" else _rescue_sqlite(damaged, rescued)
+
+
+def is_unindexed(file: Path) -> bool:
+    """Whether ``file`` is a whole MCAP file without the index that reading in the order of time needs."""
+    if file.suffix != ".mcap":
+        return False
+    try:
+        with file.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+    except Exception:  # damaged, which its reader will say better
+        return False
+    if summary is None:
+        return True
+    empty = summary.statistics is not None and summary.statistics.message_count == 0
+    return not empty and not (summary.chunk_indexes and all(c.message_index_offsets for c in summary.chunk_indexes))
+
+
+def log_left(file: Path) -> bool:
+    """Whether a killed recorder left a SQLite log beside ``file`` that holds what is not yet in it."""
+    logs = (Path(f"{file}{suffix}") for suffix in SQLITE_LOGS)
+    return file.suffix == ".db3" and any(log.is_file() and log.stat().st_size > 0 for log in logs)
+
+
+def merge_log(file: Path, merged: Path) -> None:
+    """Copies a SQLite file with the logs beside it, and merges them; a log that is damaged itself is left out.
+
+    Raises:
+        OSError: cannot be copied.
+    """
+    for suffix in ("", *SQLITE_LOGS):
+        if Path(f"{file}{suffix}").is_file():
+            shutil.copyfile(f"{file}{suffix}", f"{merged}{suffix}")
+    with closing(sqlite3.connect(merged)) as database, suppress(sqlite3.DatabaseError):
+        database.execute("PRAGMA journal_mode = DELETE")
+
+
+def unpack(compressed: Path, unpacked: Path) -> None:
+    """Unpacks a zstd file as far as it goes.
+
+    Raises:
+        OSError: ``compressed`` cannot be read or ``unpacked`` not be written.
+    """
+    with compressed.open("rb") as source, unpacked.open("wb") as sink:
+        for piece in _pieces(source, "zstd"):
+            sink.write(piece)
+
+
+def unpacked_message(raw: bytes) -> bytes:
+    """A message as its publisher serialised it, also from a bag with compressed messages; CDR never looks like zstd."""
+    return b"".join(_pieces(io.BytesIO(raw), "zstd")) if raw.startswith(_ZSTD_MAGIC) else raw
+
+
+def _until_cut(records: Iterator[_T]) -> Iterator[_T]:
+    """Yields records up to the first that cannot be read; an error of the one who takes them is not held back."""
+    with suppress(Exception):  # a cut surfaces as any error of the decoders: struct, index, unicode, codec, SQLite
+        yield from records
+
+
+def _pieces(source: IO[bytes], codec: str) -> Iterator[bytes]:
+    stream = pa.CompressedInputStream(source, codec)
+    return _until_cut(iter(lambda: stream.read(1 << 16), b""))
+
+
+def _rescue_mcap(damaged: Path, rescued: Path) -> Rescued:
+    messages, complete = 0, False
+    with damaged.open("rb") as source, rescued.open("wb") as sink:
+        writer = McapWriter(sink)
+        writer.start(profile="ros2")
+        schemas: dict[int, int] = {0: 0}
+        channels: dict[int, int] = {}
+        source.seek(len(b"\x89MCAP0\r\n"))
+        for r in _until_cut(_mcap_records(source, damaged.stat().st_size)):
+            if isinstance(r, Schema) and r.id not in schemas:
+                schemas[r.id] = writer.register_schema(r.name, r.encoding, r.data)
+            elif isinstance(r, Channel) and r.id not in channels:
+                channels[r.id] = writer.register_channel(r.topic, r.message_encoding, schemas[r.schema_id], r.metadata)
+            elif isinstance(r, Message):
+                writer.add_message(channels[r.channel_id], r.log_time, r.data, r.publish_time, r.sequence)
+                messages += 1
+            elif isinstance(r, DataEnd):
+                complete = True
+        writer.finish()  # type: ignore[no-untyped-call]
+    return Rescued(messages, complete)
+
+
+def _mcap_records(source: IO[bytes], size: int) -> Iterator[Schema | Channel | Message | DataEnd]:
+    """Yields the records of a stream of ``size`` bytes, also out of the chunk that the cut goes through."""
+    while len(head := source.read(9)) == 9:
+        opcode, length = struct.unpack("<BQ", head)
+        body = source.read(min(length, size - source.tell()))
+        stream = ReadDataStream(io.BytesIO(body))
+        if opcode == Opcode.CHUNK:
+            content = _chunk_content(body)
+            yield from _mcap_records(io.BytesIO(content), len(content))
+        if len(body) < length or opcode == 0:  # cut here, or filled up with zeros when the power went
+            return
+        if opcode == Opcode.SCHEMA:
+            yield Schema.read(stream)
+        elif opcode == Opcode.CHANNEL:
+            yield Channel.read(stream)
+        elif opcode == Opcode.MESSAGE:
+            yield Message.read(stream, length)
+        elif opcode == Opcode.DATA_END:
+            yield DataEnd.read(stream)
+
+
+def _chunk_content(body: bytes) -> bytes:
+    """What is left of a chunk's records: start, end, size and checksum, then the codec's name, then the data."""
+    (length,) = struct.unpack_from("<I", body, 28)
+    codec, data = body[32 : 32 + length].decode(), body[40 + length :]
+    return b"".join(_pieces(io.BytesIO(data), codec)) if codec else data
+
+
+def _rescue_sqlite(damaged: Path, rescued: Path) -> Rescued:
+    """Copies the small tables, which lie at the front, by SQLite, and the messages page by page.
+
+    SQLite finds messages from the root of their tree, whose branches move towards the end of the file as it grows: in a
+    file cut at two thirds it would find none.
+    """
+    address = f"file:{quote(str(damaged))}?mode=ro&immutable=1"
+    with closing(sqlite3.connect(address, uri=True)) as source, closing(sqlite3.connect(rescued)) as sink:
+        tables = dict(_until_cut(_definitions(source)))
+        if "messages" not in tables or "topics" not in tables:
+            return Rescued(0, False)
+        for table, statement in tables.items():
+            sink.execute(statement)
+            row: tuple[object, ...]
+            for row in _until_cut(_message_rows(damaged) if table == "messages" else _rows(source, table)):
+                sink.execute(f"INSERT OR IGNORE INTO {table} VALUES ({','.join('?' * len(row))})", row)  # noqa: S608
+        sink.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
+        sink.commit()
+        ((count,),) = sink.execute("SELECT count(*) FROM messages JOIN topics ON messages.topic_id = topics.id")
+    return Rescued(int(count), False)
+
+
+def _definitions(source: sqlite3.Connection) -> Iterator[tuple[str, str]]:
+    """Name and definition of the tables of a bag."""
+    source.execute("PRAGMA writable_schema = ON")  # else a file shorter than its header says is refused altogether
+    names = ",".join(f"'{table}'" for table in _TABLES)
+    yield from source.execute(f"SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name IN ({names})")  # noqa: S608
+
+
+def _rows(source: sqlite3.Connection, table: str) -> Iterator[tuple[object, ...]]:
+    yield from source.execute(f"SELECT * FROM {table}")  # noqa: S608 - one of _TABLES
+
+
+def _message_rows(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
+    """Yields ``id, topic_id, timestamp, data`` from all pages that hold rows of that shape.
+
+    The layout of pages, cells and records is that of SQLite's file format documentation.
+    """
+    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        size = int.from_bytes(content[16:18], "big")
+        size = 65536 if size == 1 else size
+        pages = _Pages(content, size, size - content[20])
+        for start in range(0, len(content) - size + 1, size):
+            head = start + (100 if start == 0 else 0)
+            if content[head] != _TABLE_LEAF:
+                continue
+            cells = int.from_bytes(content[head + 3 : head + 5], "big")
+            for (offset,) in struct.iter_unpack(">H", content[head + 8 : head + 8 + 2 * cells]):
+                row = pages.message(start + offset)
+                if row is not None:
+                    yield row
+
+
+class _Pages(NamedTuple):
+    """A SQLite file: its bytes, the size of a page, and how much of a page is in use."""
+
+    content: mmap.mmap
+    size: int
+    usable: int
+
+    def message(self, at: int) -> tuple[int, int, int, bytes] | None:
+        """The row in the cell at offset ``at``; ``None`` if it is of another table or runs past the end."""
+        length, at = _varint(self.content, at)
+        rowid, at = _varint(self.content, at)
+        payload = self._payload(at, length)
+        end, position = _varint(payload, 0)
+        kinds = []
+        while position < end:
+            kind, position = _varint(payload, position)
+            kinds.append(kind)
+        if len(payload) < length or len(kinds) != 4 or kinds[0] != 0 or kinds[3] < 12 or kinds[3] % 2 or rowid >> 63:
+            return None
+        topic, position = _integer(payload, end, kinds[1])
+        stamp, position = _integer(payload, position, kinds[2])
+        return rowid, topic, stamp, payload[position : position + (kinds[3] - 12) // 2]
+
+    def _payload(self, at: int, length: int) -> bytes:
+        """A cell's content, what overflows its page included; shorter than ``length`` where pages are missing."""
+        most = self.usable - 35
+        if length <= most:
+            return self.content[at : at + length]
+        least = (self.usable - 12) * 32 // 255 - 23
+        here = least + (length - least) % (self.usable - 4)
+        here = here if here <= most else least
+        parts = [self.content[at : at + here]]
+        page = int.from_bytes(self.content[at + here : at + here + 4], "big")
+        left = length - here
+        while left > 0 and 0 < page * self.size <= len(self.content):
+            start = (page - 1) * self.size
+            parts.append(self.content[start + 4 : start + 4 + min(left, self.usable - 4)])
+            left -= len(parts[-1])
+            page = int.from_bytes(self.content[start : start + 4], "big")
+        return b"".join(parts)
+
+
+def _integer(payload: bytes, at: int, kind: int) -> tuple[int, int]:
+    """The integer of a serial type at ``at``, and the offset behind it."""
+    size = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)[kind]
+    value = kind - 8 if kind in (8, 9) else int.from_bytes(payload[at : at + size], "big", signed=True)
+    return value, at + size
+
+
+def _varint(content: mmap.mmap | bytes, at: int) -> tuple[int, int]:
+    """SQLite's variable-length integer at ``at``, and the offset behind it."""
+    value = 0
+    for k in range(8):
+        byte = content[at + k]
+        value = value << 7 | byte & 0x7F
+        if byte < 0x80:
+            return value, at + k + 1
+    return value << 8 | content[at + 8], at + 9

@@ -1,0 +1,241 @@
+"""Laps: a driver and a plant on a track, as arrays and as a rosbag2 with the package's default topics."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.errors import UserError
+from dynssm_ros.signals.bags import write_bag
+from dynssm_ros.signals.messages import (
+    COMMAND_TOPIC,
+    FEEDBACK_TOPIC,
+    JOINT_STATE,
+    ODOMETRY,
+    ODOMETRY_TOPIC,
+    joint_state,
+    odometry,
+)
+from dynssm_ros.simulation.driver import Driver, Style
+from dynssm_ros.simulation.lines import ClosedLine, Vector
+from dynssm_ros.simulation.plant import Plant, PlantKind, Pose, SingleTrackPlant
+from dynssm_ros.simulation.speed_profile import vehicle_limits
+from dynssm_ros.simulation.tracks import Track
+from dynssm_ros.vehicle import Applied, State, Vehicle
+
+START_TIME = 1_000_000_000_000_000_000  # ns: the stamp of the first sample; a fixed one, so that runs repeat
+DEFAULT_STYLE = Style()
+
+Progress = Callable[[int, int], None]
+"""Called with the simulated milliseconds or metres done and the number of all."""
+
+
+class SimulationError(UserError):
+    """The car cannot be driven around the track as asked."""
+
+
+class Sample(NamedTuple):
+    """One instant: state and pose, the feedback of the actuators, the command that acts until the next instant.
+
+    ``s`` (m, counted on over the laps) and ``lateral`` (m, positive left) are along the track's centre line.
+    """
+
+    time: float
+    state: State
+    pose: Pose
+    feedback: Applied
+    command: Applied
+    s: float
+    lateral: float
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A simulated drive of ``N`` samples. Sample ``k`` holds the state at ``time[k]`` and the command that acts on it.
+
+    Attributes:
+        vehicle: the car, with the effects that acted.
+        track: where it drove.
+        plant: how it was integrated.
+        seed: of driver and noise.
+        time: stamps (ns), shape ``(N,)``.
+        state: true ``v_x, v_y, omega`` (m/s, m/s, rad/s), shape ``(N, 3)``.
+        measured: the same with sensor noise, shape ``(N, 3)``.
+        pose: ``x, y, theta`` (m, m, rad unwrapped), shape ``(N, 3)``.
+        feedback: throttle (fraction) and steering (rad) of the actuators: the commands of the step before, ``(N, 2)``.
+        command: absolute throttle and steering that act from this step to the next, shape ``(N, 2)``.
+        s: distance along the centre line since its first point (m), counted on over the laps, shape ``(N,)``.
+        lateral: distance from the centre line (m, positive left), shape ``(N,)``.
+    """
+
+    vehicle: Vehicle
+    track: Track
+    plant: PlantKind
+    seed: int
+    time: npt.NDArray[np.int64]
+    state: Vector
+    measured: Vector
+    pose: Vector
+    feedback: Vector
+    command: Vector
+    s: Vector
+    lateral: Vector
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last (s)."""
+        return float(self.time[-1] - self.time[0]) / 1e9
+
+    @property
+    def laps(self) -> float:
+        """Laps driven, with the fraction of the last."""
+        return float(self.s[-1] - self.s[0]) / self.track.length
+
+    @property
+    def lap_times(self) -> Vector:
+        """Times of the complete laps (s), from crossings of the first sample's place."""
+        marks = self.s[0] + self.track.length * np.arange(int(self.laps) + 1)
+        return np.diff(np.interp(marks, self.s, (self.time - self.time[0]) / 1e9))
+
+
+def drive(
+    vehicle: Vehicle,
+    track: Track,
+    plant: PlantKind = "euler",
+    seed: int = 0,
+    style: Style = DEFAULT_STYLE,
+    line: ClosedLine | None = None,
+) -> Iterator[Sample]:
+    """Drives without end from a rolling start at the line's first point; see :func:`simulate`.
+
+    Raises:
+        SimulationError: the car spins, stops or leaves the track.
+    """
+    line = line or track.centre
+    room = max(0.0, float(np.min(track.clearance(line.points))))
+    driver = Driver(vehicle, line, vehicle_limits(vehicle), style, seed, room)
+    (x, y), theta = line.position(0.0, driver.offset(0.0)), float(line.heading(0.0))
+    v_x = 0.7 * driver.speed(0.0)
+    car: Plant = SingleTrackPlant(
+        vehicle, plant, Pose(float(x), float(y), theta), State(v_x, 0.0, v_x * float(line.curvature(0.0)))
+    )
+    feedback, on_line = Applied(0.0, 0.0), 0.0
+    s = float(track.project([x, y])[0])
+    for k in itertools.count():
+        pose, state, time = car.pose, car.state, k * vehicle.sampling_time
+        _check_motion(vehicle, track, time, pose, state)
+        on_line = float(line.project(pose[:2], near=on_line)[0])
+        on_track, lateral = (float(value) for value in track.project(pose[:2], near=s))
+        s += math.remainder(on_track - s, track.length)
+        _check_place(vehicle, track, time, state, s, lateral)
+        command = driver.command(time, pose, state, on_line, feedback)
+        yield Sample(time, state, pose, feedback, command, s, lateral)
+        car.advance(command, on_track)
+        feedback = command
+
+
+def simulate(
+    vehicle: Vehicle,
+    track: Track,
+    duration: float | None = None,
+    laps: float | None = None,
+    plant: PlantKind = "euler",
+    seed: int = 0,
+    style: Style = DEFAULT_STYLE,
+    line: ClosedLine | None = None,
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    progress: Progress | None = None,
+) -> Run:
+    """Drives ``duration`` seconds or a number of ``laps``.
+
+    Args:
+        vehicle: the car; its effects act, its actuator limits hold, its T_s is the time between samples.
+        track: where to drive.
+        duration: time to drive (s).
+        laps: or laps to drive.
+        plant: how the motion is integrated.
+        seed: of the driver's variation and the noise; the same seed gives the same run.
+        style: how the driver drives.
+        line: line to follow; the centre line if not given.
+        noise: standard deviations of white noise on the measured ``v_x, v_y`` (m/s) and ``omega`` (rad/s).
+        progress: told of each sample.
+
+    Raises:
+        SimulationError: neither or both of ``duration`` and ``laps``, or one that is not positive; the car spins, stops
+            or leaves the track.
+    """
+    goal = duration if laps is None else laps
+    if (duration is None) == (laps is None) or goal is None or not goal > 0:
+        raise SimulationError(f"duration {duration}, laps {laps}; expected one of them, positive")
+    samples: list[Sample] = []
+    for sample in drive(vehicle, track, plant, seed, style, line):
+        samples.append(sample)
+        done = sample.time if laps is None else (sample.s - samples[0].s) / track.length
+        if progress is not None:
+            progress(min(round(1000 * done), round(1000 * goal)), round(1000 * goal))
+        if done >= goal - 1e-9:
+            break
+    state = np.array([sample.state for sample in samples])
+    rng = np.random.default_rng([seed, 1])  # apart from the driver's, so that noise does not change the drive
+    return Run(
+        vehicle=vehicle,
+        track=track,
+        plant=plant,
+        seed=seed,
+        time=START_TIME + np.round(1e9 * np.array([sample.time for sample in samples])).astype(np.int64),
+        state=state,
+        measured=state + rng.standard_normal(state.shape) * np.array(noise),
+        pose=np.array([sample.pose for sample in samples]),
+        feedback=np.array([sample.feedback for sample in samples]),
+        command=np.array([sample.command for sample in samples]),
+        s=np.array([sample.s for sample in samples]),
+        lateral=np.array([sample.lateral for sample in samples]),
+    )
+
+
+def write_run(run: Run, path: str | Path) -> None:
+    """Writes what a recorder on the car would have written: a rosbag2 folder (MCAP), atomically.
+
+    All messages of a sample carry its stamp. They are logged as they become known: feedback, command, odometry, a
+    microsecond apart, so that a reader holds the actuators of a step when its odometry arrives.
+
+    Raises:
+        BagError: ``path`` exists and is no bag.
+    """
+    with write_bag(path) as bag:
+        bag.add_topic(FEEDBACK_TOPIC, JOINT_STATE)
+        bag.add_topic(COMMAND_TOPIC, JOINT_STATE)
+        bag.add_topic(ODOMETRY_TOPIC, ODOMETRY)
+        for k, stamp in enumerate(run.time.tolist()):
+            for later, (topic, values) in enumerate(((FEEDBACK_TOPIC, run.feedback), (COMMAND_TOPIC, run.command)), 1):
+                throttle, steering = values[k]
+                message = joint_state(stamp, {"throttle": throttle, "steering": steering})
+                bag.write(topic, stamp + 1000 * later, message)
+            bag.write(ODOMETRY_TOPIC, stamp + 3000, odometry(stamp, tuple(run.pose[k]), tuple(run.measured[k])))
+
+
+def _check_motion(vehicle: Vehicle, track: Track, time: float, pose: Pose, state: State) -> None:
+    """The car must roll forwards, more along than across."""
+    if not (all(map(math.isfinite, (*pose, *state))) and state.v_x > abs(state.v_y)):
+        raise SimulationError(
+            f"{vehicle.name} spins or stops on track {track.name} after {time:.2f} s "
+            f"(v_x = {state.v_x:.3g} m/s, v_y = {state.v_y:.3g} m/s); drive less aggressively"
+        )
+
+
+def _check_place(vehicle: Vehicle, track: Track, time: float, state: State, s: float, lateral: float) -> None:
+    """The centre of gravity must stay between the borders."""
+    right, left = track.widths(s)
+    if not -right <= lateral <= left:
+        raise SimulationError(
+            f"{vehicle.name} leaves track {track.name} after {time:.2f} s at s = {s % track.length:.4g} m "
+            f"({lateral:+.3g} m beside the centre line, {state.v_x:.3g} m/s); "
+            "drive less aggressively or take a wider track"
+        )

@@ -1,0 +1,103 @@
+"""The car on the road: the vehicle's equations of motion with its effects, and its pose, advanced step by step."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any, Literal, NamedTuple, Protocol
+
+from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step_with_memory
+from dynssm_ros.vehicle.effects import initial_memory
+from dynssm_ros.vehicle.single_track import Motion, StageEffect
+
+PlantKind = Literal["euler", "rk4"]
+"""``euler``: one forward Euler step per T_s for state and pose, as in the published data; ``rk4``: steps of 1 ms."""
+
+RK4_STEP = 1e-3  # s, at most
+
+# floats through `math` are ten times faster than through numpy; the names are those of numpy
+SCALAR = SimpleNamespace(
+    sin=math.sin, cos=math.cos, tan=math.tan, arctan=math.atan, arctan2=math.atan2, tanh=math.tanh, exp=math.exp,
+    sqrt=math.sqrt, fabs=math.fabs, hypot=math.hypot, pi=math.pi,
+)  # fmt: skip
+
+
+class Pose(NamedTuple):
+    """Position (m) and heading (rad, counter-clockwise, not wrapped) of the centre of gravity."""
+
+    x: float
+    y: float
+    theta: float
+
+
+class Plant(Protocol):
+    """A car that can be driven."""
+
+    @property
+    def pose(self) -> Pose:
+        """Where it is."""
+
+    @property
+    def state(self) -> State:
+        """How it moves."""
+
+    def advance(self, applied: Applied, s: float = 0.0) -> None:
+        """Moves it on by T_s under constant inputs; ``s`` is its track position (m), for effects that live there."""
+
+
+class _Odometer:
+    """Carries the pose as states of the equations of motion, so that it is integrated exactly like them."""
+
+    MEMORY = ("pose.x", "pose.y", "pose.theta")
+
+    def apply(self, stage: str, xp: Any, q: Motion) -> None:
+        """Shows the pose to the effects that follow, and sets its rates."""
+        x, y, theta = self.MEMORY
+        if stage == "inputs":
+            q.context = {**q.context, "x": q.memory[x], "y": q.memory[y], "theta": q.memory[theta]}
+        elif stage == "accelerations":
+            sin, cos = xp.sin(q.memory[theta]), xp.cos(q.memory[theta])
+            q.memory_rate[x] = q.v_x * cos - q.v_y * sin
+            q.memory_rate[y] = q.v_x * sin + q.v_y * cos
+            q.memory_rate[theta] = q.omega
+
+
+class SingleTrackPlant:
+    """The single-track car. The input of a step acts on that step.
+
+    Effects may read from the context ``time`` (s) and ``s`` (m), held over a step, and ``x, y, theta`` (m, m, rad).
+    """
+
+    def __init__(self, vehicle: Vehicle, kind: PlantKind, pose: Pose, state: State) -> None:
+        self.state = state
+        self._vehicle = vehicle
+        self._kind = kind
+        self._theta = Coefficients(*(float(value) for value in vehicle.nominal))
+        self._effects: tuple[StageEffect, ...] = (_Odometer(), *vehicle.active_effects)
+        self._memory = dict(zip(_Odometer.MEMORY, pose, strict=True))
+        self._memory |= initial_memory(vehicle.active_effects, 0.0, 0.0)
+        self._substeps = 1 if kind == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
+        self._steps = 0
+
+    @property
+    def pose(self) -> Pose:
+        """Where the car is."""
+        return Pose(*(self._memory[name] for name in _Odometer.MEMORY))
+
+    def advance(self, applied: Applied, s: float = 0.0) -> None:
+        """Moves the car on by T_s under constant inputs; ``s`` is its track position (m)."""
+        T_s = self._vehicle.sampling_time
+        self.state, self._memory = step_with_memory(
+            SCALAR,
+            self.state,
+            self._memory,
+            applied,
+            self._theta,
+            self._vehicle.constants,
+            T_s,
+            self._effects,
+            self._kind,
+            self._substeps,
+            {"time": self._steps * T_s, "s": s},
+        )
+        self._steps += 1

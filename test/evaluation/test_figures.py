@@ -1,0 +1,132 @@
+"""Figures draw whatever a model may have done, name their units, and show what was planted."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+
+from dynssm_ros.evaluation import figures
+from dynssm_ros.evaluation.rollout import Rollout
+from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
+
+
+@pytest.fixture
+def run():
+    """Time and states of a run with a gap, and three models of it; one is not finite anywhere."""
+    rng = np.random.default_rng(1)
+    time = 0.04 * np.r_[0:300, 400:700]
+    states = np.cumsum(rng.normal(size=(600, 3)) * [0.05, 0.01, 0.002], axis=0)
+    predicted = {
+        "dynssm": states + rng.normal(size=states.shape) * 0.001,
+        "diverged": np.full_like(states, np.nan),
+        "persistence": np.vstack([states[:1], states[:-1]]),
+    }
+    return time, states, predicted
+
+
+def drawn(figure):
+    """Draws the figure and returns its visible axes."""
+    sink = io.BytesIO()
+    figure.savefig(sink, format="png", dpi=40)
+    assert len(sink.getvalue()) > 1000
+    return [axes for axes in figure.axes if axes.axison]
+
+
+def test_predicted_and_measured_shows_three_channels_with_units(run):
+    time, states, predicted = run
+    axes = drawn(figures.predicted_and_measured(time, states, predicted))
+    assert [a.get_ylabel() for a in axes[::2]] == ["$v_x$ (m/s)", "$v_y$ (m/s)", r"$\omega$ (rad/s)"]
+    assert all(len(a.get_lines()) == 4 for a in axes)
+
+
+def test_increments_leave_out_persistence_and_say_how_much_is_explained(run):
+    _, states, predicted = run
+    axes = drawn(figures.increments(predicted["persistence"], states, predicted))
+    assert len(axes) == 6
+    assert axes[0].get_title(loc="left").endswith("100 % explained")
+    assert axes[3].get_title(loc="left").endswith("none explained")
+
+
+def test_relative_errors_cut_long_bars_but_write_the_true_number():
+    rmse = {"m": np.array([0.5, 100.0, np.nan]), "persistence": np.array([1.0, 10.0, 1.0])}
+    (panel,) = drawn(figures.relative_errors(rmse, np.array([1.0, 10.0, 1.0])))
+    assert [bar.get_width() for bar in panel.patches] == [0.5, figures.MAX_BAR, 0.0]
+    written = [t.get_text() for t in panel.texts]
+    assert written == ["50 %", "1000 % (cut)", "not finite", "persistence"]
+
+
+def test_rollout_growth_draws_states_and_displacement():
+    grow = np.arange(1.0, 16)
+    rollouts = {
+        "m": Rollout(0.04, 10, np.stack([grow] * 3, axis=1), grow**2),
+        "diverged": Rollout(0.04, 10, np.full((15, 3), np.inf), np.full(15, np.nan)),
+    }
+    axes = drawn(figures.rollout_growth(rollouts))
+    np.testing.assert_array_equal(axes[3].get_lines()[0].get_ydata(), grow**2)
+    assert [a.get_xlabel() for a in axes] == ["", "", "time ahead (s)", "time ahead (s)"]
+
+
+def test_adapted_parameters_shade_what_is_outside_the_bounds():
+    car = load_vehicle("orca")
+    time = np.arange(100) * 0.02
+    theta = car.nominal + 0.1 * (car.upper - car.lower) * np.sin(time)[:, None]
+    axes = drawn(figures.adapted_parameters(time, theta, car))
+    assert len(axes) == len(COEFFICIENTS)
+    for k, panel in enumerate(axes):
+        edges = sorted(patch.get_y() + offset for patch in panel.patches for offset in (0.0, patch.get_height()))
+        assert edges[1] == pytest.approx(car.lower[k])
+        assert edges[2] == pytest.approx(car.upper[k])
+    assert axes[-1].get_title(loc="left") == "$I_{z}$ (kg m²)"
+
+
+def test_adapted_parameters_need_no_vehicle_and_cut_lines_at_gaps():
+    time = 0.02 * np.r_[0:50, 100:150]
+    axes = drawn(figures.adapted_parameters(time, np.ones((100, 17))))
+    assert np.isnan(axes[0].get_lines()[0].get_ydata()).sum() == 1
+
+
+def test_parameter_usage_names_coefficients_that_rest_on_a_bound():
+    car = load_vehicle("orca")
+    theta = np.tile(0.5 * (car.lower + car.upper), (100, 1))
+    theta[:25, 3] = car.upper[3]
+    (panel,) = drawn(figures.parameter_usage(theta, car))
+    assert [t.get_text() for t in panel.texts] == ["25 % of the time on a bound"]
+    assert [t.get_text() for t in panel.get_yticklabels()][3] == "$E_{f}$"
+
+
+def test_latency_histogram_counts_every_call():
+    samples = {"a": np.geomspace(10, 20, 200), "b": np.full(50, 700.0)}
+    figure = figures.latency_histogram(samples)
+    (panel,) = drawn(figure)
+    assert sum(bar.get_height() for bar in panel.patches) == 250
+    assert panel.get_xlabel() == "time per prediction (µs)"
+    assert "b: p50 700 µs, p99 700 µs" in [t.get_text() for t in figure.legends[0].get_texts()]
+
+
+def test_error_map_draws_the_largest_error_last():
+    angle = np.linspace(0, 2 * np.pi, 200)
+    errors = np.zeros((200, 3))
+    errors[17] = [-2.0, 3.0, np.inf]
+    axes = drawn(figures.error_map(100 * np.cos(angle), 60 * np.sin(angle), errors))
+    dots = axes[0].collections[0]
+    assert dots.get_array()[-1] == 2.0
+    np.testing.assert_allclose(dots.get_offsets()[-1], [100 * np.cos(angle[17]), 60 * np.sin(angle[17])])
+
+
+def test_liveliest_stretch_is_where_the_states_change_and_never_spans_a_gap():
+    time = 0.1 * np.r_[0:200, 300:500]
+    states = np.zeros((400, 3))
+    states[:, 0] = 0.001 * np.arange(400)
+    states[330:350, 1] = np.random.default_rng(0).normal(size=20)
+    stretch = figures.liveliest(time, states, 4.0)
+    assert len(stretch) == 40
+    assert stretch[0] <= 330
+    assert stretch[-1] >= 350
+    states[195:205, 2] = np.random.default_rng(0).normal(size=10) * 100
+    assert np.diff(time[figures.liveliest(time, states, 4.0)]).max() < 0.11
+
+
+def test_liveliest_stretch_of_a_short_run_is_all_of_it():
+    np.testing.assert_array_equal(figures.liveliest(np.arange(5.0), np.zeros((5, 3)), 60.0), np.arange(5))

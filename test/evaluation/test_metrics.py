@@ -1,0 +1,89 @@
+"""One-step measures against planted truths."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dynssm_ros.evaluation import metrics
+from dynssm_ros.runtime.models import Persistence, WindowPrediction
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+class Average:
+    """Predicts the mean state of its window; remembers the shapes it was called with."""
+
+    H = 4
+    covariance = None
+
+    def __init__(self):
+        self.shapes = []
+
+    def predict(self, windows):
+        self.shapes.append(windows.shape)
+        return WindowPrediction(windows[:, :, :3].mean(axis=1), windows[:, -1, :1] * np.ones(17), None)
+
+
+def test_gather_returns_the_rows_around_each_row():
+    matrix = np.arange(20.0).reshape(10, 2)
+    stretches = metrics.gather(matrix, np.array([2, 5]), before=2, after=1)
+    np.testing.assert_array_equal(stretches[0], matrix[0:4])
+    np.testing.assert_array_equal(stretches[1], matrix[3:7])
+
+
+def test_batches_predict_the_same_as_one_go(rng):
+    matrix, rows = rng.normal(size=(101, 7)), np.arange(3, 100)
+    whole = metrics.predict_rows(Average(), matrix, rows, batch=1000)
+    batched = metrics.predict_rows(Average(), matrix, rows, batch=8)
+    np.testing.assert_array_equal(whole.state, batched.state)
+    np.testing.assert_array_equal(whole.theta, batched.theta)
+    np.testing.assert_allclose(whole.state[10], matrix[10:14, :3].mean(axis=0))
+    assert batched.physics is None
+
+
+def test_windows_exist_for_one_batch_only(rng):
+    model, done = Average(), []
+    metrics.predict_rows(model, rng.normal(size=(101, 7)), np.arange(3, 100), batch=40, tick=done.append)
+    assert model.shapes == [(40, 4, 7), (40, 4, 7), (17, 4, 7)]
+    assert done == [40, 40, 17]
+
+
+def test_rmse_and_largest_error_of_planted_errors():
+    errors = np.array([[3.0, 0.0, -1.0], [-4.0, 0.0, 1.0]])
+    np.testing.assert_allclose(metrics.rmse(errors), [np.sqrt(12.5), 0.0, 1.0])
+    np.testing.assert_array_equal(metrics.max_error(errors), [4.0, 0.0, 1.0])
+
+
+def test_rmse_of_persistence_is_the_rms_of_the_increments(rng):
+    matrix, rows = rng.normal(size=(50, 7)), np.arange(49)
+    predicted = metrics.predict_rows(Persistence(), matrix, rows).state
+    increments = np.diff(matrix[:, :3], axis=0)
+    np.testing.assert_allclose(metrics.rmse(predicted - matrix[1:, :3]), np.sqrt(np.mean(increments**2, axis=0)))
+
+
+def test_explained_is_one_for_truth_zero_for_persistence_and_nan_without_change(rng):
+    increments = rng.normal(size=(100, 3)) * [1.0, 2.0, 0.0]
+    np.testing.assert_array_equal(metrics.explained(increments, increments), [1.0, 1.0, np.nan])
+    np.testing.assert_array_equal(metrics.explained(increments, 0 * increments)[:2], [0.0, 0.0])
+    assert metrics.explained(increments, -increments)[0] == pytest.approx(-3.0)
+
+
+def test_honest_gaussian_variances_cover_ninety_percent(rng):
+    variances = np.array([0.04, 1e-4, 9.0])
+    errors = rng.normal(size=(40_000, 3)) * np.sqrt(variances)
+    three_sigma = 3 * np.sqrt(0.9 * 0.1 / len(errors))
+    np.testing.assert_allclose(metrics.coverage(errors, variances), 0.9, atol=three_sigma)
+    np.testing.assert_allclose(metrics.coverage(errors, variances, level=0.5), 0.5, atol=0.01)
+    assert (metrics.coverage(errors, variances / 4) < 0.65).all()
+
+
+def test_latency_times_single_windows_after_the_warm_up(rng):
+    model = Average()
+    samples = metrics.latency_us(model, rng.normal(size=(5, 4, 7)), calls=30, warm_up=10)
+    assert samples.shape == (30,)
+    assert (samples > 0).all()
+    assert model.shapes == [(1, 4, 7)] * 40
