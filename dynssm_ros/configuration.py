@@ -29,16 +29,14 @@ class StrictModel(BaseModel):
 def config_directories() -> Iterator[Path]:
     """Yields the folders that may hold shipped configuration, best first.
 
-    The source tree (editable installs), the ament prefixes (colcon), the environment's ``share`` (pip).
+    The source tree (editable installs, ``colcon build --symlink-install``); ``share`` of the prefix that the package lies
+    in (pip, colcon); ``share`` of the environment and of the ament prefixes, where the package is only linked to.
     """
-    yield Path(__file__).resolve().parent.parent / "config"
-    prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    prefixes.append(sysconfig.get_path("data"))
-    for prefix in prefixes:
+    package = Path(__file__).resolve().parent
+    yield package.parent / "config"
+    ament = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    for prefix in (*package.parents, sysconfig.get_path("data"), *filter(None, ament)):
         yield Path(prefix) / "share" / PACKAGE / "config"
-    # colcon without an activated workspace: <prefix>/lib/pythonX.Y/site-packages/dynssm_ros/configuration.py
-    for prefix_path in Path(__file__).resolve().parents[4:5]:
-        yield prefix_path / "share" / PACKAGE / "config"
 
 
 def config_root() -> Path:

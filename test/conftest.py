@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+
 from pathlib import Path
 
 import pytest
+
+os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"  # a wrongly typed message field must fail, not corrupt
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -29,3 +32,52 @@ def putnam(data: Path) -> Path:
 def orca_bag(data: Path) -> Path:
     """The published ORCA run on ETHZ as a rosbag2 folder."""
     return data / "orca" / "ethz_pure_pursuit"
+
+
+@pytest.fixture(scope="session")
+def laps_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """20 s of the simulated ORCA car on a club track, as a rosbag2 folder with the standard topics."""
+    from dynssm_ros.simulation.laps import simulate, write_run
+    from dynssm_ros.simulation.tracks import load_track
+    from dynssm_ros.vehicle import load_vehicle
+
+    bag = tmp_path_factory.mktemp("laps") / "club"
+    write_run(simulate(load_vehicle("orca"), load_track("club"), duration=20.0), bag)
+    return bag
+
+
+@pytest.fixture(scope="session")
+def small_model(laps_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a small DynSSM, trained for two epochs on ``laps_bag`` (T_s 0.02 s, H 5, commands from topics)."""
+    from dynssm_ros.learning.configuration import ModelConfig
+    from dynssm_ros.learning.export import save_artifact
+    from dynssm_ros.learning.training import train
+    from dynssm_ros.signals.extraction import extract
+    from dynssm_ros.signals.signal_map import load_signal_map
+    from dynssm_ros.vehicle import load_vehicle
+
+    config = ModelConfig.model_validate(
+        {
+            "name": "small",
+            "H": 5,
+            "ssm": {"channels": 4, "states": 2},
+            "gru": {"hidden": 6},
+            "fusion": {"hidden": 8, "latent": 8},
+            "physics": {},
+            "adaptation": {"hidden": 8, "alpha": 0.5},
+            "residual": {"hidden": [8], "scale": 1.0},
+            "loss": {"parameters": 0.001},
+            "training": {
+                "epochs": 2,
+                "batch_size": 64,
+                "learning_rate": 0.001,
+                "patience": 5,
+                "min_speed": 0.0,
+                "validation_block": 1.0,
+            },
+        }
+    )
+    folder = tmp_path_factory.mktemp("models")
+    recording = extract([laps_bag], load_signal_map("default"), 50.0)
+    trained = train(recording, config, load_vehicle("orca"), folder / "checkpoint.pt")
+    return save_artifact(trained, folder / "small").path

@@ -30,7 +30,7 @@ def simulate(
         PlantKind, typer.Option(help="euler: one step per T_s, as in the published data; rk4: steps of 1 ms.")
     ] = "euler",
     seed: Annotated[int, typer.Option(help="Of the driver's variation and the noise.", min=0)] = 0,
-    aggressiveness: Annotated[float, typer.Option(help="Share of the car's limits in use.", min=0.1, max=1.2)] = 0.9,
+    aggressiveness: Annotated[float, typer.Option(help="Share of the car's limits in use.", min=0.1, max=1.2)] = 0.95,
     variation: Annotated[float, typer.Option(help="How much speed and line vary.", min=0.0, max=1.0)] = 0.5,
     noise: Annotated[
         str, typer.Option(help="Standard deviations of the measured v_x,v_y,omega (m/s, m/s, rad/s).")

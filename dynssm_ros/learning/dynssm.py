@@ -182,7 +182,7 @@ class DynSSM(nn.Module):
     def for_deployment(self) -> DynSSM:
         """Switches the state-space layers to their recurrence; returns itself."""
         if self.fusion.ssm is not None:
-            self.fusion.ssm.recurrent = True
+            self.fusion.ssm.for_deployment()
         return self.eval()
 
 

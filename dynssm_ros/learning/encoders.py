@@ -30,13 +30,25 @@ class DiagonalSsm(nn.Module):
         self.log_a = nn.Parameter(torch.log(torch.arange(1, states + 1).float()).repeat(channels, 1))
         self.C = nn.Parameter(torch.randn(channels, states) / math.sqrt(states))
         self.D = nn.Parameter(torch.ones(channels))
+        self.frozen: tuple[Tensor, Tensor] | None = None
 
     def discretised(self) -> tuple[Tensor, Tensor]:
         """``(dt A, B_bar)`` of shape ``(channels, states)``: exponent per step and zero-order-hold input gain."""
         a = -torch.exp(self.log_a)
         exponent = torch.exp(self.log_dt)[:, None] * a
-        # exp(x) - 1 without loss of digits, by operators that ONNX has
-        return exponent, 2 * torch.exp(exponent / 2) * torch.sinh(exponent / 2) / a
+        return exponent, torch.expm1(exponent) / a
+
+    def step_coefficients(self) -> tuple[Tensor, Tensor]:
+        """``(A_bar, B_bar)`` of the recurrence, shape ``(channels, states)``; constants once :meth:`freeze` was called."""
+        if self.frozen is not None:
+            return self.frozen
+        exponent, gain = self.discretised()
+        return torch.exp(exponent), gain
+
+    @torch.no_grad()
+    def freeze(self) -> None:
+        """Computes the coefficients of the recurrence once and for all, for deployment."""
+        self.frozen = self.step_coefficients()
 
     def convolution(self, u: Tensor) -> Tensor:
         """``(B, L, channels)`` to the same shape, by a causal convolution with the impulse response."""
@@ -52,9 +64,8 @@ class DiagonalSsm(nn.Module):
 
     def recurrence(self, u: Tensor) -> Tensor:
         """``(B, L, channels)`` to the same shape, step by step."""
-        exponent, b = self.discretised()
-        decay = torch.exp(exponent)
-        driven = u[..., None] * b
+        decay, gain = self.step_coefficients()
+        driven = u[..., None] * gain
         x = driven[:, 0]
         states = [x]
         for k in range(1, u.shape[1]):
@@ -71,7 +82,14 @@ class SsmEncoder(nn.Module):
         self.features = config.channels
         self.project = nn.Linear(inputs, config.channels)
         self.layers = nn.ModuleList(DiagonalSsm(config.channels, config.states) for _ in range(config.layers))
-        self.recurrent = False  # deployment switches to the recurrence
+        self.recurrent = False
+
+    def for_deployment(self) -> None:
+        """Switches to the recurrence with constant coefficients."""
+        self.recurrent = True
+        for layer in self.layers:
+            assert isinstance(layer, DiagonalSsm)
+            layer.freeze()
 
     def forward(self, window: Tensor) -> Tensor:
         """``(B, H, inputs)`` normalised to ``(B, channels)``."""

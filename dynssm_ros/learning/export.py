@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import logging
@@ -34,7 +35,8 @@ class _Deployed(nn.Module):
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()
-        self.model = model.for_deployment() if isinstance(model, DynSSM) else model.eval()
+        model = copy.deepcopy(model).eval()
+        self.model = model.for_deployment() if isinstance(model, DynSSM) else model
 
     def forward(self, window: Tensor) -> tuple[Tensor, ...]:
         output = self.model(window)

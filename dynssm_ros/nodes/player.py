@@ -21,6 +21,7 @@ from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class
 from dynssm_ros.signals.bags import BagMessage, open_bag
 
 MATCH_TIMEOUT = 10.0  # s
+_SETTLE = 0.3  # s; the listener's side of a match comes a moment after ours
 _SPIN_BELOW = 1e-3  # s; shorter waits are not worth a sleep
 
 
@@ -62,7 +63,10 @@ class Playback:
         end = time.monotonic() + timeout
         while True:
             waiting = tuple(t for t, publisher in self._publishers.items() if publisher.get_subscription_count() == 0)
-            if not waiting or time.monotonic() > end:
+            if not waiting:
+                spin(_SETTLE)
+                return ()
+            if time.monotonic() > end:
                 return waiting
             spin(0.05)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from enum import IntEnum
+from math import isinf
 
 import numpy as np
 
@@ -77,13 +78,14 @@ class Health:
 
     def verdict(self, now: float) -> tuple[Level, str]:
         """How it is now, in words: silent or missing inputs first, then why predictions are refused."""
-        silent = [topic for topic in self.topics if self.age(topic, now) > self.max_silence]
-        if silent:
-            topic = silent[0]
-            age = self.age(topic, now)
-            return Level.ERROR, f"{topic}: " + (
-                "nothing received" if age == float("inf") else f"silent for {age:.1f} s"
-            )
+        silent = {topic: self.age(topic, now) for topic in self.topics}
+        words = [
+            f"{topic}: " + ("nothing received" if isinf(age) else f"silent for {age:.1f} s")
+            for topic, age in silent.items()
+            if age > self.max_silence
+        ]
+        if words:
+            return Level.ERROR, "; ".join(words)
         if self._last_refusal is not None and self._last_refusal[0] > self._last_prediction:
             refusal = self._last_refusal[1]
             return (Level.WARN if refusal is Refusal.FILLING else Level.ERROR), refusal.value

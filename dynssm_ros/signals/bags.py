@@ -23,7 +23,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.files import replacing
-from dynssm_ros.signals.rescue import is_unindexed, log_left, merge_log, rescue, unpack, unpacked_message
+from dynssm_ros.signals.rescue import is_short, is_unindexed, log_left, merge_log, rescue, unpack, unpacked_message
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 _NO_INDEX = "it has no index"
@@ -148,6 +148,8 @@ def _open(paths: list[Path]) -> AnyReader:
             raise BagError(_LOG_LEFT)
         if any(is_unindexed(file) for file in files):
             raise BagError(_NO_INDEX)
+        if any(is_short(file) for file in files):
+            raise BagError("a file is shorter than its header says")
         reader = AnyReader(paths, default_typestore=_TYPESTORE)
         reader.open()
     except Exception as error:  # rosbags lets through what its decoders raise: struct, codec, YAML, index, type errors
@@ -217,7 +219,7 @@ def _usable_file(file: Path, scratch: Path, notes: list[str]) -> Path | None:
     if not complete:
         notes.append(f"{file.name} is cut off ({damage}): recovered {messages} messages up to the cut")
     elif damage != _NO_INDEX:
-        notes.append(f"{file.name} cannot be read as it is ({damage}): all its {messages} messages were copied")
+        notes.append(f"{file.name} cannot be read as it is ({damage}): its {messages} ROS messages were copied")
     return rescued
 
 

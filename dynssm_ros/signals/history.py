@@ -41,6 +41,7 @@ class RingBuffer:
     """
 
     def __init__(self, capacity: int = 256) -> None:
+        """Makes room for ``capacity`` samples, at least 2."""
         self._times = np.empty(2 * capacity)
         self._values = np.empty(2 * capacity)
         self._capacity = capacity

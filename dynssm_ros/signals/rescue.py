@@ -26,9 +26,11 @@ from mcap.writer import Writer as McapWriter
 
 SQLITE_LOGS = ("-wal", "-journal")
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_ROS_ENCODINGS = ("ros2msg", "ros2idl", "omgidl", "")
 _TABLE_LEAF = 0x0D
 _TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
 _T = TypeVar("_T")
+_McapRecord = Schema | Channel | Message | DataEnd
 
 
 class Rescued(NamedTuple):
@@ -39,7 +41,7 @@ class Rescued(NamedTuple):
 
 
 def rescue(damaged: Path, rescued: Path) -> Rescued:
-    """Copies the messages before the cut of a ``.mcap`` or ``.db3`` file to ``rescued``, with an index.
+    """Copies the ROS messages before the cut of a ``.mcap`` or ``.db3`` file to ``rescued``, with an index.
 
     Raises:
         OSError: ``damaged`` cannot be read or ``rescued`` not be written.
@@ -60,6 +62,16 @@ def is_unindexed(file: Path) -> bool:
         return True
     empty = summary.statistics is not None and summary.statistics.message_count == 0
     return not empty and not (summary.chunk_indexes and all(c.message_index_offsets for c in summary.chunk_indexes))
+
+
+def is_short(file: Path) -> bool:
+    """Whether a SQLite file is shorter than its header says, which SQLite may notice only in the middle of reading."""
+    if file.suffix != ".db3":
+        return False
+    with file.open("rb") as stream:
+        header = stream.read(100)
+    pages = int.from_bytes(header[28:32], "big") if header[24:28] == header[92:96] else 0
+    return header.startswith(b"SQLite format 3\0") and file.stat().st_size < pages * _page_size(header)
 
 
 def log_left(file: Path) -> bool:
@@ -117,11 +129,11 @@ def _rescue_mcap(damaged: Path, rescued: Path) -> Rescued:
         channels: dict[int, int] = {}
         source.seek(len(b"\x89MCAP0\r\n"))
         for r in _until_cut(_mcap_records(source, damaged.stat().st_size)):
-            if isinstance(r, Schema) and r.id not in schemas:
+            if isinstance(r, Schema) and r.id not in schemas and r.encoding in _ROS_ENCODINGS:
                 schemas[r.id] = writer.register_schema(r.name, r.encoding, r.data)
-            elif isinstance(r, Channel) and r.id not in channels:
+            elif isinstance(r, Channel) and r.id not in channels and r.schema_id in schemas:
                 channels[r.id] = writer.register_channel(r.topic, r.message_encoding, schemas[r.schema_id], r.metadata)
-            elif isinstance(r, Message):
+            elif isinstance(r, Message) and r.channel_id in channels:
                 writer.add_message(channels[r.channel_id], r.log_time, r.data, r.publish_time, r.sequence)
                 messages += 1
             elif isinstance(r, DataEnd):
@@ -130,25 +142,31 @@ def _rescue_mcap(damaged: Path, rescued: Path) -> Rescued:
     return Rescued(messages, complete)
 
 
-def _mcap_records(source: IO[bytes], size: int) -> Iterator[Schema | Channel | Message | DataEnd]:
+def _mcap_records(source: IO[bytes], size: int) -> Iterator[_McapRecord]:
     """Yields the records of a stream of ``size`` bytes, also out of the chunk that the cut goes through."""
-    while len(head := source.read(9)) == 9:
+    last: _McapRecord | None = None
+    while len(head := source.read(9)) == 9 and head[0] != 0:
+        if last is not None:
+            yield last
+            last = None
         opcode, length = struct.unpack("<BQ", head)
         body = source.read(min(length, size - source.tell()))
-        stream = ReadDataStream(io.BytesIO(body))
         if opcode == Opcode.CHUNK:
             content = _chunk_content(body)
             yield from _mcap_records(io.BytesIO(content), len(content))
-        if len(body) < length or opcode == 0:  # cut here, or filled up with zeros when the power went
+        if len(body) < length:
             return
+        stream = ReadDataStream(io.BytesIO(body))
         if opcode == Opcode.SCHEMA:
-            yield Schema.read(stream)
+            last = Schema.read(stream)
         elif opcode == Opcode.CHANNEL:
-            yield Channel.read(stream)
+            last = Channel.read(stream)
         elif opcode == Opcode.MESSAGE:
-            yield Message.read(stream, length)
+            last = Message.read(stream, length)
         elif opcode == Opcode.DATA_END:
-            yield DataEnd.read(stream)
+            last = DataEnd.read(stream)
+    if last is not None and not head.startswith(b"\0"):  # zeros are what a power cut fills a file, and records, up with
+        yield last
 
 
 def _chunk_content(body: bytes) -> bytes:
@@ -181,10 +199,11 @@ def _rescue_sqlite(damaged: Path, rescued: Path) -> Rescued:
 
 
 def _definitions(source: sqlite3.Connection) -> Iterator[tuple[str, str]]:
-    """Name and definition of the tables of a bag."""
+    """Name and definition of the tables of a bag; SQLite fills with zeros what the cut took from them."""
     source.execute("PRAGMA writable_schema = ON")  # else a file shorter than its header says is refused altogether
     names = ",".join(f"'{table}'" for table in _TABLES)
-    yield from source.execute(f"SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name IN ({names})")  # noqa: S608
+    query = f"SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name IN ({names})"  # noqa: S608
+    yield from ((name, statement) for name, statement in source.execute(query) if "\0" not in statement)
 
 
 def _rows(source: sqlite3.Connection, table: str) -> Iterator[tuple[object, ...]]:
@@ -197,8 +216,7 @@ def _message_rows(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
     The layout of pages, cells and records is that of SQLite's file format documentation.
     """
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        size = int.from_bytes(content[16:18], "big")
-        size = 65536 if size == 1 else size
+        size = _page_size(content)
         pages = _Pages(content, size, size - content[20])
         for start in range(0, len(content) - size + 1, size):
             head = start + (100 if start == 0 else 0)
@@ -251,6 +269,11 @@ class _Pages(NamedTuple):
             left -= len(parts[-1])
             page = int.from_bytes(self.content[start : start + 4], "big")
         return b"".join(parts)
+
+
+def _page_size(header: mmap.mmap | bytes) -> int:
+    size = int.from_bytes(header[16:18], "big")
+    return 65536 if size == 1 else size
 
 
 def _integer(payload: bytes, at: int, kind: int) -> tuple[int, int]:

@@ -23,7 +23,7 @@ class Style:
             way from the line to the nearer border. At 0 all laps are the same.
     """
 
-    aggressiveness: float = 0.9
+    aggressiveness: float = 0.95
     variation: float = 0.5
 
 

@@ -13,16 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.errors import UserError
-from dynssm_ros.signals.bags import write_bag
-from dynssm_ros.signals.messages import (
-    COMMAND_TOPIC,
-    FEEDBACK_TOPIC,
-    JOINT_STATE,
-    ODOMETRY,
-    ODOMETRY_TOPIC,
-    joint_state,
-    odometry,
-)
+from dynssm_ros.signals.standard import write_standard_bag
 from dynssm_ros.simulation.driver import Driver, Style
 from dynssm_ros.simulation.lines import ClosedLine, Vector
 from dynssm_ros.simulation.plant import Plant, PlantKind, Pose, SingleTrackPlant
@@ -209,16 +200,7 @@ def write_run(run: Run, path: str | Path) -> None:
     Raises:
         BagError: ``path`` exists and is no bag.
     """
-    with write_bag(path) as bag:
-        bag.add_topic(FEEDBACK_TOPIC, JOINT_STATE)
-        bag.add_topic(COMMAND_TOPIC, JOINT_STATE)
-        bag.add_topic(ODOMETRY_TOPIC, ODOMETRY)
-        for k, stamp in enumerate(run.time.tolist()):
-            for later, (topic, values) in enumerate(((FEEDBACK_TOPIC, run.feedback), (COMMAND_TOPIC, run.command)), 1):
-                throttle, steering = values[k]
-                message = joint_state(stamp, {"throttle": throttle, "steering": steering})
-                bag.write(topic, stamp + 1000 * later, message)
-            bag.write(ODOMETRY_TOPIC, stamp + 3000, odometry(stamp, tuple(run.pose[k]), tuple(run.measured[k])))
+    write_standard_bag(path, run.time, run.measured, run.pose, run.feedback, run.command)
 
 
 def _check_motion(vehicle: Vehicle, track: Track, time: float, pose: Pose, state: State) -> None:

@@ -101,7 +101,7 @@ def _trace(segment: Segment, spacing: float) -> npt.NDArray[np.complex128]:
     count = max(1, round(length / spacing))
     ends = np.linspace(0.0, 1.0, count + 1)
     if isinstance(segment, Straight):
-        return ends * length + 0j
+        return (ends * length).astype(np.complex128)
     nodes, weights = np.polynomial.legendre.leggauss(6)
     inside = ends[:-1, None] + (nodes + 1) / (2 * count)
     pieces = np.exp(1j * segment.turned(inside)) @ weights * (length / (2 * count))

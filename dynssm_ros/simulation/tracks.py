@@ -16,6 +16,7 @@ from dynssm_ros.simulation.lines import ClosedLine, Floats, Vector
 
 CSV_COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 MIN_POINTS = 10
+MAX_FOLDED = 0.25  # share of the lap; 0.04 on the published ETHZ track
 
 
 class TrackError(UserError):
@@ -177,13 +178,20 @@ def _check_points(track: Track) -> None:
 def _check_borders(track: Track) -> None:
     """The road must not overlap itself. Inside a corner tighter than its half width a border folds; that is allowed."""
     N, s, length = len(track.centre.points), track.centre.s, track.length
+    curvature = track.centre.curvature(s)
+    for side, reach in (("left", curvature * track.width_left), ("right", -curvature * track.width_right)):
+        if np.mean(reach > 1) > MAX_FOLDED:
+            raise TrackError(
+                f"track {track.name}: borders cross: the {side} border runs backwards along {np.mean(reach > 1):.0%} of "
+                "the lap; expected a half width below the radius of the corners"
+            )
     start = np.concatenate([track.left_border, track.right_border])
     end = np.concatenate([np.roll(border, -1, axis=0) for border in (track.left_border, track.right_border)])
     i, j = _crossings(start, end)
     apart = np.abs(s[i % N] - s[j % N])
     apart = np.minimum(apart, length - apart)
     full_width = track.width_left[i % N] + track.width_right[i % N]
-    bad = np.flatnonzero((i // N != j // N) | (apart > 3 * full_width))
+    bad = np.flatnonzero((i // N != j // N) | (apart > 1.5 * full_width))
     if len(bad):
         k, m = i[bad[0]], j[bad[0]]
         raise TrackError(

@@ -1,0 +1,46 @@
+"""Starts the predictor beside a car's stack: ``ros2 launch dynssm_ros predictor.launch.py model:=MODEL_DIR``."""
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+
+def predictor(context: LaunchContext) -> list[Node]:
+    """The node; an argument that was left empty does not override what the parameters file says."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ("model", "signals", "use_sim_time")}
+    overrides = {name: value for name, value in given.items() if value}
+    if "use_sim_time" in overrides:
+        overrides["use_sim_time"] = overrides["use_sim_time"] == "true"
+    return [
+        Node(
+            package="dynssm_ros",
+            executable="predictor",
+            name="dynssm",
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[LaunchConfiguration("params_file"), overrides],
+            ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+            output="screen",
+        )
+    ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    parameters = PathJoinSubstitution([FindPackageShare("dynssm_ros"), "config", "predictor.yaml"])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("model", default_value="", description="Model folder."),
+            DeclareLaunchArgument("signals", default_value="", description="Shipped signal map or file."),
+            DeclareLaunchArgument(
+                "use_sim_time",
+                default_value="",
+                choices=["", "true", "false"],
+                description="Follow /clock, as when a bag is played with it.",
+            ),
+            DeclareLaunchArgument("params_file", default_value=parameters, description="ROS parameters file."),
+            DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node."),
+            DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn or error."),
+            OpaqueFunction(function=predictor),
+        ]
+    )

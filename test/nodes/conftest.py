@@ -1,0 +1,127 @@
+"""A car on the bus: publishes single messages to a predictor in its own process and waits for what comes back."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+
+from dynssm_ros.nodes.live import Collector, LiveRun, collecting, isolated_environment, predictor_process
+from dynssm_ros.nodes.support import SENSOR_QOS
+from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC, PREDICTION_TOPIC
+
+PERIOD = 20_000_000  # ns
+
+
+class Car:
+    """Drives straight at 1 m/s on simulated stamps; what it sends can be spoilt message by message."""
+
+    def __init__(self, collector: Collector, run: LiveRun, process: subprocess.Popen[str]) -> None:
+        self.collector, self.run, self.process = collector, run, process
+        self.stamp = 1_700_000_000_000_000_000
+        self._odometry = collector.create_publisher(Odometry, ODOMETRY_TOPIC, SENSOR_QOS)
+        self._feedback = collector.create_publisher(JointState, FEEDBACK_TOPIC, SENSOR_QOS)
+        self._command = collector.create_publisher(JointState, COMMAND_TOPIC, SENSOR_QOS)
+
+    def wait_for_match(self) -> None:
+        publishers = (self._odometry, self._feedback, self._command)
+        deadline = time.monotonic() + 30
+        matched = threading.Event()
+        while not all(p.get_subscription_count() for p in publishers) or not self.collector.count_publishers(PREDICTION_TOPIC):
+            assert self.process.poll() is None, "the predictor stopped"
+            assert time.monotonic() < deadline, "no match within 30 s"
+            matched.wait(0.02)  # nobody sets it: discovery raises no event in rclpy
+        while not self._all_heard():  # the node's side of a match comes later than ours
+            assert time.monotonic() < deadline, "the node hears nothing after 30 s"
+            self.step()
+        self.stamp += 10_000_000_000  # a gap: the window starts anew
+
+    def _all_heard(self) -> bool:
+        """Whether the next diagnostics know of a message of every topic."""
+        assert self.diagnosed(""), "no diagnostics"
+        return "nothing received" not in self.run.diagnostics[-1][1]
+
+    def odometry(self, v_x: float = 1.0) -> int:
+        """Sends odometry at the present stamp; returns the stamp that a prediction for it has."""
+        message = Odometry()
+        self._stamp(message)
+        message.header.frame_id, message.child_frame_id = "map", "base_link"
+        message.twist.twist.linear.x = v_x
+        message.pose.pose.orientation.w = 1.0
+        self._odometry.publish(message)
+        return self.stamp + PERIOD
+
+    def actuators(self, commands: bool = True) -> None:
+        for publisher in (self._feedback, self._command) if commands else (self._feedback,):
+            message = JointState(name=["throttle", "steering"], position=[0.2, 0.0])
+            self._stamp(message)
+            publisher.publish(message)
+
+    def step(self, v_x: float = 1.0, commands: bool = True, actuators: bool = True) -> int:
+        """One period of driving: actuators, then odometry, then the clock goes on."""
+        if actuators:
+            self.actuators(commands)
+        expected = self.odometry(v_x)
+        self.stamp += PERIOD
+        return expected
+
+    def answered(self, expected: int, timeout: float = 5.0) -> bool:
+        """Waits for the prediction with that stamp."""
+        return self.collector.wait_for(lambda: expected in self.run.predicted, timeout)
+
+    def drive_until_answered(self, limit: int = 50, **how: bool) -> int:
+        """Drives, waiting a little for each answer, until there is one; returns the number of periods it took."""
+        for count in range(1, limit + 1):
+            if self.answered(self.step(**how), timeout=0.3):
+                return count
+        raise AssertionError(f"no prediction within {limit} periods; diagnostics: {self.run.diagnostics[-1:]}")
+
+    def diagnosed(self, words: str, timeout: float = 5.0) -> bool:
+        """Waits for a diagnostic status from now on whose message contains ``words``."""
+        seen = len(self.run.diagnostics)
+        return self.collector.wait_for(lambda: any(words in m for _, m, _ in self.run.diagnostics[seen:]), timeout)
+
+    def set_parameter(self, name: str, value: object) -> tuple[bool, str]:
+        client = self.collector.create_client(SetParameters, "/dynssm/set_parameters")
+        assert client.wait_for_service(10.0)
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        done = threading.Event()
+        future = client.call_async(request)
+        future.add_done_callback(lambda _: done.set())
+        assert done.wait(10.0)
+        result = future.result().results[0]
+        return result.successful, result.reason
+
+    def _stamp(self, message: Odometry | JointState) -> None:
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.stamp, 1_000_000_000)
+
+
+StartCar = Callable[..., Car]
+
+
+@pytest.fixture
+def start_car(small_model: Path) -> Iterator[StartCar]:
+    """Starts predictors with the small model (or another) and hands out cars that talk to them."""
+    with ExitStack() as stack:
+
+        def start(model: Path = small_model, **parameters: object) -> Car:
+            os.environ.update(isolated_environment())
+            process = stack.enter_context(
+                predictor_process(model, {"diagnostics_period": 0.1, **parameters}, os.environ.copy())
+            )
+            run = LiveRun(PERIOD)
+            car = Car(stack.enter_context(collecting(run)), run, process)
+            car.wait_for_match()
+            return car
+
+        yield start

@@ -1,0 +1,57 @@
+"""The player as its own process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from dynssm_ros.nodes.live import LiveRun, collecting, isolated_environment, predictor_process
+from dynssm_ros.signals.messages import PREDICTION_TOPIC
+
+pytestmark = [pytest.mark.xdist_group("dds"), pytest.mark.timeout(120)]
+
+
+def _player(*parameters: str) -> list[str]:
+    arguments = [part for text in parameters for part in ("-p", text)]
+    return [sys.executable, "-m", "dynssm_ros.nodes.player", "--ros-args", *arguments]
+
+
+def test_player_and_predictor_work_as_separate_processes(small_model: Path, laps_bag: Path) -> None:
+    os.environ.update(isolated_environment())
+    run = LiveRun(20_000_000)
+    with predictor_process(small_model, {}, os.environ.copy()), collecting(run) as collector:
+        listening = threading.Event()
+        while not collector.count_publishers(PREDICTION_TOPIC):
+            listening.wait(0.02)  # nobody sets it: discovery raises no event in rclpy
+        player = subprocess.Popen(_player(f"bag:={laps_bag}", "rate:=4.0"), env=os.environ.copy())
+        assert player.wait(60) == 0
+        last = 1_000_000_000_000_000_000 + 20_000_000_000 + run.T_s
+        assert collector.wait_for(lambda: last in run.predicted, 5.0)
+        assert collector.count_publishers(PREDICTION_TOPIC) == 1
+    assert len(run.predicted) == 1001 - 4
+
+
+@pytest.mark.parametrize(
+    ("parameters", "expected"),
+    [
+        ([], "parameter bag: not set"),
+        (["bag:=/nowhere"], "/nowhere: no such bag"),
+    ],
+)
+def test_a_wrong_start_is_one_clear_line(parameters: list[str], expected: str) -> None:
+    command = _player(*parameters) if parameters else [sys.executable, "-m", "dynssm_ros.nodes.player"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 1
+    assert result.stderr.strip().splitlines() == [line for line in result.stderr.strip().splitlines() if expected in line]
+
+
+def test_a_bag_of_types_that_are_not_installed_names_the_way_out(putnam: Path) -> None:
+    result = subprocess.run(_player(f"bag:={putnam}"), capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 1
+    assert "raptor_dbw_msgs" in result.stderr
+    assert "dynssm extract" in result.stderr

@@ -1,0 +1,159 @@
+"""The predictor node over real DDS, in a process of its own."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dynssm_ros.nodes.live import run_live
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.predictor import Prediction, Predictor
+from dynssm_ros.runtime.replay import replay
+from dynssm_ros.signals.bags import open_bag
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.signals.standard import recording_to_bag
+from dynssm_ros.vehicle import COEFFICIENTS
+
+pytestmark = [pytest.mark.xdist_group("dds"), pytest.mark.timeout(120)]
+
+H = 5
+
+
+@pytest.mark.parametrize(("rate", "speed"), [(50.0, 1.0), (100.0, 1.0), (100.0, 4.0)])
+def test_every_odometry_message_after_the_first_window_gets_a_prediction_as_replay_gives_it(
+    small_model: Path, laps_bag: Path, tmp_path: Path, rate: float, speed: float
+) -> None:
+    bag = tmp_path / "resampled"
+    recording_to_bag(extract([laps_bag], load_signal_map("default"), rate), bag)
+    run = run_live(small_model, bag, 0.02, rate=speed, duration=4.0 * speed)
+    assert len(run.sent) >= 4.0 * speed * rate
+    assert run.missing() == []
+    assert min(run.predicted) - run.T_s == sorted(run.sent)[round((H - 1) * 0.02 * rate)]
+
+    predictor = Predictor(OnnxModel(open_artifact(small_model)), load_signal_map("default"))
+    with open_bag(bag) as opened:
+        offline = {o.outcome.stamp: o.outcome for o in replay(opened, predictor) if isinstance(o.outcome, Prediction)}
+    live = np.array([run.predicted[stamp] for stamp in sorted(run.predicted)])
+    expected = np.array([offline[stamp].state for stamp in sorted(run.predicted)])
+    np.testing.assert_allclose(live, expected, atol=1e-9, rtol=0)
+    some = sorted(run.parameters)[0]
+    np.testing.assert_allclose(run.parameters[some], offline[some].theta, atol=1e-12)
+    assert len(run.parameters[some]) == len(COEFFICIENTS)
+
+
+def test_bad_samples_yield_no_prediction_and_the_node_recovers_by_itself(start_car) -> None:
+    car = start_car()
+    assert car.drive_until_answered() == H
+    nan = car.step(v_x=float("nan"))
+    good = car.step()
+    assert car.answered(good)
+    assert nan not in car.run.predicted
+    assert all(np.isfinite(state).all() for state in car.run.predicted.values())
+
+
+def test_time_that_jumps_back_restarts_the_window(start_car) -> None:
+    car = start_car()
+    car.drive_until_answered()
+    car.stamp -= 10_000_000_000
+    first = car.stamp + car.run.T_s
+    assert car.drive_until_answered() >= H
+    assert first not in car.run.predicted
+
+
+@pytest.mark.parametrize("how", [{"actuators": False}, {"commands": False}])
+def test_stale_actuators_stop_predictions_and_diagnostics_say_so_until_they_are_back(start_car, how) -> None:
+    car = start_car()
+    car.drive_until_answered()
+    stale = [car.step(**how) for _ in range(30)]
+    assert car.diagnosed("silent for")
+    assert not any(expected in car.run.predicted for expected in stale[15:])
+    car.drive_until_answered()
+    assert car.diagnosed("predicting") or car.answered(car.step())
+
+
+def test_odometry_that_stops_is_reported_as_silent(start_car) -> None:
+    car = start_car()
+    car.drive_until_answered()
+    assert car.diagnosed("/vehicle/odometry: silent for")
+    assert car.run.diagnostics[-1][0] == 2, "an error, not a warning"
+
+
+def test_diagnostics_hold_rates_ages_latencies_and_refusals(start_car) -> None:
+    car = start_car()
+    before = int(car.run.diagnostics[-1][2]["refused: filling"])
+    car.drive_until_answered()
+    assert car.diagnosed("")
+    values = car.run.diagnostics[-1][2]
+    for key in ("latency p50 (ms)", "latency p99 (ms)", "share of the residual", "/vehicle/odometry rate (Hz)"):
+        assert float(values[key]) >= 0
+    assert int(values["refused: filling"]) - before == H - 1
+
+
+def test_a_model_is_swapped_while_running_and_a_bad_one_is_refused(start_car, small_model: Path, tmp_path: Path) -> None:
+    car = start_car()
+    car.drive_until_answered()
+    successful, reason = car.set_parameter("model", str(tmp_path / "none"))
+    assert not successful
+    assert "no such model folder" in reason
+    assert car.answered(car.step())
+    other = shutil.copytree(small_model, tmp_path / "other")
+    assert car.set_parameter("model", str(other)) == (True, "")
+    assert car.answered(car.step()), "the window survives the swap"
+    assert car.diagnosed("")
+    assert car.run.diagnostics[-1][2]["model folder"] == str(other)
+
+
+def test_the_horizon_is_published_on_request(start_car) -> None:
+    from nav_msgs.msg import Path as PathMessage
+
+    from dynssm_ros.nodes.support import SENSOR_QOS
+
+    car = start_car(horizon=0.2)
+    paths: list[PathMessage] = []
+    car.collector.create_subscription(PathMessage, "/dynssm/horizon", paths.append, SENSOR_QOS)
+    car.drive_until_answered()
+    car.drive_until_answered()
+    assert car.collector.wait_for(lambda: bool(paths), 0.1) or car.answered(car.step())
+    assert len(paths[-1].poses) == 10
+    assert paths[-1].poses[0].header.stamp == paths[-1].header.stamp
+
+
+def test_the_process_holds_no_torch(start_car) -> None:
+    car = start_car()
+    car.drive_until_answered()
+    mapped = Path(f"/proc/{car.process.pid}/maps").read_text()
+    assert "onnxruntime" in mapped
+    assert "torch" not in mapped
+
+
+def test_simulated_time_without_a_clock_does_not_hinder_predictions(start_car) -> None:
+    car = start_car(use_sim_time=True)
+    assert car.drive_until_answered() == H
+
+
+@pytest.mark.parametrize(
+    ("parameters", "expected"),
+    [
+        ([], "parameter model: not set"),
+        (["model:=/nowhere"], "/nowhere: no such model folder"),
+        (["model:={model}", "signals:=nothing"], "signals: 'nothing' is neither a file nor a shipped name"),
+        (["model:={model}", "signals:=av21"], "signals: missing throttle_command, steering_command"),
+    ],
+)
+def test_a_wrong_start_is_one_clear_line(small_model: Path, parameters: list[str], expected: str) -> None:
+    command = [sys.executable, "-m", "dynssm_ros.nodes.predictor"]
+    if parameters:
+        command += ["--ros-args", *(p for text in parameters for p in ("-p", text.format(model=small_model)))]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 1
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    assert expected in lines[0]

@@ -1,0 +1,119 @@
+"""The rescue of SQLite pages against SQLite itself, whatever the sizes."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dynssm_ros.signals.rescue import is_unindexed, log_left, rescue, unpacked_message
+
+Row = tuple[int, int, int, bytes]
+TABLES = """
+CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);
+CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL);
+CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL,
+                      data BLOB NOT NULL);
+CREATE INDEX timestamp_idx ON messages (timestamp ASC);
+INSERT INTO schema VALUES (3, 'jazzy');
+"""
+
+
+def make(path: Path, page_size: int, rows: list[Row]) -> None:
+    path.unlink(missing_ok=True)
+    with closing(sqlite3.connect(path)) as database:
+        database.execute(f"PRAGMA page_size = {page_size}")
+        database.executescript(TABLES)
+        topics = [(number, f"/t{number}", "a/msg/B") for number in {row[1] for row in rows}]
+        database.executemany("INSERT INTO topics VALUES (?, ?, ?)", topics)
+        database.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+        database.commit()
+
+
+def rows_of(path: Path) -> list[Row]:
+    with closing(sqlite3.connect(path)) as database:
+        return database.execute("SELECT * FROM messages ORDER BY id").fetchall()
+
+
+def rescued(path: Path, share: float = 1.0) -> list[Row]:
+    cut, saved = path.with_suffix(".cut.db3"), path.with_suffix(".saved.db3")
+    content = path.read_bytes()
+    cut.write_bytes(content[: int(share * len(content))])
+    saved.unlink(missing_ok=True)
+    count, complete = rescue(cut, saved)
+    assert not complete
+    found = rows_of(saved) if count else []
+    assert len(found) == count
+    return found
+
+
+integers = st.one_of(st.integers(-3, 300), st.integers(-(2**63), 2**63 - 1))
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.lists(st.tuples(st.integers(0, 400), integers, st.integers(0, 9000)), min_size=1, max_size=30),
+    st.sampled_from([512, 1024, 4096, 65536]),
+)
+def test_rows_of_any_size_come_out_of_pages_of_any_size(
+    tmp_path_factory: pytest.TempPathFactory, drawn: list[tuple[int, int, int]], page_size: int
+) -> None:
+    path = tmp_path_factory.mktemp("pages") / "bag.db3"
+    rows = [
+        (number, topic, stamp, bytes(k % 251 for k in range(number, number + size)))
+        for number, (topic, stamp, size) in enumerate(drawn, 1)
+    ]
+    make(path, page_size, rows)
+    assert rows_of(path) == rows
+    assert rescued(path) == rows
+
+
+@pytest.mark.parametrize("page_size", [512, 4096])
+def test_sizes_around_the_overflow_of_a_page_come_out_whole(tmp_path: Path, page_size: int) -> None:
+    path = tmp_path / "bag.db3"
+    sizes = [*range(page_size - 60, page_size + 5), *range(page_size * 2 - 30, page_size * 2), 100_000]
+    rows = [(number, 1, number, bytes([number % 256]) * size) for number, size in enumerate(sizes, 1)]
+    make(path, page_size, rows)
+    assert rescued(path) == rows
+
+
+@pytest.mark.parametrize("size", [60, 700, 9000])
+def test_a_cut_leaves_the_beginning_where_the_tree_has_grown_branches(tmp_path: Path, size: int) -> None:
+    """With small pages the tree of 3000 rows has several levels, and its upper branches lie behind the cut."""
+    path = tmp_path / "bag.db3"
+    rows = [(number, 1 + number % 3, 10**18 + number, bytes([number % 256]) * size) for number in range(1, 3001)]
+    make(path, 512 if size < 100 else 4096, rows)
+    counts = []
+    for share in (0.05, 0.25, 0.5, 0.75, 0.95, 1.0):
+        found = rescued(path, share)
+        assert found == rows[: len(found)]
+        counts.append(len(found) / len(rows))
+    assert counts[-1] == 1.0
+    assert all(count > 0.9 * share - 0.02 for count, share in zip(counts, (0.05, 0.25, 0.5, 0.75, 0.95), strict=False))
+
+
+def test_other_tables_and_other_databases_give_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "bag.db3"
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE messages (id INTEGER PRIMARY KEY, a INTEGER, b INTEGER, c BLOB)")
+        database.execute("INSERT INTO messages VALUES (1, 2, 3, x'00')")
+        database.commit()
+    assert rescued(path) == []
+
+
+def test_only_mcap_files_can_lack_an_index_and_only_sqlite_leaves_logs(tmp_path: Path) -> None:
+    for name in ("a.db3", "a.mcap", "a.db3-wal"):
+        (tmp_path / name).write_bytes(b"x")
+    assert not is_unindexed(tmp_path / "a.db3")
+    assert not is_unindexed(tmp_path / "a.mcap")
+    assert log_left(tmp_path / "a.db3")
+    assert not log_left(tmp_path / "a.mcap")
+
+
+def test_messages_that_are_not_compressed_are_left_alone() -> None:
+    raw = b"\x00\x01\x00\x00payload"
+    assert unpacked_message(raw) is raw

@@ -1,0 +1,140 @@
+"""The house keeps its floors: imports run downwards, and heavy libraries stay in their rooms."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "dynssm_ros"
+ROOT = Path(__file__).resolve().parent.parent
+
+FLOORS = (  # lowest first; a room imports its own floor and those below
+    {"vehicle"},
+    {"signals"},
+    {"learning", "runtime", "simulation"},
+    {"control", "diagnosis", "evaluation", "nodes"},
+    {"cli"},
+)
+FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
+GROUND = {"configuration", "errors", "files"}  # for all rooms, so they import none
+
+ROS = {
+    "ament_index_python", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "launch", "launch_ros", "nav_msgs",
+    "rcl_interfaces", "rclpy", "rosgraph_msgs", "rosidl_runtime_py", "sensor_msgs", "std_msgs",
+}  # fmt: skip
+OWNERS = {"torch": {"learning"}, "lightning": {"learning"}, "casadi": {"control", "diagnosis"}}
+OWNERS |= {module: {"nodes"} for module in ROS}
+
+
+def imports(source: str, module: str, is_package: bool = False) -> Iterator[tuple[str, int]]:
+    """Yields the absolute dotted name and the line of every import, wherever it stands."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = module.split(".")
+            base = base[: len(base) - node.level + is_package] if node.level else []
+            origin = ".".join([*base, *([node.module] if node.module else [])])
+            yield from ((f"{origin}.{alias.name}", node.lineno) for alias in node.names)
+
+
+def violations(source: str, module: str, is_package: bool = False) -> list[str]:
+    """What ``source``, as the text of ``module``, imports against the rules; one line each."""
+    parts = module.split(".")
+    room = parts[1] if len(parts) > 1 else ""
+    found = []
+    for name, line in imports(source, module, is_package):
+        top, _, rest = name.partition(".")
+        other = rest.split(".")[0]
+        where = f"{module}:{line}: imports {name}"
+        if top == PACKAGE and other in FLOOR and FLOOR[other] > FLOOR.get(room, -1):
+            found.append(f"{where}, a floor above {room or PACKAGE}")
+        if room not in OWNERS.get(top, {room}):
+            found.append(f"{where} outside {' and '.join(sorted(OWNERS[top]))}")
+    return found
+
+
+def modules() -> Iterator[tuple[str, Path]]:
+    """Yields every module of the package by dotted name."""
+    for path in sorted((ROOT / PACKAGE).rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
+
+
+def test_every_room_has_a_floor() -> None:
+    rooms = {path.parent.name for path in (ROOT / PACKAGE).glob("*/__init__.py")}
+    assert rooms <= FLOOR.keys()
+    assert {path.stem for path in (ROOT / PACKAGE).glob("*.py")} == GROUND | {"__init__"}
+
+
+def test_imports_run_downwards_and_stay_in_their_rooms() -> None:
+    found = [
+        violation
+        for module, path in modules()
+        for violation in violations(path.read_text(encoding="utf-8"), module, path.name == "__init__.py")
+    ]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("dynssm_ros.vehicle.effects", "import dynssm_ros.signals.bags"),
+        ("dynssm_ros.vehicle.effects", "from dynssm_ros import signals"),
+        ("dynssm_ros.vehicle.effects", "from ..signals import bags"),
+        ("dynssm_ros.vehicle.effects", "from .. import signals"),
+        ("dynssm_ros.runtime.predictor", "def f():\n    from dynssm_ros.nodes import predictor"),
+        ("dynssm_ros.files", "from dynssm_ros.vehicle import Vehicle"),
+        ("dynssm_ros.files", "from .vehicle import Vehicle"),
+        ("dynssm_ros.runtime.models", "import torch"),
+        ("dynssm_ros.runtime.models", "def f():\n    from torch import nn"),
+        ("dynssm_ros.cli.train", "def train():\n    import torch"),
+        ("dynssm_ros.signals.bags", "from nav_msgs.msg import Odometry"),
+        ("dynssm_ros.cli.replay", "import rclpy"),
+        ("dynssm_ros.simulation.plant", "import casadi as ca"),
+        ("dynssm_ros.errors", "import torch.nn"),
+    ],
+)
+def test_a_planted_violation_is_caught(module: str, source: str) -> None:
+    assert len(violations(source, module)) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("dynssm_ros.signals.bags", "from dynssm_ros.vehicle import Vehicle"),
+        ("dynssm_ros.signals.bags", "from . import messages"),
+        ("dynssm_ros.cli.main", "from dynssm_ros import __version__\nfrom ..nodes import predictor"),
+        ("dynssm_ros.learning.training", "import torch"),
+        ("dynssm_ros.nodes.predictor", "import rclpy\nfrom nav_msgs.msg import Odometry"),
+        ("dynssm_ros.cli.train", "def train():\n    from dynssm_ros.learning import training"),
+    ],
+)
+def test_what_the_architecture_allows_passes(module: str, source: str) -> None:
+    assert violations(source, module) == []
+
+
+def test_a_package_resolves_relative_imports_from_itself() -> None:
+    assert [name for name, _ in imports("from .bags import Bag", "dynssm_ros.signals", is_package=True)] == [
+        "dynssm_ros.signals.bags.Bag"
+    ]
+
+
+def test_no_room_but_learning_pulls_in_torch() -> None:
+    """The live node and the command line start without torch, also through what they import."""
+    wanted = [name for name, _ in modules() if name.split(".")[1:2] != ["learning"]]
+    script = f"""
+import importlib, importlib.util, sys
+for name in {wanted!r}:
+    if name.startswith("dynssm_ros.nodes") and importlib.util.find_spec("rclpy") is None:
+        continue
+    importlib.import_module(name)
+    assert "torch" not in sys.modules, f"importing {{name}} imports torch"
+"""
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert result.returncode == 0, result.stderr

@@ -1,0 +1,283 @@
+"""What is installed is complete, consistent and valid: versions, dependencies, shared files, configuration, launch."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+import setuptools
+import yaml
+
+import dynssm_ros
+from dynssm_ros.configuration import config_root
+from dynssm_ros.learning.configuration import load_model_config
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.vehicle.parameters import load_vehicle
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = "dynssm_ros"
+PIP_NAMES = {"yaml": "pyyaml"}
+ROSDEP_KEYS = {"onnxruntime": "python3-onnxruntime-pip", "rosbags": "python3-rosbags-pip"}
+FROM_ROS = ("rclpy", "_msgs", "_interfaces")  # of the ROS installation or the `ros` extra
+NEEDED_BY_OTHERS = {"setuptools", "onnx", "onnxscript"}  # by the console scripts; by torch's ONNX export
+
+
+@pytest.fixture
+def arguments(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What setup.py passes to setuptools."""
+    passed: dict[str, Any] = {}
+    monkeypatch.setattr(setuptools, "setup", passed.update)
+    monkeypatch.chdir(ROOT)
+    execute(ROOT / "setup.py")
+    return passed
+
+
+@pytest.fixture(scope="module")
+def manifest() -> ElementTree.Element:
+    return ElementTree.parse(ROOT / "package.xml").getroot()
+
+
+def execute(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(path.name.partition(".")[0], path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def third_party_imports() -> set[str]:
+    """Top-level modules that the package imports, its own and the standard library's left out."""
+    found: set[str] = set()
+    for path in (ROOT / PACKAGE).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found.update(alias.name.partition(".")[0] for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                found.add(node.module.partition(".")[0])
+    return found - sys.stdlib_module_names - {PACKAGE}
+
+
+def requirements(arguments: dict[str, Any]) -> dict[str, str]:
+    """Floor of every required distribution, by lower-case name; empty without one."""
+    pairs = (requirement.partition(">=") for requirement in arguments["install_requires"])
+    return {name.lower(): floor for name, _, floor in pairs}
+
+
+def pip_only(manifest_text: str) -> set[str]:
+    """The distributions that package.xml names as having no rosdep key."""
+    match = re.search(r"without a rosdep key[^:]*: ([\w ]+) -->", manifest_text)
+    assert match is not None
+    return set(match[1].split())
+
+
+def shipped(kind: str) -> list[str]:
+    return sorted(path.stem for path in (ROOT / "config" / kind).glob("*.yaml"))
+
+
+def test_versions_agree(arguments: dict[str, Any], manifest: ElementTree.Element) -> None:
+    assert arguments["version"] == manifest.findtext("version") == dynssm_ros.__version__
+
+
+def test_setup_and_manifest_tell_the_same(arguments: dict[str, Any], manifest: ElementTree.Element) -> None:
+    maintainer = manifest.find("maintainer")
+    assert maintainer is not None
+    assert arguments["name"] == manifest.findtext("name") == PACKAGE
+    assert arguments["license"] == manifest.findtext("license")
+    assert (arguments["maintainer"], arguments["maintainer_email"]) == (maintainer.text, maintainer.get("email"))
+    assert manifest.findtext("export/build_type") == "ament_python"
+
+
+def test_every_import_is_required_by_pip(arguments: dict[str, Any]) -> None:
+    imported = {PIP_NAMES.get(name, name) for name in third_party_imports() if not name.endswith(FROM_ROS)}
+    assert imported - requirements(arguments).keys() == set()
+
+
+def test_nothing_is_required_that_is_not_used(arguments: dict[str, Any]) -> None:
+    imported = {PIP_NAMES.get(name, name) for name in third_party_imports()}
+    assert requirements(arguments).keys() - imported == NEEDED_BY_OTHERS
+
+
+def test_every_import_is_declared_to_ros(manifest: ElementTree.Element) -> None:
+    declared = {depend.text for depend in manifest.findall("exec_depend")}
+    undeclared = pip_only((ROOT / "package.xml").read_text(encoding="utf-8"))
+    for name in third_party_imports():
+        key = name if name.endswith(FROM_ROS) else ROSDEP_KEYS.get(name, f"python3-{name}")
+        assert key in declared or name in undeclared, f"{name}: no {key} in package.xml"
+
+
+def test_manifest_repeats_the_requirements(arguments: dict[str, Any], manifest: ElementTree.Element) -> None:
+    modules = {distribution: module for module, distribution in PIP_NAMES.items()}
+    keys = {
+        ROSDEP_KEYS.get(name, f"python3-{modules.get(name, name)}"): floor
+        for name, floor in requirements(arguments).items()
+    }
+    floors = {depend.text: depend.get("version_gte", "") for depend in manifest.findall("exec_depend")}
+    undeclared = {f"python3-{name}" for name in pip_only((ROOT / "package.xml").read_text(encoding="utf-8"))}
+    assert keys.keys() - floors.keys() == undeclared
+    assert {key: floors[key] for key in keys.keys() & floors.keys()} == {
+        key: floor for key, floor in keys.items() if key in floors
+    }
+
+
+def test_every_requirement_is_pinned(arguments: dict[str, Any]) -> None:
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pinned = {line.partition("==")[0] for line in lines if "==" in line}
+    wanted = [
+        *arguments["install_requires"],
+        *(item for extra in arguments["extras_require"].values() for item in extra),
+    ]
+    assert {re.split(r"[\[><=]", requirement)[0].lower() for requirement in wanted} - pinned == set()
+    assert "torch==2.13.0" in lines
+
+
+def test_every_shared_file_is_installed_where_the_package_looks(arguments: dict[str, Any]) -> None:
+    installed = {
+        f"{folder}/{Path(source).name}": source for folder, sources in arguments["data_files"] for source in sources
+    }
+    expected = {
+        f"share/{PACKAGE}/{path.relative_to(ROOT).as_posix()}": path.relative_to(ROOT).as_posix()
+        for folder in ("config", "launch")
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    expected[f"share/{PACKAGE}/package.xml"] = "package.xml"
+    expected[f"share/ament_index/resource_index/packages/{PACKAGE}"] = f"resource/{PACKAGE}"
+    assert installed == expected
+
+
+def test_every_module_and_template_is_installed(arguments: dict[str, Any]) -> None:
+    folders = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / PACKAGE).rglob("*.py")}
+    assert {package.replace(".", "/") for package in arguments["packages"]} == folders
+    patterns = arguments["package_data"][PACKAGE]
+    data = {path for pattern in patterns for path in (ROOT / PACKAGE).glob(pattern)}
+    others = {path for path in (ROOT / PACKAGE).rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
+    assert data == others
+
+
+def test_commands_lead_to_functions(arguments: dict[str, Any]) -> None:
+    targets = dict(script.split(" = ") for script in arguments["entry_points"]["console_scripts"])
+    assert targets.keys() == {"dynssm", "predictor", "player"}
+    for target in targets.values():
+        module, _, function = target.partition(":")
+        path = (ROOT / module.replace(".", "/")).with_suffix(".py")
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+def test_configuration_is_found_in_the_source_tree() -> None:
+    assert config_root() == ROOT / "config"
+
+
+@pytest.mark.parametrize("name", shipped("vehicles"))
+def test_shipped_vehicles_are_valid(name: str) -> None:
+    assert load_vehicle(name).name
+
+
+@pytest.mark.parametrize("name", shipped("signals"))
+def test_shipped_signal_maps_are_valid(name: str) -> None:
+    assert load_signal_map(name).name == name
+
+
+@pytest.mark.parametrize("name", shipped("models"))
+def test_shipped_models_are_valid(name: str) -> None:
+    assert load_model_config(name).name == name
+
+
+def test_parameters_file_fits_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same parser as the node's reads it, and the types are those that the node declares."""
+    rclpy = pytest.importorskip("rclpy")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+    path = ROOT / "config" / "predictor.yaml"
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))["/**"]["ros__parameters"]
+    context = rclpy.Context()
+    rclpy.init(args=["--ros-args", "--params-file", str(path)], context=context)
+    try:
+        node = rclpy.create_node("dynssm", context=context, automatically_declare_parameters_from_overrides=True)
+        read = {name: node.get_parameter(name).value for name in content}
+        node.destroy_node()
+    finally:
+        context.try_shutdown()
+    assert read == content
+    assert read == {"model": "", "signals": "default", "max_age": 0.2, "horizon": 0.0, "diagnostics_period": 1.0}
+    assert [type(value) for value in read.values()] == [str, str, float, float, float]
+
+
+class Recorder:
+    """Stands for a class of launch or launch_ros: keeps what it was made with.
+
+    ``launch`` is not among the wheels, so this checks the structure of the launch file, not that it runs.
+    """
+
+    def __init__(self, *positional: Any, **named: Any) -> None:
+        self.positional, self.named = positional, named
+
+    def perform(self, context: SimpleNamespace) -> str:
+        """As of a LaunchConfiguration."""
+        return context.launch_configurations[self.positional[0]]
+
+
+@pytest.fixture
+def launch_file(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The launch file over recording stand-ins of launch and launch_ros."""
+    names = {
+        "launch": ["LaunchContext", "LaunchDescription"],
+        "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction"],
+        "launch.substitutions": ["LaunchConfiguration", "PathJoinSubstitution"],
+        "launch_ros": [],
+        "launch_ros.actions": ["Node"],
+        "launch_ros.substitutions": ["FindPackageShare"],
+    }
+    for module_name, classes in names.items():
+        module = ModuleType(module_name)
+        for name in classes:
+            setattr(module, name, type(name, (Recorder,), {}))
+        monkeypatch.setitem(sys.modules, module_name, module)
+    return execute(ROOT / "launch" / "predictor.launch.py")
+
+
+def launched(launch_file: ModuleType, **given: str) -> Recorder:
+    """The node that the launch file starts when these arguments are given."""
+    *declared, function = launch_file.generate_launch_description().positional[0]
+    values = {argument.positional[0]: argument.named["default_value"] for argument in declared}
+    (node,) = function.named["function"](SimpleNamespace(launch_configurations=values | given))
+    return node
+
+
+def test_launch_file_declares_described_arguments(launch_file: ModuleType) -> None:
+    *declared, function = launch_file.generate_launch_description().positional[0]
+    assert [argument.positional for argument in declared] == [
+        ("model",), ("signals",), ("use_sim_time",), ("params_file",), ("namespace",), ("log_level",),
+    ]  # fmt: skip
+    assert all(argument.named["description"] for argument in declared)
+    assert type(function).__name__ == "OpaqueFunction"
+    default = declared[3].named["default_value"].positional[0]
+    assert default[0].positional == (PACKAGE,)
+    assert ROOT.joinpath(*default[1:]).is_file()
+
+
+def test_launch_file_starts_the_predictor_with_the_parameters_file(launch_file: ModuleType) -> None:
+    node = launched(launch_file).named
+    assert (node["package"], node["executable"], node["name"]) == (PACKAGE, "predictor", "dynssm")
+    parameters, overrides = node["parameters"]
+    assert parameters.positional == ("params_file",)
+    assert node["namespace"].positional == ("namespace",)
+    assert [item if isinstance(item, str) else item.positional for item in node["ros_arguments"]] == [
+        "--log-level",
+        ("log_level",),
+    ]
+    assert overrides == {}, "an argument that is not given must not hide the parameters file"
+
+
+def test_launch_arguments_override_the_parameters_file(launch_file: ModuleType) -> None:
+    node = launched(launch_file, model="out/model", signals="av21", use_sim_time="true").named
+    assert node["parameters"][1] == {"model": "out/model", "signals": "av21", "use_sim_time": True}
+    assert launched(launch_file, use_sim_time="false").named["parameters"][1] == {"use_sim_time": False}
