@@ -70,8 +70,8 @@ $(STAMP): setup.py constraints.txt pyproject.toml
 	fi
 	echo "== installing dynssm_ros with the versions of constraints.txt; the large parts are"
 	$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt -e '.[ros,test]' \
-	  | awk '/(Downloading|Processing|Using cached) .*MB\)/ {print "   " $$2, $$3, $$4; fflush()}
-	         /^Installing collected/ {print "== unpacking " NF - 3 " packages"; fflush()}'
+	  | awk '/Downloading .*[0-9][0-9]\.[0-9] MB\)/ {print "   " $$2, $$3, $$4; fflush()}
+	         /^Installing collected/ {print "== unpacking", NF - 3, "packages"; fflush()}'
 	touch $@
 
 # each recipe is one script

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -34,6 +34,24 @@ class Output(NamedTuple):
     """Normalised output of the residual network, Eq. (31), ``(B, 3)``."""
 
 
+class _Torch:
+    """torch as an array namespace whose arctan2 has a value, and a gradient, where the car stands.
+
+    ONNX has no arctan2; the exporter's own divides zero by zero there.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(torch, name)
+
+    @staticmethod
+    def arctan2(y: Tensor, x: Tensor) -> Tensor:
+        """0 at the origin, like any other."""
+        return torch.arctan2(y, torch.where((x == 0) & (y == 0), 1.0, x))
+
+
+_XP = _Torch()
+
+
 class PhysicsLayer(nn.Module):
     """f_dyn: the one single-track source under torch, from window rows and coefficients to the state increment."""
 
@@ -45,21 +63,21 @@ class PhysicsLayer(nn.Module):
 
     def forward(self, latest: Tensor, theta: Tensor) -> Tensor:
         """Raw last rows ``(B, 7)`` and coefficients ``(B, 17)`` to increments ``(B, 3)``."""
-        rows = latest.unbind(-1)
+        rows = latest.split(1, dim=-1)  # columns of shape (B, 1): the deployed graph need not take them apart and stack them
         now = State(*rows[:3])
         following, _ = step_with_memory(
-            torch,
+            _XP,
             now,
             initial_memory(self.effects, rows[3], rows[4]),
             applied_inputs(rows),
-            Coefficients(*theta.unbind(-1)),
+            Coefficients(*theta.split(1, dim=-1)),
             self.vehicle.constants,
             self.vehicle.sampling_time,
             self.effects,
             self.config.integrator,
             self.config.substeps,
         )
-        return torch.stack([after - before for after, before in zip(following, now, strict=True)], dim=-1)
+        return torch.cat([after - before for after, before in zip(following, now, strict=True)], dim=-1)
 
 
 class ParameterHead(nn.Module):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -39,11 +40,11 @@ class DiagonalSsm(nn.Module):
         return exponent, torch.expm1(exponent) / a
 
     def step_coefficients(self) -> tuple[Tensor, Tensor]:
-        """``(A_bar, B_bar)`` of the recurrence, shape ``(channels, states)``; constants once :meth:`freeze` was called."""
+        """``(A_bar, C B_bar)`` of the recurrence, ``(channels, states)``; constants once :meth:`freeze` was called."""
         if self.frozen is not None:
             return self.frozen
         exponent, gain = self.discretised()
-        return torch.exp(exponent), gain
+        return torch.exp(exponent), self.C * gain
 
     @torch.no_grad()
     def freeze(self) -> None:
@@ -64,14 +65,17 @@ class DiagonalSsm(nn.Module):
 
     def recurrence(self, u: Tensor) -> Tensor:
         """``(B, L, channels)`` to the same shape, step by step."""
+        return torch.cat(self.steps(u[..., None].split(1, dim=1)), dim=1).squeeze(-1)
+
+    def steps(self, u: Sequence[Tensor]) -> list[Tensor]:
+        """Inputs of successive instants, each ``(B, 1, channels, 1)``, to their outputs of the same shape."""
         decay, gain = self.step_coefficients()
-        driven = u[..., None] * gain
-        x = driven[:, 0]
-        states = [x]
-        for k in range(1, u.shape[1]):
-            x = decay * x + driven[:, k]
-            states.append(x)
-        return (torch.stack(states, dim=1) * self.C).sum(-1) + self.D * u
+        x = u[0]
+        outputs = []
+        for k, now in enumerate(u):
+            x = decay * x + now if k else now  # the state in units of B_bar: one operation less a step
+            outputs.append((x * gain).sum(-1, keepdim=True) + self.D[:, None] * now)
+        return outputs
 
 
 class SsmEncoder(nn.Module):
@@ -94,10 +98,18 @@ class SsmEncoder(nn.Module):
     def forward(self, window: Tensor) -> Tensor:
         """``(B, H, inputs)`` normalised to ``(B, channels)``."""
         u: Tensor = self.project(window)
+        if self.recurrent:
+            return self._last(u)
         for layer in self.layers:
-            assert isinstance(layer, DiagonalSsm)
-            u = u + functional.silu(layer.recurrence(u) if self.recurrent else layer.convolution(u))
+            u = u + functional.silu(layer.convolution(u))
         return u[:, -1]
+
+    def _last(self, u: Tensor) -> Tensor:
+        """The same by the recurrence; instants are kept apart, so that a graph of it computes only what the last needs."""
+        instants = list(u[..., None].split(1, dim=1))
+        for layer in self.layers:
+            instants = [u_k + functional.silu(y_k) for u_k, y_k in zip(instants, layer.steps(instants), strict=True)]
+        return instants[-1].flatten(1)
 
 
 class GruEncoder(nn.Module):

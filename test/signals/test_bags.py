@@ -228,7 +228,7 @@ def test_wherever_a_file_is_cut_the_messages_before_the_cut_are_recovered(
         (bag / "metadata.yaml").unlink()
     whole, file, counts = read(bag)[0], storage(bag), []
     content = file.read_bytes()
-    for share in np.linspace(0.0, 0.995, 26):
+    for share in np.linspace(0.0, 0.995, 5 if metadata else 26):
         file.write_bytes(content[: int(share * len(content))])
         found, notes = read_or_refused(bag)
         assert any(said in notes[-1] for said in outcome(file, len(found)))
@@ -237,7 +237,7 @@ def test_wherever_a_file_is_cut_the_messages_before_the_cut_are_recovered(
     assert counts == sorted(counts)
     assert counts[0] == 0
     if "file" not in form:  # zstd gives back whole blocks of 128 kB, and this is all in one
-        assert counts[13] > (0 if "chunks" in form else 100)
+        assert counts[len(counts) // 2] > (0 if "chunks" in form else 100)
         assert counts[-1] > 400
 
 
@@ -490,7 +490,7 @@ def test_flipped_bytes_never_raise_anything_but_a_bag_error(make_bag: Any, drive
     bag = make_bag(drive(25), "bag", *STORED[form])
     file, chance = storage(bag), random.Random(11)
     content = file.read_bytes()
-    for _ in range(25):
+    for _ in range(15):
         damaged = bytearray(content)
         for _ in range(chance.choice([1, 1, 3, 30])):
             damaged[chance.randrange(len(damaged))] = chance.randrange(256)
