@@ -34,9 +34,9 @@ def config_directories() -> Iterator[Path]:
     """
     package = Path(__file__).resolve().parent
     yield package.parent / "config"
-    ament = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    for prefix in (*package.parents, sysconfig.get_path("data"), *filter(None, ament)):
-        yield Path(prefix) / "share" / PACKAGE / "config"
+    ament = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
+    for prefix in (*package.parents, Path(sysconfig.get_path("data")), *ament):
+        yield prefix / "share" / PACKAGE / "config"
 
 
 def config_root() -> Path:
@@ -58,11 +58,11 @@ def find_config(kind: str, name_or_path: str | Path) -> Path:
         ConfigurationError: neither a file nor a shipped name.
     """
     path = Path(name_or_path)
-    if path.is_file():
+    if os.path.isfile(path):  # unlike Path.is_file, False where looking is forbidden or the name impossible
         return path
     shipped = config_root() / kind
     candidate = shipped / f"{name_or_path}.yaml"
-    if candidate.is_file():
+    if os.path.isfile(candidate):
         return candidate
     names = ", ".join(sorted(p.stem for p in shipped.glob("*.yaml")))
     raise ConfigurationError(f"{kind}: '{name_or_path}' is neither a file nor a shipped name ({names})")

@@ -83,14 +83,10 @@ def time_predictions(artifact: Artifact, drive: Recording, calls: int) -> tuple[
 
     Both are timed in turn in one run, because machines are noisy.
     """
-    import torch
+    from dynssm_ros.learning.export import eager_prediction
 
-    from dynssm_ros.learning.export import load_torch
-
-    torch.set_num_threads(1)
-    eager = load_torch(artifact)
+    run_eager = eager_prediction(artifact)
     predictor = Predictor(OnnxModel(artifact), load_signal_map("default"))
-    window = torch.zeros(1, artifact.card.window, 7) + torch.tensor(artifact.card.normalisation.input_mean)
     samples = _samples(drive)
 
     def predict() -> bool:
@@ -103,8 +99,7 @@ def time_predictions(artifact: Artifact, drive: Recording, calls: int) -> tuple[
 
     def run_torch() -> None:
         begin = time.perf_counter()
-        with torch.inference_mode():
-            eager(window)
+        run_eager()
         times[1].append(time.perf_counter() - begin)
 
     times: tuple[list[float], list[float]] = ([], [])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import typer
 from rich.console import Console
@@ -27,20 +27,28 @@ CommandsOption = Annotated[
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the result as JSON.", dir_okay=False)]
 
 
+class Update(Protocol):
+    """Tells a progress bar how much is done, of how much, and a few words about it."""
+
+    def __call__(self, done: int, total: int, words: str = "") -> None:
+        """Shows it."""
+
+
 @contextmanager
-def progress_bar(description: str) -> Iterator[Callable[[int, int], None]]:
-    """Shows a progress bar on stderr if that is a terminal; yields the function that is told (done, total)."""
+def progress_bar(description: str) -> Iterator[Update]:
+    """Shows a progress bar on stderr if that is a terminal; yields the function that is told of progress."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.percentage:3.0f} %"),
+        TextColumn("{task.fields[words]}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
-        task = progress.add_task(description, total=None)
+        task = progress.add_task(description, total=None, words="")
 
-        def update(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
+        def update(done: int, total: int, words: str = "") -> None:
+            progress.update(task, completed=done, total=total, words=words)
 
         yield update

@@ -37,9 +37,9 @@ def extract(
     signal_map = load_signal_map(signals).with_commands(commands)
     with progress_bar("reading") as progress:
         recording = extract_bags(bags, signal_map, rate, drop_bad, progress)
-    recording.save(out)
     if bag is not None:
         recording_to_bag(recording, bag)
+    recording.save(out)
     for note in recording.info.notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     segments = int(recording.segment[-1]) + 1

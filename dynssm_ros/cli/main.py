@@ -26,6 +26,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+_UsageProblem = typer.BadParameter.__mro__[2]  # click's base of all usage errors, wherever typer keeps its click
+
 for command in (demo, simulate, extract, calibrate, train, evaluate, replay, bench):
     app.command()(command)
 
@@ -42,9 +44,24 @@ def _options(version: bool = typer.Option(False, "--version", callback=_print_ve
 
 
 def main() -> None:
-    """Runs the command line."""
+    """Runs the command line; whatever is wrong with what the user gave is one line and exit status 1."""
     try:
-        app()
+        status = app(standalone_mode=False)
     except UserError as error:
-        errors.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True, highlight=False)
-        sys.exit(1)
+        _fail(str(error))
+    except _UsageProblem as error:
+        _fail(error.format_message())  # type: ignore[attr-defined]
+    except (KeyboardInterrupt, typer.Abort):
+        sys.exit(130)
+    else:
+        sys.exit(status if isinstance(status, int) else 0)
+
+
+def _fail(words: str) -> None:
+    line = " ".join(words.split())
+    errors.print(f"[red]error:[/red] {escape(line)}", soft_wrap=True, highlight=False)
+    sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -20,7 +20,9 @@ def replay(
     model: Annotated[Path, typer.Option(help="Model folder.")],
     out: Annotated[Path, typer.Option(help="rosbag2 folder to write.")],
     signals: Annotated[str, typer.Option(help="Signal map: name of a shipped one or a file.")] = "default",
-    max_age: Annotated[float, typer.Option(help="Oldest actuator sample that a prediction may rest on (s).")] = 0.2,
+    max_age: Annotated[
+        float, typer.Option(help="Oldest actuator sample that a prediction may rest on (s).", min=0.0)
+    ] = 0.2,
 ) -> None:
     """Predict offline what the node would have published for a bag."""
     predictor = Predictor(OnnxModel(open_artifact(model)), load_signal_map(signals), max_age)

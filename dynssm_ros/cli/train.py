@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from dynssm_ros.cli.console import CommandsOption, VehicleOption, console, errors
-from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.cli.console import CommandsOption, VehicleOption, console, errors, progress_bar
+from dynssm_ros.files import replacing
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.vehicle import load_vehicle
 
@@ -29,43 +28,30 @@ def train(
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
 ) -> None:
     """Train a model on recordings and write its folder: card, weights, ONNX, metrics, loss picture."""
-    import torch
-
     from dynssm_ros.evaluation.figures import loss_components
     from dynssm_ros.learning.configuration import load_model_config
-    from dynssm_ros.learning.export import save_artifact
+    from dynssm_ros.learning.export import check_replaceable, save_artifact
+    from dynssm_ros.learning.training import check_device
     from dynssm_ros.learning.training import train as fit
 
-    if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
-        raise ConfigurationError(
-            f"--device {device}: not available here; expected cpu" + (" or cuda" if torch.cuda.is_available() else "")
-        )
+    check_device(device)
+    out = out if out.name else out.absolute()  # "." has no name to put the checkpoint beside
+    check_replaceable(out)
     config = load_model_config(model)
     given = {key: value for key, value in (("seed", seed), ("epochs", epochs)) if value is not None}
     config = config.model_copy(update={"training": config.training.model_copy(update=given)})
     data = concatenate([Recording.load(path).with_commands(commands).split_last(holdout)[0] for path in recordings])
     checkpoint = out.with_name(f"{out.name}.checkpoint.pt")
-    columns = (
-        TextColumn("training"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total} epochs, {task.description}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
-        task = progress.add_task("", total=config.training.epochs)
-
-        def show(done: int, total: int, words: str) -> None:
-            progress.update(task, completed=done, total=total, description=words)
-
+    with progress_bar("training") as progress:
         try:
-            trained = fit(data, config, load_vehicle(vehicle), checkpoint, device, show)
+            trained = fit(data, config, load_vehicle(vehicle), checkpoint, device, progress)
         except KeyboardInterrupt:
             errors.print(f"interrupted; the same command continues from {checkpoint.name}")
             raise typer.Exit(130) from None
     artifact = save_artifact(trained, out, {"holdout": holdout, "device": device})
     if trained.history:
-        loss_components(trained.history, trained.best_epoch).savefig(out / "losses.png", dpi=150)
+        with replacing(out / "losses.png") as aside:
+            loss_components(trained.history, trained.best_epoch).savefig(aside, dpi=150)
     checkpoint.unlink(missing_ok=True)
     if trained.resumed_from:
         console.print(f"continued from epoch {trained.resumed_from}")

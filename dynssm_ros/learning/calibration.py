@@ -141,38 +141,23 @@ def calibrate(
     Raises:
         RecordingError: another sampling time than the vehicle's, or too few rows.
     """
-    if abs(recording.T_s - vehicle.sampling_time) > 1e-9:
-        raise RecordingError(
-            f"recording {', '.join(recording.info.source)}: sampling time {recording.T_s:g} s, but vehicle "
-            f"{vehicle.name} has {vehicle.sampling_time:g} s; extract with --rate {1 / vehicle.sampling_time:g}"
-        )
+    recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
     errors = PredictionErrors(recording, vehicle, steps, min_speed)
     lower, width = vehicle.lower, vehicle.upper - vehicle.lower
-    scale = np.maximum(errors.scale, 1e-12)
-
-    def residuals(p: Vector) -> Vector:
-        weighted: Vector = (errors(lower + p * width) / scale[:, :, None]).ravel()
-        return np.nan_to_num(weighted, copy=False, nan=1e6, posinf=1e6, neginf=-1e6)
-
-    random = np.random.default_rng(seed)
-    points = [(vehicle.nominal - lower) / width, np.full(len(lower), 0.5)]
-    points += [random.uniform(0.1, 0.9, len(lower)) for _ in range(starts - 2)]
+    weighted = _Weighted(errors, lower, width)
     fits = []
-    for number, point in enumerate(points[:starts], 1):
-        inside = np.clip(point, 1e-6, 1 - 1e-6)
-        fits.append(_fit(residuals, inside, loss, tolerance=1e-5, evaluations=40))
+    for number, point in enumerate(_starting_points(vehicle, starts, seed), 1):
+        fits.append(_fit(weighted, point, loss, tolerance=1e-5, evaluations=40))
         if progress is not None:
             progress(number, starts + 1)
-    # weigh each channel by its own error now that it is known, and polish
     best = min(fits, key=lambda fit: float(fit.cost)).x
-    left = errors(lower + best * width)
-    scale = np.maximum(1.4826 * np.median(np.abs(left), axis=2), 1e-9 * errors.scale + 1e-15)
-    final = _fit(residuals, best, loss, tolerance=1e-15, evaluations=100)
+    weighted.reweigh(best)
+    final = _fit(weighted, best, loss, tolerance=1e-15, evaluations=100)
     if progress is not None:
         progress(starts + 1, starts + 1)
     theta = lower + final.x * width
     free = (final.x > _ON_BOUND) & (final.x < 1 - _ON_BOUND)
-    covariance, unidentified = _knowledge(final.jac, residuals(final.x), np.tile(errors.blocks, 3 * steps), free)
+    covariance, unidentified = _knowledge(final.jac, weighted(final.x), np.tile(errors.blocks, 3 * steps), free)
     std = np.where(free, np.sqrt(np.diag(covariance)), np.sqrt(1 / _UNIFORM_PRECISION)) * width
     return Calibration(
         vehicle.with_nominal(np.clip(theta, vehicle.lower, vehicle.upper), std),
@@ -185,6 +170,32 @@ def calibrate(
         len(errors.starts),
         steps,
     )
+
+
+class _Weighted:
+    """Prediction errors in units of a scale per channel and step, as a function of the unit coordinates."""
+
+    def __init__(self, errors: PredictionErrors, lower: Vector, width: Vector) -> None:
+        self._errors, self._lower, self._width = errors, lower, width
+        self._scale = np.maximum(errors.scale, 1e-12)
+
+    def __call__(self, p: Vector) -> Vector:
+        weighted: Vector = (self._errors(self._lower + p * self._width) / self._scale[:, :, None]).ravel()
+        return np.nan_to_num(weighted, copy=False, nan=1e6, posinf=1e6, neginf=-1e6)
+
+    def reweigh(self, p: Vector) -> None:
+        """Weighs each channel by its own error, now that it is known; the floor keeps exact data finite."""
+        left = self._errors(self._lower + p * self._width)
+        floor = 1e-9 * self._errors.scale + 1e-15
+        self._scale = np.maximum(1.4826 * np.median(np.abs(left), axis=2), floor)
+
+
+def _starting_points(vehicle: Vehicle, count: int, seed: int) -> list[Vector]:
+    """The nominal values, the middle of the bounds, then random points, in unit coordinates off the bounds."""
+    random = np.random.default_rng(seed)
+    nominal = (vehicle.nominal - vehicle.lower) / (vehicle.upper - vehicle.lower)
+    points = [np.clip(nominal, 1e-6, 1 - 1e-6), np.full(len(nominal), 0.5)]
+    return [*points, *(random.uniform(0.1, 0.9, len(nominal)) for _ in range(count - 2))][:count]
 
 
 def _fit(residuals: Callable[[Vector], Vector], start: Vector, loss: Loss, tolerance: float, evaluations: int) -> Any:

@@ -65,7 +65,7 @@ class PhysicsConfig(StrictModel):
 
 
 class LossConfig(StrictModel):
-    """Weights and switches of the objective, Eq. (25)."""
+    """Weights and switches of the objective, Eq. (24)."""
 
     scale: Literal["target", "increment"] = Field(
         default="increment", description="s_y: standard deviation of the target state (paper) or of its increment"

@@ -70,8 +70,8 @@ def normalisation(recording: Recording, windows: Windows) -> Normalisation:
         RecordingError: a state never changes.
     """
     ends = windows.ends.numpy()
-    rows = recording.matrix[ends]
-    increments = recording.matrix[ends + 1, :3] - rows[:, :3]
+    rows, targets = recording.matrix[ends], recording.matrix[ends + 1, :3]
+    increments = targets - rows[:, :3]
     std = rows.std(axis=0)
     for name, spread in zip(("v_x", "v_y", "omega"), increments.std(axis=0), strict=True):
         if spread < _CONSTANT:
@@ -81,6 +81,6 @@ def normalisation(recording: Recording, windows: Windows) -> Normalisation:
     return Normalisation(
         input_mean=tuple(rows.mean(axis=0).tolist()),
         input_std=tuple(np.where(std < _CONSTANT, 1.0, std).tolist()),
-        state_scale=tuple(std[:3].tolist()),
+        state_scale=tuple(targets.std(axis=0).tolist()),
         increment_scale=tuple(increments.std(axis=0).tolist()),
     )

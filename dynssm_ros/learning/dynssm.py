@@ -23,30 +23,29 @@ class Output(NamedTuple):
     """What a model computes for ``B`` windows; all increments are ``s_{t+1} - s_t``."""
 
     increment: Tensor
-    """Final prediction, Eq. (33), as an increment ``(B, 3)``."""
+    """Final prediction, Eq. (30), as an increment ``(B, 3)``."""
     physics: Tensor | None
-    """The physics' increment, Eq. (29), ``(B, 3)``."""
+    """The physics' increment, Eq. (26), ``(B, 3)``."""
     theta: Tensor | None
-    """Adapted coefficients, Eq. (21), ``(B, 17)``."""
+    """Adapted coefficients, Eq. (18), ``(B, 17)``."""
     deviation: Tensor | None
-    """Normalised parameter deviation, Eq. (23), ``(B, 17)``."""
+    """Normalised parameter deviation, Eq. (20), ``(B, 17)``."""
     correction: Tensor | None
-    """Normalised output of the residual network, Eq. (31), ``(B, 3)``."""
+    """Normalised output of the residual network, Eq. (28), ``(B, 3)``."""
 
 
 class _Torch:
-    """torch as an array namespace whose arctan2 has a value, and a gradient, where the car stands.
-
-    ONNX has no arctan2; the exporter's own divides zero by zero there.
-    """
+    """torch as an array namespace, with an arctan2 that ONNX can express."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(torch, name)
 
     @staticmethod
     def arctan2(y: Tensor, x: Tensor) -> Tensor:
-        """0 at the origin, like any other."""
-        return torch.arctan2(y, torch.where((x == 0) & (y == 0), 1.0, x))
+        """As torch's. Exported it is for ``x >= 0``, cheap and defined at standstill; the exporter's own divides 0 by 0."""
+        if torch.onnx.is_in_onnx_export():
+            return torch.arctan(y / x.clamp(min=torch.finfo(x.dtype).tiny))
+        return torch.arctan2(y, x)
 
 
 _XP = _Torch()
@@ -63,14 +62,15 @@ class PhysicsLayer(nn.Module):
 
     def forward(self, latest: Tensor, theta: Tensor) -> Tensor:
         """Raw last rows ``(B, 7)`` and coefficients ``(B, 17)`` to increments ``(B, 3)``."""
-        rows = latest.split(1, dim=-1)  # columns of shape (B, 1): the deployed graph need not take them apart and stack them
+        # columns of shape (B, 1), which the deployed graph need not squeeze and stack again
+        rows = torch.split(latest, 1, dim=-1)
         now = State(*rows[:3])
         following, _ = step_with_memory(
             _XP,
             now,
             initial_memory(self.effects, rows[3], rows[4]),
             applied_inputs(rows),
-            Coefficients(*theta.split(1, dim=-1)),
+            Coefficients(*torch.split(theta, 1, dim=-1)),
             self.vehicle.constants,
             self.vehicle.sampling_time,
             self.effects,
@@ -81,7 +81,7 @@ class PhysicsLayer(nn.Module):
 
 
 class ParameterHead(nn.Module):
-    """Bounded adaptation: theta = clip(theta_0 + alpha tanh(g(z, h)) range), Eq. (19) to (21)."""
+    """Bounded adaptation: theta = clip(theta_0 + alpha tanh(g(z, h)) range), Eq. (18)."""
 
     lower: Tensor
     upper: Tensor
@@ -104,13 +104,13 @@ class ParameterHead(nn.Module):
         """``z_t`` and the latest normalised input to ``(theta, normalised deviation, c_t)``."""
         conditioned = self.condition(torch.cat([latent, latest], dim=-1))
         admissible = self.upper - self.lower
-        shift = self.alpha * torch.tanh(self.deviate(conditioned)) * admissible
+        shift = torch.tanh(self.deviate(conditioned)) * (self.alpha * admissible)
         theta = torch.clamp(self.nominal + shift, self.lower, self.upper)
         return theta, (theta - self.nominal) / admissible, conditioned
 
 
 class GatedResidual(nn.Module):
-    """lambda_r s_delta * sigmoid(gate(q)) * r(q), Eq. (30) to (32)."""
+    """lambda_r s_delta * sigmoid(gate(q)) * r(q), Eq. (28) and (29)."""
 
     def __init__(self, features: int, hidden: tuple[int, ...], scale: float) -> None:
         super().__init__()
@@ -183,7 +183,7 @@ class DynSSM(nn.Module):
     def _residual_input(
         self, conditioned: Tensor, deviation: Tensor | None, raw: Tensor, latest: Tensor, increment: Tensor | None
     ) -> Tensor:
-        """``q_t = [c_t, normalised deviation, h_t, physics state, physics increment]``, Eq. (30)."""
+        """``q_t = [c_t, normalised deviation, h_t, physics state, physics increment]``, Eq. (27)."""
         assert self.config.residual is not None
         standardised = self.config.residual.inputs == "normalised"
         parts = [conditioned, latest if standardised else raw]

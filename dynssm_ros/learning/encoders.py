@@ -40,11 +40,11 @@ class DiagonalSsm(nn.Module):
         return exponent, torch.expm1(exponent) / a
 
     def step_coefficients(self) -> tuple[Tensor, Tensor]:
-        """``(A_bar, C B_bar)`` of the recurrence, ``(channels, states)``; constants once :meth:`freeze` was called."""
+        """``(A_bar, C B_bar)`` of the recurrence, ``(states, channels)``; constants once :meth:`freeze` was called."""
         if self.frozen is not None:
             return self.frozen
         exponent, gain = self.discretised()
-        return torch.exp(exponent), self.C * gain
+        return torch.exp(exponent).T.contiguous(), (self.C * gain).T.contiguous()
 
     @torch.no_grad()
     def freeze(self) -> None:
@@ -53,28 +53,36 @@ class DiagonalSsm(nn.Module):
 
     def convolution(self, u: Tensor) -> Tensor:
         """``(B, L, channels)`` to the same shape, by a causal convolution with the impulse response."""
-        length = u.shape[1]
-        exponent, b = self.discretised()
-        powers = torch.exp(exponent[:, :, None] * torch.arange(length, device=u.device))
-        kernel = torch.einsum("cn,cnl->cl", self.C * b, powers)
+        kernel, step = self.response(u.shape[1]), torch.arange(u.shape[1], device=u.device)
         # windows are short: the convolution is a product with the lower-triangular Toeplitz matrix of the response
-        lag = torch.arange(length, device=u.device)[:, None] - torch.arange(length, device=u.device)
+        lag = step[:, None] - step
         toeplitz = kernel[:, lag.clamp(min=0)] * (lag >= 0)
         y: Tensor = torch.einsum("cts,bsc->btc", toeplitz, u) + self.D * u
         return y
 
+    def convolved_last(self, u: Tensor) -> Tensor:
+        """The last instant of :meth:`convolution`, ``(B, channels)``."""
+        y: Tensor = (self.response(u.shape[1]).flip(1).T * u).sum(1) + self.D * u[:, -1]
+        return y
+
+    def response(self, length: int) -> Tensor:
+        """Impulse response without the feedthrough ``D``, ``(channels, length)``."""
+        exponent, b = self.discretised()
+        powers = torch.exp(exponent[:, :, None] * torch.arange(length, device=exponent.device))
+        return torch.einsum("cn,cnl->cl", self.C * b, powers)
+
     def recurrence(self, u: Tensor) -> Tensor:
         """``(B, L, channels)`` to the same shape, step by step."""
-        return torch.cat(self.steps(u[..., None].split(1, dim=1)), dim=1).squeeze(-1)
+        return torch.cat(self.steps(torch.split(u, 1, dim=1)), dim=1)
 
     def steps(self, u: Sequence[Tensor]) -> list[Tensor]:
-        """Inputs of successive instants, each ``(B, 1, channels, 1)``, to their outputs of the same shape."""
+        """Inputs of successive instants, each ``(B, 1, channels)``, to their outputs of the same shape."""
         decay, gain = self.step_coefficients()
-        x = u[0]
+        x = torch.zeros_like(decay)
         outputs = []
-        for k, now in enumerate(u):
-            x = decay * x + now if k else now  # the state in units of B_bar: one operation less a step
-            outputs.append((x * gain).sum(-1, keepdim=True) + self.D[:, None] * now)
+        for now in u:
+            x = decay * x + now  # (B, states, channels), in units of B_bar: one operation less a step
+            outputs.append((x * gain).sum(1, keepdim=True) + self.D * now)
         return outputs
 
 
@@ -91,8 +99,7 @@ class SsmEncoder(nn.Module):
     def for_deployment(self) -> None:
         """Switches to the recurrence with constant coefficients."""
         self.recurrent = True
-        for layer in self.layers:
-            assert isinstance(layer, DiagonalSsm)
+        for layer in self._ssm_layers():
             layer.freeze()
 
     def forward(self, window: Tensor) -> Tensor:
@@ -100,16 +107,20 @@ class SsmEncoder(nn.Module):
         u: Tensor = self.project(window)
         if self.recurrent:
             return self._last(u)
-        for layer in self.layers:
+        *earlier, last = self._ssm_layers()
+        for layer in earlier:
             u = u + functional.silu(layer.convolution(u))
-        return u[:, -1]
+        return u[:, -1] + functional.silu(last.convolved_last(u))
 
     def _last(self, u: Tensor) -> Tensor:
         """The same by the recurrence; instants are kept apart, so that a graph of it computes only what the last needs."""
-        instants = list(u[..., None].split(1, dim=1))
-        for layer in self.layers:
+        instants = list(torch.split(u, 1, dim=1))
+        for layer in self._ssm_layers():
             instants = [u_k + functional.silu(y_k) for u_k, y_k in zip(instants, layer.steps(instants), strict=True)]
-        return instants[-1].flatten(1)
+        return instants[-1].squeeze(1)
+
+    def _ssm_layers(self) -> list[DiagonalSsm]:
+        return [layer for layer in self.layers if isinstance(layer, DiagonalSsm)]
 
 
 class GruEncoder(nn.Module):
@@ -127,7 +138,7 @@ class GruEncoder(nn.Module):
 
 
 class Fusion(nn.Module):
-    """phi_fuse: both memories and the latest normalised input to the latent memory ``z_t``, Eq. (18)."""
+    """phi_fuse: both memories and the latest normalised input to the latent memory ``z_t``, Eq. (17)."""
 
     def __init__(self, inputs: int, ssm: SsmConfig | None, gru: GruConfig | None, config: FusionConfig) -> None:
         super().__init__()

@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import warnings
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
 
@@ -24,7 +25,17 @@ from dynssm_ros.learning.dataset import Windows
 from dynssm_ros.learning.dynssm import DynSSM
 from dynssm_ros.learning.ridge import Ridge
 from dynssm_ros.learning.training import Trained
-from dynssm_ros.runtime.artifact import METRICS, ONNX, WEIGHTS, Artifact, ModelCard, checksum, open_artifact, write_card
+from dynssm_ros.runtime.artifact import (
+    CARD,
+    METRICS,
+    ONNX,
+    WEIGHTS,
+    Artifact,
+    ModelCard,
+    checksum,
+    open_artifact,
+    write_card,
+)
 
 TOLERANCE = 1e-5
 """Largest difference between ONNX and torch, in units of each state's scale."""
@@ -54,8 +65,7 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
     Raises:
         ArtifactError: ``out`` is something else, or the exported graph differs from the trained model.
     """
-    if out.exists() and not (out / "model.yaml").is_file():
-        raise ArtifactError(f"{out}: exists and is not a model folder; not replaced")
+    check_replaceable(out)
     model, config = trained.model, trained.config
     sample = _sample_windows(trained)
     with replacing(out) as folder:
@@ -92,6 +102,16 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
         )
         write_card(card, folder)
     return open_artifact(out)
+
+
+def check_replaceable(out: Path) -> None:
+    """Checks that a model folder may be written to ``out``, before a training is spent on it.
+
+    Raises:
+        ArtifactError: something else is there.
+    """
+    if out.exists() and not (out / CARD).is_file():
+        raise ArtifactError(f"{out}: exists and is not a model folder; not replaced")
 
 
 def export_onnx(model: nn.Module, sample: Tensor, file: Path) -> None:
@@ -158,6 +178,19 @@ def load_torch(artifact: Artifact) -> nn.Module:
     )
     model.load_state_dict(load_file(artifact.weights))
     return model.eval()
+
+
+def eager_prediction(artifact: Artifact) -> Callable[[], None]:
+    """One prediction by the model as trained, in eager torch on one core: what ONNX Runtime is compared with."""
+    torch.set_num_threads(1)
+    model = load_torch(artifact)
+    window = torch.tensor(artifact.card.normalisation.input_mean).expand(1, artifact.card.window, -1).contiguous()
+
+    def predict() -> None:
+        with torch.inference_mode():
+            model(window)
+
+    return predict
 
 
 def _sample_windows(trained: Trained, count: int = 256) -> Tensor:

@@ -1,4 +1,4 @@
-"""The physics-informed objective, term by term, Eq. (22) to (27)."""
+"""The physics-informed objective, term by term, Eq. (19) to (24)."""
 
 from __future__ import annotations
 

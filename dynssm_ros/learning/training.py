@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import math
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dynssm_ros.errors import RecordingError
+from dynssm_ros import __version__
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.files import replacing
 from dynssm_ros.learning.configuration import LossConfig, ModelConfig
 from dynssm_ros.learning.dataset import Windows, normalisation, split_windows
@@ -68,12 +71,9 @@ def train(
 
     Raises:
         RecordingError: another sampling time than the vehicle's, or too little data.
+        ConfigurationError: the training diverges at once.
     """
-    if abs(recording.T_s - vehicle.sampling_time) > 1e-9:
-        raise RecordingError(
-            f"recording {', '.join(recording.info.source)}: sampling time {recording.T_s:g} s, but vehicle "
-            f"{vehicle.name} has {vehicle.sampling_time:g} s; extract with --rate {1 / vehicle.sampling_time:g}"
-        )
+    recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
     torch.set_num_threads(1)  # batches are small: more threads wait for each other longer than they compute
     torch.manual_seed(config.training.seed)
     training, validation = split_windows(recording, config.H, config.training)
@@ -91,6 +91,17 @@ def train(
         config, vehicle, recording, model, scale, run.history, run.best_epoch, validation_rmse(model, validation),
         (len(training), len(validation)), run.resumed_from,
     )  # fmt: skip
+
+
+def check_device(device: str) -> None:
+    """Checks that torch can compute on ``device``.
+
+    Raises:
+        ConfigurationError: it cannot; names what there is.
+    """
+    available = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    if device not in available:
+        raise ConfigurationError(f"--device {device}: not available here; expected {' or '.join(available)}")
 
 
 @torch.no_grad()
@@ -134,6 +145,7 @@ class _Optimisation:
         device: torch.device,
     ) -> None:
         assert config.loss is not None
+        self.name = config.name
         self.loss: LossConfig = config.loss
         self.settings = config.training
         self.model = DynSSM(config, vehicle, scale).to(device)
@@ -152,12 +164,18 @@ class _Optimisation:
         self.state = _State(history={f"{part}/{term}": [] for part in ("train", "validation") for term in COMPONENTS})
 
     def run(self, progress: Progress | None) -> _Run:
-        """Trains until the validation loss stops falling; returns the best model."""
+        """Trains until the validation loss stops falling; returns the best model.
+
+        Raises:
+            ConfigurationError: it diverges before there is a best one.
+        """
         resumed_from = self._resume()
         state, settings = self.state, self.settings
         while state.epoch < settings.epochs and state.epoch - state.best_epoch < settings.patience:
             trained = self._epoch()
             validated = self._validate()
+            if not math.isfinite(validated["prediction"]):  # what has diverged stays so
+                break
             state.epoch += 1
             for part, terms in (("train", trained), ("validation", validated)):
                 for term, value in terms.items():
@@ -173,6 +191,11 @@ class _Optimisation:
                     settings.epochs,
                     f"validation {validated['prediction']:.4f}, best {state.best_loss:.4f}",
                 )
+        if not state.best:
+            raise ConfigurationError(
+                f"model {self.name}: diverged in the first epoch; expected a smaller learning_rate than "
+                f"{settings.learning_rate:g}"
+            )
         self.model.load_state_dict(state.best)
         return _Run(self.model, state.history, state.best_epoch, resumed_from)
 
@@ -217,10 +240,12 @@ class _Optimisation:
         if not self.checkpoint.is_file():
             return 0
         try:
+            with zipfile.ZipFile(self.checkpoint) as archive:
+                damaged = archive.testzip()  # torch does not compare the checksums that it writes
             content = torch.load(self.checkpoint, map_location=self.training.ends.device, weights_only=True)
         except Exception:  # whatever a foreign or damaged file raises: it is not ours to continue
             return 0
-        if not isinstance(content, dict) or content.get("identity") != self.identity:
+        if damaged or not isinstance(content, dict) or content.get("identity") != self.identity:
             return 0
         self.model.load_state_dict(content["model"])
         self.optimiser.load_state_dict(content["optimiser"])
@@ -231,8 +256,8 @@ class _Optimisation:
 
 
 def _identity(config: ModelConfig, vehicle: Vehicle, training: Windows) -> str:
-    """Names a training by its data, car and configuration, so that a checkpoint is never continued for another."""
-    digest = hashlib.sha256(config.model_dump_json().encode())
+    """Names a training by code, data, car and configuration, so that a checkpoint is never continued for another."""
+    digest = hashlib.sha256(f"{__version__} {torch.__version__} {config.model_dump_json()}".encode())
     digest.update(vehicle.model_dump_json().encode())
     digest.update(np.ascontiguousarray(training.matrix.numpy()).tobytes())
     digest.update(training.ends.numpy().tobytes())

@@ -48,7 +48,7 @@ class Normalisation(StrictModel):
 class ModelCard(StrictModel):
     """``model.yaml``: all that is needed to use the model, and how it came about."""
 
-    format_version: int = FORMAT_VERSION
+    format_version: int = Field(default=FORMAT_VERSION, ge=1)
     name: str
     kind: Literal["dynssm", "ridge"] = Field(description="which model class the weights belong to")
     architecture: dict[str, Any] = Field(description="the model configuration it was trained from")
@@ -67,9 +67,11 @@ class ModelCard(StrictModel):
     checksums: dict[str, str] = Field(description="SHA-256 of the other files")
 
     @model_validator(mode="after")
-    def _same_columns(self) -> ModelCard:
+    def _consistent(self) -> ModelCard:
         if self.columns != WINDOW_COLUMNS:
             raise ValueError(f"columns {self.columns} are not {WINDOW_COLUMNS}")
+        if set(self.checksums) != {WEIGHTS, ONNX, METRICS}:
+            raise ValueError(f"checksums {sorted(self.checksums)} are not those of {WEIGHTS}, {ONNX} and {METRICS}")
         return self
 
 
@@ -105,7 +107,11 @@ def open_artifact(path: str | Path) -> Artifact:
             raise ArtifactError(f"{path}: incomplete model folder, {name} is missing")
     card = read_card(path)
     for name, expected in card.checksums.items():
-        if checksum(path / name) != expected:
+        try:
+            found = checksum(path / name)
+        except OSError as error:
+            raise ArtifactError(f"{path / name}: cannot be read ({error.strerror})") from error
+        if found != expected:
             raise ArtifactError(f"{path / name}: does not match its checksum in {CARD}; damaged or exchanged")
     _check_weights(path / WEIGHTS)
     return Artifact(path, card)

@@ -11,7 +11,7 @@ import onnxruntime as ort
 
 from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
-from dynssm_ros.signals.inputs import applied_inputs
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle import Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_memory
@@ -108,6 +108,9 @@ class OnnxModel:
     """A trained model, run by ONNX Runtime on one core.
 
     The graph computes the increment ``s_{t+1} - s_t`` in single precision; it is added to the state in double.
+
+    Raises:
+        ArtifactError: ONNX Runtime refuses the graph, or it is not one of such a model.
     """
 
     def __init__(self, artifact: Artifact) -> None:
@@ -129,6 +132,12 @@ class OnnxModel:
         except Exception as error:  # onnxruntime raises its own unrelated classes
             raise ArtifactError(f"{artifact.onnx}: ONNX Runtime refuses it ({' '.join(str(error).split())})") from error
         self._outputs = [output.name for output in self._session.get_outputs()]
+        inputs = [(each.name, each.shape[1:]) for each in self._session.get_inputs()]
+        if inputs != [("window", [self.H, len(WINDOW_COLUMNS)])] or "increment" not in self._outputs:
+            raise ArtifactError(
+                f"{artifact.onnx}: maps {inputs} to {self._outputs}; expected a window of {self.H} rows and "
+                f"{len(WINDOW_COLUMNS)} columns to increment, theta, physics"
+            )
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Runs the graph on ``windows``."""

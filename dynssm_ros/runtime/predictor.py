@@ -6,6 +6,8 @@ predicts one sampling time ahead. Bad data never yields a prediction but a :clas
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,7 +79,7 @@ class Predictor:
 
     def _set_model(self, model: OnnxModel) -> None:
         self.model = model
-        self._scale = np.array(model.artifact.card.normalisation.increment_scale)
+        self._scale = model.artifact.card.normalisation.increment_scale
         self._period = round(model.T_s * 1e9)
 
     def observe(self, stamp: int, values: dict[str, float]) -> Refusal | None:
@@ -89,19 +91,21 @@ class Predictor:
         refusal = self.history.add(stamp, values)
         if refusal is not None:
             return refusal
+        if not _finite(values.values()):  # the pose, which is no part of the window
+            return Refusal.NOT_FINITE
         window = self.history.window(stamp)
         if isinstance(window, Refusal):
             return window
         state, theta, physics = self.model.predict(window[None])
-        if not np.isfinite(state).all() or (theta is not None and not np.isfinite(theta).all()):
+        now, following = window[-1, :3].tolist(), state[0].tolist()  # a few floats are faster than a small array
+        if not _finite(following) or (theta is not None and not _finite(theta[0].tolist())):
             return Refusal.BAD_PREDICTION
-        now = window[-1, :3]
         return Prediction(
             stamp + self._period,
             state[0],
-            propagate_pose(values, now, state[0], self.model.T_s),
+            propagate_pose(values, now, following, self.model.T_s),
             None if theta is None else theta[0],
-            0.0 if physics is None else self._residual_share(now, state[0], physics[0]),
+            0.0 if physics is None else self._residual_share(now, following, physics[0].tolist()),
         )
 
     def horizon(self, prediction: Prediction, steps: int) -> list[Pose]:
@@ -121,15 +125,15 @@ class Predictor:
             following = self.model.predict(window[None]).state[0]
             x, y, theta = poses[-1]
             pose = propagate_pose({"x": x, "y": y, "theta": theta}, state, following, self.model.T_s)
-            if pose is None or not np.isfinite(following).all():
+            if pose is None or not _finite(pose):
                 break
             poses.append(pose)
             state = following
         return poses
 
-    def _residual_share(self, now: Vector, state: Vector, physics: Vector) -> float:
-        residual = float(np.abs((state - physics) / self._scale).sum())
-        explained = float(np.abs((physics - now) / self._scale).sum())
+    def _residual_share(self, now: list[float], following: list[float], physics: list[float]) -> float:
+        residual = sum(abs(a - b) / s for a, b, s in zip(following, physics, self._scale, strict=True))
+        explained = sum(abs(a - b) / s for a, b, s in zip(physics, now, self._scale, strict=True))
         return residual / (residual + explained) if residual > 0 else 0.0
 
 
@@ -148,13 +152,19 @@ def live_signal_map(model: OnnxModel, signal_map: SignalMap) -> SignalMap:
     return signal_map.with_commands(model.commands)
 
 
-def propagate_pose(values: dict[str, float], now: Vector, following: Vector, T_s: float) -> Pose | None:
+def _finite(values: Iterable[float]) -> bool:
+    return all(map(math.isfinite, values))
+
+
+def propagate_pose(
+    values: Mapping[str, float], now: Iterable[float], following: Iterable[float], T_s: float
+) -> Pose | None:
     """The pose one step on, by the mean velocity of the step at its middle heading; ``None`` without a pose."""
     try:
         x, y, theta = values["x"], values["y"], values["theta"]
     except KeyError:
         return None
-    v_x, v_y, omega = (float(v) for v in (now + following) / 2)
+    v_x, v_y, omega = (float(a + b) / 2 for a, b in zip(now, following, strict=True))
     heading = theta + omega * T_s / 2
-    c, s = np.cos(heading), np.sin(heading)
-    return float(x + T_s * (v_x * c - v_y * s)), float(y + T_s * (v_x * s + v_y * c)), float(theta + omega * T_s)
+    c, s = math.cos(heading), math.sin(heading)
+    return x + T_s * (v_x * c - v_y * s), y + T_s * (v_x * s + v_y * c), theta + omega * T_s

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynssm_ros.errors import BagError
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.bags import Bag, open_bag, write_bag
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
@@ -70,7 +71,12 @@ def replay_to_bag(
 
     Returns:
         The number of predictions, the refusals by reason, and notes on a bag that had to be recovered.
+
+    Raises:
+        BagError: as :func:`replay`, or ``out`` is the bag itself.
     """
+    if out.resolve() in (bag.resolve(), bag.resolve().parent):
+        raise BagError(f"{out}: is the bag that is replayed; expected another folder to write")
     refusals: Counter[Refusal] = Counter()
     count = 0
     covariance = twist_covariance(np.zeros(3) if predictor.model.covariance is None else predictor.model.covariance)

@@ -7,6 +7,7 @@ files are lost.
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -121,7 +122,7 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         BagError: nothing there, not a bag, or nothing to recover.
     """
     path = Path(path)
-    if not path.exists():
+    if not os.path.exists(path):  # unlike Path.exists, False where looking is forbidden
         raise BagError(f"{path}: no such bag")
     with ExitStack() as stack:
         notes: list[str] = []
@@ -194,6 +195,7 @@ def _open_files(path: Path, scratch: Path, damage: str, notes: list[str]) -> Any
 
 def _usable_file(file: Path, scratch: Path, notes: list[str]) -> Path | None:
     scratch.mkdir()
+    file.open("rb").close()  # what may not be read is not damaged
     if file.suffix == ".zstd":
         source = scratch / f"unpacked{Path(file.stem).suffix}"
         unpack(file, source)

@@ -60,7 +60,7 @@ def lookahead_commands(feedback: Vector, segment: npt.NDArray[np.int32]) -> Vect
 
 
 def applied_inputs(rows: Any) -> Applied:
-    """Applied throttle and steering of window rows, applied = feedback + command, Eq. (16).
+    """Applied throttle and steering of window rows, applied = feedback + command, Eq. (15).
 
     Args:
         rows: columns ``WINDOW_COLUMNS`` along the first axis, shape ``(7, ...)``.

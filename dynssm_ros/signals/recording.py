@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -135,6 +136,18 @@ class Recording:
             )
         return replace(self, info=self.info.model_copy(update={"commands": commands}), columns=columns)
 
+    def require_sampling_time(self, T_s: float, of: str) -> None:
+        """Checks that this recording has the sampling time ``T_s`` (s) ``of`` something that shall use it.
+
+        Raises:
+            RecordingError: it has another.
+        """
+        if abs(self.T_s - T_s) > 1e-9:
+            raise RecordingError(
+                f"recording {', '.join(self.info.source)}: sampling time {self.T_s:g} s, but {of} has {T_s:g} s; "
+                f"extract with --rate {1 / T_s:g}"
+            )
+
     def save(self, path: str | Path) -> None:
         """Writes Parquet with the metadata inside, atomically."""
         arrays = {"time": pa.array(self.time), "segment": pa.array(self.segment)}
@@ -157,7 +170,7 @@ class Recording:
             RecordingError: missing, not Parquet, not a recording, or damaged.
         """
         path = Path(path)
-        if not path.is_file():
+        if not os.path.isfile(path):
             raise RecordingError(f"{path}: no such recording; `dynssm extract` makes one from a bag")
         try:
             table = pq.read_table(path, partitioning=None)  # a folder named a=b is no column

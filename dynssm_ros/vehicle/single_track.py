@@ -250,7 +250,7 @@ def step(
     substeps: int = 1,
     context: Mapping[str, Array] | None = None,
 ) -> State:
-    """Advances the state by ``T_s`` seconds under constant inputs, Eq. (28).
+    """Advances the state by ``T_s`` seconds under constant inputs, Eq. (32).
 
     The paper's step is one forward Euler step; ``integrator="rk4"`` and ``substeps`` refine it. Effects with memory
     need :func:`step_with_memory`.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,16 @@ CUSTOM_TYPES = {
     "team_msgs/msg/Odd": "float64 header\nfloat64 value\n",
 }
 
+FORMS = {
+    "sqlite": (StoragePlugin.SQLITE3, CompressionMode.NONE),
+    "mcap": (StoragePlugin.MCAP, CompressionMode.NONE),
+    "mcap, zstd chunks": (StoragePlugin.MCAP, CompressionMode.STORAGE),
+    "sqlite, zstd file": (StoragePlugin.SQLITE3, CompressionMode.FILE),
+    "mcap, zstd file": (StoragePlugin.MCAP, CompressionMode.FILE),
+    "sqlite, zstd messages": (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+    "mcap, zstd messages": (StoragePlugin.MCAP, CompressionMode.MESSAGE),
+}
+
 Record = tuple[str, str, int, Any]
 """Topic, type, log time (ns) and message."""
 MakeBag = Callable[..., Path]
@@ -37,17 +48,32 @@ def typestore() -> Any:
     return store
 
 
+@pytest.fixture(params=FORMS)
+def form(request: pytest.FixtureRequest) -> str:
+    """How a bag is stored."""
+    return str(request.param)
+
+
+@pytest.fixture(autouse=True)
+def scratch(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Everything temporary goes to a folder of which nothing may be left."""
+    folder = tmp_path_factory.mktemp("scratch")
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    yield
+    assert list(folder.iterdir()) == []
+
+
 @pytest.fixture
 def make_bag(tmp_path: Path, typestore: Any) -> MakeBag:
-    """Writes records as a rosbag2 folder; ``raw`` bytes are written as they are."""
+    """Writes records as a rosbag2 folder; a message of bytes is written as it is."""
 
     def make(
         records: Iterable[Record],
         name: str = "bag",
-        plugin: StoragePlugin = StoragePlugin.MCAP,
-        compression: CompressionMode = CompressionMode.NONE,
+        form: str = "mcap",
         topics: Mapping[str, str] | None = None,
     ) -> Path:
+        plugin, compression = FORMS[form]
         writer = Writer(tmp_path / name, version=9, storage_plugin=plugin)
         writer.set_compression(compression, CompressionFormat.ZSTD)
         with writer:

@@ -131,7 +131,7 @@ def test_a_cut_off_file_is_told(tmp_path: Path) -> None:
         Recording.load(file)
 
 
-@pytest.mark.parametrize("what", ["missing.parquet", "."])
+@pytest.mark.parametrize("what", ["missing.parquet", ".", "x" * 300])
 def test_a_missing_recording_says_how_to_make_one(tmp_path: Path, what: str) -> None:
     with pytest.raises(RecordingError, match="no such recording; `dynssm extract` makes one"):
         Recording.load(tmp_path / what)

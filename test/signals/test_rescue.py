@@ -54,7 +54,7 @@ def rescued(path: Path, share: float = 1.0) -> list[Row]:
 integers = st.one_of(st.integers(-3, 300), st.integers(-(2**63), 2**63 - 1))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=25)
 @given(
     st.lists(st.tuples(st.integers(0, 400), integers, st.integers(0, 9000)), min_size=1, max_size=30),
     st.sampled_from([512, 1024, 4096, 65536]),

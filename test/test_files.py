@@ -1,0 +1,103 @@
+"""Outputs: the old one or the new one, and nothing beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dynssm_ros.errors import UserError
+from dynssm_ros.files import replacing, write_json
+
+
+def folder_of(path: Path, text: str) -> None:
+    path.mkdir()
+    (path / "content").write_text(text)
+
+
+def text_of(path: Path) -> str:
+    return (path / "content" if path.is_dir() else path).read_text()
+
+
+@pytest.fixture(params=["file", "folder"])
+def make(request: pytest.FixtureRequest) -> Callable[[Path, str], object]:
+    return folder_of if request.param == "folder" else Path.write_text
+
+
+def test_a_new_output_takes_its_place_and_leaves_nothing_beside(
+    tmp_path: Path, make: Callable[[Path, str], object]
+) -> None:
+    target = tmp_path / "deep" / "out"
+    for text in ("first", "second"):
+        with replacing(target) as aside:
+            make(aside, text)
+            assert aside.name == "out"
+        assert text_of(target) == text
+        assert [p.name for p in target.parent.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
+def test_a_failure_leaves_the_older_output(
+    tmp_path: Path, make: Callable[[Path, str], object], error: type[BaseException]
+) -> None:
+    target = tmp_path / "out"
+    make(target, "old")
+
+    def fail() -> None:
+        with replacing(target) as aside:
+            make(aside, "new")
+            raise error
+
+    with pytest.raises(error):
+        fail()
+    assert text_of(target) == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_folder_that_cannot_be_put_in_place_leaves_the_older_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "out"
+    folder_of(target, "old")
+
+    def fail(*_: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    def run() -> None:
+        with replacing(target) as aside:
+            folder_of(aside, "new")
+            monkeypatch.setattr("os.replace", fail)
+
+    with pytest.raises(UserError, match=r"out: cannot be written .Input/output error"):
+        run()
+    assert text_of(target) == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with (
+        pytest.raises(UserError, match=r"file/out: cannot be written \(File exists: .*file\)"),
+        replacing(tmp_path / "file" / "out"),
+    ):
+        pass
+    folder_of(tmp_path / "folder", "x")
+
+    def file_onto_folder() -> None:
+        with replacing(tmp_path / "folder") as aside:
+            aside.write_text("x")
+
+    with pytest.raises(UserError, match=r"folder: cannot be written .Is a directory"):
+        file_onto_folder()
+    assert text_of(tmp_path / "folder") == "x"
+
+
+def test_json_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", {"rmse": {"v_x": 0.1}, "coverage_90": None})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"rmse": {"v_x": 0.1}, "coverage_90": None}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "a.json", {"rmse": float("nan")})
+    assert json.loads((tmp_path / "a.json").read_text())["rmse"] == {"v_x": 0.1}
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
