@@ -34,7 +34,8 @@ test: $(STAMP) ## style, types and all tests
 	@set -x
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	# the types of the newest numpy hold; Python 3.10 has an older one
+	if $(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then $(BIN)/mypy; fi
 	$(BIN)/pytest -n $(JOBS) --dist loadgroup --timeout 300
 
 colcon-test: $(STAMP) ## build and use the package in a fresh colcon workspace

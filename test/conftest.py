@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
-
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# the same examples in every run, so that a red test is red for everybody
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.load_profile("repeatable")
 
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"  # a wrongly typed message field must fail, not corrupt
 

@@ -50,7 +50,9 @@ def main() -> None:
     except UserError as error:
         _fail(str(error))
     except _UsageProblem as error:
-        _fail(error.format_message())  # type: ignore[attr-defined]
+        words = error.format_message()  # type: ignore[attr-defined]
+        if words:  # without a subcommand the help is shown, and that is no error
+            _fail(words)
     except (KeyboardInterrupt, typer.Abort):
         sys.exit(130)
     else:

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 
 from dynssm_ros.errors import RecordingError
+from dynssm_ros.learning.least_squares import Fit, Loss, least_squares
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle
@@ -24,13 +23,13 @@ from dynssm_ros.vehicle.effects import initial_memory
 from dynssm_ros.vehicle.single_track import Integrator, step_with_memory
 
 Vector = npt.NDArray[np.float64]
-Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
 Progress = Callable[[int, int], None]
 
 _UNIFORM_PRECISION = 12.0  # inverse variance of a uniform distribution on [0, 1]
 _ON_BOUND = 1e-3  # fraction of the range
 _BLOCK = 2.0  # s; errors closer than this are treated as correlated
-_MAX_RESIDUALS = 40_000
+_MAX_RESIDUALS = 40_000  # per channel
+_MAX_SEARCHED = 4_000  # the same while it looks for the right valley
 
 
 @dataclass(frozen=True)
@@ -69,9 +68,10 @@ class PredictionErrors:
         min_speed: float = 0.0,
         integrator: Integrator = "euler",
         substeps: int = 1,
+        limit: int = _MAX_RESIDUALS,
     ) -> None:
         starts = recording.window_ends(1, horizon=steps, min_speed=min_speed)
-        stride = max(1, -(-len(starts) * steps // _MAX_RESIDUALS))
+        stride = max(1, -(-len(starts) * steps // limit))
         self.starts = starts[::stride]
         if len(self.starts) * 3 < 10 * len(COEFFICIENTS):
             raise RecordingError(
@@ -132,7 +132,7 @@ def calibrate(
         recording: measured or simulated laps.
         vehicle: start values and bounds; its effects are part of the model.
         steps: steps ahead that are predicted; more weigh slow errors higher.
-        loss: robust loss of scipy's ``least_squares``.
+        loss: robust loss, by its name in scipy's ``least_squares``.
         min_speed: rows that are slower are left out (m/s).
         starts: starting points: the nominal values, the middle of the bounds, then seeded random ones.
         seed: of the random starting points.
@@ -144,20 +144,21 @@ def calibrate(
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
     errors = PredictionErrors(recording, vehicle, steps, min_speed)
     lower, width = vehicle.lower, vehicle.upper - vehicle.lower
-    weighted = _Weighted(errors, lower, width)
+    sample = _Weighted(PredictionErrors(recording, vehicle, steps, min_speed, limit=_MAX_SEARCHED), lower, width)
     fits = []
     for number, point in enumerate(_starting_points(vehicle, starts, seed), 1):
-        fits.append(_fit(weighted, point, loss, tolerance=1e-5, evaluations=40))
+        fits.append(least_squares(sample, point, loss, tolerance=1e-5, iterations=60))
         if progress is not None:
             progress(number, starts + 1)
-    best = min(fits, key=lambda fit: float(fit.cost)).x
+    weighted = _Weighted(errors, lower, width)
+    best = min(fits, key=lambda fit: fit.cost).p
     weighted.reweigh(best)
-    final = _fit(weighted, best, loss, tolerance=1e-15, evaluations=100)
+    final = least_squares(weighted, best, loss, tolerance=1e-9, iterations=100)
     if progress is not None:
         progress(starts + 1, starts + 1)
-    theta = lower + final.x * width
-    free = (final.x > _ON_BOUND) & (final.x < 1 - _ON_BOUND)
-    covariance, unidentified = _knowledge(final.jac, weighted(final.x), np.tile(errors.blocks, 3 * steps), free)
+    theta = lower + final.p * width
+    free = (final.p > _ON_BOUND) & (final.p < 1 - _ON_BOUND)
+    covariance, unidentified = _knowledge(final, np.tile(errors.blocks, 3 * steps), free)
     std = np.where(free, np.sqrt(np.diag(covariance)), np.sqrt(1 / _UNIFORM_PRECISION)) * width
     return Calibration(
         vehicle.with_nominal(np.clip(theta, vehicle.lower, vehicle.upper), std),
@@ -198,32 +199,18 @@ def _starting_points(vehicle: Vehicle, count: int, seed: int) -> list[Vector]:
     return [*points, *(random.uniform(0.1, 0.9, len(nominal)) for _ in range(count - 2))][:count]
 
 
-def _fit(residuals: Callable[[Vector], Vector], start: Vector, loss: Loss, tolerance: float, evaluations: int) -> Any:
-    """Runs scipy's trust-region reflective least squares on [0, 1]; at most ``evaluations`` Jacobians."""
-    return least_squares(
-        residuals,
-        start,
-        bounds=(0.0, 1.0),
-        loss=loss,
-        x_scale="jac",
-        xtol=tolerance,
-        ftol=tolerance,
-        gtol=tolerance,
-        max_nfev=evaluations,
-    )
-
-
 def _knowledge(
-    jacobian: Vector, residuals: Vector, blocks: npt.NDArray[np.int64], free: npt.NDArray[np.bool_]
+    fit: Fit, blocks: npt.NDArray[np.int64], free: npt.NDArray[np.bool_]
 ) -> tuple[Vector, tuple[dict[str, float], ...]]:
     """Covariance in unit coordinates, and the directions that the data leave open.
 
     Neighbouring errors are correlated, so the scores are summed over blocks in time (cluster-robust "sandwich").
     """
-    size = jacobian.shape[1]
-    spread = max(float(np.std(residuals)), 1e-300)
-    information = jacobian.T @ jacobian / spread**2
-    scores = jacobian * (residuals / spread**2)[:, None]
+    size = len(fit.p)
+    # brings the robust loss, whatever its scale, to the units of a likelihood: information and scores' variance agree
+    calibration = float(fit.slope.mean()) / max(float((fit.psi**2).mean()), 1e-300)
+    information = calibration * (fit.jacobian * fit.slope) @ fit.jacobian.T
+    scores = calibration * (fit.jacobian * fit.psi).T
     _, index = np.unique(blocks, return_inverse=True)
     summed = np.zeros((index.max() + 1, size))
     np.add.at(summed, index, scores)

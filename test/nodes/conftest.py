@@ -37,7 +37,9 @@ class Car:
         publishers = (self._odometry, self._feedback, self._command)
         deadline = time.monotonic() + 30
         matched = threading.Event()
-        while not all(p.get_subscription_count() for p in publishers) or not self.collector.count_publishers(PREDICTION_TOPIC):
+        while not all(p.get_subscription_count() for p in publishers) or not self.collector.count_publishers(
+            PREDICTION_TOPIC
+        ):
             assert self.process.poll() is None, "the predictor stopped"
             assert time.monotonic() < deadline, "no match within 30 s"
             matched.wait(0.02)  # nobody sets it: discovery raises no event in rclpy

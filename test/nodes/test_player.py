@@ -47,7 +47,9 @@ def test_a_wrong_start_is_one_clear_line(parameters: list[str], expected: str) -
     command = _player(*parameters) if parameters else [sys.executable, "-m", "dynssm_ros.nodes.player"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert result.returncode == 1
-    assert result.stderr.strip().splitlines() == [line for line in result.stderr.strip().splitlines() if expected in line]
+    assert result.stderr.strip().splitlines() == [
+        line for line in result.stderr.strip().splitlines() if expected in line
+    ]
 
 
 def test_a_bag_of_types_that_are_not_installed_names_the_way_out(putnam: Path) -> None:

@@ -96,7 +96,9 @@ def test_diagnostics_hold_rates_ages_latencies_and_refusals(start_car) -> None:
     assert int(values["refused: filling"]) - before == H - 1
 
 
-def test_a_model_is_swapped_while_running_and_a_bad_one_is_refused(start_car, small_model: Path, tmp_path: Path) -> None:
+def test_a_model_is_swapped_while_running_and_a_bad_one_is_refused(
+    start_car, small_model: Path, tmp_path: Path
+) -> None:
     car = start_car()
     car.drive_until_answered()
     successful, reason = car.set_parameter("model", str(tmp_path / "none"))
