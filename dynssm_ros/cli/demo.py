@@ -72,7 +72,7 @@ def demo(
     calibrated = _calibrate(laps, car, out)
     model = _train(laps, calibrated, out)
     evaluation = _evaluate(test, calibrated, model)
-    live = _run_live(model, out / f"{TEST_TRACK}.bag", test)
+    live = _run_live(model, out / f"{TEST_TRACK}_bag", test)
     report = _report(evaluation, live)
     report.save(out / "report.html")
     console.print(summary_table(evaluation).brief.rich())
@@ -87,7 +87,7 @@ def demo(
 
 def _drive(car: Vehicle, track: str, duration: float, seed: int, out: Path) -> Recording:
     """Simulates laps into a bag and extracts that."""
-    bag = out / f"{track}.bag"
+    bag = out / f"{track}_bag"
     with progress_bar(f"1 simulate {track}") as progress:
         run = simulate(
             car.with_effect(*HIDDEN), load_track(track), duration, plant="rk4", seed=seed, style=Style(0.9, 0.6),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any, cast
 
 import typer
 from rich.markup import escape
@@ -26,7 +27,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_UsageProblem = typer.BadParameter.__mro__[2]  # click's base of all usage errors, wherever typer keeps its click
+# click's base of all usage errors, wherever typer keeps its click
+_UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
 for command in (demo, simulate, extract, calibrate, train, evaluate, replay, bench):
     app.command()(command)
@@ -50,7 +52,7 @@ def main() -> None:
     except UserError as error:
         _fail(str(error))
     except _UsageProblem as error:
-        words = error.format_message()  # type: ignore[attr-defined]
+        words = cast("Any", error).format_message()
         if words:  # without a subcommand the help is shown, and that is no error
             _fail(words)
     except (KeyboardInterrupt, typer.Abort):

@@ -20,6 +20,9 @@ def replay(
     model: Annotated[Path, typer.Option(help="Model folder.")],
     out: Annotated[Path, typer.Option(help="rosbag2 folder to write.")],
     signals: Annotated[str, typer.Option(help="Signal map: name of a shipped one or a file.")] = "default",
+    with_inputs: Annotated[
+        bool, typer.Option("--with-inputs", help="Also copy the topics of the bag, to look at them together.")
+    ] = False,
     max_age: Annotated[
         float, typer.Option(help="Oldest actuator sample that a prediction may rest on (s).", min=0.0)
     ] = 0.2,
@@ -27,7 +30,7 @@ def replay(
     """Predict offline what the node would have published for a bag."""
     predictor = Predictor(OnnxModel(open_artifact(model)), load_signal_map(signals), max_age)
     with progress_bar("replaying") as progress:
-        count, refusals, notes = replay_to_bag(bag, predictor, out, progress)
+        count, refusals, notes = replay_to_bag(bag, predictor, out, with_inputs, progress)
     for note in notes:
         console.print(f"note: {note}")
     reasons = ", ".join(f"{number} x {refusal.value}" for refusal, number in refusals.items())

@@ -11,7 +11,7 @@ import numpy as np
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.runtime.predictor import Prediction, Predictor
-from dynssm_ros.signals.bags import Bag, open_bag, write_bag
+from dynssm_ros.signals.bags import Bag, copy_topics, open_bag, write_bag
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.messages import (
@@ -65,9 +65,20 @@ def replay(bag: Bag, predictor: Predictor, progress: Callable[[int, int], None] 
 
 
 def replay_to_bag(
-    bag: Path, predictor: Predictor, out: Path, progress: Callable[[int, int], None] | None = None
+    bag: Path,
+    predictor: Predictor,
+    out: Path,
+    with_inputs: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[int, Counter[Refusal], list[str]]:
     """Writes the predictions for ``bag`` into a new bag with the node's output topics.
+
+    Args:
+        bag: what was recorded.
+        predictor: freshly made.
+        out: the new bag.
+        with_inputs: also copy all topics of ``bag``, to look at them together.
+        progress: told of each message.
 
     Returns:
         The number of predictions, the refusals by reason, and notes on a bag that had to be recovered.
@@ -94,5 +105,9 @@ def replay_to_bag(
             if outcome.theta is not None:
                 values = dict(zip(COEFFICIENTS, outcome.theta.tolist(), strict=True))
                 sink.write(PARAMETERS_TOPIC, log_time, joint_state(outcome.stamp, values))
+        if with_inputs:
+            copy_topics(source, sink)
+            for message in source.messages(list(source.types)):
+                sink.write_raw(*message)
         notes = list(source.notes)
     return count, refusals, notes

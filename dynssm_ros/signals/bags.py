@@ -177,7 +177,8 @@ def _open_files(path: Path, scratch: Path, damage: str, notes: list[str]) -> Any
     """
     try:
         files = _storage_files(path)
-        if path.is_dir() and damage not in (_NO_INDEX, _LOG_LEFT):
+        taken_for_ros1 = path.suffix == ".bag"  # rosbags goes by the name, also of a folder; nothing is wrong with it
+        if path.is_dir() and damage not in (_NO_INDEX, _LOG_LEFT) and not taken_for_ros1:
             notes.append(f"{path.name}: read file by file ({damage})")
         found = [_usable_file(file, scratch / str(number), notes) for number, file in enumerate(files)]
     except (OSError, sqlite3.Error) as error:

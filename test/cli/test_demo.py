@@ -20,7 +20,7 @@ def test_the_demo_goes_the_whole_way_and_ends_with_a_report(tmp_path: Path, monk
     assert result.exit_code == 0
     assert "0 missing" in " ".join(result.stdout.split())
     made = {path.name for path in (tmp_path / "demo").iterdir()}
-    assert made >= {"report.html", "vehicle.yaml", "model", "losses.png", "club.bag", "club_b.parquet"}
+    assert made >= {"report.html", "vehicle.yaml", "model", "losses.png", "club_bag", "club_b.parquet"}
     assert not any("checkpoint" in name for name in made)
     html = (tmp_path / "demo" / "report.html").read_text()
     assert "Live: predicted against measured" in html

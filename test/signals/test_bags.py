@@ -207,3 +207,10 @@ def test_topics_are_copied_with_the_types_that_the_bag_describes(
         found = list(copy.messages(["/wheel"]))
         assert copy.decode("/wheel", found[0].raw).note == "left"
         assert copy.counts == {"/wheel": 1} | dict.fromkeys(TOPICS, 3)
+
+
+def test_a_folder_named_like_a_ros_1_bag_is_read_without_a_note(tmp_path: Path, drive: Any) -> None:
+    write(tmp_path / "run.bag", drive(5))
+    with open_bag(tmp_path / "run.bag") as bag:
+        assert bag.notes == []
+        assert len(list(bag.messages(TOPICS))) == 15

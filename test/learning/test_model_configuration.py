@@ -1,0 +1,97 @@
+"""Model files: the shipped ones, `base:`, and what is refused."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from dynssm_ros.configuration import config_root
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.learning.configuration import load_model_config
+
+SHIPPED = sorted(path.stem for path in (config_root() / "models").glob("*.yaml"))
+LACKS = {
+    "no_ssm": ("ssm",),
+    "no_gru": ("gru",),
+    "no_adaptation": ("adaptation",),
+    "no_residual": ("residual",),
+    "neural_only": ("physics", "adaptation"),
+}
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_file_is_valid_and_carries_its_own_name(name: str) -> None:
+    assert load_model_config(name).name == name
+
+
+@pytest.mark.parametrize("name", [name for name in SHIPPED if name.startswith("dynssm")])
+def test_an_ablation_lacks_what_its_name_says_and_nothing_else(name: str) -> None:
+    config = load_model_config(name)
+    lacks = LACKS.get("_".join(name.split("_")[2:]), ())
+    blocks = ("ssm", "gru", "physics", "adaptation", "residual")
+    assert {block for block in blocks if getattr(config, block) is None} == set(lacks)
+
+
+def write(folder: Path, name: str, content: dict[str, Any]) -> Path:
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def test_base_gives_what_a_file_leaves_out_block_by_block(tmp_path: Path) -> None:
+    write(tmp_path, "middle", {"base": "dynssm_av21", "H": 9, "training": {"epochs": 7}})
+    config = load_model_config(write(tmp_path, "leaf", {"base": "middle", "name": "leaf", "ssm": None}))
+    shipped = load_model_config("dynssm_av21")
+    assert (config.name, config.H, config.ssm) == ("leaf", 9, None)
+    assert config.training == shipped.training.model_copy(update={"epochs": 7})
+    assert config.gru == shipped.gru
+
+
+def test_files_that_refer_to_each_other_in_a_circle_are_refused(tmp_path: Path) -> None:
+    write(tmp_path, "a", {"base": "b"})
+    with pytest.raises(ConfigurationError, match="circle"):
+        load_model_config(write(tmp_path, "b", {"base": "a"}))
+
+
+def test_a_base_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="'nowhere' is neither a file nor a shipped name"):
+        load_model_config(write(tmp_path, "a", {"base": "nowhere", "name": "a"}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"ssm": None, "gru": None}, "at least one encoder is needed: ssm or gru"),
+        ({"fusion": None}, "needs the blocks fusion and loss"),
+        ({"loss": None}, "needs the blocks fusion and loss"),
+        ({"physics": None}, "adaptation needs physics to adapt"),
+        ({"physics": None, "adaptation": None, "residual": None}, "without physics there must be a residual network"),
+        ({"adaptation": None, "residual": None}, "nothing to learn"),
+        ({"adaptation": {"alpha": 1.5}}, "adaptation.alpha: Input should be less than or equal to 1 (got 1.5)"),
+        ({"H": 0}, "H: Input should be greater than or equal to 1 (got 0)"),
+        ({"gru": {"width": 3}}, "gru.width: Extra inputs are not permitted (got 3)"),
+        ({"residual": {"hidden": []}}, "residual.hidden"),
+        ({"training": {"validation_every": 1}}, "training.validation_every"),
+        ({"loss": {"scale": "state"}}, "loss.scale: Input should be 'target' or 'increment' (got 'state')"),
+        ({"kind": "transformer"}, "kind: Input should be 'dynssm' or 'ridge'"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_field_and_value(
+    tmp_path: Path, changes: dict[str, Any], expected: str
+) -> None:
+    path = write(tmp_path, "bad", {"base": "dynssm_av21", **changes})
+    with pytest.raises(ConfigurationError, match=re.escape(expected)) as refused:
+        load_model_config(path)
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_configuration_cannot_be_changed_behind_a_model(make_config: Any) -> None:
+    config = make_config()
+    with pytest.raises(ValidationError, match="frozen"):
+        config.H = 3
