@@ -34,24 +34,24 @@ setup(
         *shared("config", "launch"),
     ],
     zip_safe=False,
-    # Floors are what the code was tested with, from below; `constraints.txt` has the versions of `make demo`.
+    # The floors are the oldest that pass the tests together; `constraints.txt` has the versions of `make demo`.
     install_requires=[
         "setuptools",  # the console scripts that colcon writes
         "numpy>=1.26",
         "scipy>=1.11",
-        "torch>=2.9",  # training; the ONNX export of recurrent models with a dynamic batch
+        "torch>=2.13",  # training
         "onnx>=1.17",  # what torch exports through ...
         "onnxscript>=0.5",  # ... and by
         "onnxruntime>=1.19",  # the deployed predictor
         "safetensors>=0.4",  # weights without pickle
         "pyarrow>=15",  # recordings
         "pydantic>=2.7",  # configuration
-        "pyyaml>=6",
-        "rosbags>=0.10.7",  # bags without a ROS installation
-        "mcap>=1.1",  # what a cut MCAP file still holds
-        "typer>=0.15",
-        "rich>=13",
-        "matplotlib>=3.8",  # the figures and ...
+        "pyyaml>=6.0.1",
+        "rosbags>=0.11.6",  # bags without a ROS installation
+        "mcap>=1.1.1",  # what a cut MCAP file still holds
+        "typer>=0.20",
+        "rich>=14.3",
+        "matplotlib>=3.9",  # the figures and ...
         "jinja2>=3.1",  # ... the page of the reports
     ],
     extras_require={

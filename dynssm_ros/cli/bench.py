@@ -18,13 +18,13 @@ from dynssm_ros.cli.console import JsonOption, console, progress_bar
 from dynssm_ros.files import write_json
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
 from dynssm_ros.runtime.models import OnnxModel
-from dynssm_ros.runtime.predictor import Prediction, Predictor
+from dynssm_ros.runtime.predictor import Predictor
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, load_signal_map
 from dynssm_ros.signals.standard import recording_to_bag
 
 Vector = npt.NDArray[np.float64]
-_WARM_UP = 50
+_WARM_UP, _BLOCK = 50, 200  # calls
 
 
 def bench(
@@ -81,7 +81,8 @@ def sample_drive(artifact: Artifact, rate: float, duration: float) -> Recording:
 def time_predictions(artifact: Artifact, drive: Recording, calls: int) -> tuple[Vector, Vector]:
     """Times of single predictions (s): the whole predictor (sample in, window cut, model run), and eager torch alone.
 
-    Both are timed in turn in one run, because machines are noisy.
+    Both are timed in one run, block by block in turn, because machines are noisy; not call by call, because each would
+    find its data driven out of the caches by the other.
     """
     from dynssm_ros.learning.export import eager_prediction
 
@@ -89,28 +90,23 @@ def time_predictions(artifact: Artifact, drive: Recording, calls: int) -> tuple[
     predictor = Predictor(OnnxModel(artifact), load_signal_map("default"))
     samples = _samples(drive)
 
-    def predict() -> bool:
+    def predict() -> float:
         stamp, actuators, odometry = next(samples)
         predictor.observe(stamp, actuators)
         begin = time.perf_counter()
-        outcome = predictor.predict(stamp, odometry)
-        times[0].append(time.perf_counter() - begin)
-        return isinstance(outcome, Prediction)
+        predictor.predict(stamp, odometry)
+        return time.perf_counter() - begin
 
-    def run_torch() -> None:
+    def predict_eagerly() -> float:
         begin = time.perf_counter()
         run_eager()
-        times[1].append(time.perf_counter() - begin)
+        return time.perf_counter() - begin
 
     times: tuple[list[float], list[float]] = ([], [])
-    warm = 0
-    while warm < _WARM_UP:
-        warm += predict()
-        run_torch()
-    times = ([], [])
-    for _ in range(calls):
-        predict()
-        run_torch()
+    for _ in range(-(-calls // _BLOCK)):
+        for call, kept in zip((predict, predict_eagerly), times, strict=True):
+            block = [call() for _ in range(_WARM_UP + _BLOCK)]
+            kept.extend(block[_WARM_UP:])
     return np.array(times[0]), np.array(times[1])
 
 

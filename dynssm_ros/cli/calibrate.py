@@ -10,8 +10,9 @@ from rich.table import Table
 
 from dynssm_ros.cli.console import CommandsOption, JsonOption, VehicleOption, console, progress_bar
 from dynssm_ros.files import write_json
-from dynssm_ros.learning.calibration import Calibration, Loss
+from dynssm_ros.learning.calibration import Calibration
 from dynssm_ros.learning.calibration import calibrate as fit
+from dynssm_ros.learning.least_squares import Loss
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, load_vehicle, save_vehicle
 
@@ -52,10 +53,13 @@ def calibrate(
     for name, unit, was, now in zip(("v_x", "v_y", "omega"), ("m/s", "m/s", "rad/s"), before, after, strict=True):
         console.print(f"one-step RMSE {name}: {was:.3g} -> {now:.3g} {unit}")
     if result.on_bound:
-        console.print(f"on a bound: {', '.join(result.on_bound)} - the data want more than the vehicle file admits")
+        console.print(
+            f"on a bound: {', '.join(result.on_bound)} - the data want more than the vehicle file admits",
+            soft_wrap=True,
+        )
     for combination in result.unidentified:
         terms = " ".join(f"{weight:+g} {name}" for name, weight in combination.items())
-        console.print(f"not determined by these data: {terms} (in units of their ranges)")
+        console.print(f"not determined by these data: {terms} (in units of their ranges)", soft_wrap=True)
     console.print(f"{out} written")
 
 

@@ -76,8 +76,8 @@ def demo(
     report = _report(evaluation, live)
     report.save(out / "report.html")
     console.print(summary_table(evaluation).brief.rich())
-    console.print(verdict(evaluation))
-    console.print(_live_words(live))
+    console.print(verdict(evaluation), soft_wrap=True)
+    console.print(_live_words(live), soft_wrap=True)
     console.print(
         f"{out / 'report.html'}: figures; the whole way took {time.monotonic() - begin:.0f} s", soft_wrap=True
     )
@@ -111,7 +111,7 @@ def _calibrate(recording: Recording, car: Vehicle, out: Path) -> Vehicle:
         result = calibrate(recording, guess, starts=2, seed=SEED, progress=progress)
     save_vehicle(result.vehicle, out / "vehicle.yaml", f"Calibrated by the demo on {TRAINING_TRACK}.")
     before, after = (", ".join(f"{v:.3g}" for v in rmse) for rmse in (result.rmse_before, result.rmse_after))
-    console.print(f"calibrated single-track: one-step RMSE (v_x, v_y, omega) {before} -> {after}")
+    console.print(f"calibrated single-track: one-step RMSE (v_x, v_y, omega) {before} -> {after}", soft_wrap=True)
     return result.vehicle
 
 

@@ -73,8 +73,8 @@ def evaluate(
         )
     _write(evaluation, car, out, json)
     console.print(summary_table(evaluation).brief.rich())
-    console.print(verdict(evaluation), markup=False)
-    console.print(f"{out / 'report.html'}: figures and how to read them", markup=False)
+    console.print(verdict(evaluation), markup=False, soft_wrap=True)
+    console.print(f"{out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)
 
 
 def _write(evaluation: Evaluation, vehicle: Vehicle | None, out: Path, json: Path | None) -> None:

@@ -32,6 +32,6 @@ def replay(
     with progress_bar("replaying") as progress:
         count, refusals, notes = replay_to_bag(bag, predictor, out, with_inputs, progress)
     for note in notes:
-        console.print(f"note: {note}")
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
     reasons = ", ".join(f"{number} x {refusal.value}" for refusal, number in refusals.items())
     console.print(f"{out}: {count} predictions" + (f"; none for: {reasons}" if reasons else ""), soft_wrap=True)

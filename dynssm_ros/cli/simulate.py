@@ -14,6 +14,7 @@ from dynssm_ros.simulation.driver import Style
 from dynssm_ros.simulation.laps import Run, write_run
 from dynssm_ros.simulation.laps import simulate as simulate_run
 from dynssm_ros.simulation.plant import PlantKind
+from dynssm_ros.simulation.racing_line import LineKind, line_of
 from dynssm_ros.simulation.tracks import load_track
 from dynssm_ros.vehicle import load_vehicle
 
@@ -27,8 +28,14 @@ def simulate(
     duration: Annotated[float | None, typer.Option(help="Time to drive (s); 60 if neither this nor --laps.")] = None,
     laps: Annotated[float | None, typer.Option(help="Laps to drive, instead of a duration.")] = None,
     plant: Annotated[
-        PlantKind, typer.Option(help="euler: one step per T_s, as in the published data; rk4: steps of 1 ms.")
+        PlantKind,
+        typer.Option(
+            help="euler: one step per T_s, as in the published data; rk4: steps of 1 ms; double_track: four wheels."
+        ),
     ] = "euler",
+    line: Annotated[
+        LineKind, typer.Option(help="What the driver follows: the centre line or the racing line.")
+    ] = "centre",
     seed: Annotated[int, typer.Option(help="Of the driver's variation and the noise.", min=0)] = 0,
     aggressiveness: Annotated[float, typer.Option(help="Share of the car's limits in use.", min=0.1, max=1.2)] = 0.95,
     variation: Annotated[float, typer.Option(help="How much speed and line vary.", min=0.0, max=1.0)] = 0.5,
@@ -58,6 +65,7 @@ def simulate(
             plant,
             seed,
             Style(aggressiveness, variation),
+            line_of(line, car, course),
             noise=parse_noise(noise),
             progress=progress,
         )

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.learning.least_squares import Fit, Loss, least_squares
+from dynssm_ros.learning.least_squares import Influence, Loss, influence, least_squares
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle
@@ -153,12 +153,12 @@ def calibrate(
     weighted = _Weighted(errors, lower, width)
     best = min(fits, key=lambda fit: fit.cost).p
     weighted.reweigh(best)
-    final = least_squares(weighted, best, loss, tolerance=1e-9, iterations=100)
+    final = least_squares(weighted, best, loss, tolerance=1e-12, iterations=100)
     if progress is not None:
         progress(starts + 1, starts + 1)
     theta = lower + final.p * width
     free = (final.p > _ON_BOUND) & (final.p < 1 - _ON_BOUND)
-    covariance, unidentified = _knowledge(final, np.tile(errors.blocks, 3 * steps), free)
+    covariance, unidentified = _knowledge(influence(weighted, final.p, loss), np.tile(errors.blocks, 3 * steps), free)
     std = np.where(free, np.sqrt(np.diag(covariance)), np.sqrt(1 / _UNIFORM_PRECISION)) * width
     return Calibration(
         vehicle.with_nominal(np.clip(theta, vehicle.lower, vehicle.upper), std),
@@ -200,17 +200,17 @@ def _starting_points(vehicle: Vehicle, count: int, seed: int) -> list[Vector]:
 
 
 def _knowledge(
-    fit: Fit, blocks: npt.NDArray[np.int64], free: npt.NDArray[np.bool_]
+    at: Influence, blocks: npt.NDArray[np.int64], free: npt.NDArray[np.bool_]
 ) -> tuple[Vector, tuple[dict[str, float], ...]]:
     """Covariance in unit coordinates, and the directions that the data leave open.
 
     Neighbouring errors are correlated, so the scores are summed over blocks in time (cluster-robust "sandwich").
     """
-    size = len(fit.p)
+    size = len(at.jacobian)
     # brings the robust loss, whatever its scale, to the units of a likelihood: information and scores' variance agree
-    calibration = float(fit.slope.mean()) / max(float((fit.psi**2).mean()), 1e-300)
-    information = calibration * (fit.jacobian * fit.slope) @ fit.jacobian.T
-    scores = calibration * (fit.jacobian * fit.psi).T
+    calibration = float(at.slope.mean()) / max(float((at.psi**2).mean()), 1e-300)
+    information = calibration * (at.jacobian * at.slope) @ at.jacobian.T
+    scores = calibration * (at.jacobian * at.psi).T
     _, index = np.unique(blocks, return_inverse=True)
     summed = np.zeros((index.max() + 1, size))
     np.add.at(summed, index, scores)

@@ -14,7 +14,7 @@ from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_memory
-from dynssm_ros.vehicle.single_track import step_with_memory
+from dynssm_ros.vehicle.single_track import increment
 
 INPUTS = len(WINDOW_COLUMNS)
 
@@ -64,10 +64,9 @@ class PhysicsLayer(nn.Module):
         """Raw last rows ``(B, 7)`` and coefficients ``(B, 17)`` to increments ``(B, 3)``."""
         # columns of shape (B, 1), which the deployed graph need not squeeze and stack again
         rows = torch.split(latest, 1, dim=-1)
-        now = State(*rows[:3])
-        following, _ = step_with_memory(
+        moved, _ = increment(
             _XP,
-            now,
+            State(*rows[:3]),
             initial_memory(self.effects, rows[3], rows[4]),
             applied_inputs(rows),
             Coefficients(*torch.split(theta, 1, dim=-1)),
@@ -77,7 +76,7 @@ class PhysicsLayer(nn.Module):
             self.config.integrator,
             self.config.substeps,
         )
-        return torch.cat([after - before for after, before in zip(following, now, strict=True)], dim=-1)
+        return torch.cat(list(moved), dim=-1)
 
 
 class ParameterHead(nn.Module):
@@ -169,7 +168,7 @@ class DynSSM(nn.Module):
         if self.head is not None:
             theta, deviation, conditioned = self.head(conditioned, latest)
         elif self.physics is not None:
-            theta = self.nominal.expand(len(window), -1)
+            theta = self.nominal.expand(window.shape[0], -1)  # not len(), which an export would freeze
         if self.physics is not None:
             increment = self.physics(raw, theta)
         if self.residual is None:

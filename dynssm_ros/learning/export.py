@@ -12,6 +12,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime as ort
 import torch
 from safetensors.torch import load_file, save_file
@@ -39,6 +40,7 @@ from dynssm_ros.runtime.artifact import (
 
 TOLERANCE = 1e-5
 """Largest difference between ONNX and torch, in units of each state's scale."""
+_GRU_INITIAL_STATE = 5  # among the inputs of ONNX's GRU
 
 
 class _Deployed(nn.Module):
@@ -137,6 +139,16 @@ def export_onnx(model: nn.Module, sample: Tensor, file: Path) -> None:
             opset_version=17,
             dynamo=False,
         )
+    _start_recurrences_from_rest(file)
+
+
+def _start_recurrences_from_rest(file: Path) -> None:
+    """Drops the zeros that the exporter computes, window by window, as the first hidden state: absent means zero."""
+    graph = onnx.load(file)
+    for node in graph.graph.node:
+        if node.op_type == "GRU" and len(node.input) > _GRU_INITIAL_STATE:
+            del node.input[_GRU_INITIAL_STATE:]
+    onnx.save(graph, file)
 
 
 def check_export(model: nn.Module, sample: Tensor, file: Path, scale: np.ndarray) -> float:

@@ -126,6 +126,7 @@ class OnnxModel:
         options = ort.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        options.enable_mem_reuse = False  # small tensors: planning their reuse costs more than their memory
         options.log_severity_level = 3
         try:
             self._session = ort.InferenceSession(artifact.onnx, options, providers=["CPUExecutionProvider"])
@@ -139,9 +140,21 @@ class OnnxModel:
                 f"{len(WINDOW_COLUMNS)} columns to increment, theta, physics"
             )
 
+        # a single window, as in the node, always has its place in memory
+        self._window = np.empty((1, self.H, len(WINDOW_COLUMNS)), dtype=np.float32)
+        self._binding = self._session.io_binding()
+        self._binding.bind_cpu_input("window", self._window)
+        for name in self._outputs:
+            self._binding.bind_output(name)
+
     def predict(self, windows: Vector) -> WindowPrediction:
         """Runs the graph on ``windows``."""
-        results = self._session.run(self._outputs, {"window": windows.astype(np.float32)})
+        if len(windows) == 1:
+            self._window[...] = windows
+            self._session.run_with_iobinding(self._binding)
+            results = self._binding.copy_outputs_to_cpu()
+        else:
+            results = self._session.run(self._outputs, {"window": windows.astype(np.float32)})
         by_name = dict(zip(self._outputs, results, strict=True))
         now = windows[:, -1, :3]
         theta, physics = by_name.get("theta"), by_name.get("physics")

@@ -68,6 +68,18 @@ class RingBuffer:
         """Time of the newest sample (ns since the epoch), ``-inf`` if empty."""
         return float(self._times[self._next + self._capacity - 1]) if self._count else -np.inf
 
+    @property
+    def oldest(self) -> float:
+        """Time of the oldest sample (ns since the epoch), ``inf`` if empty."""
+        return float(self._times[self._next + self._capacity - self._count]) if self._count else np.inf
+
+    def interpolate(self, grid: Vector) -> Vector:
+        """Values at the times ``grid`` (ns since the epoch), linear between samples and held beyond the newest."""
+        end = self._next + self._capacity
+        stored = slice(end - self._count, end)
+        sampled: Vector = np.interp(grid, self._times[stored], self._values[stored])
+        return sampled
+
     def append(self, time: float, value: float, span: float) -> None:
         """Adds a sample newer than all others, growing if the buffer would forget samples younger than ``span`` ns."""
         if self._count == self._capacity and time - self.times[1] < span:
@@ -170,23 +182,19 @@ class History:
             return Refusal.MISSING
         now = float(stamp - self._epoch)
         first = now + self._offsets[0] + self._slack
-        reason: Refusal | None = None
+        filling = False
         for name, buffer in self._buffers.items():
             if len(buffer) == 0:
                 return Refusal.MISSING
             if now - buffer.newest > self._max_age:
                 return Refusal.STALE
-            if self._unbroken[name] > first or buffer.times[0] > first:
-                reason = Refusal.FILLING
-        if reason is not None:
-            return reason
-        grid = now + self._offsets
-        sampled = {name: np.interp(grid, buffer.times, buffer.values) for name, buffer in self._buffers.items()}
-        for column, name in enumerate(STATE_SIGNALS):
-            self._window[:, column] = sampled[name]
-        for column, values in enumerate(model_inputs(sampled), len(STATE_SIGNALS)):
-            self._window[:, column] = values
-        return self._window
+            filling = filling or self._unbroken[name] > first or buffer.oldest > first
+        if filling:
+            return Refusal.FILLING
+        grid = self._offsets + now
+        sampled = {name: buffer.interpolate(grid) for name, buffer in self._buffers.items()}
+        columns = (*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled))
+        return np.stack(columns, axis=1, out=self._window)
 
     @property
     def current(self) -> Vector:

@@ -16,7 +16,7 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.signals.standard import write_standard_bag
 from dynssm_ros.simulation.driver import Driver, Style
 from dynssm_ros.simulation.lines import ClosedLine, Vector
-from dynssm_ros.simulation.plant import Plant, PlantKind, Pose, SingleTrackPlant
+from dynssm_ros.simulation.plant import PlantKind, Pose, make_plant
 from dynssm_ros.simulation.speed_profile import vehicle_limits
 from dynssm_ros.simulation.tracks import Track
 from dynssm_ros.vehicle import Applied, State, Vehicle
@@ -114,9 +114,8 @@ def drive(
     driver = Driver(vehicle, line, vehicle_limits(vehicle), style, seed, room)
     (x, y), theta = line.position(0.0, driver.offset(0.0)), float(line.heading(0.0))
     v_x = 0.7 * driver.speed(0.0)
-    car: Plant = SingleTrackPlant(
-        vehicle, plant, Pose(float(x), float(y), theta), State(v_x, 0.0, v_x * float(line.curvature(0.0)))
-    )
+    state = State(v_x, 0.0, v_x * float(line.curvature(0.0)))
+    car = make_plant(vehicle, plant, Pose(float(x), float(y), theta), state)
     feedback, on_line = Applied(0.0, 0.0), 0.0
     s = float(track.project([x, y])[0])
     for k in itertools.count():
@@ -151,7 +150,7 @@ def simulate(
         track: where to drive.
         duration: time to drive (s).
         laps: or laps to drive.
-        plant: how the motion is integrated.
+        plant: how the car is modelled and its motion integrated.
         seed: of the driver's variation and the noise; the same seed gives the same run.
         style: how the driver drives.
         line: line to follow; the centre line if not given.

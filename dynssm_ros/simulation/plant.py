@@ -6,12 +6,14 @@ import math
 from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple, Protocol
 
+from dynssm_ros.simulation.double_track import DoubleTrack
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step_with_memory
 from dynssm_ros.vehicle.effects import initial_memory
-from dynssm_ros.vehicle.single_track import Motion, StageEffect
+from dynssm_ros.vehicle.single_track import Integrator, Motion, StageEffect
 
-PlantKind = Literal["euler", "rk4"]
-"""``euler``: one forward Euler step per T_s for state and pose, as in the published data; ``rk4``: steps of 1 ms."""
+PlantKind = Literal["euler", "rk4", "double_track"]
+"""``euler``: one forward Euler step per T_s for state and pose, as in the published data; ``rk4``: steps of 1 ms;
+``double_track``: four wheels with load transfer, in steps of 1 ms."""
 
 RK4_STEP = 1e-3  # s, at most
 
@@ -37,9 +39,8 @@ class Plant(Protocol):
     def pose(self) -> Pose:
         """Where it is."""
 
-    @property
-    def state(self) -> State:
-        """How it moves."""
+    state: State
+    """How it moves."""
 
     def advance(self, applied: Applied, s: float = 0.0) -> None:
         """Moves it on by T_s under constant inputs; ``s`` is its track position (m), for effects that live there."""
@@ -66,17 +67,21 @@ class SingleTrackPlant:
     """The single-track car. The input of a step acts on that step.
 
     Effects may read from the context ``time`` (s) and ``s`` (m), held over a step, and ``x, y, theta`` (m, m, rad).
+    ``body``, if given, acts before the effects and may take the place of the single-track tyres.
     """
 
-    def __init__(self, vehicle: Vehicle, kind: PlantKind, pose: Pose, state: State) -> None:
+    def __init__(
+        self, vehicle: Vehicle, integrator: Integrator, pose: Pose, state: State, body: StageEffect | None = None
+    ) -> None:
         self.state = state
         self._vehicle = vehicle
-        self._kind = kind
+        self._integrator: Integrator = integrator
         self._theta = Coefficients(*(float(value) for value in vehicle.nominal))
-        self._effects: tuple[StageEffect, ...] = (_Odometer(), *vehicle.active_effects)
+        bodies = () if body is None else (body,)
+        self._effects: tuple[StageEffect, ...] = (_Odometer(), *bodies, *vehicle.active_effects)
         self._memory = dict(zip(_Odometer.MEMORY, pose, strict=True))
         self._memory |= initial_memory(vehicle.active_effects, 0.0, 0.0)
-        self._substeps = 1 if kind == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
+        self._substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
         self._steps = 0
 
     @property
@@ -96,8 +101,15 @@ class SingleTrackPlant:
             self._vehicle.constants,
             T_s,
             self._effects,
-            self._kind,
+            self._integrator,
             self._substeps,
             {"time": self._steps * T_s, "s": s},
         )
         self._steps += 1
+
+
+def make_plant(vehicle: Vehicle, kind: PlantKind, pose: Pose, state: State) -> Plant:
+    """The plant of that kind, at ``pose`` and moving with ``state``."""
+    if kind == "double_track":
+        return SingleTrackPlant(vehicle, "rk4", pose, state, DoubleTrack.of(vehicle.constants))
+    return SingleTrackPlant(vehicle, kind, pose, state)

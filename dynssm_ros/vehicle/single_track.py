@@ -272,6 +272,29 @@ def step_with_memory(
     context: Mapping[str, Array] | None = None,
 ) -> tuple[State, dict[str, Array]]:
     """Like :func:`step`, and integrates the effects' own states (``memory``, by name) with the car's."""
+    moved, changed = increment(
+        xp, state, memory, applied, theta, constants, T_s, effects, integrator, substeps, context
+    )
+    return State(*_add(state, moved)), {name: value + changed[name] for name, value in memory.items()}
+
+
+def increment(
+    xp: Any,
+    state: State,
+    memory: Mapping[str, Array],
+    applied: Applied,
+    theta: Coefficients,
+    constants: Constants,
+    T_s: float,
+    effects: Sequence[StageEffect] = (),
+    integrator: Integrator = "euler",
+    substeps: int = 1,
+    context: Mapping[str, Array] | None = None,
+) -> tuple[State, dict[str, Array]]:
+    """How much the state and the effects' own states change in ``T_s`` seconds.
+
+    In single precision an increment is known far better than the difference of two states.
+    """
     names = tuple(memory)
 
     def rates(y: Sequence[Array]) -> tuple[Array, ...]:
@@ -279,31 +302,35 @@ def step_with_memory(
         q = motion(xp, State(*y[:3]), applied, theta, constants, effects, carried, context)
         return (q.a_x, q.a_y, q.omega_dot, *(q.memory_rate[name] for name in names))
 
-    advance = _INTEGRATORS[integrator]
-    y: tuple[Array, ...] = (*state, *memory.values())
-    for _ in range(substeps):
-        y = advance(rates, y, T_s / substeps)
-    return State(*y[:3]), dict(zip(names, y[3:], strict=True))
+    advance, h = _INTEGRATORS[integrator], T_s / substeps
+    start: tuple[Array, ...] = (*state, *memory.values())
+    moved = advance(rates, start, h)
+    for _ in range(substeps - 1):
+        moved = _add(moved, advance(rates, _add(start, moved), h))
+    return State(*moved[:3]), dict(zip(names, moved[3:], strict=True))
 
 
 _Rates = Callable[[Sequence[Array]], tuple[Array, ...]]
 
 
 def _euler(rates: _Rates, y: tuple[Array, ...], h: float) -> tuple[Array, ...]:
-    return _add(y, h, rates(y))
+    return _times(h, rates(y))
 
 
 def _rk4(rates: _Rates, y: tuple[Array, ...], h: float) -> tuple[Array, ...]:
     k1 = rates(y)
-    k2 = rates(_add(y, h / 2, k1))
-    k3 = rates(_add(y, h / 2, k2))
-    k4 = rates(_add(y, h, k3))
-    mean = tuple((a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
-    return _add(y, h, mean)
+    k2 = rates(_add(y, _times(h / 2, k1)))
+    k3 = rates(_add(y, _times(h / 2, k2)))
+    k4 = rates(_add(y, _times(h, k3)))
+    return tuple(h * (a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
 
 
-def _add(y: tuple[Array, ...], h: float, k: tuple[Array, ...]) -> tuple[Array, ...]:
-    return tuple(a + h * b for a, b in zip(y, k, strict=True))
+def _add(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, ...]:
+    return tuple(x + y for x, y in zip(a, b, strict=True))
+
+
+def _times(h: float, k: Sequence[Array]) -> tuple[Array, ...]:
+    return tuple(h * x for x in k)
 
 
 _INTEGRATORS = {"euler": _euler, "rk4": _rk4}

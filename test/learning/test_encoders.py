@@ -24,7 +24,7 @@ def layer(channels: int, states: int, seed: int, dtype: torch.dtype = torch.floa
     made = DiagonalSsm(channels, states)
     with torch.no_grad():
         for parameter in made.parameters():
-            parameter += 0.3 * torch.randn_like(parameter)
+            parameter.add_(0.3 * torch.randn_like(parameter))
     return made.to(dtype)
 
 

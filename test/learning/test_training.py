@@ -1,0 +1,384 @@
+"""Training: repeatable, resumable after any interruption, stopped in time, and it learns."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import struct
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dynssm_ros.errors import ConfigurationError, RecordingError
+from dynssm_ros.learning import training as training_module
+from dynssm_ros.learning.configuration import ModelConfig
+from dynssm_ros.learning.dataset import split_windows
+from dynssm_ros.learning.training import Trained, check_device, train
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS
+from dynssm_ros.signals.recording import Recording, RecordingInfo
+from dynssm_ros.vehicle import Vehicle
+
+MakeConfig = Callable[..., ModelConfig]
+
+
+@pytest.fixture(scope="module")
+def short(drive: Callable[..., Recording], orca: Vehicle) -> Recording:
+    """8 s of the small car."""
+    return drive(orca, 400)
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    return tmp_path / "checkpoint.pt"
+
+
+def interrupt_at(epoch: int) -> Callable[[int, int, str], None]:
+    def progress(done: int, total: int, words: str) -> None:
+        if done == epoch:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def same(a: Trained, b: Trained) -> bool:
+    """Whether weights and history agree bit by bit."""
+    ours, theirs = a.model.state_dict(), b.model.state_dict()
+    return a.history == b.history and all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+# --- repeatable ---------------------------------------------------------------------------------
+
+
+def test_the_seed_alone_decides(short: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path: Path) -> None:
+    first = train(short, make_config(), orca, tmp_path / "a.pt")
+    torch.rand(17)  # what the caller does with the generator does not matter
+    assert same(first, train(short, make_config(), orca, tmp_path / "b.pt"))
+    other = train(short, make_config(training={"seed": 1}), orca, tmp_path / "c.pt")
+    assert not same(first, other)
+    assert other.history != first.history
+
+
+def test_history_and_progress_tell_of_every_epoch(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
+) -> None:
+    told: list[tuple[int, int, str]] = []
+    trained = train(short, make_config(), orca, checkpoint, progress=lambda *args: told.append(args))
+    assert [args[:2] for args in told] == [(1, 3), (2, 3), (3, 3)]
+    validation = trained.history["validation/prediction"]
+    assert told[-1][2] == f"validation {validation[-1]:.4f}, best {min(validation):.4f}"
+    assert {len(values) for values in trained.history.values()} == {3}
+    assert trained.best_epoch == 1 + validation.index(min(validation))
+
+
+def test_the_best_epoch_is_kept_and_measured(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
+) -> None:
+    config = make_config(training={"epochs": 8, "patience": 2, "learning_rate": 0.3})
+    trained = train(short, config, orca, checkpoint)
+    validation = trained.history["validation/prediction"]
+    assert validation[-1] > min(validation)
+    window, target = split_windows(short, config.H, config.training)[1].batch(slice(None))
+    with torch.no_grad():
+        error = trained.model(window).increment - target
+    scaled = (error / torch.tensor(trained.normalisation.increment_scale)).square().mean().item()
+    assert scaled == pytest.approx(min(validation), rel=1e-5)
+    np.testing.assert_allclose(trained.validation_rmse, error.square().mean(0).sqrt().numpy(), rtol=1e-6)
+
+
+# --- interrupted --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("epoch", [1, 3, 5])
+def test_an_interrupted_training_ends_bit_for_bit_like_an_uninterrupted_one(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path: Path, epoch: int
+) -> None:
+    config = make_config(training={"epochs": 5})
+    whole = train(short, config, orca, tmp_path / "whole.pt")
+    with pytest.raises(KeyboardInterrupt):
+        train(short, config, orca, tmp_path / "cut.pt", progress=interrupt_at(epoch))
+    resumed = train(short, config, orca, tmp_path / "cut.pt")
+    assert resumed.resumed_from == epoch
+    assert whole.resumed_from == 0
+    assert same(whole, resumed)
+    assert resumed.best_epoch == whole.best_epoch
+    assert resumed.validation_rmse == whole.validation_rmse
+
+
+def test_an_interruption_in_the_middle_of_an_epoch_costs_that_epoch_alone(
+    short: Recording,
+    make_config: MakeConfig,
+    orca: Vehicle,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = make_config(training={"epochs": 4})
+    whole = train(short, config, orca, tmp_path / "whole.pt")
+    calls, objective = [0], training_module.objective
+
+    def failing(*args: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == 17:  # 6 batches and a validation per epoch: in the third
+            raise KeyboardInterrupt
+        return objective(*args)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(training_module, "objective", failing)
+        with pytest.raises(KeyboardInterrupt):
+            train(short, config, orca, tmp_path / "cut.pt")
+    resumed = train(short, config, orca, tmp_path / "cut.pt")
+    assert resumed.resumed_from == 2
+    assert same(whole, resumed)
+
+
+def test_a_finished_training_is_not_trained_on(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
+) -> None:
+    first = train(short, make_config(), orca, checkpoint)
+    again = train(short, make_config(), orca, checkpoint, progress=interrupt_at(4))
+    assert again.resumed_from == 3
+    assert same(first, again)
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from dynssm_ros.learning.configuration import ModelConfig
+from dynssm_ros.learning.export import save_artifact
+from dynssm_ros.learning.training import train
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import load_vehicle
+
+folder = Path(sys.argv[1])
+config = ModelConfig.model_validate_json((folder / "config.json").read_text())
+show = lambda done, total, words: print(done, flush=True)
+trained = train(Recording.load(folder / "r.parquet"), config, load_vehicle("orca"), folder / "checkpoint.pt", "cpu", show)
+save_artifact(trained, folder / "model")
+"""
+
+
+def test_a_killed_process_leaves_a_checkpoint_to_go_on_from_and_no_model(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path: Path
+) -> None:
+    config = make_config(training={"epochs": 10**6, "patience": 10**6})
+    short.save(tmp_path / "r.parquet")
+    (tmp_path / "config.json").write_text(config.model_dump_json())
+    command = [sys.executable, "-c", KILLED, str(tmp_path)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
+    ) as child:
+        assert child.stdout is not None
+        epochs = [int(child.stdout.readline()) for _ in range(3)]
+        child.kill()
+    assert epochs == [1, 2, 3]
+    assert child.returncode == -9
+    assert not (tmp_path / "model").exists()
+
+    killed_at = torch.load(tmp_path / "checkpoint.pt", weights_only=True)["epoch"]
+    assert killed_at >= 3
+    with pytest.raises(KeyboardInterrupt):  # the same, never killed
+        train(short, config, orca, tmp_path / "whole.pt", progress=interrupt_at(killed_at + 1))
+    with pytest.raises(KeyboardInterrupt):
+        train(short, config, orca, tmp_path / "checkpoint.pt", progress=interrupt_at(killed_at + 1))
+    resumed, whole = (torch.load(tmp_path / name, weights_only=True) for name in ("checkpoint.pt", "whole.pt"))
+    assert resumed["epoch"] == killed_at + 1
+    assert resumed["history"] == whole["history"]
+    for name, value in whole["model"].items():
+        assert torch.equal(resumed["model"][name], value), name
+
+
+# --- checkpoints that are not ours --------------------------------------------------------------
+
+
+def flipped(content: bytes, member: str) -> bytes:
+    """``content`` with one bit of an archive member's data flipped."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        info = next(each for each in archive.infolist() if each.filename.endswith(member) and each.file_size > 100)
+    name, extra = struct.unpack_from("<HH", content, info.header_offset + 26)
+    at = info.header_offset + 30 + name + extra + info.file_size // 2
+    return content[:at] + bytes([content[at] ^ 0x40]) + content[at + 1 :]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: content[: len(content) // 2],
+        lambda content: b"",
+        lambda content: b"not a checkpoint",
+        lambda content: flipped(content, "data.pkl"),
+        lambda content: flipped(content, "7"),
+    ],
+    ids=["truncated", "empty", "text", "bit flipped in a name", "bit flipped in a weight"],
+)
+def test_a_damaged_checkpoint_is_ignored(
+    short: Recording,
+    make_config: MakeConfig,
+    orca: Vehicle,
+    checkpoint: Path,
+    damage: Callable[[bytes], bytes],
+) -> None:
+    first = train(short, make_config(), orca, checkpoint)
+    checkpoint.write_bytes(damage(checkpoint.read_bytes()))
+    again = train(short, make_config(), orca, checkpoint)
+    assert again.resumed_from == 0
+    assert same(first, again)
+
+
+def test_the_checkpoint_of_another_training_is_ignored(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path, drive: Callable[..., Recording]
+) -> None:
+    base = make_config(training={"epochs": 1})
+    cases = [
+        (short, make_config(training={"epochs": 1, "seed": 5}), orca),
+        (short, make_config(training={"epochs": 1}, H=3), orca),
+        (short, base, orca.with_nominal((orca.nominal + orca.lower) / 2)),
+        (drive(orca, 400, seed=9), base, orca),
+    ]
+    for recording, config, vehicle in cases:
+        train(short, base, orca, checkpoint)
+        assert train(recording, config, vehicle, checkpoint).resumed_from == 0
+    assert train(*cases[-1], checkpoint).resumed_from == 1
+
+
+class Harmful:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.marker),)
+
+
+@pytest.mark.parametrize("kind", ["pickle", "torch archive", "old torch file"])
+def test_nothing_is_unpickled_from_a_checkpoint(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path, tmp_path: Path, kind: str
+) -> None:
+    harmful = Harmful(tmp_path / "executed")
+    if kind == "pickle":
+        checkpoint.write_bytes(pickle.dumps(harmful))
+    else:
+        torch.save({"model": harmful}, checkpoint, _use_new_zipfile_serialization=kind == "torch archive")
+    assert zipfile.is_zipfile(checkpoint) == (kind == "torch archive")
+    assert train(short, make_config(training={"epochs": 1}), orca, checkpoint).resumed_from == 0
+    assert not (tmp_path / "executed").exists()
+    pickle.loads(pickle.dumps(harmful))
+    assert (tmp_path / "executed").exists(), "the bait is harmless"
+
+
+# --- when it ends -------------------------------------------------------------------------------
+
+
+def test_it_stops_after_as_many_epochs_without_progress_as_patience_says(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
+) -> None:
+    config = make_config(training={"epochs": 50, "patience": 3, "learning_rate": 0.5})
+    trained = train(short, config, orca, checkpoint)
+    epochs = len(trained.history["train/prediction"])
+    assert epochs == trained.best_epoch + 3 < 50
+
+
+def test_a_training_that_diverges_at_once_is_a_clear_error(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
+) -> None:
+    config = make_config(training={"learning_rate": 1e30})
+    with pytest.raises(ConfigurationError, match=r"model small: diverged .* smaller learning_rate than 1e\+30"):
+        train(short, config, orca, checkpoint)
+
+
+def test_a_training_that_diverges_later_keeps_the_best_it_had(
+    short: Recording,
+    make_config: MakeConfig,
+    orca: Vehicle,
+    checkpoint: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    validate = training_module._Optimisation._validate
+
+    def diverging(self: Any) -> dict[str, float]:
+        terms = validate(self)
+        return terms if self.state.epoch < 2 else dict.fromkeys(terms, float("nan"))
+
+    monkeypatch.setattr(training_module._Optimisation, "_validate", diverging)
+    trained = train(short, make_config(training={"epochs": 9}), orca, checkpoint)
+    assert len(trained.history["validation/prediction"]) == 2
+    assert np.isfinite(trained.validation_rmse).all()
+
+
+def test_another_sampling_time_is_refused(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
+) -> None:
+    slower = orca.model_copy(update={"sampling_time": 0.04})
+    with pytest.raises(RecordingError, match=r"sampling time 0\.02 s, but vehicle orca has 0\.04 s; .*--rate 25"):
+        train(short, make_config(), slower, checkpoint)
+
+
+def test_a_device_that_is_not_there_is_refused() -> None:
+    check_device("cpu")
+    with pytest.raises(ConfigurationError, match="--device tpu: not available here; expected cpu"):
+        check_device("tpu")
+
+
+# --- what it learns -----------------------------------------------------------------------------
+
+
+def persistence(recording: Recording, config: ModelConfig) -> np.ndarray:
+    """RMSE of predicting no change, on the validation windows."""
+    _, increment = split_windows(recording, config.H, config.training)[1].batch(slice(None))
+    return increment.square().mean(0).sqrt().numpy()
+
+
+@pytest.mark.parametrize("name", ["whole", "neural_only"])
+def test_it_learns_a_car_whose_coefficients_are_wrong(
+    laps: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path, name: str
+) -> None:
+    lacks: dict[str, Any] = {} if name == "whole" else {"physics": None, "adaptation": None, "residual": {"scale": 3.0}}
+    changes = {"physics": {"nominal": "mid_range"}} | lacks
+    config = make_config(**changes, training={"epochs": 25, "learning_rate": 0.02})
+    trained = train(laps, config, orca, checkpoint)
+    assert (np.array(trained.validation_rmse) < 0.7 * persistence(laps, config)).all()
+    assert trained.history["train/prediction"][-1] < trained.history["train/prediction"][0]
+
+
+def test_ridge_regression_recovers_a_linear_car(make_config: MakeConfig, orca: Vehicle, checkpoint: Path) -> None:
+    rng = np.random.default_rng(4)
+    N, H = 1200, 3
+    W = 0.02 * rng.standard_normal((3, H, 7))
+    W[:, -1, :3] -= 0.1 * np.eye(3)  # stable
+    matrix = np.zeros((N, 7))
+    matrix[:, 3:] = rng.standard_normal((N, 4))
+    for k in range(H - 1, N - 1):
+        matrix[k + 1, :3] = matrix[k, :3] + np.einsum("chj,hj->c", W, matrix[k - H + 1 : k + 1]) + [0.01, 0.0, -0.02]
+    info = RecordingInfo(sampling_time=0.02, commands="topics", source=("linear",))
+    columns = {name: matrix[:, k] for k, name in enumerate(WINDOW_COLUMNS)}
+    time = np.arange(N, dtype=np.int64) * 20_000_000
+    recording = Recording(info, time, np.zeros(N, np.int32), columns)
+    config = make_config(kind="ridge", H=H, ridge_penalty=1e-6, training={"min_speed": 0.0})
+    config = config.model_copy(update={"training": config.training.model_copy(update={"min_speed": 0.0})})
+    recording.columns["v_x"] += 5.0  # the car drives forwards
+    trained = train(recording, config, orca, checkpoint)
+    assert (np.array(trained.validation_rmse) < 1e-5 * np.array(trained.normalisation.state_scale)).all()
+    std, s_delta = np.array(trained.normalisation.input_std), np.array(trained.normalisation.increment_scale)
+    found = trained.model.linear.weight.detach().numpy().reshape(3, H, 7)  # type: ignore[union-attr, operator]
+    np.testing.assert_allclose(found * s_delta[:, None, None] / std, W, atol=1e-5)
+    assert trained.history == {}
+    assert not checkpoint.exists()
+
+
+def test_a_strong_penalty_leaves_the_mean_increment(
+    laps: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
+) -> None:
+    config = make_config(kind="ridge", ridge_penalty=1e12)
+    trained = train(laps, config, orca, checkpoint)
+    windows, _ = split_windows(laps, config.H, config.training)
+    window, target = windows.batch(slice(None))
+    with torch.no_grad():
+        predicted = trained.model(window).increment
+    np.testing.assert_allclose(predicted.numpy(), np.tile(target.mean(0).numpy(), (len(windows), 1)), atol=1e-7)
