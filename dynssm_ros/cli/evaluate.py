@@ -24,7 +24,7 @@ def evaluate(
     model: Annotated[
         list[str],
         typer.Option(
-            help="Model folder, persistence or single_track (needs --vehicle); repeat to compare.",
+            help="Model folder, persistence, single_track or single_track_ewma (need --vehicle); repeat to compare.",
             metavar="NAME_OR_DIR",
         ),
     ],

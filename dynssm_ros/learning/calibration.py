@@ -27,7 +27,8 @@ Progress = Callable[[int, int], None]
 
 _UNIFORM_PRECISION = 12.0  # inverse variance of a uniform distribution on [0, 1]
 _ON_BOUND = 1e-3  # fraction of the range
-_BLOCK = 2.0  # s; errors closer than this are treated as correlated
+_BLOCK = 2.0  # s; errors closer than this are treated as correlated,
+_BLOCKS = 4  # as far as that leaves this many blocks for each coefficient
 _MAX_RESIDUALS = 40_000  # per channel
 _MAX_SEARCHED = 4_000  # the same while it looks for the right valley
 
@@ -87,7 +88,8 @@ class PredictionErrors:
         self._target = np.stack([rows[:3, self.starts + k + 1] for k in range(steps)], axis=1)
         # an error of k steps is measured against what the state does in k steps
         self.scale = np.stack([(self._target[:, k] - rows[:3, self.starts]).std(axis=1) for k in range(steps)], axis=1)
-        self.blocks = recording.time[self.starts] // round(_BLOCK * 1e9)
+        block = min(_BLOCK, len(starts) * recording.T_s / (_BLOCKS * len(COEFFICIENTS)))
+        self.blocks = recording.time[self.starts] // round(block * 1e9)
 
     def __call__(self, theta: Vector) -> Vector:
         """Errors ``(3, steps, N)`` in m/s, m/s, rad/s for coefficients ``(17,)``."""
@@ -216,7 +218,8 @@ def _knowledge(
     np.add.at(summed, index, scores)
     keep = np.flatnonzero(free)
     part = np.ix_(keep, keep)
-    meat = summed[:, keep].T @ summed[:, keep]
+    # fitting takes as many degrees of freedom from the blocks as there are free coefficients
+    meat = summed[:, keep].T @ summed[:, keep] * (len(summed) / max(1, len(summed) - len(keep)))
     bread = np.linalg.inv(information[part] + _UNIFORM_PRECISION * np.eye(len(keep)))
     covariance = np.zeros((size, size))
     covariance[part] = bread @ (meat + _UNIFORM_PRECISION * np.eye(len(keep))) @ bread

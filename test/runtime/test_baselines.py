@@ -1,0 +1,73 @@
+"""The baselines that need no training."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma, load_model
+from dynssm_ros.signals.inputs import applied_inputs
+from dynssm_ros.vehicle import Coefficients, State, load_vehicle, step
+
+CAR = load_vehicle("orca")
+
+
+def drive(bias: np.ndarray, rows: int = 80) -> np.ndarray:
+    """Window rows of the ORCA car under smooth inputs, with ``bias`` added to each step: ``(rows, 7)``."""
+    t = np.arange(rows) * CAR.sampling_time
+    drive = np.zeros((rows, 7))
+    drive[:, 3], drive[:, 4] = 0.5 + 0.1 * np.sin(3 * t), 0.1 * np.sin(2 * t)
+    drive[0, :3] = 1.5, 0.0, 0.0
+    for k in range(rows - 1):
+        applied = applied_inputs(drive[k])
+        state = step(np, State(*drive[k, :3]), applied, Coefficients(*CAR.nominal), CAR.constants, CAR.sampling_time)
+        drive[k + 1, :3] = np.array(state) + bias
+    return drive
+
+
+def windows(rows: np.ndarray, H: int) -> tuple[np.ndarray, np.ndarray]:
+    """All windows of ``H`` rows and the states that follow them."""
+    ends = np.arange(H - 1, len(rows) - 1)
+    return np.stack([rows[end - H + 1 : end + 1] for end in ends]), rows[ends + 1, :3]
+
+
+def test_persistence_repeats_the_last_state() -> None:
+    given, _ = windows(drive(np.zeros(3)), 4)
+    np.testing.assert_array_equal(Persistence().predict(given).state, given[:, -1, :3])
+
+
+def test_the_single_track_reproduces_its_own_drive() -> None:
+    given, following = windows(drive(np.zeros(3)), 1)
+    np.testing.assert_allclose(SingleTrack(CAR).predict(given).state, following, rtol=0, atol=1e-14)
+
+
+def test_the_average_of_past_errors_takes_a_constant_bias_off_and_nothing_else() -> None:
+    model = SingleTrackEwma(CAR)
+    bias = np.array([0.01, -0.02, 0.3])
+    given, following = windows(drive(bias), model.H)
+    prediction = model.predict(given)
+    np.testing.assert_allclose(prediction.state, following, rtol=0, atol=1e-12)
+    assert prediction.physics is not None
+    np.testing.assert_allclose(following - prediction.physics, np.tile(bias, (len(given), 1)), atol=1e-12)
+
+
+def test_a_changing_bias_is_followed_within_the_memory_of_the_average() -> None:
+    model = SingleTrackEwma(CAR)
+    before, after = drive(np.zeros(3), 40), drive(np.array([0.0, 0.01, 0.0]), 120)
+    rows = np.concatenate([before, after])
+    state, following = windows(rows[45:], model.H)
+    left = model.predict(state).state[:, 1] - following[:, 1]
+    assert abs(left[-1]) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["single_track", "single_track_ewma"])
+def test_single_track_models_need_a_vehicle(name: str) -> None:
+    assert load_model(name, CAR).name == name
+    with pytest.raises(ConfigurationError, match=f"model {name}: needs --vehicle"):
+        load_model(name)
+
+
+def test_an_unknown_model_is_named_with_the_known_ones() -> None:
+    with pytest.raises(ConfigurationError, match="'nothing'.*persistence, single_track, single_track_ewma"):
+        load_model("nothing")
