@@ -74,6 +74,7 @@ setup(
             "dynssm = dynssm_ros.cli.main:main",
             "predictor = dynssm_ros.nodes.predictor:main",
             "player = dynssm_ros.nodes.player:main",
+            "simulator = dynssm_ros.nodes.simulator:main",
         ],
     },
 )

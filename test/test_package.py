@@ -165,7 +165,7 @@ def test_every_module_and_template_is_installed(arguments: dict[str, Any]) -> No
 
 def test_commands_lead_to_functions(arguments: dict[str, Any]) -> None:
     targets = dict(script.split(" = ") for script in arguments["entry_points"]["console_scripts"])
-    assert targets.keys() == {"dynssm", "predictor", "player"}
+    assert targets.keys() == {"dynssm", "predictor", "player", "simulator"}
     for target in targets.values():
         module, _, function = target.partition(":")
         path = (ROOT / module.replace(".", "/")).with_suffix(".py")

@@ -70,7 +70,7 @@ def simulate(
             progress=progress,
         )
     write_run(run, out)
-    result = summary(run)
+    result = summary(run) | {"line": line}
     if json is not None:
         write_json(json, result)
     console.print(

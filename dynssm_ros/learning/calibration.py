@@ -155,7 +155,7 @@ def calibrate(
     weighted = _Weighted(errors, lower, width)
     best = min(fits, key=lambda fit: fit.cost).p
     weighted.reweigh(best)
-    final = least_squares(weighted, best, loss, tolerance=1e-12, iterations=100)
+    final = least_squares(weighted, best, loss, tolerance=1e-12, iterations=1000)
     if progress is not None:
         progress(starts + 1, starts + 1)
     theta = lower + final.p * width

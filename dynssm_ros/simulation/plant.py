@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -67,18 +68,23 @@ class SingleTrackPlant:
     """The single-track car. The input of a step acts on that step.
 
     Effects may read from the context ``time`` (s) and ``s`` (m), held over a step, and ``x, y, theta`` (m, m, rad).
-    ``body``, if given, acts before the effects and may take the place of the single-track tyres.
+    ``first`` and ``last`` act before and after the vehicle's own effects.
     """
 
     def __init__(
-        self, vehicle: Vehicle, integrator: Integrator, pose: Pose, state: State, body: StageEffect | None = None
+        self,
+        vehicle: Vehicle,
+        integrator: Integrator,
+        pose: Pose,
+        state: State,
+        first: Sequence[StageEffect] = (),
+        last: Sequence[StageEffect] = (),
     ) -> None:
         self.state = state
         self._vehicle = vehicle
         self._integrator: Integrator = integrator
         self._theta = Coefficients(*(float(value) for value in vehicle.nominal))
-        bodies = () if body is None else (body,)
-        self._effects: tuple[StageEffect, ...] = (_Odometer(), *bodies, *vehicle.active_effects)
+        self._effects: tuple[StageEffect, ...] = (_Odometer(), *first, *vehicle.active_effects, *last)
         self._memory = dict(zip(_Odometer.MEMORY, pose, strict=True))
         self._memory |= initial_memory(vehicle.active_effects, 0.0, 0.0)
         self._substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
@@ -108,8 +114,8 @@ class SingleTrackPlant:
         self._steps += 1
 
 
-def make_plant(vehicle: Vehicle, kind: PlantKind, pose: Pose, state: State) -> Plant:
-    """The plant of that kind, at ``pose`` and moving with ``state``."""
+def make_plant(vehicle: Vehicle, kind: PlantKind, pose: Pose, state: State, last: Sequence[StageEffect] = ()) -> Plant:
+    """The plant of that kind, at ``pose`` and moving with ``state``; ``last`` acts after the vehicle's effects."""
     if kind == "double_track":
-        return SingleTrackPlant(vehicle, "rk4", pose, state, DoubleTrack.of(vehicle.constants))
-    return SingleTrackPlant(vehicle, kind, pose, state)
+        return SingleTrackPlant(vehicle, "rk4", pose, state, (DoubleTrack.of(vehicle.constants),), last)
+    return SingleTrackPlant(vehicle, kind, pose, state, (), last)

@@ -100,9 +100,9 @@ def _offsets(line: ClosedLine, track: Track, margin: float, weight: float, reach
     normal = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
     bend = (np.roll(line.points, 1, axis=0) - 2 * line.points + np.roll(line.points, -1, axis=0)) / h**2
     kappa = np.sum(bend * normal, axis=1)  # by the differences that ``second`` takes; the spline's would ring with it
-    same = sparse.eye_array(N, format="csr")
+    same: Any = sparse.diags_array(np.ones(N), format="csr")
     second = (same[np.roll(np.arange(N), 1)] - 2 * same + same[np.roll(np.arange(N), -1)]) / h**2
-    J: Any = second + sparse.diags_array(kappa**2 / 2)
+    J = second + sparse.diags_array(kappa**2 / 2)
     H = sparse.csc_array(J.T @ J - weight / 2 * second)
     g = np.asarray(J.T @ kappa - weight / 2 * kappa)
 

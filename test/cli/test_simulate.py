@@ -41,6 +41,17 @@ def test_simulate_writes_a_bag_a_summary_and_json(dynssm, tmp_path):
         assert set(opened.counts.values()) == {451}
 
 
+def test_line_and_plant_are_chosen_and_said(dynssm, tmp_path):
+    found = {}
+    for line, plant in (("centre", "rk4"), ("racing", "double_track")):
+        path = tmp_path / f"{line}.json"
+        options = ("--line", line, "--plant", plant, "--laps", 1, "--out", tmp_path / line, "--json", path)
+        assert dynssm("simulate", "--vehicle", "orca", "--track", "club", *options)[0] == 0
+        found[line] = json.loads(path.read_text())
+        assert (found[line]["line"], found[line]["plant"]) == (line, plant)
+    assert found["racing"]["duration_s"] < 0.8 * found["centre"]["duration_s"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -55,6 +66,7 @@ def test_simulate_writes_a_bag_a_summary_and_json(dynssm, tmp_path):
         (["--laps", "1", "--duration", "5"], "expected one of them, positive"),
         (["--scale", "0"], "scale 0; expected a positive number"),
         (["--scale", "0.2"], "orca leaves track club"),
+        (["--scale", "0.1", "--line", "racing"], "track club is 0.04 m wide"),
     ],
 )
 def test_user_errors_are_one_line_and_leave_no_bag(dynssm, tmp_path, arguments, complaint):

@@ -69,5 +69,5 @@ def test_single_track_models_need_a_vehicle(name: str) -> None:
 
 
 def test_an_unknown_model_is_named_with_the_known_ones() -> None:
-    with pytest.raises(ConfigurationError, match="'nothing'.*persistence, single_track, single_track_ewma"):
+    with pytest.raises(ConfigurationError, match=r"'nothing'.*persistence, single_track, single_track_ewma"):
         load_model("nothing")

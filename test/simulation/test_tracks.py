@@ -172,3 +172,11 @@ def test_other_columns_and_unknown_names_are_refused(tmp_path):
 )
 def test_published_tracks_load(data, name, length):
     assert load_track(data / "tracks" / f"{name}.csv").length == pytest.approx(length, rel=1e-3)
+
+
+@pytest.mark.parametrize(("name", "length"), [("austin", 401.0), ("ims", 291.0)])
+def test_published_full_size_tracks_scale_to_the_lengths_of_the_literature(data, name, length):
+    full = load_track(data / "tracks" / f"{name}.csv")
+    small = full.scaled(length / full.length)
+    assert small.length == pytest.approx(length, rel=1e-9)
+    np.testing.assert_allclose(small.width_left / full.width_left, length / full.length)

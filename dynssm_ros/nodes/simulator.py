@@ -1,0 +1,172 @@
+"""A simulated car on the bus: ``ros2 run dynssm_ros simulator --ros-args -p vehicle:=orca -p track:=club``.
+
+Publishes odometry and actuator feedback once per T_s, as the predictor's default topics. Its own driver laps the track
+and publishes the commands, or, with ``driver:=external``, it obeys those that somebody else sends. All driving is in
+:mod:`dynssm_ros.simulation`; this node converts, keeps the time and publishes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any, Literal, get_args
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.nodes.support import SENSOR_QOS, describe, run
+from dynssm_ros.signals.decoding import decoders
+from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.simulation.driver import Style
+from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
+from dynssm_ros.simulation.laps import Sample, drive
+from dynssm_ros.simulation.plant import PlantKind
+from dynssm_ros.simulation.racing_line import LineKind, line_of
+from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.vehicle import Applied, State, load_vehicle
+
+DriverKind = Literal["pure_pursuit", "external"]
+_LATE = 1.0  # s; a node that was held up for longer goes on from there and does not catch up
+
+
+class SimulatorNode(Node):
+    """Drives one car in real time."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("simulator", **options)
+        vehicle = describe(self, "vehicle", "orca", "Vehicle: shipped name or file.", read_only=True)
+        track = describe(self, "track", "club", "Track: built-in name or CSV file.", read_only=True)
+        scale = describe(self, "scale", 1.0, "Size of the track.", (1e-4, 1e4), read_only=True)
+        self._plant: PlantKind = self._choice("plant", "euler", get_args(PlantKind), "How the car is modelled.")
+        self._line: LineKind = self._choice("line", "centre", get_args(LineKind), "What the own driver follows.")
+        self._driver: DriverKind = self._choice(
+            "driver", "pure_pursuit", get_args(DriverKind), f"The own one, or whoever sends {COMMAND_TOPIC}."
+        )
+        self._seed = describe(self, "seed", 0, "Of the driver's variation and the noise.", read_only=True)
+        noise = describe(
+            self, "noise", [0.0, 0.0, 0.0], "Of v_x, v_y (m/s), omega (rad/s): deviations.", read_only=True
+        )
+        aggressiveness = describe(
+            self, "aggressiveness", 0.95, "Share of the limits in use.", (0.1, 1.2), read_only=True
+        )
+        variation = describe(self, "variation", 0.5, "How much speed and line vary.", (0.0, 1.0), read_only=True)
+        self._rate = describe(self, "rate", 1.0, "Speed factor over real time.", (0.01, 100.0), read_only=True)
+        watchdog = describe(
+            self, "watchdog", 0.2, "Age of an external command from which on the car brakes (s).", (0.01, 10.0),
+            read_only=True,
+        )  # fmt: skip
+        if len(noise) != 3 or not all(0 <= std < math.inf for std in noise):
+            raise ConfigurationError(f"parameter noise: {list(noise)}; expected three finite numbers of at least 0")
+        if self._seed < 0:
+            raise ConfigurationError(f"parameter seed: {self._seed}; expected at least 0")
+        self._vehicle = load_vehicle(vehicle)
+        self._track = load_track(track).scaled(scale)
+        self._style = Style(aggressiveness, variation)
+        self._noise = np.array(noise)
+        self._rng = np.random.default_rng([self._seed, 1])  # apart from the driver's, as in `dynssm simulate`
+        self._commands = CommandHolder(self._vehicle, watchdog, time.monotonic)
+        self._obeyed = self._on_road = True
+
+        self._publish_feedback = self.create_publisher(JointState, FEEDBACK_TOPIC, SENSOR_QOS).publish
+        self._publish_odometry = self.create_publisher(Odometry, ODOMETRY_TOPIC, SENSOR_QOS).publish
+        if self._driver == "pure_pursuit":
+            self._publish_command = self.create_publisher(JointState, COMMAND_TOPIC, SENSOR_QOS).publish
+        else:
+            self._decoder = decoders(load_signal_map("default"))[COMMAND_TOPIC]
+            self.create_subscription(JointState, COMMAND_TOPIC, self._on_command, SENSOR_QOS)
+        self._samples = self._drive()
+        self._first_stamp = int(self.get_clock().now().nanoseconds)
+        self._begin, self._count = time.monotonic(), 0
+        self._period = self._vehicle.sampling_time / self._rate
+        self.create_timer(self._period, self._on_time, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_logger().info(
+            f"{self._vehicle.name} on {self._track.name} ({self._track.length:.4g} m), plant {self._plant}, "
+            f"driver {self._driver}, {1 / self._period:.4g} Hz"
+        )
+
+    def _choice(self, name: str, default: str, allowed: tuple[str, ...], description: str) -> Any:
+        value = describe(self, name, default, f"{description} One of: {', '.join(allowed)}.", read_only=True)
+        if value not in allowed:
+            raise ConfigurationError(f"parameter {name}: '{value}'; expected {' or '.join(allowed)}")
+        return value
+
+    def _drive(self) -> Iterator[Sample]:
+        if self._driver == "external":
+            return drive_by_commands(self._vehicle, self._track, self._plant, self._commands.command)
+        line = line_of(self._line, self._vehicle, self._track)
+        return drive(self._vehicle, self._track, self._plant, self._seed, self._style, line)
+
+    def _on_command(self, message: JointState) -> None:
+        values = self._decoder.decode(message)
+        command = Applied(*(values.get(name, math.nan) for name in ("throttle_command", "steering_command")))
+        if not self._commands.receive(command):
+            self.get_logger().warning(
+                f"{COMMAND_TOPIC}: throttle {command.r:g}, steering {command.delta:g} ignored; expected finite numbers",
+                throttle_duration_sec=1.0,
+            )
+
+    def _on_time(self) -> None:
+        """Publishes the samples that are due; the clock of the steps does not drift from that of the timer."""
+        late = time.monotonic() - self._begin - self._count * self._period
+        if late > _LATE:
+            self._begin += late
+            late = 0.0
+        for _ in range(1 + int(late / self._period)):
+            self._publish(next(self._samples))
+
+    def _publish(self, sample: Sample) -> None:
+        """Actuators first, as a predictor needs them when the odometry arrives."""
+        stamp = self._first_stamp + round(self._count * self._vehicle.sampling_time * 1e9)
+        self._count += 1
+        self._publish_feedback(_actuators(stamp, sample.feedback))
+        if self._driver == "pure_pursuit":
+            self._publish_command(_actuators(stamp, sample.command))
+        else:
+            self._tell(sample)
+        self._publish_odometry(
+            _odometry(stamp, sample, State(*(sample.state + self._noise * self._rng.standard_normal(3))))
+        )
+
+    def _tell(self, sample: Sample) -> None:
+        """Logs when an external driver falls silent, comes back, leaves the road or returns to it."""
+        obeyed = self._commands.fresh
+        if obeyed != self._obeyed:
+            self.get_logger().info(f"obeys {COMMAND_TOPIC}" if obeyed else f"{COMMAND_TOPIC} is silent: brakes")
+        right, left = self._track.widths(sample.s)
+        on_road = bool(-right <= sample.lateral <= left)
+        if on_road != self._on_road:
+            words = "is back on" if on_road else "leaves"
+            self.get_logger().warning(f"{self._vehicle.name} {words} the road at s = {sample.s:.4g} m")
+        self._obeyed, self._on_road = obeyed, on_road
+
+
+def _actuators(stamp: int, applied: Applied) -> JointState:
+    message = JointState(name=["throttle", "steering"], position=[float(applied.r), float(applied.delta)])
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
+    return message
+
+
+def _odometry(stamp: int, sample: Sample, measured: State) -> Odometry:
+    message = Odometry(child_frame_id="base_link")
+    message.header.frame_id = "map"
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
+    pose, twist = message.pose.pose, message.twist.twist
+    pose.position.x, pose.position.y = sample.pose.x, sample.pose.y
+    pose.orientation.z, pose.orientation.w = math.sin(sample.pose.theta / 2), math.cos(sample.pose.theta / 2)
+    twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in measured)
+    return message
+
+
+def main(args: list[str] | None = None) -> None:
+    """Runs the node; a user error is one line and exit status 1."""
+    run(SimulatorNode, args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,195 @@
+"""The simulated car on the bus, as its own process: alone, with the predictor, and driven by somebody else."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
+
+from dynssm_ros.nodes.live import LiveRun, collecting, isolated_environment, predictor_process
+from dynssm_ros.nodes.support import SENSOR_QOS
+from dynssm_ros.signals.decoding import header_stamp_ns
+from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
+from dynssm_ros.simulation.laps import drive
+from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.vehicle import load_vehicle
+
+pytestmark = [pytest.mark.xdist_group("dds"), pytest.mark.timeout(120)]
+
+PERIOD = 20_000_000  # ns
+
+
+def _simulator(*parameters: str) -> list[str]:
+    arguments = [part for text in parameters for part in ("-p", text)]
+    return [sys.executable, "-m", "dynssm_ros.nodes.simulator", *(["--ros-args", *arguments] if arguments else [])]
+
+
+class Pit:
+    """Hears the simulated car and, if asked to, drives it."""
+
+    def __init__(self, stack: ExitStack, *parameters: str) -> None:
+        self.run = LiveRun(PERIOD)
+        self.collector = stack.enter_context(collecting(self.run))
+        self.odometry: list[Odometry] = []
+        self.feedback: dict[int, tuple[float, ...]] = {}
+        self.command: dict[int, tuple[float, ...]] = {}
+        self.answer: JointState | None = None
+        subscribe = self.collector.create_subscription
+        subscribe(JointState, FEEDBACK_TOPIC, lambda m: self._keep(self.feedback, m), SENSOR_QOS)
+        subscribe(JointState, COMMAND_TOPIC, lambda m: self._keep(self.command, m), SENSOR_QOS)
+        subscribe(Odometry, ODOMETRY_TOPIC, self._on_odometry, SENSOR_QOS)
+        self._send = self.collector.create_publisher(JointState, COMMAND_TOPIC, SENSOR_QOS).publish
+        self.process = subprocess.Popen(
+            _simulator(*parameters), env=os.environ.copy(), stderr=subprocess.PIPE, text=True
+        )
+        stack.callback(self._stop)
+
+    @property
+    def v_x(self) -> float:
+        return self.odometry[-1].twist.twist.linear.x
+
+    def reply(self, throttle: float, steering: float) -> None:
+        """Answers every odometry message from now on with this command."""
+        self.answer = JointState(name=["throttle", "steering"], position=[throttle, steering])
+
+    def wait_for(self, condition: Callable[[], bool], timeout: float = 20.0) -> bool:
+        return self.collector.wait_for(condition, timeout)
+
+    def _keep(self, place: dict[int, tuple[float, ...]], message: JointState) -> None:
+        place[header_stamp_ns(message) or 0] = tuple(message.position)
+
+    def _on_odometry(self, message: Odometry) -> None:
+        with self.collector.changed:
+            self.odometry.append(message)
+            self.collector.changed.notify_all()
+        if self.answer is not None:
+            self._send(self.answer)
+
+    def _stop(self) -> None:
+        self.process.send_signal(signal.SIGINT)
+        self.process.communicate(timeout=10)
+
+
+StartPit = Callable[..., Pit]
+
+
+@pytest.fixture
+def start_pit() -> Iterator[StartPit]:
+    with ExitStack() as stack:
+        os.environ.update(isolated_environment())
+        yield lambda *parameters: Pit(stack, *parameters)
+
+
+def test_it_drives_what_simulate_drives_in_real_time(start_pit: StartPit) -> None:
+    pit = start_pit("seed:=3")
+    assert pit.wait_for(lambda: bool(pit.odometry))
+    begin, seen = time.monotonic(), len(pit.odometry)
+    assert pit.wait_for(lambda: len(pit.odometry) >= seen + 100)
+    assert time.monotonic() - begin == pytest.approx(100 * 0.02, abs=0.3)
+
+    stamps = np.array([header_stamp_ns(m) for m in pit.odometry])
+    assert set(np.diff(stamps)) == {PERIOD}
+    twists = np.array([(t.linear.x, t.linear.y, t.angular.z) for t in (m.twist.twist for m in pit.odometry)])
+    offline = list(itertools.islice(drive(load_vehicle("orca"), load_track("club"), seed=3), 1000))
+    states = np.array([sample.state for sample in offline])
+    first = int(np.argmin(np.max(np.abs(states - twists[0]), axis=1)))  # a few are lost before the match
+    np.testing.assert_array_equal(twists, states[first : first + len(twists)])
+    for k, stamp in enumerate(stamps[:100].tolist()):
+        assert pit.feedback[stamp] == pytest.approx(offline[first + k].feedback, abs=0)
+        assert pit.command[stamp] == pytest.approx(offline[first + k].command, abs=0)
+    poses = [m.pose.pose.position for m in pit.odometry]
+    assert (poses[50].x, poses[50].y) == offline[first + 50].pose[:2]
+
+
+def test_predictor_answers_each_odometry_message_of_the_simulated_car(start_pit: StartPit, small_model: Path) -> None:
+    with ExitStack() as stack:
+        stack.enter_context(predictor_process(small_model, {"diagnostics_period": 0.1}, os.environ.copy()))
+        pit = start_pit("noise:=[0.01, 0.005, 0.05]", "plant:=double_track", "rate:=2.0")
+        assert pit.wait_for(lambda: len(pit.run.predicted) >= 100)
+        heard = {header_stamp_ns(m) for m in pit.odometry}
+        first, last = min(pit.run.predicted), max(pit.run.predicted)
+        assert set(range(first, last + 1, PERIOD)) == set(pit.run.predicted)
+        actual = {header_stamp_ns(m): m.twist.twist.linear.x for m in pit.odometry}
+        errors = [state[0] - actual[stamp] for stamp, state in pit.run.predicted.items() if stamp in actual]
+        assert len(heard) > 95
+        assert np.sqrt(np.mean(np.square(errors))) < 0.1
+
+
+def test_external_driver_is_obeyed_and_its_silence_stops_the_car(start_pit: StartPit) -> None:
+    pit = start_pit("driver:=external")
+    assert pit.wait_for(lambda: len(pit.odometry) > 20)
+    assert {m.twist.twist.linear.x for m in pit.odometry} == {0.0}, "it waits"
+    assert set(pit.feedback.values()) == {(0.0, 0.0), (-0.1, 0.0)} or set(pit.feedback.values()) == {(-0.1, 0.0)}
+
+    pit.reply(0.5, 0.03)
+    assert pit.wait_for(lambda: pit.v_x > 1.0)
+    newest = pit.feedback[max(pit.feedback)]
+    assert newest == (0.5, 0.03)
+    pit.reply(float("nan"), 0.0)
+    assert pit.wait_for(lambda: pit.v_x < 1e-6), "nothing that is worth obeying: it brakes"
+    assert pit.feedback[max(pit.feedback)] == (-0.1, 0.03), "with the steering held"
+
+    pit.reply(0.5, 0.0)
+    assert pit.wait_for(lambda: pit.v_x > 0.5), "and it comes back"
+    pit.answer = None
+    assert pit.wait_for(lambda: pit.v_x < 1e-6)
+
+
+def test_single_missing_commands_do_not_brake(start_pit: StartPit) -> None:
+    pit = start_pit("driver:=external", "watchdog:=5.0")
+    assert pit.wait_for(lambda: bool(pit.odometry))
+    pit.reply(0.4, 0.0)
+    assert pit.wait_for(lambda: pit.v_x > 0.3)
+    pit.answer = None
+    sent = len(pit.odometry)
+    assert pit.wait_for(lambda: len(pit.odometry) >= sent + 20)
+    assert pit.feedback[max(pit.feedback)] == (0.4, 0.0)
+
+
+def test_a_car_that_cannot_hold_the_road_ends_in_one_line() -> None:
+    command = _simulator("scale:=0.3", "rate:=50.0")
+    result = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False, env=isolated_environment()
+    )
+    assert result.returncode == 1
+    errors = [line for line in result.stderr.strip().splitlines() if "[INFO]" not in line]
+    assert len(errors) == 1
+    assert "orca leaves track club after" in errors[0]
+
+
+@pytest.mark.parametrize(
+    ("parameter", "expected"),
+    [
+        ("track:=nowhere", "'nowhere' is neither a file nor a built-in name"),
+        ("vehicle:=tank", "'tank' is neither a file nor a shipped name"),
+        ("plant:=rk5", "parameter plant: 'rk5'; expected euler or rk4 or double_track"),
+        ("driver:=nobody", "parameter driver: 'nobody'; expected pure_pursuit or external"),
+        ("line:=left", "parameter line: 'left'; expected centre or racing"),
+        ("noise:=[0.1, -0.2, 0.0]", "parameter noise: [0.1, -0.2, 0.0]; expected three finite numbers"),
+        ("seed:=-1", "parameter seed: -1; expected at least 0"),
+    ],
+)
+def test_a_wrong_start_is_one_clear_line(parameter: str, expected: str) -> None:
+    result = subprocess.run(_simulator(parameter), capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 1
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    assert expected in lines[0]
+
+
+def test_the_process_holds_no_torch(start_pit: StartPit) -> None:
+    pit = start_pit()
+    assert pit.wait_for(lambda: bool(pit.odometry))
+    assert "torch" not in Path(f"/proc/{pit.process.pid}/maps").read_text()

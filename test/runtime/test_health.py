@@ -1,0 +1,57 @@
+"""What the live predictor says of itself."""
+
+from __future__ import annotations
+
+import pytest
+
+from dynssm_ros.runtime.health import Health, Level
+from dynssm_ros.signals.history import Refusal
+
+ODOMETRY, FEEDBACK = "/odometry", "/feedback"
+
+
+@pytest.fixture
+def health() -> Health:
+    """After one second of odometry at 100 Hz and feedback at 50 Hz, every message answered in 1 ms."""
+    health = Health((FEEDBACK, ODOMETRY), max_silence=0.25)
+    for k in range(101):
+        now = k / 100
+        if k % 2 == 0:
+            health.arrived(FEEDBACK, now)
+        health.arrived(ODOMETRY, now)
+        health.predicted(0.001 + 0.00001 * k, 0.25, now + 0.001)
+    return health
+
+
+def test_rates_ages_and_latencies_are_those_of_the_messages(health: Health) -> None:
+    assert health.rate(ODOMETRY, 1.0) == pytest.approx(100.0)
+    assert health.rate(FEEDBACK, 1.0) == pytest.approx(50.0)
+    assert health.age(FEEDBACK, 1.1) == pytest.approx(0.1)
+    assert health.latency(50) == pytest.approx(0.0015)
+    assert health.verdict(1.05) == (Level.OK, "predicting")
+    assert health.values(1.05)["share of the residual"] == "0.250"
+
+
+def test_before_the_first_message_nothing_was_received() -> None:
+    health = Health((FEEDBACK, ODOMETRY), 0.25)
+    assert health.verdict(0.0) == (Level.ERROR, "/feedback: nothing received; /odometry: nothing received")
+    assert health.rate(ODOMETRY, 0.0) == 0.0
+    assert health.values(0.0)["latency p99 (ms)"] == "0.000"
+
+
+def test_silence_is_an_error_and_has_no_rate(health: Health) -> None:
+    for k in range(101, 200):
+        health.arrived(FEEDBACK, k / 100)
+    level, words = health.verdict(1.99)
+    assert level is Level.ERROR
+    assert words == "/odometry: silent for 1.0 s"
+    assert health.rate(ODOMETRY, 1.99) == 0.0
+
+
+@pytest.mark.parametrize(("refusal", "level"), [(Refusal.FILLING, Level.WARN), (Refusal.STALE, Level.ERROR)])
+def test_a_refusal_is_told_until_a_prediction_goes_out_again(health: Health, refusal: Refusal, level: Level) -> None:
+    health.refused(refusal, 1.02)
+    assert health.verdict(1.03) == (level, refusal.value)
+    assert health.values(1.03)[f"refused: {refusal.name.lower()}"] == "1"
+    health.predicted(0.001, 0.0, 1.04)
+    assert health.verdict(1.05) == (Level.OK, "predicting")

@@ -1,0 +1,66 @@
+"""Offline replay: the live predictor fed from a bag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dynssm_ros.errors import BagError
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.predictor import Prediction, Predictor
+from dynssm_ros.runtime.replay import replay, replay_to_bag
+from dynssm_ros.signals.bags import open_bag
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.history import Refusal
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.vehicle import COEFFICIENTS
+
+H = 5
+DEFAULT = load_signal_map("default")
+
+
+@pytest.fixture
+def predictor(small_model: Path) -> Predictor:
+    return Predictor(OnnxModel(open_artifact(small_model)), DEFAULT)
+
+
+def test_replay_gives_what_evaluation_computes_from_the_recording(predictor: Predictor, laps_bag: Path) -> None:
+    with open_bag(laps_bag) as bag:
+        outcomes = [answer.outcome for answer in replay(bag, predictor)]
+    assert outcomes[: H - 1] == [Refusal.FILLING] * (H - 1)
+    predicted = np.array([outcome.state for outcome in outcomes[H - 1 :] if isinstance(outcome, Prediction)])
+    rows = extract([laps_bag], DEFAULT, 50.0).matrix
+    windows = np.lib.stride_tricks.sliding_window_view(rows, H, axis=0).transpose(0, 2, 1)
+    assert len(predicted) == len(windows) == len(rows) - H + 1
+    np.testing.assert_allclose(predicted, predictor.model.predict(windows).state, rtol=1e-6, atol=1e-6)
+
+
+def test_the_new_bag_holds_predictions_parameters_and_on_request_the_inputs(
+    predictor: Predictor, laps_bag: Path, tmp_path: Path
+) -> None:
+    count, refusals, notes = replay_to_bag(laps_bag, predictor, tmp_path / "out", with_inputs=True)
+    assert (count, refusals, notes) == (997, {Refusal.FILLING: H - 1}, [])
+    with open_bag(tmp_path / "out") as bag, open_bag(laps_bag) as source:
+        assert bag.counts == {"/dynssm/prediction": count, "/dynssm/parameters": count, **source.counts}
+        topic, log_time, raw = next(iter(bag.messages(["/dynssm/prediction"])))
+        message = bag.decode(topic, raw)
+        parameters = bag.decode("/dynssm/parameters", next(iter(bag.messages(["/dynssm/parameters"]))).raw)
+    stamp = message.header.stamp
+    assert stamp.sec * 10**9 + stamp.nanosec == pytest.approx(log_time + 20_000_000, abs=10_000)
+    assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
+    variances = message.twist.covariance[[0, 7, 35]]
+    np.testing.assert_allclose(variances, predictor.model.covariance)
+    assert parameters.name == list(COEFFICIENTS)
+
+
+def test_a_bag_without_the_topics_leaves_nothing_behind(predictor: Predictor, orca_bag: Path, tmp_path: Path) -> None:
+    other = load_signal_map("default").model_dump()
+    for source in other["signals"].values():
+        source["topic"] = source["topic"].replace("/vehicle", "/car")
+    renamed = Predictor(predictor.model, type(DEFAULT).model_validate(other))
+    with pytest.raises(BagError, match="topic /car/actuator_feedback is missing"):
+        replay_to_bag(orca_bag, renamed, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,119 @@
+"""A car that obeys: the watchdog, the actuator limits, standing still and setting off."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from dynssm_ros.simulation.external import CommandHolder, Creeping, drive_by_commands
+from dynssm_ros.simulation.laps import SimulationError
+from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, step
+
+ORCA, AV21, CLUB = load_vehicle("orca"), load_vehicle("av21"), load_track("club")
+
+
+class Watch:
+    """A clock that is set by hand."""
+
+    now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+def drive(vehicle, command, count, plant="euler", track=CLUB):
+    chosen = command if callable(command) else lambda previous: command
+    return list(itertools.islice(drive_by_commands(vehicle, track, plant, chosen), count))
+
+
+def test_fresh_commands_are_obeyed_within_the_actuators():
+    watch = Watch()
+    holder = CommandHolder(ORCA, 0.2, watch)
+    assert holder.receive(Applied(0.4, 0.05))
+    watch.now += 0.19
+    assert holder.command(Applied(0.0, 0.0)) == (0.4, 0.05)
+    holder.receive(Applied(7.0, 0.3))
+    assert holder.command(Applied(0.0, 0.0)) == (1.0, 5.0 * 0.02), "throttle range, steering rate"
+    assert holder.command(Applied(0.0, 0.34)) == (1.0, 0.3)
+    holder.receive(Applied(-7.0, -9.0))
+    assert holder.command(Applied(0.0, -0.34)) == (-0.1, -0.35), "throttle and steering range"
+
+
+def test_old_commands_make_it_brake_with_the_steering_held():
+    watch = Watch()
+    holder = CommandHolder(ORCA, 0.2, watch)
+    assert holder.command(Applied(0.5, 0.1)) == (-0.1, 0.1), "none yet"
+    holder.receive(Applied(0.4, 0.05))
+    assert holder.fresh
+    watch.now += 0.21
+    assert not holder.fresh
+    assert holder.command(Applied(0.4, 0.05)) == (-0.1, 0.05)
+    holder.receive(Applied(0.4, 0.05))
+    assert holder.fresh
+
+
+@pytest.mark.parametrize("bad", [Applied(float("nan"), 0.0), Applied(0.1, float("inf"))])
+def test_commands_that_are_not_finite_change_nothing(bad):
+    holder = CommandHolder(ORCA, 0.2, Watch())
+    assert not holder.receive(bad)
+    assert not holder.fresh
+
+
+@pytest.mark.parametrize("plant", ["euler", "rk4", "double_track"])
+@pytest.mark.parametrize("vehicle", [ORCA, AV21], ids=["orca", "av21"])
+def test_it_stands_until_it_is_driven_and_comes_to_rest_again_under_the_brakes(vehicle, plant):
+    standing = drive(vehicle, Applied(0.0, 0.1), 30, plant)
+    assert {sample.state for sample in standing} == {State(0.0, 0.0, 0.0)}
+    assert {sample.pose for sample in standing} == {standing[0].pose}
+
+    commands = itertools.chain([Applied(0.4, 0.02)] * 40, itertools.repeat(Applied(vehicle.inputs.throttle[0], 0.02)))
+    states = [sample.state for sample in drive(vehicle, lambda previous: next(commands), 150, plant)]
+    assert states[40].v_x > 0.5
+    assert min(state.v_x for state in states) >= 0.0
+    np.testing.assert_allclose(states[-1], 0.0, atol=1e-9)
+    assert max(abs(state.v_y) for state in states) < 0.2 * states[40].v_x, "no ringing on the way"
+
+
+def test_above_creeping_speed_each_step_is_the_vehicle_model():
+    samples = drive(ORCA, Applied(0.6, 0.03), 120)
+    fast = [pair for pair in itertools.pairwise(samples) if pair[0].state.v_x > Creeping(ORCA, "euler").speed]
+    assert len(fast) > 30
+    for before, after in fast:
+        reached = step(np, before.state, before.command, Coefficients(*ORCA.nominal), ORCA.constants, 0.02)
+        np.testing.assert_allclose(after.state, reached, rtol=1e-9)
+        assert after.feedback == before.command
+
+
+def test_creeping_wheels_roll_without_slip():
+    car, limit = ORCA.constants, Creeping(ORCA, "euler").speed
+    creeping = [s.state for s in drive(ORCA, Applied(0.4, 0.2), 60) if 0.1 < s.state.v_x < limit]
+    assert len(creeping) > 3
+    for before, after in itertools.pairwise(creeping):
+        assert after.omega == pytest.approx(before.v_x * np.tan(0.2) / (car.l_f + car.l_r))
+        assert after.v_y == pytest.approx(car.l_r * after.omega)
+
+
+def test_creeping_speed_is_where_forward_euler_starts_to_ring():
+    limit = Creeping(ORCA, "euler").speed
+
+    def settles(v_x):
+        state = State(v_x, 0.0, 0.5)
+        for _ in range(200):
+            moved = step(np, state, Applied(0.2, 0.0), Coefficients(*ORCA.nominal), ORCA.constants, 0.02)
+            state = State(v_x, moved.v_y, moved.omega)
+        return abs(state.omega - moved.omega) < 1e-9 and abs(state.omega) < 0.3
+
+    assert settles(1.3 * limit)
+    assert not settles(0.6 * limit)
+    assert Creeping(ORCA, "rk4").speed == pytest.approx(limit / 20)
+
+
+def test_it_goes_on_beside_the_road():
+    lateral = [sample.lateral for sample in drive(ORCA, Applied(0.5, 0.0), 150)]
+    assert max(map(abs, lateral)) > 0.5
+
+
+def test_motion_that_is_not_finite_is_one_clear_line():
+    with pytest.raises(SimulationError, match="orca: its motion is not finite after"):
+        drive(ORCA, Applied(float("nan"), 0.0), 5)
