@@ -59,13 +59,13 @@ def racing_line(track: Track, margin: float, tension: float = TENSION) -> Closed
             swell, because a longer way round has less curvature; the larger, the shorter the line.
 
     Raises:
-        TrackError: the road is not twice as wide as the margin everywhere.
+        TrackError: the road is not twice as wide as the margin everywhere, or so winding that no line was found.
     """
     width = track.width_left + track.width_right
-    k = int(np.argmin(width))
-    if not 0 <= 2 * margin * (1 + _SLACK) < width[k]:
+    tight = int(np.argmin(width))
+    if not 0 <= 2 * margin * (1 + _SLACK) < width[tight]:
         raise TrackError(
-            f"track {track.name} is {width[k]:.3g} m wide at s = {track.centre.s[k]:.4g} m; expected more than twice the "
+            f"track {track.name} is {width[tight]:.3g} m wide at s = {track.centre.s[tight]:.4g} m; expected more than twice the "
             f"margin of {margin:.3g} m that a racing line keeps"
         )
     count = int(np.clip(2 * len(track.centre.points), MIN_POINTS, MAX_POINTS))
@@ -80,6 +80,10 @@ def racing_line(track: Track, margin: float, tension: float = TENSION) -> Closed
             best, least = line, cost
         if np.max(np.abs(offsets)) < _CONVERGED * np.min(width):
             break
+    if least == np.inf:
+        raise TrackError(
+            f"track {track.name}: no racing line keeps {margin:.3g} m from the borders; expected a wider road"
+        )
     return best
 
 

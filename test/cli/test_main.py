@@ -35,7 +35,10 @@ def test_every_command_has_help(command: str) -> None:
         (["extract"], "Missing argument"),
         (["extract", "bag", "--signals", "av21", "--rate", "0", "--out", "r.parquet"], "'--rate'"),
         (["bench", "--model", "/nowhere"], "/nowhere: no such model folder"),
-        (["train", "r.parquet", "--model", "nothing", "--vehicle", "orca", "--out", "m"], "'nothing' is neither a file"),
+        (
+            ["train", "r.parquet", "--model", "nothing", "--vehicle", "orca", "--out", "m"],
+            "'nothing' is neither a file",
+        ),
         (["train", "r.parquet", "--model", "ridge_orca", "--vehicle", "orca", "--out", "m", "--device", "tpu"], "tpu"),
     ],
 )

@@ -1,0 +1,127 @@
+"""From a bag to a model and its predictions by the commands alone, as the README has it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from dynssm_ros.cli import main as cli
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.signals.bags import open_bag
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import load_vehicle
+
+MODEL = """
+base: dynssm_orca
+name: tiny
+H: 4
+ssm: {channels: 4, states: 2}
+gru: {hidden: 4}
+fusion: {hidden: 8, latent: 8}
+adaptation: {hidden: 8}
+residual: {hidden: [8]}
+training: {epochs: 2, batch_size: 64}
+"""
+
+
+@pytest.fixture
+def dynssm(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Runs the command line in this process: ``dynssm(...) -> (status, stdout, stderr)``."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["dynssm", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        out, err = capsys.readouterr()
+        return int(stopped.value.code or 0), out, err
+
+    return run
+
+
+def test_the_commands_lead_from_a_bag_to_predictions(dynssm, laps_bag: Path, tmp_path: Path) -> None:
+    laps, car, model = tmp_path / "laps.parquet", tmp_path / "car.yaml", tmp_path / "model"
+    (tmp_path / "tiny.yaml").write_text(MODEL)
+    standard = tmp_path / "standard"
+    assert dynssm("extract", laps_bag, "--signals", "default", "--rate", 50, "--out", laps, "--bag", standard)[0] == 0
+    with open_bag(standard) as bag:
+        assert set(bag.types) == {"/vehicle/odometry", "/vehicle/actuator_feedback", "/vehicle/actuator_command"}
+
+    status, out, _ = dynssm(
+        "calibrate", laps, "--vehicle", "orca", "--starts", 1, "--out", car, "--json", tmp_path / "car.json"
+    )
+    assert status == 0
+    assert "one-step RMSE v_x" in out
+    assert load_vehicle(car).coefficients["D_f"].std is not None
+    assert json.loads((tmp_path / "car.json").read_text())["coefficients"]["I_z"]["unit"] == "kg m^2"
+
+    status, out, _ = dynssm(
+        "train",
+        laps,
+        "--model",
+        tmp_path / "tiny.yaml",
+        "--vehicle",
+        car,
+        "--holdout",
+        0.2,
+        "--seed",
+        3,
+        "--out",
+        model,
+    )
+    assert status == 0
+    assert "seed 3" in out
+    card = open_artifact(model).card
+    assert (card.name, card.window, card.training["seed"], card.training["holdout"]) == ("tiny", 4, 3, 0.2)
+    assert (model / "losses.png").stat().st_size > 1000
+    assert not list(tmp_path.glob("*checkpoint*"))
+
+    arguments = ["--model", model, "--model", "single_track", "--model", "persistence", "--vehicle", car]
+    status, out, _ = dynssm(
+        "evaluate", laps, *arguments, "--holdout", 0.2, "--out", tmp_path / "e", "--json", tmp_path / "e.json"
+    )
+    assert status == 0
+    result = json.loads((tmp_path / "e.json").read_text())
+    assert set(result["models"]) == {"tiny", "single_track", "persistence"}
+    assert result["models"]["single_track"]["rmse"]["omega"] < 1e-6
+    assert result["commands"] == "topics"
+
+    status, out, _ = dynssm("replay", laps_bag, "--model", model, "--out", tmp_path / "replayed")
+    assert status == 0
+    assert f"{len(Recording.load(laps)) - 3} predictions" in out
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"vehicle": "av21"}, "sampling time 0.02 s, but vehicle av21 has 0.04 s"),
+        ({"model": "ridge_av21", "commands": "topics"}, "min_speed|5 m/s or more"),
+        ({"commands": "topics", "recording": "gone.parquet"}, "no such recording"),
+    ],
+)
+def test_what_does_not_fit_is_one_line_and_leaves_nothing(
+    dynssm, laps_bag: Path, tmp_path: Path, changes: dict[str, str], words: str
+) -> None:
+    laps = tmp_path / "laps.parquet"
+    assert dynssm("extract", laps_bag, "--signals", "default", "--rate", 50, "--out", laps)[0] == 0
+    given = {"recording": str(laps), "model": "ridge_orca", "vehicle": "orca"} | changes
+    recording = given.pop("recording")
+    options = [part for name, value in given.items() for part in (f"--{name}", value)]
+    status, _, err = dynssm("train", recording, *options, "--out", tmp_path / "model")
+    assert status == 1
+    (line,) = err.strip().splitlines()
+    assert any(word in line for word in words.split("|"))
+    assert [path.name for path in tmp_path.iterdir()] == ["laps.parquet"]
+
+
+def test_a_model_file_with_a_wrong_field_names_it(dynssm, laps_bag: Path, tmp_path: Path) -> None:
+    laps, model = tmp_path / "laps.parquet", tmp_path / "model.yaml"
+    dynssm("extract", laps_bag, "--signals", "default", "--rate", 50, "--out", laps)
+    model.write_text(yaml.safe_dump({"base": "dynssm_orca", "name": "x", "gru": {"hidden": -1}}))
+    status, _, err = dynssm("train", laps, "--model", model, "--vehicle", "orca", "--out", tmp_path / "m")
+    assert status == 1
+    assert "model.yaml: gru.hidden" in err
+    assert "-1" in err
