@@ -40,8 +40,8 @@ setup(
         "numpy>=1.26",
         "scipy>=1.11",
         "torch>=2.13",  # training
-        "onnx>=1.17",  # what torch exports through ...
-        "onnxscript>=0.5",  # ... and by
+        "onnx>=1.17",  # the exported graph ...
+        "onnxscript>=0.5",  # ... and what torch exports it by
         "onnxruntime>=1.19",  # the deployed predictor
         "safetensors>=0.4",  # weights without pickle
         "pyarrow>=15",  # recordings

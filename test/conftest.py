@@ -13,6 +13,7 @@ settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"  # a wrongly typed message field must fail, not corrupt
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # tests run side by side
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 

@@ -27,7 +27,7 @@ PACKAGE = "dynssm_ros"
 PIP_NAMES = {"yaml": "pyyaml"}
 ROSDEP_KEYS = {"onnxruntime": "python3-onnxruntime-pip", "rosbags": "python3-rosbags-pip"}
 FROM_ROS = ("rclpy", "_msgs", "_interfaces")  # of the ROS installation or the `ros` extra
-NEEDED_BY_OTHERS = {"setuptools", "onnx", "onnxscript"}  # by the console scripts; by torch's ONNX export
+NEEDED_BY_OTHERS = {"setuptools", "onnxscript"}  # by the console scripts; by torch's ONNX export
 
 
 @pytest.fixture

@@ -1,9 +1,9 @@
 """Calibration: the nominal coefficients by bounded nonlinear least squares on prediction errors.
 
 Errors of one or several steps ahead are minimised rather than differentiated noisy states. Everything is computed in
-coordinates where each coefficient's admissible range is [0, 1]; the bounds act as weak knowledge (a uniform
-distribution's variance), so that what the data cannot tell comes out as "known by its bounds only" and not as a wild
-value with a wild error.
+coordinates where each coefficient's admissible range is [0, 1]; nominal values and bounds act as weak knowledge (a
+uniform distribution's variance), so that what the data cannot tell stays nominal and comes out as "known by its bounds
+only" and not as a wild value with a wild error.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ _UNIFORM_PRECISION = 12.0  # inverse variance of a uniform distribution on [0, 1
 _ON_BOUND = 1e-3  # fraction of the range
 _BLOCK = 2.0  # s; errors closer than this are treated as correlated,
 _BLOCKS = 4  # as far as that leaves this many blocks for each coefficient
+_ROUNDS = 10  # of fitting and weighing anew, at most
 _MAX_RESIDUALS = 40_000  # per channel
 _MAX_SEARCHED = 4_000  # the same while it looks for the right valley
 
@@ -154,13 +155,12 @@ def calibrate(
             progress(number, starts + 1)
     weighted = _Weighted(errors, lower, width)
     best = min(fits, key=lambda fit: fit.cost).p
-    weighted.reweigh(best)
-    final = least_squares(weighted, best, loss, tolerance=1e-12, iterations=1000)
+    p = _polish(weighted, best, (vehicle.nominal - lower) / width, loss)
     if progress is not None:
         progress(starts + 1, starts + 1)
-    theta = lower + final.p * width
-    free = (final.p > _ON_BOUND) & (final.p < 1 - _ON_BOUND)
-    covariance, unidentified = _knowledge(influence(weighted, final.p, loss), np.tile(errors.blocks, 3 * steps), free)
+    theta = lower + p * width
+    free = (p > _ON_BOUND) & (p < 1 - _ON_BOUND)
+    covariance, unidentified = _knowledge(influence(weighted, p, loss), np.tile(errors.blocks, 3 * steps), free)
     std = np.where(free, np.sqrt(np.diag(covariance)), np.sqrt(1 / _UNIFORM_PRECISION)) * width
     return Calibration(
         vehicle.with_nominal(np.clip(theta, vehicle.lower, vehicle.upper), std),
@@ -186,11 +186,29 @@ class _Weighted:
         weighted: Vector = (self._errors(self._lower + p * self._width) / self._scale[:, :, None]).ravel()
         return np.nan_to_num(weighted, copy=False, nan=1e6, posinf=1e6, neginf=-1e6)
 
-    def reweigh(self, p: Vector) -> None:
-        """Weighs each channel by its own error, now that it is known; the floor keeps exact data finite."""
-        left = self._errors(self._lower + p * self._width)
+    def reweigh(self, p: Vector) -> bool:
+        """Weighs each channel by its own error at ``p``; returns whether that halves any.
+
+        The floor keeps exact data finite.
+        """
+        before, left = self._scale, self._errors(self._lower + p * self._width)
         floor = 1e-9 * self._errors.scale + 1e-15
         self._scale = np.maximum(1.4826 * np.median(np.abs(left), axis=2), floor)
+        return bool((self._scale < 0.5 * before).any())
+
+
+def _polish(weighted: _Weighted, start: Vector, nominal: Vector, loss: Loss) -> Vector:
+    """Fits with each channel weighed by its own error, which is only known along the way."""
+
+    def residuals(p: Vector) -> Vector:
+        return np.concatenate([weighted(p), np.sqrt(_UNIFORM_PRECISION) * (p - nominal)])
+
+    p = start
+    for number in range(_ROUNDS):
+        if not weighted.reweigh(p) and number > 0:
+            break
+        p = least_squares(residuals, p, loss, tolerance=1e-12, iterations=1000).p
+    return p
 
 
 def _starting_points(vehicle: Vehicle, count: int, seed: int) -> list[Vector]:

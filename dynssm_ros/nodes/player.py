@@ -6,18 +6,16 @@ until somebody listens, because DDS matching takes a moment and best-effort mess
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
-from dynssm_ros.errors import BagError, UserError
-from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class
+from dynssm_ros.errors import BagError
+from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class, run
 from dynssm_ros.signals.bags import BagMessage, open_bag
 
 MATCH_TIMEOUT = 10.0  # s
@@ -113,28 +111,22 @@ class PlayerNode(Node):
             raise BagError("parameter bag: not set; expected a rosbag2 folder, e.g. -p bag:=out/laps")
         self.playback = Playback(self, bag)
 
+    def play(self) -> None:
+        """Plays the bag, once or in a loop, when somebody listens."""
+        unheard = self.playback.wait_for_listeners(lambda seconds: rclpy.spin_once(self, timeout_sec=seconds))
+        if unheard:
+            self.get_logger().warning(f"nobody listens to {', '.join(unheard)}")
+        while True:
+            for _ in self.playback.play(self.rate):
+                if not rclpy.ok():
+                    return
+            if not self.loop:
+                return
+
 
 def main(args: list[str] | None = None) -> None:
     """Plays until the end of the bag or an interrupt; a user error is one line and exit status 1."""
-    rclpy.init(args=args)
-    try:
-        node = PlayerNode()
-        unheard = node.playback.wait_for_listeners(lambda seconds: rclpy.spin_once(node, timeout_sec=seconds))
-        if unheard:
-            node.get_logger().warning(f"nobody listens to {', '.join(unheard)}")
-        while True:
-            for _ in node.playback.play(node.rate):
-                if not rclpy.ok():
-                    return
-            if not node.loop:
-                return
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return
-    finally:
-        rclpy.try_shutdown()
+    run(PlayerNode, args, PlayerNode.play)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
@@ -14,6 +14,8 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from dynssm_ros.errors import ConfigurationError, UserError
+
+NodeType = TypeVar("NodeType", bound=Node)
 
 # sensor data, but deep enough that a pause of the process (a model swap, a busy core) loses nothing
 SENSOR_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=100)
@@ -49,15 +51,25 @@ def describe(
     return node.declare_parameter(name, default, descriptor).value
 
 
-def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
-    """Starts rclpy, spins the node until it is interrupted, and turns user errors into one line and exit status 1."""
+def spin(node: Node) -> None:
+    """Serves a node's callbacks until rclpy is shut down."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    executor.spin()
+
+
+def run(
+    make_node: Callable[[], NodeType], args: list[str] | None = None, work: Callable[[NodeType], None] = spin
+) -> None:
+    """Starts rclpy, lets a node ``work`` until it is done or interrupted, and ends cleanly.
+
+    A user error becomes one line and exit status 1.
+    """
     rclpy.init(args=args)
-    node: Node | None = None
+    node: NodeType | None = None
     try:
         node = make_node()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        executor.spin()
+        work(node)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)

@@ -65,8 +65,8 @@ def racing_line(track: Track, margin: float, tension: float = TENSION) -> Closed
     tight = int(np.argmin(width))
     if not 0 <= 2 * margin * (1 + _SLACK) < width[tight]:
         raise TrackError(
-            f"track {track.name} is {width[tight]:.3g} m wide at s = {track.centre.s[tight]:.4g} m; expected more than twice the "
-            f"margin of {margin:.3g} m that a racing line keeps"
+            f"track {track.name} is {width[tight]:.3g} m wide at s = {track.centre.s[tight]:.4g} m; expected more than "
+            f"twice the margin of {margin:.3g} m that a racing line keeps"
         )
     count = int(np.clip(2 * len(track.centre.points), MIN_POINTS, MAX_POINTS))
     weight = tension**2 * curvature_integral(track.centre) / track.length

@@ -1,113 +1,168 @@
-"""The model folder: what is wrong with one is found when it is opened, in one clear line."""
+"""Model folders: what is written is read, and each way of damage is one clear line."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 import yaml
 from safetensors.numpy import load_file, save_file
 
 from dynssm_ros.errors import ArtifactError
-from dynssm_ros.runtime.artifact import FORMAT_VERSION, open_artifact
+from dynssm_ros.runtime.artifact import CARD, FORMAT_VERSION, METRICS, ONNX, WEIGHTS, checksum, open_artifact, read_card
+from dynssm_ros.runtime.artifact import write_card as write
 from dynssm_ros.runtime.models import OnnxModel
-
-Damage = Callable[[Path], None]
-FILES = ("model.yaml", "weights.safetensors", "model.onnx", "metrics.json")
 
 
 @pytest.fixture
 def folder(small_model: Path, tmp_path: Path) -> Path:
-    """A copy to be damaged."""
+    """A copy of the small model, to spoil."""
     return shutil.copytree(small_model, tmp_path / "model")
 
 
-def edit_card(folder: Path, **changes: Any) -> None:
-    card = yaml.safe_load((folder / "model.yaml").read_text())
-    (folder / "model.yaml").write_text(yaml.safe_dump(card | changes))
+def change_card(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    content = yaml.safe_load((folder / CARD).read_text())
+    change(content)
+    (folder / CARD).write_text(yaml.safe_dump(content))
 
 
-def sign(folder: Path) -> None:
-    """Makes the checksums right again, as a careful forger would."""
-    sums = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in FILES[1:]}
-    edit_card(folder, checksums=sums)
+def certify(folder: Path) -> None:
+    """Makes the card's checksums those of the files, as somebody would who changes them on purpose."""
+    change_card(folder, lambda card: card.update(checksums={n: checksum(folder / n) for n in (WEIGHTS, ONNX, METRICS)}))
 
 
-def poison(folder: Path) -> None:
-    weights = load_file(folder / "weights.safetensors")
-    name = sorted(weights)[0]
-    weights[name] = np.full_like(weights[name], np.nan)
-    save_file(weights, folder / "weights.safetensors")
-    sign(folder)
+def refusal(folder: Path, use: Callable[[Path], object] = open_artifact) -> str:
+    """The one line with which ``folder`` is refused."""
+    with pytest.raises(ArtifactError) as refused:
+        use(folder)
+    assert str(folder) in str(refused.value)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
 
 
-def test_a_good_folder_opens_and_says_what_it_is(folder: Path) -> None:
-    card = open_artifact(folder).card
-    assert (card.name, card.kind, card.window, card.sampling_time, card.commands) == (
-        "small",
-        "dynssm",
-        5,
-        0.02,
-        "topics",
-    )
-    assert card.vehicle.name == "orca"
-    assert card.training["recordings"] == ["club"]
-    assert json.loads((folder / "metrics.json").read_text())["onnx_difference"] <= 1e-5
+def deploy(folder: Path) -> OnnxModel:
+    return OnnxModel(open_artifact(folder))
 
 
-@pytest.mark.parametrize("name", FILES)
+def test_a_card_is_read_as_it_was_written(small_model: Path, tmp_path: Path) -> None:
+    card = open_artifact(small_model).card
+    write(card, tmp_path)
+    assert read_card(tmp_path) == card
+    assert card.format_version == FORMAT_VERSION
+
+
+def test_a_folder_that_is_not_there_says_how_to_make_one(tmp_path: Path) -> None:
+    assert refusal(tmp_path / "none").endswith("no such model folder; `dynssm train` writes one")
+
+
+@pytest.mark.parametrize("name", [CARD, WEIGHTS, ONNX, METRICS])
 def test_a_missing_file_is_named(folder: Path, name: str) -> None:
     (folder / name).unlink()
-    with pytest.raises(ArtifactError, match=f"incomplete model folder, {name} is missing"):
-        open_artifact(folder)
+    assert f"incomplete model folder, {name} is missing" in refusal(folder)
 
 
-@pytest.mark.parametrize("name", FILES[1:])
-def test_an_exchanged_or_truncated_file_is_noticed(folder: Path, name: str) -> None:
-    (folder / name).write_bytes((folder / name).read_bytes()[:-7])
-    with pytest.raises(ArtifactError, match=f"{name}: does not match its checksum"):
-        open_artifact(folder)
+@pytest.mark.parametrize("name", [WEIGHTS, ONNX, METRICS])
+def test_a_changed_file_is_named(folder: Path, name: str) -> None:
+    content = bytearray((folder / name).read_bytes())
+    content[len(content) // 2] ^= 1
+    (folder / name).write_bytes(content)
+    assert f"{name}: does not match its checksum in {CARD}; damaged or exchanged" in refusal(folder)
+
+
+def test_a_newer_format_is_refused_before_its_fields_are_judged(folder: Path) -> None:
+    change_card(folder, lambda card: card.update(format_version=FORMAT_VERSION + 1, new_field=1))
+    assert f"format_version {FORMAT_VERSION + 1} is newer than this package reads ({FORMAT_VERSION})" in refusal(folder)
 
 
 @pytest.mark.parametrize(
-    ("damage", "words"),
+    ("change", "expected"),
     [
-        (lambda f: edit_card(f, format_version=FORMAT_VERSION + 1), f"{FORMAT_VERSION + 1} is newer than"),
-        (lambda f: edit_card(f, window=0), "window: "),
-        (lambda f: edit_card(f, colour="red"), "colour: "),
-        (lambda f: edit_card(f, columns=["v_x"] * 7), "columns"),
-        (lambda f: (f / "model.yaml").write_text("name: ["), "not valid YAML"),
-        (poison, "weight .* holds NaN"),
-        (lambda f: ((f / "weights.safetensors").write_bytes(b"weights"), sign(f)), "not a readable safetensors file"),
+        (lambda card: card.update(format_version=0), "format_version: Input should be greater than or equal to 1"),
+        (lambda card: card.update(format_version="new"), "format_version: Input should be a valid integer"),
+        (lambda card: card.pop("sampling_time"), "sampling_time: Field required"),
+        (lambda card: card.update(sampling_time=-0.02), "sampling_time: Input should be greater than 0 (got -0.02)"),
+        (lambda card: card.update(window="five"), "window: Input should be a valid integer"),
+        (lambda card: card.update(surprise=1), "surprise: Extra inputs are not permitted (got 1)"),
+        (lambda card: card.update(commands="guessed"), "commands: Input should be 'topics', 'lookahead' or 'none'"),
+        (lambda card: card["columns"].reverse(), "columns ('delta_cmd',"),
+        (lambda card: card["normalisation"]["input_std"].__setitem__(3, 0.0), "input_std must be positive everywhere"),
+        (lambda card: card["normalisation"]["input_mean"].pop(), "normalisation.input_mean"),
+        (lambda card: card["covariance"].__setitem__(1, float("nan")), "covariance.1: Input should be a finite number"),
+        (lambda card: card["vehicle"]["coefficients"].pop("B_f"), "missing B_f"),
+        (
+            lambda card: card["vehicle"]["constants"].update(m=0.0),
+            "vehicle.constants.m: Input should be greater than 0",
+        ),
+        (
+            lambda card: card["checksums"].pop(ONNX),
+            "checksums ['metrics.json', 'weights.safetensors'] are not those of",
+        ),
+        (lambda card: card["checksums"].update({"../secret": "0"}), "are not those of"),
     ],
 )
-def test_each_damage_is_one_clear_line(folder: Path, damage: Damage, words: str) -> None:
-    damage(folder)
-    with pytest.raises(ArtifactError, match=words) as caught:
-        open_artifact(folder)
-    assert "\n" not in str(caught.value)
-    assert str(folder) in str(caught.value)
+def test_a_card_that_does_not_fit_is_refused_by_field(
+    folder: Path, change: Callable[[dict[str, Any]], None], expected: str
+) -> None:
+    change_card(folder, change)
+    assert expected in refusal(folder)
 
 
-def test_a_graph_that_is_none_is_refused(folder: Path) -> None:
-    (folder / "model.onnx").write_bytes(b"no graph")
-    sign(folder)
-    with pytest.raises(ArtifactError, match="ONNX Runtime refuses it"):
-        OnnxModel(open_artifact(folder))
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("name: [", "not valid YAML"),
+        ("- a list", "expected a mapping of fields, got list"),
+        ("", "expected a mapping of fields, got NoneType"),
+        ("!!python/object/apply:os.mkdir [executed]", "not valid YAML"),
+    ],
+)
+def test_a_card_that_is_no_mapping_is_refused_and_nothing_is_executed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, text: str, expected: str
+) -> None:
+    monkeypatch.chdir(folder.parent)
+    (folder / CARD).write_text(text)
+    assert expected in refusal(folder)
+    assert not (folder.parent / "executed").exists()
 
 
-def test_a_graph_of_another_window_is_refused(folder: Path) -> None:
-    edit_card(folder, window=6)
-    with pytest.raises(ArtifactError, match="expected a window of 6 rows"):
-        OnnxModel(open_artifact(folder))
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_weight_that_is_not_finite_is_named_though_its_checksum_fits(folder: Path, value: float) -> None:
+    weights = load_file(folder / WEIGHTS)
+    weights["head.deviate.bias"][3] = value
+    save_file(weights, folder / WEIGHTS)
+    certify(folder)
+    assert "weight head.deviate.bias holds NaN or infinity" in refusal(folder)
 
 
-def test_no_folder_at_all_says_how_to_get_one(tmp_path: Path) -> None:
-    with pytest.raises(ArtifactError, match="no such model folder; `dynssm train` writes one"):
-        open_artifact(tmp_path / "nothing")
+def test_weights_that_are_no_safetensors_are_refused(folder: Path) -> None:
+    (folder / WEIGHTS).write_bytes(b"\x80\x04garbage" * 10)
+    certify(folder)
+    assert "not a readable safetensors file" in refusal(folder)
+
+
+@pytest.mark.parametrize("spoil", [lambda content: b"garbage", lambda content: content[:200], lambda content: b""])
+def test_a_graph_that_onnx_runtime_refuses_is_an_error_on_opening(
+    folder: Path, spoil: Callable[[bytes], bytes]
+) -> None:
+    (folder / ONNX).write_bytes(spoil((folder / ONNX).read_bytes()))
+    certify(folder)
+    assert "ONNX Runtime refuses it" in refusal(folder, deploy)
+
+
+def test_the_graph_of_another_model_is_an_error_on_opening(folder: Path) -> None:
+    change_card(folder, lambda card: card.update(window=9))
+    assert "expected a window of 9 rows and 7 columns" in refusal(folder, deploy)
+
+
+def test_a_graph_without_the_increment_is_an_error_on_opening(folder: Path) -> None:
+    graph = onnx.load(folder / ONNX)
+    index = next(k for k, output in enumerate(graph.graph.output) if output.name == "increment")
+    del graph.graph.output[index]
+    onnx.save(graph, folder / ONNX)
+    certify(folder)
+    assert "to ['theta', 'physics']" in refusal(folder, deploy)
