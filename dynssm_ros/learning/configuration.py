@@ -96,6 +96,11 @@ class ModelConfig(StrictModel):
     name: str
     kind: Literal["dynssm", "ridge"] = "dynssm"
     H: int = Field(ge=1, description="rows of the history window")
+    physics_errors: bool = Field(
+        default=False,
+        description="beyond the paper: the encoders also see the physics' own one-step errors over the window, which are "
+        "known at run time and carry what another track or set-up changes",
+    )
     ssm: SsmConfig | None = None
     gru: GruConfig | None = None
     fusion: FusionConfig | None = None
@@ -116,6 +121,8 @@ class ModelConfig(StrictModel):
             raise ValueError("at least one encoder is needed: ssm or gru")
         if self.adaptation is not None and self.physics is None:
             raise ValueError("adaptation needs physics to adapt")
+        if self.physics_errors and (self.physics is None or self.H == 1):
+            raise ValueError("physics_errors needs physics, and a window of two rows or more")
         if self.physics is None and self.residual is None:
             raise ValueError("without physics there must be a residual network to predict the increment")
         if self.physics is not None and self.adaptation is None and self.residual is None:

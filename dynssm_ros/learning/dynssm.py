@@ -17,6 +17,7 @@ from dynssm_ros.vehicle.effects import initial_memory
 from dynssm_ros.vehicle.single_track import increment
 
 INPUTS = len(WINDOW_COLUMNS)
+_LARGEST_ERROR = 8.0  # in units of s_delta; beyond it an encoder learns nothing more from the size
 
 
 class Output(NamedTuple):
@@ -61,7 +62,7 @@ class PhysicsLayer(nn.Module):
         self.effects = vehicle.active_effects
 
     def forward(self, latest: Tensor, theta: Tensor) -> Tensor:
-        """Raw last rows ``(B, 7)`` and coefficients ``(B, 17)`` to increments ``(B, 3)``."""
+        """Raw rows ``(..., 7)`` and coefficients, broadcastable to ``(..., 17)``, to increments ``(..., 3)``."""
         # columns of shape (B, 1), which the deployed graph need not squeeze and stack again
         rows = torch.split(latest, 1, dim=-1)
         moved, _ = increment(
@@ -84,12 +85,10 @@ class ParameterHead(nn.Module):
 
     lower: Tensor
     upper: Tensor
-    nominal: Tensor
 
     def __init__(self, config: ModelConfig, vehicle: Vehicle, latent: int) -> None:
         super().__init__()
         assert config.adaptation is not None
-        assert config.physics is not None
         self.alpha = config.adaptation.alpha
         self.condition = nn.Sequential(nn.Linear(latent + INPUTS, config.adaptation.hidden), nn.SiLU())
         self.deviate = nn.Linear(config.adaptation.hidden, len(COEFFICIENTS))
@@ -97,15 +96,14 @@ class ParameterHead(nn.Module):
         nn.init.zeros_(self.deviate.bias)
         self.register_buffer("lower", torch.tensor(vehicle.lower, dtype=torch.float32))
         self.register_buffer("upper", torch.tensor(vehicle.upper, dtype=torch.float32))
-        self.register_buffer("nominal", nominal_parameters(config.physics, vehicle))
 
-    def forward(self, latent: Tensor, latest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """``z_t`` and the latest normalised input to ``(theta, normalised deviation, c_t)``."""
+    def forward(self, latent: Tensor, latest: Tensor, nominal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """``z_t``, the latest normalised input and theta_0 to ``(theta, normalised deviation, c_t)``."""
         conditioned = self.condition(torch.cat([latent, latest], dim=-1))
         admissible = self.upper - self.lower
         shift = torch.tanh(self.deviate(conditioned)) * (self.alpha * admissible)
-        theta = torch.clamp(self.nominal + shift, self.lower, self.upper)
-        return theta, (theta - self.nominal) / admissible, conditioned
+        theta = torch.clamp(nominal + shift, self.lower, self.upper)
+        return theta, (theta - nominal) / admissible, conditioned
 
 
 class GatedResidual(nn.Module):
@@ -145,7 +143,7 @@ class DynSSM(nn.Module):
         self.register_buffer("mean", torch.tensor(normalisation.input_mean))
         self.register_buffer("std", torch.tensor(normalisation.input_std))
         self.register_buffer("increment_scale", torch.tensor(normalisation.increment_scale))
-        self.fusion = Fusion(INPUTS, config.ssm, config.gru, config.fusion)
+        self.fusion = Fusion(INPUTS + (3 if config.physics_errors else 0), config.ssm, config.gru, config.fusion)
         self.physics = PhysicsLayer(vehicle, config.physics) if config.physics else None
         self.head = ParameterHead(config, vehicle, latent) if config.adaptation else None
         conditioned = config.adaptation.hidden if config.adaptation else latent
@@ -155,7 +153,7 @@ class DynSSM(nn.Module):
             features += len(COEFFICIENTS) if self.head else 0
             features += 6 if self.physics else 0
             self.residual = GatedResidual(features, config.residual.hidden, config.residual.scale)
-        if config.physics and not config.adaptation:
+        if config.physics:
             self.register_buffer("nominal", nominal_parameters(config.physics, vehicle))
 
     def forward(self, window: Tensor) -> Output:
@@ -163,10 +161,11 @@ class DynSSM(nn.Module):
         normalised = (window - self.mean) / self.std
         latest = normalised[:, -1]
         raw = window[:, -1]
-        conditioned = self.fusion(normalised)
+        seen = torch.cat([normalised, self._past_errors(window)], dim=-1) if self.config.physics_errors else normalised
+        conditioned = self.fusion(seen)
         theta = deviation = increment = None
         if self.head is not None:
-            theta, deviation, conditioned = self.head(conditioned, latest)
+            theta, deviation, conditioned = self.head(conditioned, latest, self.nominal)
         elif self.physics is not None:
             theta = self.nominal.expand(window.shape[0], -1)  # not len(), which an export would freeze
         if self.physics is not None:
@@ -178,6 +177,17 @@ class DynSSM(nn.Module):
         scaled, correction = self.residual(q)
         added = self.increment_scale * scaled
         return Output(added if increment is None else increment + added, increment, theta, deviation, correction)
+
+    def _past_errors(self, window: Tensor) -> Tensor:
+        """One-step errors of the nominal physics over the window in units of ``s_delta``, ``(B, H, 3)``.
+
+        Row ``k`` holds the error of the step that led to it; the first row, whose step is not in the window, is zero.
+        """
+        assert self.physics is not None
+        before, after = window[:, :-1], window[:, 1:, :3]
+        errors = (after - before[..., :3] - self.physics(before, self.nominal)) / self.increment_scale
+        bounded = errors.clamp(-_LARGEST_ERROR, _LARGEST_ERROR)
+        return torch.cat([torch.zeros_like(bounded[:, :1]), bounded], dim=1)
 
     def _residual_input(
         self, conditioned: Tensor, deviation: Tensor | None, raw: Tensor, latest: Tensor, increment: Tensor | None

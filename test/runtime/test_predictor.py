@@ -12,8 +12,9 @@ import yaml
 
 from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.models import OnnxModel, WindowPrediction
 from dynssm_ros.runtime.predictor import Prediction, Predictor, propagate_pose
+from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.signal_map import load_signal_map
 
@@ -52,9 +53,48 @@ class Drive:
         return outcome
 
 
+class Still(OnnxModel):
+    """Says that nothing changes, and remembers what it was asked."""
+
+    def __init__(self, model: Path) -> None:
+        super().__init__(open_artifact(model))
+        self.asked: list[np.ndarray] = []
+        self.physics = 0.0
+
+    def predict(self, windows: np.ndarray) -> WindowPrediction:
+        self.asked.append(windows.copy())
+        now = windows[:, -1, :3].copy()
+        return WindowPrediction(now, None, now + self.physics)
+
+
+@pytest.fixture
+def still(small_model: Path) -> Still:
+    return Still(small_model)
+
+
 @pytest.fixture
 def drive(small_model: Path) -> Drive:
     return Drive(small_model)
+
+
+def test_samples_on_the_grid_give_what_the_model_says_of_the_recordings_windows(drive: Drive, laps_bag: Path) -> None:
+    recording = extract([laps_bag], DEFAULT, 50.0).select(slice(0, 120))
+    model, compared = drive.predictor.model, 0
+    for k, (stamp, row) in enumerate(zip(recording.time.tolist(), recording.matrix.tolist(), strict=True)):
+        v_x, v_y, omega, r, delta, more_r, more_delta = row
+        drive.predictor.observe(stamp, {"throttle_feedback": r, "steering_feedback": delta})
+        drive.predictor.observe(stamp, {"throttle_command": r + more_r, "steering_command": delta + more_delta})
+        outcome = drive.predictor.predict(stamp, {"v_x": v_x, "v_y": v_y, "omega": omega})
+        if k < H - 1:
+            assert outcome is Refusal.FILLING
+            continue
+        expected = model.predict(recording.matrix[k - H + 1 : k + 1][None])
+        assert isinstance(outcome, Prediction)
+        assert outcome.pose is None
+        np.testing.assert_allclose(outcome.state, expected.state[0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(outcome.theta, expected.theta[0], rtol=0, atol=1e-9)
+        compared += 1
+    assert compared == 120 - H + 1
 
 
 def test_the_prediction_is_the_models_for_the_window_one_sampling_time_ahead(drive: Drive) -> None:
@@ -126,6 +166,26 @@ def test_stale_actuators_yield_nothing_until_they_are_back(drive: Drive) -> None
 def test_a_signal_that_never_came_is_missing(small_model: Path) -> None:
     predictor = Predictor(OnnxModel(open_artifact(small_model)), DEFAULT)
     assert predictor.predict(START, {"v_x": 1.0, "v_y": 0.0, "omega": 0.0}) is Refusal.MISSING
+    predictor.observe(START, {"throttle_feedback": 0.2, "steering_feedback": 0.0, "throttle_command": 0.2})
+    assert predictor.predict(START + PERIOD, {"v_x": 1.0, "v_y": 0.0, "omega": 0.0}) is Refusal.MISSING
+
+
+@pytest.mark.parametrize("spoilt", ["state", "theta"])
+def test_a_model_that_yields_nan_yields_no_prediction_until_it_is_well_again(
+    drive: Drive, monkeypatch: pytest.MonkeyPatch, spoilt: str
+) -> None:
+    expected, model = drive.fill(), drive.predictor.model
+    with monkeypatch.context() as ill:
+        well = model.predict
+        ill.setattr(
+            model,
+            "predict",
+            lambda windows: well(windows)._replace(**{spoilt: np.array([[0.0, np.nan, 0.0]])}),
+        )
+        assert drive.step() is Refusal.BAD_PREDICTION
+    outcome = drive.step()
+    assert isinstance(outcome, Prediction)
+    np.testing.assert_allclose(outcome.state, expected.state)
 
 
 def test_a_gap_in_the_odometry_restarts_the_window(drive: Drive) -> None:
@@ -151,6 +211,24 @@ def test_a_model_is_swapped_without_losing_the_window(drive: Drive, small_model:
     assert isinstance(drive.step(), Prediction)
 
 
+def test_a_longer_window_fills_on_from_what_is_there(drive: Drive, still: Still) -> None:
+    drive.fill()
+    still.H = H + 2
+    drive.predictor.swap(still)
+    assert drive.step() is Refusal.FILLING
+    assert isinstance(drive.step(), Prediction)
+
+
+def test_a_model_for_other_commands_is_not_swapped_in(drive: Drive, small_model: Path) -> None:
+    drive.fill()
+    other, before = OnnxModel(open_artifact(small_model)), drive.predictor.model
+    other.commands = "none"
+    with pytest.raises(ArtifactError, match=r"small: trained with commands 'none', but the node runs with 'topics'"):
+        drive.predictor.swap(other)
+    assert drive.predictor.model is before
+    assert isinstance(drive.step(), Prediction)
+
+
 @pytest.mark.parametrize(
     ("commands", "error", "words"),
     [("lookahead", ArtifactError, "look into the future"), ("topics", ConfigurationError, "missing throttle_command")],
@@ -173,6 +251,59 @@ def test_the_horizon_begins_with_the_prediction_and_goes_on_with_the_command_hel
     travelled = np.diff(np.array(poses)[:, 0])
     assert (travelled > 0).all()
     np.testing.assert_allclose(travelled[0], outcome.state[0] * T_S, rtol=0.05)
+
+
+def test_at_constant_velocity_the_horizon_is_the_line_or_the_circle_that_is_driven(drive: Drive, still: Still) -> None:
+    drive.predictor.swap(still)
+    drive.fill()
+    for omega in (0.0, 0.8):
+        outcome = drive.step(v_x=2.0, v_y=0.0, omega=omega, x=1.0, y=-1.0, theta=0.3)
+        assert isinstance(outcome, Prediction)
+        poses = np.array(drive.predictor.horizon(outcome, 25))
+        t = T_S * np.arange(1, 26)
+        np.testing.assert_allclose(poses[:, 2], 0.3 + omega * t, atol=1e-12)
+        along = t if omega == 0 else 2 * np.sin(omega * t / 2) / omega  # chord and its direction
+        heading = 0.3 + omega * t / 2
+        expected = np.stack([1 + 2 * along * np.cos(heading), -1 + 2 * along * np.sin(heading)], axis=1)
+        np.testing.assert_allclose(poses[:, :2], expected, atol=1e-12 if omega == 0 else 1e-4)
+
+
+def test_over_the_horizon_the_actuators_stay_at_the_last_command(drive: Drive, still: Still) -> None:
+    drive.predictor.swap(still)
+    drive.fill()
+    drive.predictor.observe(drive.stamp, {"throttle_feedback": 0.2, "steering_feedback": 0.05})
+    drive.predictor.observe(drive.stamp, {"throttle_command": 0.5, "steering_command": -0.1})
+    outcome = drive.odometry(v_x=1.0)
+    assert isinstance(outcome, Prediction)
+    still.asked.clear()
+    assert len(drive.predictor.horizon(outcome, 4)) == 4
+    assert len(still.asked) == 3
+    for k, asked in enumerate(still.asked):
+        expected = np.tile([1.0, 0.0, 0.1, 0.5, -0.1, 0.0, 0.0], (k + 1, 1))
+        np.testing.assert_allclose(asked[0, H - 1 - k :], expected, atol=1e-12)
+        np.testing.assert_allclose(asked[0, H - 2 - k], [1.0, 0.0, 0.1, 0.2, 0.05, 0.3, -0.15], atol=1e-12)
+    np.testing.assert_allclose(drive.predictor.history.current[-1, 5:], [0.3, -0.15])  # not changed by the rollout
+
+
+def test_without_a_pose_there_is_no_horizon(drive: Drive) -> None:
+    drive.fill()
+    drive.actuators()
+    outcome = drive.predictor.predict(drive.stamp, {"v_x": 1.0, "v_y": 0.0, "omega": 0.0})
+    assert isinstance(outcome, Prediction)
+    assert outcome.pose is None
+    assert drive.predictor.horizon(outcome, 10) == []
+
+
+@pytest.mark.parametrize(("physics", "share"), [(0.0, 0.0), (1e-3, 0.5)])
+def test_the_share_of_the_residual_is_its_part_of_what_changes(
+    drive: Drive, still: Still, physics: float, share: float
+) -> None:
+    drive.predictor.swap(still)
+    drive.fill()
+    still.physics = physics  # the residual takes back what the physics adds
+    outcome = drive.step()
+    assert isinstance(outcome, Prediction)
+    assert outcome.residual_share == pytest.approx(share)
 
 
 def test_a_pose_is_propagated_along_a_circle_to_second_order() -> None:
