@@ -102,7 +102,8 @@ class Table:
             if self._numeric(k):
                 shown.add_column(escape(heading), justify="right", no_wrap=True)
             else:
-                shown.add_column(escape(heading), overflow="fold")
+                longest = max((len(row[k].text) for row in self.cells), default=0)
+                shown.add_column(escape(heading), overflow="fold", min_width=min(longest, 20))  # names in one piece
         for row in self.cells:
             shown.add_row(*(f"[bold green]{escape(c.text)}[/]" if c.best else escape(c.text) for c in row))
         return shown

@@ -199,11 +199,10 @@ class DynSSM(nn.Module):
         if deviation is not None:
             parts.append(deviation)
         if increment is not None:
-            predicted = raw[:, :3] + increment
             if standardised:
-                parts += [(predicted - self.mean[:3]) / self.std[:3], increment / self.increment_scale]
+                parts += [latest[:, :3] + increment / self.std[:3], increment / self.increment_scale]
             else:
-                parts += [predicted, increment]
+                parts += [raw[:, :3] + increment, increment]
         return torch.cat(parts, dim=-1)
 
     def for_deployment(self) -> DynSSM:

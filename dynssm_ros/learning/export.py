@@ -188,7 +188,13 @@ def load_torch(artifact: Artifact) -> nn.Module:
         if card.kind == "ridge"
         else DynSSM(config, card.vehicle, card.normalisation)
     )
-    model.load_state_dict(load_file(artifact.weights))
+    try:
+        model.load_state_dict(load_file(artifact.weights))
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        raise ArtifactError(
+            f"{artifact.weights}: not the weights of the model that {CARD} describes ({reason})"
+        ) from error
     return model.eval()
 
 

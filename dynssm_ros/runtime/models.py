@@ -182,8 +182,7 @@ class OnnxModel:
         else:
             results = self._session.run(self._outputs, {"window": windows.astype(np.float32)})
         by_name = dict(zip(self._outputs, results, strict=True))
-        now = windows[:, -1, :3]
-        theta, physics = by_name.get("theta"), by_name.get("physics")
+        now, theta, physics = windows[:, -1, :3], by_name.get("theta"), by_name.get("physics")
         return WindowPrediction(
             now + by_name["increment"],
             None if theta is None else theta.astype(np.float64),

@@ -47,6 +47,8 @@ class RingBuffer:
         self._capacity = capacity
         self._next = 0
         self._count = 0
+        self.newest = -np.inf
+        """Time of the newest sample (ns since the epoch), ``-inf`` if empty."""
 
     def __len__(self) -> int:
         return self._count
@@ -62,11 +64,6 @@ class RingBuffer:
         """Values of all stored samples, oldest first; a view."""
         end = self._next + self._capacity
         return self._values[end - self._count : end]
-
-    @property
-    def newest(self) -> float:
-        """Time of the newest sample (ns since the epoch), ``-inf`` if empty."""
-        return float(self._times[self._next + self._capacity - 1]) if self._count else -np.inf
 
     @property
     def oldest(self) -> float:
@@ -89,10 +86,12 @@ class RingBuffer:
         self._values[k] = self._values[k + self._capacity] = value
         self._next = (k + 1) % self._capacity
         self._count = min(self._count + 1, self._capacity)
+        self.newest = time
 
     def clear(self) -> None:
         """Forgets all samples."""
         self._next = self._count = 0
+        self.newest = -np.inf
 
     def _grow(self) -> None:
         times, values, count = self.times.copy(), self.values.copy(), self._count
@@ -184,17 +183,17 @@ class History:
         first = now + self._offsets[0] + self._slack
         filling = False
         for name, buffer in self._buffers.items():
-            if len(buffer) == 0:
-                return Refusal.MISSING
-            if now - buffer.newest > self._max_age:
-                return Refusal.STALE
+            age = now - buffer.newest
+            if age > self._max_age:
+                return Refusal.MISSING if age == np.inf else Refusal.STALE
             filling = filling or self._unbroken[name] > first or buffer.oldest > first
         if filling:
             return Refusal.FILLING
         grid = self._offsets + now
         sampled = {name: buffer.interpolate(grid) for name, buffer in self._buffers.items()}
-        columns = (*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled))
-        return np.stack(columns, axis=1, out=self._window)
+        for column, values in enumerate((*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled))):
+            self._window[:, column] = values
+        return self._window
 
     @property
     def current(self) -> Vector:

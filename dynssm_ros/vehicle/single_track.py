@@ -159,10 +159,10 @@ def loads(xp: Any, q: Motion) -> None:
     if not q.load_transfer:
         q.F_zf = q.F_zr = q.F_z0
         return
-    transfer = q.h_cg * q.F_rx
     wheelbase = q.l_f + q.l_r
-    q.F_zf = (q.m * GRAVITY * q.l_r - transfer) / wheelbase
-    q.F_zr = (q.m * GRAVITY * q.l_f + transfer) / wheelbase
+    weight, transfer = q.m * GRAVITY, q.h_cg / wheelbase * q.F_rx
+    q.F_zf = weight * q.l_r / wheelbase - transfer
+    q.F_zr = weight * q.l_f / wheelbase + transfer
 
 
 def tyres(xp: Any, q: Motion) -> None:
@@ -175,8 +175,9 @@ def tyres(xp: Any, q: Motion) -> None:
 def forces(xp: Any, q: Motion) -> None:
     """Sums the tyre forces in the body frame, the numerators of Eq. (1) to (3)."""
     q.F_x = q.F_rx - q.F_fy * xp.sin(q.delta)
-    q.F_y = q.F_ry + q.F_fy * xp.cos(q.delta)
-    q.M_z = q.l_f * q.F_fy * xp.cos(q.delta) - q.l_r * q.F_ry
+    across = q.F_fy * xp.cos(q.delta)
+    q.F_y = q.F_ry + across
+    q.M_z = q.l_f * across - q.l_r * q.F_ry
 
 
 def accelerations(xp: Any, q: Motion) -> None:

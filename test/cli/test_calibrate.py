@@ -1,0 +1,103 @@
+"""``dynssm calibrate``: the vehicle file, the figures for programs, and what the data do not say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def laps(laps_bag: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "laps.parquet"
+    extract([laps_bag], load_signal_map("default"), 50.0).save(path)
+    return path
+
+
+def wrong_car(folder: Path, **bounds: tuple[float, float]) -> Path:
+    """A vehicle file of the small car with mid-range values and other bounds."""
+    car = load_vehicle("orca")
+    content = car.with_nominal((car.lower + car.upper) / 2).model_dump(mode="json")
+    for name, interval in bounds.items():
+        content["coefficients"][name] |= {"bounds": list(interval), "nominal": sum(interval) / 2}
+    path = folder / "wrong.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def test_a_wrong_car_becomes_the_right_one(dynssm: Run, laps: Path, tmp_path: Path) -> None:
+    car, out_json = tmp_path / "car.yaml", tmp_path / "car.json"
+    arguments = ["--vehicle", wrong_car(tmp_path), "--starts", 1, "--out", car, "--json", out_json]
+    status, out, err = dynssm("calibrate", laps, *arguments)
+    assert (status, err) == (0, "")
+    found, truth = load_vehicle(car), load_vehicle("orca")
+    np.testing.assert_allclose(found.nominal, truth.nominal, rtol=1e-3)
+    assert f"{car} written" in out.replace("\n", "")
+    assert "Calibrated on " in car.read_text().splitlines()[0]
+
+    result = json.loads(out_json.read_text())
+    assert list(result["coefficients"]) == list(COEFFICIENTS)
+    assert result["coefficients"]["D_f"]["value"] == pytest.approx(truth.coefficients["D_f"].nominal, rel=1e-3)
+    assert result["coefficients"]["D_f"]["unit"] == "N"
+    assert max(result["rmse_after"].values()) < 1e-6 < min(result["rmse_before"].values())
+    assert (result["on_bound"], result["unidentified"]) == ([], [])
+    assert (result["rows"], result["steps"]) == (len(Recording.load(laps)) - 1, 1)
+
+
+def test_a_coefficient_on_its_bound_is_told_and_marked(dynssm: Run, laps: Path, tmp_path: Path) -> None:
+    car = wrong_car(tmp_path, I_z=(4e-5, 5e-5))
+    status, out, _ = dynssm("calibrate", laps, "--vehicle", car, "--starts", 1, "--out", tmp_path / "car.yaml")
+    assert status == 0
+    line = next(line for line in out.splitlines() if line.startswith("on a bound: "))
+    assert "I_z" in line
+    assert line.endswith(" - the data want more than the vehicle file admits")
+    assert "I_z *" in out
+
+
+def test_a_straight_drive_says_what_it_cannot_determine(dynssm: Run, laps: Path, tmp_path: Path) -> None:
+    recording = Recording.load(laps)
+    rng, N, T_s = np.random.default_rng(0), len(recording), recording.T_s
+    columns = {name: np.zeros(N) for name in recording.columns}
+    columns["r_fb"] = 0.4 + 0.1 * np.sin(0.7 * np.arange(N) * T_s)
+    columns["v_x"][0] = 1.5
+    for k in range(N - 1):
+        v_x, r = columns["v_x"][k], columns["r_fb"][k]
+        force = (0.287 - 0.0545 * v_x) * r - 0.0518 - 0.00035 * v_x**2
+        columns["v_x"][k + 1] = v_x + T_s * force / 0.041 + 1e-4 * rng.standard_normal()
+    columns["v_y"], columns["omega"] = 1e-4 * rng.standard_normal(N), 1e-3 * rng.standard_normal(N)
+    straight = tmp_path / "straight.parquet"
+    Recording(recording.info, recording.time, recording.segment, columns).save(straight)
+    status, out, _ = dynssm("calibrate", straight, "--vehicle", "orca", "--starts", 1, "--out", tmp_path / "car.yaml")
+    assert status == 0
+    open_lines = [line for line in out.splitlines() if line.startswith("not determined by these data: ")]
+    assert len(open_lines) >= 4
+    assert all(line.endswith("(in units of their ranges)") for line in open_lines)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--vehicle", "av21"], "sampling time 0.02 s, but vehicle av21 has 0.04 s; extract with --rate 25"),
+        (["--vehicle", "orca", "--min-speed", "90"], "only 0 usable rows at 90 m/s or more"),
+        (["--vehicle", "gone"], "'gone' is neither a file nor a shipped name"),
+    ],
+)
+def test_what_does_not_fit_is_one_line_and_leaves_nothing(
+    dynssm: Run, laps: Path, tmp_path: Path, options: list[str], words: str
+) -> None:
+    status, _, err = dynssm("calibrate", laps, *options, "--out", tmp_path / "car.yaml")
+    assert status == 1
+    (line,) = err.strip().splitlines()
+    assert words in line
+    assert [path.name for path in tmp_path.iterdir()] == ["laps.parquet"]

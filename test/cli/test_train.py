@@ -1,0 +1,111 @@
+"""``dynssm train`` beyond the straight way: interruptions, what is in the way, what is not there."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from dynssm_ros.learning import training
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.signal_map import load_signal_map
+
+Run = Callable[..., tuple[int, str, str]]
+MODEL = """
+base: dynssm_orca
+name: tiny
+H: 4
+ssm: {channels: 4, states: 2}
+gru: {hidden: 4}
+fusion: {hidden: 8, latent: 8}
+adaptation: {hidden: 8}
+residual: {hidden: [8]}
+training: {epochs: 4, batch_size: 64}
+"""
+
+
+@pytest.fixture
+def arguments(laps_bag: Path, tmp_path: Path) -> list[str]:
+    """A training of four epochs on the simulated laps."""
+    extract([laps_bag], load_signal_map("default"), 50.0).save(tmp_path / "laps.parquet")
+    (tmp_path / "tiny.yaml").write_text(MODEL)
+    model = ["--model", str(tmp_path / "tiny.yaml"), "--vehicle", "orca", "--out", str(tmp_path / "model")]
+    return ["train", str(tmp_path / "laps.parquet"), *model]
+
+
+def test_an_interrupted_training_says_how_to_go_on_and_does(
+    dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    validate, epochs = training._Optimisation._validate, [0]
+
+    def interrupted(self: training._Optimisation) -> dict[str, float]:
+        epochs[0] += 1
+        if epochs[0] == 3:
+            raise KeyboardInterrupt
+        return validate(self)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(training._Optimisation, "_validate", interrupted)
+        status, _, err = dynssm(*arguments)
+    assert status == 130
+    assert err.split("\n")[-2] == "interrupted; the same command continues from model.checkpoint.pt"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["laps.parquet", "model.checkpoint.pt", "tiny.yaml"]
+
+    status, out, _ = dynssm(*arguments)
+    assert status == 0
+    assert "continued from epoch 2" in out
+    resumed = (tmp_path / "model" / "weights.safetensors").read_bytes()
+    status, out, _ = dynssm(*arguments)
+    assert "continued" not in out
+    assert (tmp_path / "model" / "weights.safetensors").read_bytes() == resumed
+    assert len(json.loads((tmp_path / "model" / "metrics.json").read_text())["history"]["train/prediction"]) == 4
+
+
+def test_seed_epochs_and_commands_of_the_command_line_win(dynssm: Run, arguments: list[str], tmp_path: Path) -> None:
+    status, out, _ = dynssm(*arguments, "--epochs", 1, "--seed", 9, "--commands", "none")
+    assert status == 0
+    assert "(commands: none)" in out
+    card = open_artifact(tmp_path / "model").card
+    assert card.commands == "none"
+    assert (card.architecture["training"]["seed"], card.architecture["training"]["epochs"]) == (9, 1)
+
+
+def test_a_folder_that_is_no_model_is_refused_before_a_training_is_spent_on_it(
+    dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "train", None)
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "thesis.tex").touch()
+    status, _, err = dynssm(*arguments)
+    assert status == 1
+    assert err.strip() == f"error: {tmp_path / 'model'}: exists and is not a model folder; not replaced"
+    assert [path.name for path in (tmp_path / "model").iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_device_that_is_not_there_is_refused(dynssm: Run, arguments: list[str]) -> None:
+    status, _, err = dynssm(*arguments, "--device", "cuda")
+    assert status == 1
+    assert err.strip() == "error: --device cuda: not available here; expected cpu"
+
+
+def test_the_present_folder_can_hold_the_model(
+    dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert dynssm(*arguments, "--epochs", 1)[0] == 0
+    monkeypatch.chdir(tmp_path / "model")
+    assert dynssm(*arguments[:-1], ".", "--epochs", 1, "--seed", 5)[0] == 0
+    assert open_artifact(tmp_path / "model").card.training["seed"] == 5
+
+
+def test_without_a_terminal_there_is_no_progress_bar(arguments: list[str]) -> None:
+    command = [sys.executable, "-m", "dynssm_ros.cli.main", *arguments, "--epochs", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "parameters, best epoch 1, seed 0; one-step RMSE on" in done.stdout
