@@ -93,10 +93,12 @@ def start_pit() -> Iterator[StartPit]:
 
 def test_it_drives_what_simulate_drives_in_real_time(start_pit: StartPit) -> None:
     pit = start_pit("seed:=3")
+    assert pit.wait_for(lambda: bool(pit.odometry and pit.feedback and pit.command))  # topics match one by one
+    pit.odometry.clear()
     assert pit.wait_for(lambda: bool(pit.odometry))
     begin, seen = time.monotonic(), len(pit.odometry)
     assert pit.wait_for(lambda: len(pit.odometry) >= seen + 100)
-    assert time.monotonic() - begin == pytest.approx(100 * 0.02, abs=0.3)
+    assert time.monotonic() - begin == pytest.approx(100 * 0.02, abs=0.5)
 
     stamps = np.array([header_stamp_ns(m) for m in pit.odometry])
     assert set(np.diff(stamps)) == {PERIOD}
@@ -116,7 +118,7 @@ def test_predictor_answers_each_odometry_message_of_the_simulated_car(start_pit:
     with ExitStack() as stack:
         stack.enter_context(predictor_process(small_model, {"diagnostics_period": 0.1}, os.environ.copy()))
         pit = start_pit("noise:=[0.01, 0.005, 0.05]", "plant:=double_track", "rate:=2.0")
-        assert pit.wait_for(lambda: len(pit.run.predicted) >= 100)
+        assert pit.wait_for(lambda: min(len(pit.run.predicted), len(pit.odometry)) >= 100)
         heard = {header_stamp_ns(m) for m in pit.odometry}
         first, last = min(pit.run.predicted), max(pit.run.predicted)
         assert set(range(first, last + 1, PERIOD)) == set(pit.run.predicted)
