@@ -1,0 +1,84 @@
+"""What the README says is what the code does."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from dynssm_ros.cli.main import app
+from dynssm_ros.signals import messages
+from dynssm_ros.signals.signal_map import SIGNALS, load_signal_map
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def table(head: str) -> dict[str, list[str]]:
+    """The README's table whose first column is headed ``head``: cells by the code in the first cell."""
+    lines = README.splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith(f"| {head} |"))
+    rows = {}
+    for line in lines[start + 2 :]:
+        if not line.startswith("|"):
+            break
+        first, *rest = (cell.strip() for cell in line.strip("|").split("|"))
+        rows[first.strip("`")] = rest
+    return rows
+
+
+def test_every_command_is_described_and_every_described_one_exists() -> None:
+    described = {name.removeprefix("dynssm ") for name in table("command")}
+    registered = {command.callback.__name__ for command in app.registered_commands if command.callback}
+    assert described == registered
+
+
+def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_file() -> None:
+    tree = ast.parse((ROOT / "dynssm_ros" / "nodes" / "predictor.py").read_text(encoding="utf-8"))
+    declared = {
+        node.args[1].value: node.args[2].value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "describe"
+        if isinstance(node.args[1], ast.Constant) and isinstance(node.args[2], ast.Constant)
+    }
+    assert {name: cells[0].strip("`") for name, cells in table("parameter").items()} == {
+        name: str(value) for name, value in declared.items()
+    }
+    shipped = yaml.safe_load((ROOT / "config" / "predictor.yaml").read_text())["/**"]["ros__parameters"]
+    assert shipped == declared
+
+
+def test_the_topics_are_those_of_the_default_signal_map_and_of_the_node() -> None:
+    topics = {cells[0].strip("`"): cells[1].strip("`") for cells in _topic_rows()}
+    default = {source.topic: source.type for source in load_signal_map("default").signals.values()}
+    published = {messages.PREDICTION_TOPIC, messages.PARAMETERS_TOPIC, messages.HORIZON_TOPIC, "/diagnostics"}
+    assert {topic: kind for topic, kind in topics.items() if topic in default} == default
+    assert set(topics) == set(default) | published
+
+
+def test_every_signal_and_shipped_file_is_named() -> None:
+    text = " ".join(README.split())
+    for name in SIGNALS:
+        assert re.search(rf"\b{name}\b", text), name
+    for kind in ("vehicles", "signals"):
+        for path in (ROOT / "config" / kind).glob("*.yaml"):
+            assert f"`{path.stem}`" in text, path.stem
+
+
+@pytest.mark.parametrize("target", re.findall(r"^    make (\w+)", README, flags=re.M))
+def test_the_make_targets_exist(target: str) -> None:
+    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), flags=re.M)
+
+
+def _topic_rows() -> list[list[str]]:
+    lines = README.splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith("| direction |"))
+    rows = []
+    for line in lines[start + 2 :]:
+        if not line.startswith("|"):
+            return rows
+        rows.append([cell.strip() for cell in line.strip("|").split("|")][1:])
+    return rows
