@@ -32,11 +32,11 @@ from dynssm_ros.simulation.laps import simulate, write_run
 from dynssm_ros.simulation.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 
-VEHICLE, MODEL, SIGNALS = "orca", "dynssm_orca", "default"
-TRAINING_TRACK, TEST_TRACK = "club", "club_b"
-TRAINING_TIME, TEST_TIME, LIVE_TIME = 200.0, 60.0, 15.0  # s
-NOISE = (0.01, 0.005, 0.05)  # m/s, m/s, rad/s
-HIDDEN = ("steering_offset", {"offset": 0.01})
+VEHICLE, MODEL, SIGNALS = "av21", "dynssm_av21_errors", "default"
+TRAINING_TRACK, TEST_TRACK = "road_course", "oval"
+TRAINING_TIME, TEST_TIME, LIVE_TIME = 600.0, 120.0, 15.0  # s
+NOISE = (0.02, 0.01, 0.002)  # m/s, m/s, rad/s
+HIDDEN = ("steering_offset", {"offset": 0.004})
 EPOCHS = 40
 SEED = 0
 
@@ -90,7 +90,7 @@ def _drive(car: Vehicle, track: str, duration: float, seed: int, out: Path) -> R
     bag = out / f"{track}_bag"
     with progress_bar(f"1 simulate {track}") as progress:
         run = simulate(
-            car.with_effect(*HIDDEN), load_track(track), duration, plant="rk4", seed=seed, style=Style(0.9, 0.6),
+            car.with_effect(*HIDDEN), load_track(track), duration, plant="rk4", seed=seed, style=Style(0.85, 0.6),
             noise=NOISE, progress=progress,
         )  # fmt: skip
         write_run(run, bag)
@@ -108,7 +108,7 @@ def _calibrate(recording: Recording, car: Vehicle, out: Path) -> Vehicle:
 
     guess = car.with_nominal((car.lower + car.upper) / 2)  # the demo does not start from the simulator's own values
     with progress_bar("3 calibrate") as progress:
-        result = calibrate(recording, guess, starts=2, seed=SEED, progress=progress)
+        result = calibrate(recording, guess, min_speed=5.0, starts=2, seed=SEED, progress=progress)
     save_vehicle(result.vehicle, out / "vehicle.yaml", f"Calibrated by the demo on {TRAINING_TRACK}.")
     before, after = (", ".join(f"{v:.3g}" for v in rmse) for rmse in (result.rmse_before, result.rmse_after))
     console.print(f"calibrated single-track: one-step RMSE (v_x, v_y, omega) {before} -> {after}", soft_wrap=True)

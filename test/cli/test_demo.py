@@ -14,13 +14,13 @@ pytestmark = [pytest.mark.xdist_group("dds"), pytest.mark.timeout(240)]
 
 
 def test_the_demo_goes_the_whole_way_and_ends_with_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"TRAINING_TIME": 30.0, "TEST_TIME": 10.0, "LIVE_TIME": 4.0, "EPOCHS": 1}.items():
+    for name, value in {"TRAINING_TIME": 90.0, "TEST_TIME": 20.0, "LIVE_TIME": 4.0, "EPOCHS": 1}.items():
         monkeypatch.setattr(demo, name, value)
     result = CliRunner().invoke(app, ["demo", "--out", str(tmp_path / "demo")], catch_exceptions=False)
     assert result.exit_code == 0
     assert "0 missing" in " ".join(result.stdout.split())
     made = {path.name for path in (tmp_path / "demo").iterdir()}
-    assert made >= {"report.html", "vehicle.yaml", "model", "losses.png", "club_bag", "club_b.parquet"}
+    assert made >= {"report.html", "vehicle.yaml", "model", "losses.png", "road_course_bag", "oval.parquet"}
     assert not any("checkpoint" in name for name in made)
     html = (tmp_path / "demo" / "report.html").read_text()
     assert "Live: predicted against measured" in html
