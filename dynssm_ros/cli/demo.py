@@ -169,7 +169,7 @@ def _run_live(model: Path, bag: Path, recording: Recording) -> _Live:
 def _live_words(live: _Live) -> str:
     p50, p99 = np.percentile(live.latencies, [50, 99]) * 1e3
     return (
-        f"live through DDS: {live.sent} odometry messages, {len(live.predicted)} predictions, {live.missing} missing after "
+        f"Live through DDS: {live.sent} odometry messages, {len(live.predicted)} predictions, {live.missing} missing after "
         f"the first window; odometry published to prediction received p50 {p50:.2f} ms, p99 {p99:.2f} ms"
     )
 
