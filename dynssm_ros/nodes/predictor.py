@@ -6,7 +6,6 @@ the README. All thinking is in :mod:`dynssm_ros.runtime`; this node converts, ca
 
 from __future__ import annotations
 
-import math
 import time
 from functools import partial
 from typing import Any
@@ -22,11 +21,11 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError, UserError
-from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class, run
+from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class, run, set_pose, set_stamp
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.health import Health
 from dynssm_ros.runtime.models import OnnxModel
-from dynssm_ros.runtime.predictor import Pose, Prediction, Predictor
+from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.decoding import TopicDecoder, decoders, header_stamp_ns
 from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, twist_covariance
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -102,14 +101,14 @@ class PredictorNode(Node):
         self._health.predicted(done - now, outcome.residual_share, done)
 
     def _publish(self, prediction: Prediction, message: Any) -> None:
-        odometry, seconds = self._prediction, divmod(prediction.stamp, 1_000_000_000)
-        odometry.header.stamp.sec, odometry.header.stamp.nanosec = seconds
+        odometry = self._prediction
+        set_stamp(odometry.header, prediction.stamp)
         if isinstance(message, Odometry):
             odometry.header.frame_id, odometry.child_frame_id = message.header.frame_id, message.child_frame_id
         twist = odometry.twist.twist
         twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in prediction.state)
         if prediction.pose is not None:
-            _fill_pose(odometry.pose.pose, prediction.pose)
+            set_pose(odometry.pose.pose, *prediction.pose)
         self._publish_prediction(odometry)
         if prediction.theta is not None:
             self._adapted.header.stamp = odometry.header.stamp
@@ -124,9 +123,8 @@ class PredictorNode(Node):
         for k, pose in enumerate(self._predictor.horizon(prediction, max(1, round(self._horizon / period)))):
             stamped = PoseStamped()
             stamped.header.frame_id = path.header.frame_id
-            seconds = divmod(prediction.stamp + round(k * period * 1e9), 1_000_000_000)
-            stamped.header.stamp.sec, stamped.header.stamp.nanosec = seconds
-            _fill_pose(stamped.pose, pose)
+            set_stamp(stamped.header, prediction.stamp + round(k * period * 1e9))
+            set_pose(stamped.pose, *pose)
             path.poses.append(stamped)
         return path
 
@@ -177,12 +175,6 @@ class PredictorNode(Node):
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         self._publish_diagnostics(array)
-
-
-def _fill_pose(pose: Any, at: Pose) -> None:
-    x, y, theta = at
-    pose.position.x, pose.position.y = x, y
-    pose.orientation.z, pose.orientation.w = math.sin(theta / 2), math.cos(theta / 2)
 
 
 def main(args: list[str] | None = None) -> None:

@@ -19,7 +19,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.nodes.support import SENSOR_QOS, describe, run
+from dynssm_ros.nodes.support import SENSOR_QOS, describe, run, set_pose, set_stamp
 from dynssm_ros.signals.decoding import decoders
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -148,17 +148,16 @@ class SimulatorNode(Node):
 
 def _actuators(stamp: int, applied: Applied) -> JointState:
     message = JointState(name=["throttle", "steering"], position=[float(applied.r), float(applied.delta)])
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
+    set_stamp(message.header, stamp)
     return message
 
 
 def _odometry(stamp: int, sample: Sample, measured: State) -> Odometry:
     message = Odometry(child_frame_id="base_link")
     message.header.frame_id = "map"
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
-    pose, twist = message.pose.pose, message.twist.twist
-    pose.position.x, pose.position.y = sample.pose.x, sample.pose.y
-    pose.orientation.z, pose.orientation.w = math.sin(sample.pose.theta / 2), math.cos(sample.pose.theta / 2)
+    set_stamp(message.header, stamp)
+    set_pose(message.pose.pose, *sample.pose)
+    twist = message.twist.twist
     twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in measured)
     return message
 

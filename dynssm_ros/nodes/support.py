@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -49,6 +50,17 @@ def describe(
     ranges = [FloatingPointRange(from_value=bounds[0], to_value=bounds[1])] if bounds else []
     descriptor = ParameterDescriptor(description=description, floating_point_range=ranges, read_only=read_only)
     return node.declare_parameter(name, default, descriptor).value
+
+
+def set_stamp(header: Any, stamp: int) -> None:
+    """Writes ``stamp`` (ns) into a message header."""
+    header.stamp.sec, header.stamp.nanosec = divmod(stamp, 1_000_000_000)
+
+
+def set_pose(pose: Any, x: float, y: float, theta: float) -> None:
+    """Writes a planar pose (m, m, rad) into a pose message."""
+    pose.position.x, pose.position.y = x, y
+    pose.orientation.z, pose.orientation.w = math.sin(theta / 2), math.cos(theta / 2)
 
 
 def spin(node: Node) -> None:

@@ -4,10 +4,31 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from dynssm_ros.cli import main as cli
+
+TINY = """
+base: dynssm_orca
+name: tiny
+H: 4
+ssm: {channels: 4, states: 2}
+gru: {hidden: 4}
+fusion: {hidden: 8, latent: 8}
+adaptation: {hidden: 8}
+residual: {hidden: [8]}
+training: {epochs: 4, batch_size: 64}
+"""
+
+
+@pytest.fixture
+def tiny_model(tmp_path: Path) -> Path:
+    """A model file that trains in a second, four epochs."""
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY)
+    return path
 
 
 @pytest.fixture

@@ -3,48 +3,19 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
 
-from dynssm_ros.cli import main as cli
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.signals.bags import open_bag
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import load_vehicle
 
-MODEL = """
-base: dynssm_orca
-name: tiny
-H: 4
-ssm: {channels: 4, states: 2}
-gru: {hidden: 4}
-fusion: {hidden: 8, latent: 8}
-adaptation: {hidden: 8}
-residual: {hidden: [8]}
-training: {epochs: 2, batch_size: 64}
-"""
 
-
-@pytest.fixture
-def dynssm(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Runs the command line in this process: ``dynssm(...) -> (status, stdout, stderr)``."""
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["dynssm", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        out, err = capsys.readouterr()
-        return int(stopped.value.code or 0), out, err
-
-    return run
-
-
-def test_the_commands_lead_from_a_bag_to_predictions(dynssm, laps_bag: Path, tmp_path: Path) -> None:
+def test_the_commands_lead_from_a_bag_to_predictions(dynssm, laps_bag: Path, tiny_model: Path, tmp_path: Path) -> None:
     laps, car, model = tmp_path / "laps.parquet", tmp_path / "car.yaml", tmp_path / "model"
-    (tmp_path / "tiny.yaml").write_text(MODEL)
     standard = tmp_path / "standard"
     assert dynssm("extract", laps_bag, "--signals", "default", "--rate", 50, "--out", laps, "--bag", standard)[0] == 0
     with open_bag(standard) as bag:

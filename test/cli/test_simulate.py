@@ -3,26 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import pytest
 
-from dynssm_ros.cli.main import main
 from dynssm_ros.signals.bags import open_bag
-
-
-@pytest.fixture
-def dynssm(monkeypatch, capsys):
-    """Runs the command line; returns exit status, stdout and stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["dynssm", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        out, err = capsys.readouterr()
-        return stop.value.code, out, err
-
-    return run
 
 
 def test_simulate_writes_a_bag_a_summary_and_json(dynssm, tmp_path):

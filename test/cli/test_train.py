@@ -17,25 +17,13 @@ from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map
 
 Run = Callable[..., tuple[int, str, str]]
-MODEL = """
-base: dynssm_orca
-name: tiny
-H: 4
-ssm: {channels: 4, states: 2}
-gru: {hidden: 4}
-fusion: {hidden: 8, latent: 8}
-adaptation: {hidden: 8}
-residual: {hidden: [8]}
-training: {epochs: 4, batch_size: 64}
-"""
 
 
 @pytest.fixture
-def arguments(laps_bag: Path, tmp_path: Path) -> list[str]:
+def arguments(laps_bag: Path, tiny_model: Path, tmp_path: Path) -> list[str]:
     """A training of four epochs on the simulated laps."""
     extract([laps_bag], load_signal_map("default"), 50.0).save(tmp_path / "laps.parquet")
-    (tmp_path / "tiny.yaml").write_text(MODEL)
-    model = ["--model", str(tmp_path / "tiny.yaml"), "--vehicle", "orca", "--out", str(tmp_path / "model")]
+    model = ["--model", str(tiny_model), "--vehicle", "orca", "--out", str(tmp_path / "model")]
     return ["train", str(tmp_path / "laps.parquet"), *model]
 
 
