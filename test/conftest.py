@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,18 @@ def putnam(data: Path) -> Path:
 def orca_bag(data: Path) -> Path:
     """The published ORCA run on ETHZ as a rosbag2 folder."""
     return data / "orca" / "ethz_pure_pursuit"
+
+
+@pytest.fixture(scope="session")
+def acting() -> Callable[..., dict[str, float]]:
+    """Parameters with which the effect of a name acts: each a share of the way from neutral to its upper bound."""
+    from dynssm_ros.vehicle.effects import EFFECTS
+
+    def parameters(name: str, share: float = 0.2) -> dict[str, float]:
+        described = EFFECTS[name].PARAMETERS.items()
+        return {key: p.neutral + (0.0 if p.shape else share) * (p.upper - p.neutral) for key, p in described}
+
+    return parameters
 
 
 @pytest.fixture(scope="session")

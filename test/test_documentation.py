@@ -12,6 +12,7 @@ import yaml
 from dynssm_ros.cli.main import app
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.signal_map import SIGNALS, load_signal_map
+from dynssm_ros.vehicle.effects import EFFECTS
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -82,3 +83,12 @@ def _topic_rows() -> list[list[str]]:
             return rows
         rows.append([cell.strip() for cell in line.strip("|").split("|")][1:])
     return rows
+
+
+def test_the_effects_of_the_document_are_those_of_the_code() -> None:
+    rows = [line for line in (ROOT / "docs" / "effects.md").read_text(encoding="utf-8").splitlines() if "| `" in line]
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    described = {name.strip("`"): (what, re.findall(r"`(\w+)`", how), advice) for name, what, how, advice in cells}
+    assert described == {
+        name: (effect.SUMMARY, list(effect.PARAMETERS), effect.ADVICE) for name, effect in EFFECTS.items()
+    }

@@ -17,6 +17,7 @@ from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.simulation.racing_line import LineKind, line_of
 from dynssm_ros.simulation.tracks import load_track
 from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle.effects import parse_effect
 
 
 def simulate(
@@ -94,23 +95,6 @@ def summary(run: Run) -> dict[str, Any]:
         "mean_speed": float(run.state[:, 0].mean()),
         "top_speed": float(run.state[:, 0].max()),
     }
-
-
-def parse_effect(text: str) -> tuple[str, dict[str, float]]:
-    """``NAME[:k=v,...]`` to name and parameters.
-
-    Raises:
-        UserError: not of that form.
-    """
-    name, _, rest = text.partition(":")
-    parameters: dict[str, float] = {}
-    for pair in filter(None, rest.split(",")):
-        key, _, value = pair.partition("=")
-        try:
-            parameters[key.strip()] = float(value)
-        except ValueError as error:
-            raise UserError(f"--effect {text}: '{pair}'; expected NAME=NUMBER, as in drag:coefficient=0.3") from error
-    return name.strip(), parameters
 
 
 def parse_noise(text: str) -> tuple[float, float, float]:

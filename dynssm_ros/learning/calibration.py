@@ -16,11 +16,12 @@ import numpy.typing as npt
 
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.learning.least_squares import Influence, Loss, influence, least_squares
+from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle
-from dynssm_ros.vehicle.effects import initial_memory
-from dynssm_ros.vehicle.single_track import Integrator, step_with_memory
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.effects import require_context
+from dynssm_ros.vehicle.single_track import Integrator, settled_memory, step_with_memory
 
 Vector = npt.NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -60,7 +61,12 @@ class Calibration:
 
 
 class PredictionErrors:
-    """Errors of ``steps``-step predictions from every usable row, as a function of the coefficients."""
+    """Errors of ``steps``-step predictions from every usable row, as a function of the coefficients.
+
+    Raises:
+        RecordingError: too few usable rows.
+        ConfigurationError: an effect of the vehicle needs a signal that the recording does not have.
+    """
 
     def __init__(
         self,
@@ -84,6 +90,9 @@ class PredictionErrors:
         self._integrator: Integrator = integrator
         self._substeps = substeps
         self._effects = vehicle.active_effects
+        context = recording_context(recording)
+        require_context(self._effects, context, f"recording {', '.join(recording.info.source)}")
+        self._context = [{name: v[self.starts + k] for name, v in context.items()} for k in range(steps)]
         rows = recording.matrix.T
         self._rows = [rows[:, self.starts + k] for k in range(steps)]
         self._target = np.stack([rows[:3, self.starts + k + 1] for k in range(steps)], axis=1)
@@ -94,8 +103,9 @@ class PredictionErrors:
 
     def __call__(self, theta: Vector) -> Vector:
         """Errors ``(3, steps, N)`` in m/s, m/s, rad/s for coefficients ``(17,)``."""
-        state = State(*self._rows[0][:3])
-        memory = initial_memory(self._effects, self._rows[0][3], self._rows[0][4])
+        first, coefficients, constants = self._rows[0], Coefficients(*theta), self.vehicle.constants
+        state, feedback = State(*first[:3]), Applied(*first[3:5])
+        memory = settled_memory(np, state, feedback, coefficients, constants, self._effects, context=self._context[0])
         predicted = np.empty_like(self._target)
         for k in range(self.steps):
             state, memory = step_with_memory(
@@ -103,12 +113,13 @@ class PredictionErrors:
                 state,
                 memory,
                 applied_inputs(self._rows[k]),
-                Coefficients(*theta),
-                self.vehicle.constants,
+                coefficients,
+                constants,
                 self.vehicle.sampling_time,
                 self._effects,
                 self._integrator,
                 self._substeps,
+                self._context[k],
             )
             predicted[:, k] = state
         return predicted - self._target

@@ -30,6 +30,7 @@ from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.simulation.racing_line import LineKind, line_of
 from dynssm_ros.simulation.tracks import load_track
 from dynssm_ros.vehicle import Applied, State, load_vehicle
+from dynssm_ros.vehicle.effects import parse_effect
 
 DriverKind = Literal["pure_pursuit", "external"]
 _LATE = 1.0  # s; a node that was held up for longer goes on from there and does not catch up
@@ -41,6 +42,9 @@ class SimulatorNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__("simulator", **options)
         vehicle = describe(self, "vehicle", "orca", "Vehicle: shipped name or file.", read_only=True)
+        effects = describe(
+            self, "effects", "", "Physics beyond the vehicle file: NAME[:k=v,...], apart by blanks.", read_only=True
+        )
         track = describe(self, "track", "club", "Track: built-in name or CSV file.", read_only=True)
         scale = describe(self, "scale", 1.0, "Size of the track.", (1e-4, 1e4), read_only=True)
         self._plant: PlantKind = self._choice("plant", "euler", get_args(PlantKind), "How the car is modelled.")
@@ -66,6 +70,8 @@ class SimulatorNode(Node):
         if self._seed < 0:
             raise ConfigurationError(f"parameter seed: {self._seed}; expected at least 0")
         self._vehicle = load_vehicle(vehicle)
+        for text in effects.split():
+            self._vehicle = self._vehicle.with_effect(*parse_effect(text))
         self._track = load_track(track).scaled(scale)
         self._style = Style(aggressiveness, variation)
         self._noise = np.array(noise)
@@ -130,7 +136,7 @@ class SimulatorNode(Node):
         else:
             self._tell(sample)
         self._publish_odometry(
-            _odometry(stamp, sample, State(*(sample.state + self._noise * self._rng.standard_normal(3))))
+            _odometry(stamp, sample, State(*(sample.measured + self._noise * self._rng.standard_normal(3))))
         )
 
     def _tell(self, sample: Sample) -> None:

@@ -67,8 +67,12 @@ def _header(stamp: int, frame_id: str) -> Any:
     return _TYPES["std_msgs/msg/Header"](_TYPES["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame_id)
 
 
-def twist_covariance(variances: Vector) -> Vector:
-    """Row-major 6 x 6 twist covariance ``(36,)`` from the variances of ``v_x, v_y, omega``, shape ``(3,)``."""
+def twist_covariance(variances: Vector | None) -> Vector:
+    """Row-major 6 x 6 twist covariance ``(36,)`` from the variances of ``v_x, v_y, omega``, shape ``(3,)``.
+
+    Zeros, which stand for unknown, without variances.
+    """
     covariance = np.zeros(36)
-    covariance[[0, 7, 35]] = variances
+    if variances is not None:
+        covariance[[0, 7, 35]] = variances
     return covariance

@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from dynssm_ros.vehicle.effects.drivetrain import TRACK_WIDTH
 from dynssm_ros.vehicle.single_track import Array, Constants, Motion, shape
 
-TRACK_WIDTH = 0.55  # of the wheelbase: 1.64 m for an Indy car, 34 mm for a 1:43 car
 LOAD_SENSITIVITY = 0.15  # of a racing slick: grip per load that 100 % more load costs
 _ROUNDS = 2  # of lateral force and load transfer, which hang on each other weakly
 _MOMENT = "double_track.moment"

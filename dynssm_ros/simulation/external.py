@@ -93,7 +93,7 @@ def drive_by_commands(
     """
     (x, y), theta = track.centre.position(0.0), float(track.centre.heading(0.0))
     start = Pose(float(x), float(y), theta), State(0.0, 0.0, 0.0)
-    car = make_plant(vehicle, plant, *start, last=(Creeping(vehicle, plant),))
+    car = make_plant(vehicle, plant, *start, last=(Creeping(vehicle, plant),), lap_length=track.length)
     feedback, s = Applied(0.0, 0.0), 0.0
     for k in itertools.count():
         time, pose, state = k * vehicle.sampling_time, car.pose, car.state
@@ -104,7 +104,7 @@ def drive_by_commands(
         on_track, lateral = (float(value) for value in track.project(pose[:2], near=s))
         s += math.remainder(on_track - s, track.length)
         command = next_command(feedback)
-        yield Sample(time, state, pose, feedback, command, s, lateral)
+        yield Sample(time, state, pose, feedback, command, s, lateral, car.measured)
         car.advance(command, on_track)
         feedback = command
 

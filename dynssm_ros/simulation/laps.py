@@ -35,7 +35,8 @@ class SimulationError(UserError):
 class Sample(NamedTuple):
     """One instant: state and pose, the feedback of the actuators, the command that acts until the next instant.
 
-    ``s`` (m, counted on over the laps) and ``lateral`` (m, positive left) are along the track's centre line.
+    ``s`` (m, counted on over the laps) and ``lateral`` (m, positive left) are along the track's centre line. ``measured``
+    is what the car's sensors say of ``state``, without noise.
     """
 
     time: float
@@ -45,6 +46,7 @@ class Sample(NamedTuple):
     command: Applied
     s: float
     lateral: float
+    measured: State
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,7 @@ class Run:
         seed: of driver and noise.
         time: stamps (ns), shape ``(N,)``.
         state: true ``v_x, v_y, omega`` (m/s, m/s, rad/s), shape ``(N, 3)``.
-        measured: the same with sensor noise, shape ``(N, 3)``.
+        measured: the same as the sensors say it, with the vehicle's effects on the measurement and noise, ``(N, 3)``.
         pose: ``x, y, theta`` (m, m, rad unwrapped), shape ``(N, 3)``.
         feedback: throttle (fraction) and steering (rad) of the actuators: the commands of the step before, ``(N, 2)``.
         command: absolute throttle and steering that act from this step to the next, shape ``(N, 2)``.
@@ -115,7 +117,7 @@ def drive(
     (x, y), theta = line.position(0.0, driver.offset(0.0)), float(line.heading(0.0))
     v_x = 0.7 * driver.speed(0.0)
     state = State(v_x, 0.0, v_x * float(line.curvature(0.0)))
-    car = make_plant(vehicle, plant, Pose(float(x), float(y), theta), state)
+    car = make_plant(vehicle, plant, Pose(float(x), float(y), theta), state, lap_length=track.length)
     feedback, on_line = Applied(0.0, 0.0), 0.0
     s = float(track.project([x, y])[0])
     for k in itertools.count():
@@ -126,7 +128,7 @@ def drive(
         s += math.remainder(on_track - s, track.length)
         _check_place(vehicle, track, time, state, s, lateral)
         command = driver.command(time, pose, state, on_line, feedback)
-        yield Sample(time, state, pose, feedback, command, s, lateral)
+        yield Sample(time, state, pose, feedback, command, s, lateral, car.measured)
         car.advance(command, on_track)
         feedback = command
 
@@ -172,7 +174,7 @@ def simulate(
             progress(min(round(1000 * done), round(1000 * goal)), round(1000 * goal))
         if done >= goal - 1e-9:
             break
-    state = np.array([sample.state for sample in samples])
+    state, measured = (np.array([getattr(sample, name) for sample in samples]) for name in ("state", "measured"))
     rng = np.random.default_rng([seed, 1])  # apart from the driver's, so that noise does not change the drive
     return Run(
         vehicle=vehicle,
@@ -181,7 +183,7 @@ def simulate(
         seed=seed,
         time=START_TIME + np.round(1e9 * np.array([sample.time for sample in samples])).astype(np.int64),
         state=state,
-        measured=state + rng.standard_normal(state.shape) * np.array(noise),
+        measured=measured + rng.standard_normal(state.shape) * np.array(noise),
         pose=np.array([sample.pose for sample in samples]),
         feedback=np.array([sample.feedback for sample in samples]),
         command=np.array([sample.command for sample in samples]),

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple, Protocol
 
 from dynssm_ros.simulation.double_track import DoubleTrack
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step_with_memory
-from dynssm_ros.vehicle.effects import initial_memory
-from dynssm_ros.vehicle.single_track import Integrator, Motion, StageEffect
+from dynssm_ros.vehicle.effects import require_context
+from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDelay
+from dynssm_ros.vehicle.single_track import Integrator, Motion, StageEffect, measured_state, settled_memory
 
 PlantKind = Literal["euler", "rk4", "double_track"]
 """``euler``: one forward Euler step per T_s for state and pose, as in the published data; ``rk4``: steps of 1 ms;
@@ -43,6 +45,10 @@ class Plant(Protocol):
     state: State
     """How it moves."""
 
+    @property
+    def measured(self) -> State:
+        """What its sensors say of that, without noise."""
+
     def advance(self, applied: Applied, s: float = 0.0) -> None:
         """Moves it on by T_s under constant inputs; ``s`` is its track position (m), for effects that live there."""
 
@@ -67,8 +73,20 @@ class _Odometer:
 class SingleTrackPlant:
     """The single-track car. The input of a step acts on that step.
 
-    Effects may read from the context ``time`` (s) and ``s`` (m), held over a step, and ``x, y, theta`` (m, m, rad).
-    ``first`` and ``last`` act before and after the vehicle's own effects.
+    Effects may read from the context ``t`` (s), ``s`` and ``lap_length`` (m), held over a step, and ``x, y, theta`` (m, m,
+    rad). Those that change what is measured leave the motion as it is.
+
+    Args:
+        vehicle: the car with its effects.
+        integrator: how its motion is integrated.
+        pose: where it starts.
+        state: how it moves then.
+        first: acts before the vehicle's own effects.
+        last: acts after them.
+        lap_length: of the track (m); ``None`` if there is none.
+
+    Raises:
+        ConfigurationError: an effect needs a signal that there is not.
     """
 
     def __init__(
@@ -79,43 +97,99 @@ class SingleTrackPlant:
         state: State,
         first: Sequence[StageEffect] = (),
         last: Sequence[StageEffect] = (),
+        lap_length: float | None = None,
     ) -> None:
         self.state = state
         self._vehicle = vehicle
         self._integrator: Integrator = integrator
         self._theta = Coefficients(*(float(value) for value in vehicle.nominal))
-        self._effects: tuple[StageEffect, ...] = (_Odometer(), *first, *vehicle.active_effects, *last)
-        self._memory = dict(zip(_Odometer.MEMORY, pose, strict=True))
-        self._memory |= initial_memory(vehicle.active_effects, 0.0, 0.0)
-        self._substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
+        effects = vehicle.active_effects
+        sensors = [effect for effect in effects if isinstance(effect, MeasurementEffect)]
+        physics = [effect for effect in effects if not isinstance(effect, (MeasurementEffect, OdometryDelay))]
+        self._effects: tuple[StageEffect, ...] = (_Odometer(), *first, *physics, *last, *sensors)
         self._steps = 0
+        self._track = {} if lap_length is None else {"lap_length": lap_length}
+        require_context(effects, {*self._context(0.0), *Pose._fields}, "simulation")
+        self._memory = settled_memory(
+            SCALAR, state, Applied(0.0, 0.0), self._theta, vehicle.constants, self._effects,
+            dict(zip(_Odometer.MEMORY, pose, strict=True)), self._context(0.0), measured=False,
+        )  # fmt: skip
+        self._substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
+        delay = sum(effect.delay for effect in effects if isinstance(effect, OdometryDelay))
+        self._late = _Late(delay, self._seen()) if delay > 0 else None
 
     @property
     def pose(self) -> Pose:
         """Where the car is."""
         return Pose(*(self._memory[name] for name in _Odometer.MEMORY))
 
+    @property
+    def measured(self) -> State:
+        """What the sensors say of the motion, without noise."""
+        return self._late.state if self._late else self._seen()
+
     def advance(self, applied: Applied, s: float = 0.0) -> None:
         """Moves the car on by T_s under constant inputs; ``s`` is its track position (m)."""
-        T_s = self._vehicle.sampling_time
-        self.state, self._memory = step_with_memory(
-            SCALAR,
-            self.state,
-            self._memory,
-            applied,
-            self._theta,
-            self._vehicle.constants,
-            T_s,
-            self._effects,
-            self._integrator,
-            self._substeps,
-            {"time": self._steps * T_s, "s": s},
-        )
+        pieces = self._substeps if self._late else 1  # a late reading falls between two steps
+        h, context = self._vehicle.sampling_time / pieces, self._context(s)
+        for _ in range(pieces):
+            self.state, self._memory = step_with_memory(
+                SCALAR,
+                self.state,
+                self._memory,
+                applied,
+                self._theta,
+                self._vehicle.constants,
+                h,
+                self._effects,
+                self._integrator,
+                self._substeps // pieces,
+                context,
+                measured=False,
+            )
+            if self._late:
+                self._late.add(h, self._seen())
         self._steps += 1
 
+    def _context(self, s: float) -> dict[str, float]:
+        return {"t": self._steps * self._vehicle.sampling_time, "s": s, **self._track}
 
-def make_plant(vehicle: Vehicle, kind: PlantKind, pose: Pose, state: State, last: Sequence[StageEffect] = ()) -> Plant:
-    """The plant of that kind, at ``pose`` and moving with ``state``; ``last`` acts after the vehicle's effects."""
+    def _seen(self) -> State:
+        """The present state as the sensors see it."""
+        return measured_state(SCALAR, self.state, self._effects, self._memory)
+
+
+class _Late:
+    """A state that is read ``delay`` seconds late; it was ``first`` for ever before."""
+
+    def __init__(self, delay: float, first: State) -> None:
+        self._delay = delay
+        self._past = deque([(-delay, first), (0.0, first)])
+
+    def add(self, h: float, state: State) -> None:
+        """Notes the state ``h`` seconds after the last one."""
+        self._past.append((self._past[-1][0] + h, state))
+        while self._past[1][0] <= self._past[-1][0] - self._delay:
+            self._past.popleft()
+
+    @property
+    def state(self) -> State:
+        """The state then, between two notes in proportion."""
+        (before, old), (after, new) = self._past[0], self._past[1]
+        share = (self._past[-1][0] - self._delay - before) / (after - before)
+        return State(*(a + share * (b - a) for a, b in zip(old, new, strict=True)))
+
+
+def make_plant(
+    vehicle: Vehicle,
+    kind: PlantKind,
+    pose: Pose,
+    state: State,
+    last: Sequence[StageEffect] = (),
+    lap_length: float | None = None,
+) -> Plant:
+    """The plant of that kind; see :class:`SingleTrackPlant` for the arguments and errors."""
     if kind == "double_track":
-        return SingleTrackPlant(vehicle, "rk4", pose, state, (DoubleTrack.of(vehicle.constants),), last)
-    return SingleTrackPlant(vehicle, kind, pose, state, (), last)
+        first = (DoubleTrack.of(vehicle.constants),)
+        return SingleTrackPlant(vehicle, "rk4", pose, state, first, last, lap_length)
+    return SingleTrackPlant(vehicle, kind, pose, state, (), last, lap_length)

@@ -11,12 +11,12 @@ import numpy.typing as npt
 from dynssm_ros.errors import UserError
 from dynssm_ros.simulation.lines import ClosedLine, Vector
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, motion
-from dynssm_ros.vehicle.effects import initial_memory
+from dynssm_ros.vehicle.effects import CONTEXT_UNITS
 from dynssm_ros.vehicle.single_track import Motion
 
 TOP_SPEED = 120.0  # m/s; where the table ends for a car that drag does not stop before
 Indices = npt.NDArray[np.intp]
-_SETTLING = 1000  # steps of 1 ms: what a lag or a relaxing tyre needs to settle
+_CONTEXT = {**dict.fromkeys(CONTEXT_UNITS, 0.0), "lap_length": 1.0}  # at the start of the lap, heading along x
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +127,5 @@ def _cornering(vehicle: Vehicle, speed: Vector) -> Vector:
 
 def _settled(vehicle: Vehicle, state: State, applied: Applied) -> Motion:
     """The equations of motion at ``state`` once the effects' own states have settled."""
-    effects = vehicle.active_effects
     theta = Coefficients(*vehicle.nominal)
-    memory = initial_memory(effects, applied.r, applied.delta)
-    context = dict.fromkeys(("time", "s", "x", "y", "theta"), 0.0)
-    for _ in range(_SETTLING if memory else 1):
-        q = motion(np, state, applied, theta, vehicle.constants, effects, memory, context)
-        memory = {name: value + 1e-3 * q.memory_rate[name] for name, value in memory.items()}
-    return q
+    return motion(np, state, applied, theta, vehicle.constants, vehicle.active_effects, context=_CONTEXT)

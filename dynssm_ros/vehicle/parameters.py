@@ -120,6 +120,14 @@ class Vehicle(StrictModel):
             raise ValueError(f"effect {twice[0]} has a state of its own and can be listed only once")
         return value
 
+    @model_validator(mode="after")
+    def _effects_can_act(self) -> Vehicle:
+        for effect in self.active_effects:
+            reason = None if effect.is_neutral else effect.unusable(self.constants)
+            if reason is not None:
+                raise ValueError(f"effect {effect.NAME} cannot act: {reason}")
+        return self
+
     @property
     def nominal(self) -> Vector:
         """theta_0, shape ``(17,)``, in the order of ``COEFFICIENTS``."""

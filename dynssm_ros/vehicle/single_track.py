@@ -10,6 +10,9 @@ The equations run in named stages over one :class:`Motion`:
 
 After each stage the effects of the vehicle (:mod:`dynssm_ros.vehicle.effects`) may change what it computed. Physics
 beyond the paper enters there, not here.
+
+Some effects change what is measured and not what happens. :func:`motion` is about what happens; the steps take and give
+what is measured, because that is what a model starts from and is compared with: measured -> true -> step -> measured.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Protocol
 
 GRAVITY = 9.81  # m/s^2
+_INSTANT = 1e-3  # s; the time that a single evaluation stands for
 
 Array = Any  # float, numpy array, torch tensor or casadi expression: whatever ``xp`` computes with
 Integrator = Literal["euler", "rk4"]
@@ -110,9 +114,10 @@ class Motion:
     h_cg: Array
     F_z0: Array
     load_transfer: bool
-    # slip angles (rad), drive force (N), axle loads (N), lateral tyre forces (N)
+    # slip angles (rad), force of drive and brakes, what resistances leave of it, axle loads, lateral tyre forces (N)
     alpha_f: Array = 0.0
     alpha_r: Array = 0.0
+    F_d: Array = 0.0
     F_rx: Array = 0.0
     F_zf: Array = 0.0
     F_zr: Array = 0.0
@@ -126,14 +131,20 @@ class Motion:
     a_x: Array = 0.0
     a_y: Array = 0.0
     omega_dot: Array = 0.0
-    # states that effects carry along (a lag, a relaxing tyre) with their rates, and what else was measured
+    # states that effects carry along (a lag, a relaxing tyre) with their rates, what else was measured, and the time (s)
+    # over which the integrator holds the rates
     memory: dict[str, Array] = field(default_factory=dict)
     memory_rate: dict[str, Array] = field(default_factory=dict)
     context: Mapping[str, Array] = field(default_factory=dict)
+    h: float = _INSTANT
 
 
 class StageEffect(Protocol):
-    """What :func:`motion` asks of an effect: a method per stage, called after the stage's own equations."""
+    """What :func:`motion` asks of an effect: a method per stage, called after the stage's own equations.
+
+    It may have more, all of it optional: ``carries``, the names of its own states; and, if ``measures`` is true, the
+    methods ``measured`` and ``true`` (see :class:`dynssm_ros.vehicle.effects.measurement.MeasurementEffect`).
+    """
 
     def apply(self, stage: str, xp: Any, q: Motion) -> None:
         """Changes ``q`` after ``stage``."""
@@ -151,7 +162,8 @@ def slip(xp: Any, q: Motion) -> None:
 
 def drive(xp: Any, q: Motion) -> None:
     """Longitudinal force of the rear axle with rolling resistance and drag, Eq. (6)."""
-    q.F_rx = (q.theta.C_m1 - q.theta.C_m2 * q.v_x) * q.r - q.theta.C_r0 - q.theta.C_r2 * q.v_x * q.v_x
+    q.F_d = (q.theta.C_m1 - q.theta.C_m2 * q.v_x) * q.r
+    q.F_rx = q.F_d - q.theta.C_r0 - q.theta.C_r2 * q.v_x * q.v_x
 
 
 def loads(xp: Any, q: Motion) -> None:
@@ -197,6 +209,11 @@ def shape(xp: Any, B: Array, E: Array, alpha: Array) -> Array:
     return xp.arctan(slope - E * (slope - xp.arctan(slope)))
 
 
+def at_least(value: Array, floor: Array) -> Array:
+    """The larger of the two, in any array namespace."""
+    return (value + floor + abs(value - floor)) / 2
+
+
 def motion(
     xp: Any,
     state: State,
@@ -206,18 +223,23 @@ def motion(
     effects: Sequence[StageEffect] = (),
     memory: Mapping[str, Array] | None = None,
     context: Mapping[str, Array] | None = None,
+    h: float = _INSTANT,
 ) -> Motion:
     """Evaluates all stages for one instant.
 
     Args:
         xp: array namespace of the values.
-        state: body-frame velocities, each of shape ``(...)``.
+        state: true body-frame velocities, each of shape ``(...)``.
         applied: throttle and steering that act now, broadcastable to ``(...)``.
         theta: the 17 coefficients, broadcastable to ``(...)``.
         constants: mass and geometry.
         effects: physics beyond the nominal model, in the order in which it acts.
-        memory: the effects' own states by name.
-        context: other measured signals by name (time, heading, track position, ...) that an effect may read.
+        memory: the effects' own states by name; those left out are settled, and are in ``memory`` of the result.
+        context: other signals by the names of ``CONTEXT_UNITS`` (time, heading, track position, ...) that effects read.
+        h: time (s) over which an integrator holds the rates; lags that are quicker settle within it.
+
+    Raises:
+        ConfigurationError: an effect needs a signal that ``context`` does not have.
     """
     q = Motion(
         *state,
@@ -231,12 +253,78 @@ def motion(
         load_transfer=constants.load_transfer,
         memory=dict(memory or {}),
         context=context or {},
+        h=h,
     )
     for stage in STAGES:
         stage(xp, q)
         for effect in effects:
             effect.apply(stage.__name__, xp, q)
     return q
+
+
+def measuring(effects: Sequence[StageEffect]) -> tuple[Any, ...]:
+    """Those of ``effects`` that change what is measured."""
+    return tuple(effect for effect in effects if getattr(effect, "measures", False))
+
+
+def measured_state(xp: Any, state: State, effects: Sequence[StageEffect], memory: Mapping[str, Array]) -> State:
+    """What sensors show of the true ``state``: the effects that measure, one after the other."""
+    for effect in measuring(effects):
+        state = effect.measured(xp, state, memory)
+    return state
+
+
+def true_state(xp: Any, state: State, effects: Sequence[StageEffect], memory: Mapping[str, Array]) -> State:
+    """The true state behind a measured one: the inverse of :func:`measured_state`."""
+    for effect in reversed(measuring(effects)):
+        state = effect.true(xp, state, memory)
+    return state
+
+
+def settled_memory(
+    xp: Any,
+    state: State,
+    applied: Applied,
+    theta: Coefficients,
+    constants: Constants,
+    effects: Sequence[StageEffect],
+    memory: Mapping[str, Array] | None = None,
+    context: Mapping[str, Array] | None = None,
+    measured: bool = True,
+) -> dict[str, Array]:
+    """``memory`` and the effects' own states that it lacks, settled.
+
+    A sensor's state that hides part of the true motion hangs on that motion in turn; where ``state`` is a measured one,
+    both are found by a secant step, exact as far as the motion is linear in what is hidden.
+
+    Args:
+        xp: array namespace of the values.
+        state: body-frame velocities, each of shape ``(...)``.
+        applied: the inputs under which the states settle: to start from measured rows, what acted until then, the
+            actuators' feedback.
+        theta: the 17 coefficients.
+        constants: mass and geometry.
+        effects: physics beyond the nominal model.
+        memory: own states that are known, by name; they stay.
+        context: other signals, as in :func:`motion`.
+        measured: whether ``state`` is what is measured or the true one.
+    """
+    known = dict(memory or {})
+    if all(name in known for effect in effects for name in getattr(effect, "carries", ())):
+        return known
+    sensors = measuring(effects) if measured else ()
+
+    def settled(hidden: Mapping[str, Array]) -> dict[str, Array]:
+        true = true_state(xp, state, sensors, {**known, **hidden})
+        return motion(xp, true, applied, theta, constants, effects, known, context).memory
+
+    first = settled({})
+    names = [name for sensor in sensors for name in getattr(sensor, "carries", ()) if name not in known]
+    if not names:
+        return first
+    second = settled({name: first[name] for name in names})
+    hidden = {name: _meeting(first[name], second[name]) for name in names}
+    return settled(hidden) | hidden
 
 
 def step(
@@ -251,10 +339,10 @@ def step(
     substeps: int = 1,
     context: Mapping[str, Array] | None = None,
 ) -> State:
-    """Advances the state by ``T_s`` seconds under constant inputs, Eq. (32).
+    """Advances the measured state by ``T_s`` seconds under constant inputs, Eq. (32).
 
     The paper's step is one forward Euler step; ``integrator="rk4"`` and ``substeps`` refine it. Effects with memory
-    need :func:`step_with_memory`.
+    start settled; :func:`step_with_memory` carries it on.
     """
     return step_with_memory(xp, state, {}, applied, theta, constants, T_s, effects, integrator, substeps, context)[0]
 
@@ -271,10 +359,16 @@ def step_with_memory(
     integrator: Integrator = "euler",
     substeps: int = 1,
     context: Mapping[str, Array] | None = None,
+    measured: bool = True,
 ) -> tuple[State, dict[str, Array]]:
-    """Like :func:`step`, and integrates the effects' own states (``memory``, by name) with the car's."""
+    """Like :func:`step`, and integrates the effects' own states (``memory``, by name) with the car's.
+
+    States of effects that ``memory`` lacks start settled. ``measured`` says whether the states are measured ones, as
+    models step them, or true ones, as a plant does.
+    """
+    memory = settled_memory(xp, state, applied, theta, constants, effects, memory, context, measured)
     moved, changed = increment(
-        xp, state, memory, applied, theta, constants, T_s, effects, integrator, substeps, context
+        xp, state, memory, applied, theta, constants, T_s, effects, integrator, substeps, context, measured
     )
     return State(*_add(state, moved)), {name: value + changed[name] for name, value in memory.items()}
 
@@ -291,24 +385,38 @@ def increment(
     integrator: Integrator = "euler",
     substeps: int = 1,
     context: Mapping[str, Array] | None = None,
+    measured: bool = True,
 ) -> tuple[State, dict[str, Array]]:
-    """How much the state and the effects' own states change in ``T_s`` seconds.
+    """How much the state and the effects' own states change in ``T_s`` seconds; see :func:`step_with_memory`.
 
     In single precision an increment is known far better than the difference of two states.
     """
-    names = tuple(memory)
+    memory = settled_memory(xp, state, applied, theta, constants, effects, memory, context, measured)
+    sensors = measuring(effects) if measured else ()
+    true = true_state(xp, state, sensors, memory)
+    names, h = tuple(memory), T_s / substeps
 
     def rates(y: Sequence[Array]) -> tuple[Array, ...]:
         carried = dict(zip(names, y[3:], strict=True))
-        q = motion(xp, State(*y[:3]), applied, theta, constants, effects, carried, context)
+        q = motion(xp, State(*y[:3]), applied, theta, constants, effects, carried, context, h)
         return (q.a_x, q.a_y, q.omega_dot, *(q.memory_rate[name] for name in names))
 
-    advance, h = _INTEGRATORS[integrator], T_s / substeps
-    start: tuple[Array, ...] = (*state, *memory.values())
+    advance = _INTEGRATORS[integrator]
+    start: tuple[Array, ...] = (*true, *memory.values())
     moved = advance(rates, start, h)
     for _ in range(substeps - 1):
         moved = _add(moved, advance(rates, _add(start, moved), h))
-    return State(*moved[:3]), dict(zip(names, moved[3:], strict=True))
+    change, changed = State(*moved[:3]), dict(zip(names, moved[3:], strict=True))
+    if sensors:
+        end = {name: value + changed[name] for name, value in memory.items()}
+        change = State(*_subtract(measured_state(xp, State(*_add(true, change)), sensors, end), state))
+    return change, changed
+
+
+def _meeting(first: Array, second: Array) -> Array:
+    """Where the line through ``(0, first)`` and ``(first, second)`` meets the diagonal, if it falls or hardly rises."""
+    square = first * first
+    return first * square / at_least(2 * square - first * second, square / 4 + 1e-30)
 
 
 _Rates = Callable[[Sequence[Array]], tuple[Array, ...]]
@@ -328,6 +436,10 @@ def _rk4(rates: _Rates, y: tuple[Array, ...], h: float) -> tuple[Array, ...]:
 
 def _add(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, ...]:
     return tuple(x + y for x, y in zip(a, b, strict=True))
+
+
+def _subtract(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, ...]:
+    return tuple(x - y for x, y in zip(a, b, strict=True))
 
 
 def _times(h: float, k: Sequence[Array]) -> tuple[Array, ...]:

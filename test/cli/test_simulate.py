@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
 from dynssm_ros.signals.bags import open_bag
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.signal_map import load_signal_map
 
 
 def test_simulate_writes_a_bag_a_summary_and_json(dynssm, tmp_path):
@@ -23,6 +26,18 @@ def test_simulate_writes_a_bag_a_summary_and_json(dynssm, tmp_path):
     assert len(content["lap_times_s"]) == int(content["laps"]) == 1
     with open_bag(bag) as opened:
         assert set(opened.counts.values()) == {451}
+
+
+def test_effects_on_the_measurement_are_in_the_bag_and_not_in_the_drive(dynssm, tmp_path):
+    laps = {}
+    for name, effects in {"plain": (), "biased": ("--effect", "yaw_rate_bias:bias=0.2")}.items():
+        options = ("--duration", 2, "--out", tmp_path / name, "--json", tmp_path / f"{name}.json", *effects)
+        assert dynssm("simulate", "--vehicle", "orca", "--track", "club", *options)[0] == 0
+        laps[name] = extract([tmp_path / name], load_signal_map("default"), rate=50.0)
+    plain, biased = laps["plain"], laps["biased"]
+    np.testing.assert_allclose(biased["omega"] - plain["omega"], 0.2, rtol=1e-9)
+    for name in ("v_x", "v_y", "x", "y", "theta", "r_cmd", "delta_cmd"):
+        np.testing.assert_array_equal(biased[name], plain[name])
 
 
 def test_line_and_plant_are_chosen_and_said(dynssm, tmp_path):
@@ -45,6 +60,8 @@ def test_line_and_plant_are_chosen_and_said(dynssm, tmp_path):
         (["--effect", "drag:coefficient=much"], "expected NAME=NUMBER"),
         (["--effect", "drag:coefficient=99"], "outside"),
         (["--effect", "drag:size=1"], "has no parameter 'size'"),
+        (["--effect", "load_transfer:factor=1.3"], "expected load transfer on and h_cg > 0"),
+        (["--effect", "road_bank:roll_gain=1"], "needs the signal roll (rad)"),
         (["--noise", "1,2"], "expected three numbers"),
         (["--noise", "0,-1,0"], "expected finite numbers of at least 0"),
         (["--laps", "1", "--duration", "5"], "expected one of them, positive"),

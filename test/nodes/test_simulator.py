@@ -114,6 +114,18 @@ def test_it_drives_what_simulate_drives_in_real_time(start_pit: StartPit) -> Non
     assert (poses[50].x, poses[50].y) == offline[first + 50].pose[:2]
 
 
+def test_effects_are_added_to_the_car_and_to_what_is_measured_of_it(start_pit: StartPit) -> None:
+    pit = start_pit("seed:=3", "effects:=mass:factor=1.2 yaw_rate_bias:bias=0.1")
+    assert pit.wait_for(lambda: len(pit.odometry) > 10)
+    twists = np.array([(t.linear.x, t.linear.y, t.angular.z) for t in (m.twist.twist for m in list(pit.odometry))])
+    car = load_vehicle("orca").with_effect("mass", {"factor": 1.2})
+    offline = np.array([sample.state for sample in itertools.islice(drive(car, load_track("club"), seed=3), 1000)])
+    first = int(np.argmin(np.abs(offline[:, 0] - twists[0, 0])))
+    np.testing.assert_allclose(
+        twists - offline[first : first + len(twists)], [[0.0, 0.0, 0.1]] * len(twists), atol=1e-12
+    )
+
+
 def test_predictor_answers_each_odometry_message_of_the_simulated_car(start_pit: StartPit, small_model: Path) -> None:
     with ExitStack() as stack:
         stack.enter_context(predictor_process(small_model, {"diagnostics_period": 0.1}, os.environ.copy()))
@@ -180,6 +192,7 @@ def test_a_car_that_cannot_hold_the_road_ends_in_one_line() -> None:
         ("line:=left", "parameter line: 'left'; expected centre or racing"),
         ("noise:=[0.1, -0.2, 0.0]", "parameter noise: [0.1, -0.2, 0.0]; expected three finite numbers"),
         ("seed:=-1", "parameter seed: -1; expected at least 0"),
+        ("effects:=drag:size=2", "effect drag has no parameter 'size'"),
     ],
 )
 def test_a_wrong_start_is_one_clear_line(parameter: str, expected: str) -> None:

@@ -93,10 +93,10 @@ def test_effects_see_time_place_and_pose():
             if stage == "slip":
                 seen.append(dict(q.context))
 
-    car = SingleTrackPlant(load_vehicle("orca"), "euler", Pose(1.0, 2.0, 0.5), State(2.0, 0.0, 0.0))
+    car = SingleTrackPlant(load_vehicle("orca"), "euler", Pose(1.0, 2.0, 0.5), State(2.0, 0.0, 0.0), lap_length=9.0)
     car._effects = (*car._effects, Witness())
     car.advance(Applied(0.0, 0.0), s=3.0)
     car.advance(Applied(0.0, 0.0), s=3.1)
-    assert seen[0] == {"time": 0.0, "s": 3.0, "x": 1.0, "y": 2.0, "theta": 0.5}
-    assert seen[1]["time"] == pytest.approx(0.02)
+    assert seen[0] == {"t": 0.0, "s": 3.0, "lap_length": 9.0, "x": 1.0, "y": 2.0, "theta": 0.5}
+    assert seen[1]["t"] == pytest.approx(0.02)
     assert seen[1]["x"] > 1.0

@@ -9,14 +9,34 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, motion
-from dynssm_ros.vehicle.effects import EFFECTS, Effect, Parameter, build_effect, initial_memory
-from dynssm_ros.vehicle.single_track import GRAVITY, STAGE_NAMES, Array, Integrator, Motion, step_with_memory
+from dynssm_ros.vehicle.effects import (
+    CONTEXT_UNITS,
+    EFFECTS,
+    Effect,
+    Parameter,
+    build_effect,
+    initial_memory,
+    parse_effect,
+    require_context,
+)
+from dynssm_ros.vehicle.effects.base import lagged
+from dynssm_ros.vehicle.single_track import (
+    GRAVITY,
+    STAGE_NAMES,
+    Array,
+    Integrator,
+    Motion,
+    settled_memory,
+    step_with_memory,
+)
 
 VEHICLE = load_vehicle("av21_paper")
 CONSTANTS = VEHICLE.constants
 THETA = Coefficients(*VEHICLE.nominal)
 STATE, APPLIED = State(30.0, 0.4, 0.2), Applied(0.4, 0.05)
+CONTEXT = {"t": 60.0, "s": 1900.0, "lap_length": 4000.0, "x": 5.0, "y": -3.0, "theta": 1.1, "roll": 0.03}
 
 
 def act(*effects: Effect, memory: dict[str, Array] | None = None) -> Motion:
@@ -83,13 +103,8 @@ class ThrottleLag(Effect):
     MEMORY: ClassVar[tuple[str, ...]] = ("throttle_lag.r",)
     time_constant: float = 0.2
 
-    def initial_memory(self, r: Array, delta: Array) -> dict[str, Array]:
-        return {self.MEMORY[0]: r}
-
     def inputs(self, xp: Any, q: Motion) -> None:
-        (name,) = self.MEMORY
-        q.memory_rate[name] = (q.r - q.memory[name]) / self.time_constant
-        q.r = q.memory[name]
+        q.r = lagged(q, self.MEMORY[0], q.r, self.time_constant)
 
 
 def test_an_effect_on_the_inputs_is_a_motion_under_other_inputs() -> None:
@@ -157,20 +172,23 @@ def test_effects_act_in_the_order_given() -> None:
 
 
 @pytest.mark.parametrize(
-    ("effect", "settled"),
-    [(ThrottleLag(0.2), {"throttle_lag.r": 0.1}), (build_effect("steering_lag", {"time_constant": 0.2}), None)],
-    ids=["throttle_lag", "steering_lag"],
+    ("effect", "target", "start"),
+    [
+        (ThrottleLag(0.2), APPLIED.r, 0.1),
+        (build_effect("throttle_lag", {"time_constant": 0.2}), APPLIED.r, 0.1),
+        (build_effect("steering_lag", {"time_constant": 0.2}), APPLIED.delta, 0.02),
+        (build_effect("odometry_delay", {"delay": 0.2}), APPLIED.r, 0.1),
+    ],
+    ids=["own", "throttle_lag", "steering_lag", "odometry_delay"],
 )
-def test_a_lag_approaches_its_input_exponentially(effect: Effect, settled: dict[str, float] | None) -> None:
-    (name,) = effect.MEMORY
-    start = initial_memory((effect,), 0.1, 0.02)[name]
-    if settled is not None:
-        assert start == settled[name]
-    target, T = {"throttle_lag.r": APPLIED.r, "steering_lag.delta": APPLIED.delta}[name], 0.3
+def test_a_lag_approaches_its_input_exponentially(effect: Effect, target: float, start: float) -> None:
+    name, T, tau = effect.MEMORY[0], 0.3, 0.1 if effect.NAME == "odometry_delay" else 0.2
+    memory = initial_memory((effect,), 0.1, 0.02)
+    assert memory[name] == start
     _, memory = step_with_memory(
-        np, STATE, {name: start}, APPLIED, THETA, CONSTANTS, T, (effect,), integrator="rk4", substeps=100
+        np, STATE, memory, APPLIED, THETA, CONSTANTS, T, (effect,), integrator="rk4", substeps=100
     )
-    assert memory[name] == pytest.approx(target + (start - target) * np.exp(-T / 0.2), rel=1e-9)
+    assert memory[name] == pytest.approx(target + (start - target) * np.exp(-T / tau), rel=1e-8)
 
 
 def test_a_lag_under_forward_euler_decays_by_its_own_factor() -> None:
@@ -182,21 +200,71 @@ def test_a_lag_under_forward_euler_decays_by_its_own_factor() -> None:
     assert memory["steering_lag.delta"] == pytest.approx(APPLIED.delta * (1 - (1 - 0.04 / 0.2) ** 5), rel=1e-12)
 
 
+def test_a_lag_that_the_steps_do_not_resolve_settles_and_acts_as_its_mean_over_the_step() -> None:
+    tau, T_s = 0.004, 0.04
+    effect = build_effect("steering_lag", {"time_constant": tau})
+    state, memory = step_with_memory(np, STATE, {"steering_lag.delta": 0.0}, APPLIED, THETA, CONSTANTS, T_s, (effect,))
+    assert memory["steering_lag.delta"] == APPLIED.delta
+    mean = APPLIED.delta * (1 - tau / T_s * (1 - np.exp(-T_s / tau)))
+    expected, _ = step_with_memory(np, STATE, {}, APPLIED._replace(delta=mean), THETA, CONSTANTS, T_s)
+    np.testing.assert_allclose(state, expected, rtol=0, atol=1e-5)
+
+
 def test_the_lagged_steering_is_what_acts_on_the_tyres() -> None:
     lag = build_effect("steering_lag", {"time_constant": 0.1})
-    lagged = act(lag, memory={"steering_lag.delta": 0.02})
+    lagged_motion = act(lag, memory={"steering_lag.delta": 0.02})
     direct = motion(np, STATE, APPLIED._replace(delta=0.02), THETA, CONSTANTS)
-    assert (lagged.a_x, lagged.a_y, lagged.omega_dot) == (direct.a_x, direct.a_y, direct.omega_dot)
+    found = (lagged_motion.a_x, lagged_motion.a_y, lagged_motion.omega_dot)
+    np.testing.assert_allclose(found, (direct.a_x, direct.a_y, direct.omega_dot), rtol=1e-12)
+
+
+def test_states_of_effects_start_settled_one_behind_the_other() -> None:
+    chain = (build_effect("steering_offset", {"offset": 0.01}), build_effect("steering_lag", {"time_constant": 0.1}))
+    assert initial_memory(chain, 0.3, 0.02) == {"steering_lag.delta": 0.02 + 0.01}
+    known = {"steering_lag.delta": 0.5}
+    assert settled_memory(np, STATE, APPLIED, THETA, CONSTANTS, chain, known) == known
+    settled, _ = step_with_memory(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, chain)
+    plain, _ = step_with_memory(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, chain[:1])
+    np.testing.assert_allclose(settled, plain, rtol=1e-15)
+
+
+def advanced(integrator: Integrator, *effects: Effect) -> State:
+    """Two half steps after the inputs have changed to ``APPLIED``."""
+    context = CONTEXT if effects else {}
+    memory = settled_memory(np, STATE, Applied(0.1, 0.02), THETA, CONSTANTS, effects, context=context)
+    return step_with_memory(np, STATE, memory, APPLIED, THETA, CONSTANTS, 0.04, effects, integrator, 2, context)[0]
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 @pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_a_neutral_effect_changes_nothing(name: str, integrator: Integrator) -> None:
-    effect = build_effect(name, {key: about.neutral for key, about in EFFECTS[name].PARAMETERS.items()})
-    memory = initial_memory((effect,), *APPLIED)
-    plain, _ = step_with_memory(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, (), integrator, 2)
-    found, _ = step_with_memory(np, STATE, memory, APPLIED, THETA, CONSTANTS, 0.04, (effect,), integrator, 2)
+    neutral = {key: about.neutral for key, about in EFFECTS[name].PARAMETERS.items()}
+    effect = build_effect(name, neutral)
+    assert effect.is_neutral
+    assert effect.carries == effect.needs == ()
+    assert initial_memory((effect,), *APPLIED) == {}
+    plain = advanced(integrator)
+    found, memory = step_with_memory(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, (effect,), integrator, 2)
     assert found == plain
+    assert memory == {}
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_the_formulas_vanish_at_the_neutral_value_too(name: str, integrator: Integrator) -> None:
+    """An array is evaluated whatever it holds, so this is the physics and not the shortcut."""
+    effect = EFFECTS[name](**{key: np.array(about.neutral) for key, about in EFFECTS[name].PARAMETERS.items()})
+    assert not effect.is_neutral
+    np.testing.assert_allclose(advanced(integrator, effect), advanced(integrator), rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_an_effect_grows_from_nothing(name: str, acting: Callable[..., dict[str, float]]) -> None:
+    plain = np.array(advanced("euler"))
+    large, small = (
+        np.abs(advanced("euler", build_effect(name, acting(name, share))) - plain).max() for share in (1e-3, 1e-4)
+    )
+    assert small < 0.2 * large < 0.02
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
@@ -204,6 +272,10 @@ def test_every_shipped_effect_is_fully_described(name: str) -> None:
     effect = EFFECTS[name]
     assert name == effect.NAME
     assert effect.__doc__
+    for sentence in (effect.SUMMARY, effect.ADVICE):
+        assert sentence[0].isupper()
+        assert sentence.endswith(".")
+    assert effect.MANOEUVRE[0].islower()
     assert {f.name for f in fields(effect)} == set(effect.PARAMETERS)
     assert effect().parameters == {key: about.neutral for key, about in effect.PARAMETERS.items()}
     for about in effect.PARAMETERS.values():
@@ -211,22 +283,67 @@ def test_every_shipped_effect_is_fully_described(name: str) -> None:
         assert about.unit
         assert about.lower <= about.neutral <= about.upper
         assert about.lower < about.upper
-    assert set(effect().initial_memory(0.0, 0.0)) == set(effect.MEMORY)
-    assert any(hasattr(effect, stage) for stage in STAGE_NAMES)
+        assert set(about.context) <= set(CONTEXT_UNITS)
+    for variant in effect.variants():
+        assert set(variant) <= set(effect.PARAMETERS)
+        assert not all(effect.PARAMETERS[key].shape for key in variant)
+
+
+def test_the_library_is_complete() -> None:
+    assert set(EFFECTS) == {
+        "steering_offset", "steering_gain", "steering_lag", "throttle_lag", "drag", "rolling_resistance", "drive_gain",
+        "mass", "yaw_inertia", "front_grip", "rear_grip", "downforce", "load_transfer", "tire_relaxation",
+        "combined_slip", "road_bank", "road_grade", "crosswind", "grip_drift", "grip_patch", "locked_differential",
+        "odometry_lever_arm", "odometry_misalignment", "odometry_delay", "yaw_rate_bias", "yaw_rate_lag",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
-def test_every_shipped_effect_acts_away_from_its_neutral_value(name: str) -> None:
-    effect = build_effect(name, {key: about.upper for key, about in EFFECTS[name].PARAMETERS.items()})
-    acted = act(effect, memory=initial_memory((effect,), 0.0, 0.0))
-    plain = act()
-    assert (acted.a_x, acted.a_y, acted.omega_dot) != (plain.a_x, plain.a_y, plain.omega_dot)
+def test_every_shipped_effect_acts_away_from_its_neutral_value(
+    name: str, acting: Callable[..., dict[str, float]]
+) -> None:
+    effect = build_effect(name, acting(name))
+    memory = settled_memory(np, STATE, APPLIED, THETA, CONSTANTS, (effect,), context=CONTEXT)
+    assert set(memory) == set(effect.carries) == set(effect.MEMORY)
+    assert np.abs(np.subtract(advanced("rk4", effect), advanced("rk4"))).max() > 1e-4
+
+
+@pytest.mark.parametrize("name", sorted(name for name in EFFECTS if EFFECTS[name].signals()))
+def test_a_signal_that_an_effect_needs_and_nobody_has_is_one_clear_line(
+    name: str, acting: Callable[..., dict[str, float]]
+) -> None:
+    effect = build_effect(name, acting(name))
+    assert effect.needs == EFFECTS[name].signals()
+    for signal in effect.needs:
+        known = {key: value for key, value in CONTEXT.items() if key != signal}
+        expected = rf"^effect {name} needs the signal {signal} \({CONTEXT_UNITS[signal]}\), which is not known here \("
+        with pytest.raises(ConfigurationError, match=expected) as caught:
+            motion(np, STATE, APPLIED, THETA, CONSTANTS, (effect,), context=known)
+        assert "\n" not in str(caught.value)
+        with pytest.raises(ConfigurationError, match=f"laps.parquet: effect {name} needs the signal {signal} "):
+            require_context((effect,), known, "laps.parquet")
+    require_context((effect,), CONTEXT, "laps.parquet")
+
+
+def test_only_what_is_used_needs_its_signals() -> None:
+    level = build_effect("road_bank", {"angle": 0.1})
+    assert level.needs == ()
+    require_context((level, build_effect("grip_patch", {"centre": 0.2})), (), "nowhere")
+    assert build_effect("road_bank", {"roll_gain": 1.0}).needs == ("roll",)
+    assert build_effect("road_bank", {"cos_2": 0.1}).needs == ("s", "lap_length")
+
+
+def test_an_effect_takes_many_values_at_once() -> None:
+    angles = np.linspace(-0.1, 0.1, 5)
+    together = motion(np, STATE, APPLIED, THETA, CONSTANTS, (EFFECTS["road_bank"](angle=angles),)).a_y
+    alone = [act(build_effect("road_bank", {"angle": angle})).a_y for angle in angles]
+    np.testing.assert_allclose(together, alone, rtol=1e-14)
 
 
 @pytest.mark.parametrize(
     ("build", "expected"),
     [
-        (lambda: build_effect("warp_drive", {}), "unknown effect 'warp_drive'; known: drag"),
+        (lambda: build_effect("warp_drive", {}), "unknown effect 'warp_drive'; known: combined_slip, crosswind"),
         (lambda: build_effect("drag", {"area": 1.0}), "effect drag has no parameter 'area'; it has coefficient"),
         (lambda: build_effect("drag", {"coefficient": 2.1}), r"coefficient = 2.1 N/\(m/s\)\^2 is outside \[-1, 2\]"),
         (lambda: build_effect("drag", {"coefficient": float("nan")}), "coefficient = nan"),
@@ -236,3 +353,10 @@ def test_every_shipped_effect_acts_away_from_its_neutral_value(name: str) -> Non
 def test_a_wrong_effect_says_what_is_wrong(build: Callable[[], Effect], expected: str) -> None:
     with pytest.raises(ValueError, match=expected):
         build()
+
+
+def test_effects_are_read_from_one_line() -> None:
+    assert parse_effect("road_bank") == ("road_bank", {})
+    assert parse_effect("crosswind:x=3,y=-2.5") == ("crosswind", {"x": 3.0, "y": -2.5})
+    with pytest.raises(ConfigurationError, match=r"effect drag:coefficient=much: .*expected NAME=NUMBER"):
+        parse_effect("drag:coefficient=much")

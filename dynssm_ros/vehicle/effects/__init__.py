@@ -1,0 +1,107 @@
+"""Physics beyond the nominal model, one small class each.
+
+An effect has named, bounded parameters with units and a neutral value at which it is absent. It acts after one or more
+stages of :mod:`dynssm_ros.vehicle.single_track`: a method that carries a stage's name is called after that stage and
+changes the :class:`~dynssm_ros.vehicle.single_track.Motion`. Effects of :mod:`measurement` change instead what is
+measured of the motion. The vehicle file lists effects by name, and simulation, calibration, training and control use
+them without knowing which they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.vehicle.effects.actuators import SteeringGain, SteeringLag, SteeringOffset, ThrottleLag
+from dynssm_ros.vehicle.effects.base import (
+    CONTEXT_UNITS,
+    Effect,
+    Parameter,
+    initial_memory,
+    require_context,
+)
+from dynssm_ros.vehicle.effects.drivetrain import LockedDifferential
+from dynssm_ros.vehicle.effects.environment import Crosswind, RoadBank, RoadGrade
+from dynssm_ros.vehicle.effects.inertia import Mass, YawInertia
+from dynssm_ros.vehicle.effects.loads import Downforce, LoadTransfer
+from dynssm_ros.vehicle.effects.longitudinal import Drag, DriveGain, RollingResistance
+from dynssm_ros.vehicle.effects.measurement import (
+    OdometryDelay,
+    OdometryLeverArm,
+    OdometryMisalignment,
+    YawRateBias,
+    YawRateLag,
+)
+from dynssm_ros.vehicle.effects.tyres import CombinedSlip, FrontGrip, GripDrift, GripPatch, RearGrip, TireRelaxation
+from dynssm_ros.vehicle.single_track import STAGE_NAMES
+
+__all__ = [
+    "CONTEXT_UNITS",
+    "EFFECTS",
+    "Effect",
+    "Parameter",
+    "build_effect",
+    "initial_memory",
+    "parse_effect",
+    "require_context",
+]
+
+EFFECTS: dict[str, type[Effect]] = {
+    effect.NAME: effect
+    for effect in (
+        SteeringOffset, SteeringGain, SteeringLag, ThrottleLag,
+        Drag, RollingResistance, DriveGain,
+        Mass, YawInertia,
+        FrontGrip, RearGrip,
+        Downforce, LoadTransfer,
+        TireRelaxation, CombinedSlip,
+        RoadBank, RoadGrade, Crosswind,
+        GripDrift, GripPatch,
+        LockedDifferential,
+        OdometryLeverArm, OdometryMisalignment, OdometryDelay, YawRateBias, YawRateLag,
+    )
+}  # fmt: skip
+
+
+def build_effect(name: str, parameters: Mapping[str, float]) -> Effect:
+    """Builds an effect from its name and parameters as a vehicle file gives them; those left out are neutral.
+
+    Raises:
+        ValueError: unknown name or parameter, or a value outside its bounds.
+    """
+    if name not in EFFECTS:
+        raise ValueError(f"unknown effect '{name}'; known: {', '.join(sorted(EFFECTS))}")
+    effect = EFFECTS[name]
+    for key, value in parameters.items():
+        if key not in effect.PARAMETERS:
+            raise ValueError(f"effect {name} has no parameter '{key}'; it has {', '.join(effect.PARAMETERS)}")
+        about = effect.PARAMETERS[key]
+        if not about.lower <= value <= about.upper:
+            raise ValueError(
+                f"effect {name}: {key} = {value:g} {about.unit} is outside [{about.lower:g}, {about.upper:g}]"
+            )
+    return effect(**parameters)
+
+
+def parse_effect(text: str) -> tuple[str, dict[str, float]]:
+    """``NAME[:k=v,...]`` to name and parameters.
+
+    Raises:
+        ConfigurationError: not of that form.
+    """
+    name, _, rest = text.partition(":")
+    parameters: dict[str, float] = {}
+    for pair in filter(None, rest.split(",")):
+        key, _, value = pair.partition("=")
+        try:
+            parameters[key.strip()] = float(value)
+        except ValueError as error:
+            raise ConfigurationError(
+                f"effect {text}: '{pair}'; expected NAME=NUMBER, as in drag:coefficient=0.3"
+            ) from error
+    return name.strip(), parameters
+
+
+assert all(any(hasattr(effect, act) for act in (*STAGE_NAMES, "measured")) for effect in EFFECTS.values()), (
+    "every effect acts at a stage or measures"
+)

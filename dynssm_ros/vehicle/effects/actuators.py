@@ -1,0 +1,75 @@
+"""Actuators: what acts on the car is not quite what was measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from dynssm_ros.vehicle.effects.base import Effect, Parameter, lagged
+from dynssm_ros.vehicle.single_track import Array, Motion
+
+
+@dataclass(frozen=True)
+class SteeringOffset(Effect):
+    """``delta + offset`` steers."""
+
+    NAME = "steering_offset"
+    SUMMARY = "The zero of the steering sensor is off: the wheels point elsewhere than measured by a fixed angle."
+    ADVICE = "Re-zero the steering sensor with the wheels straight, and check toe and tie rods."
+    MANOEUVRE = "driving straight at several speeds"
+    PARAMETERS = {"offset": Parameter("rad", -0.05, 0.05, 0.0)}
+    offset: Array = 0.0
+
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Shifts the steering that acts on the tyres."""
+        q.delta = q.delta + self.offset
+
+
+@dataclass(frozen=True)
+class SteeringGain(Effect):
+    """``factor * delta`` steers."""
+
+    NAME = "steering_gain"
+    SUMMARY = "The wheels turn more or less than the measured steering says: the ratio from sensor to wheels is off."
+    ADVICE = "Measure the road-wheel angle over the sensor's range and correct the steering ratio."
+    MANOEUVRE = "corners to both sides at low lateral acceleration"
+    PARAMETERS = {"factor": Parameter("1", 0.5, 1.5, 1.0)}
+    factor: Array = 1.0
+
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Scales the steering that acts on the tyres."""
+        q.delta = q.delta * self.factor
+
+
+@dataclass(frozen=True)
+class SteeringLag(Effect):
+    """``time_constant * ddelta/dt = measured - delta``."""
+
+    NAME = "steering_lag"
+    SUMMARY = "The wheels follow the measured steering late, with a first-order lag."
+    ADVICE = "Check the steering actuator, play and compliance, and the stamps of the steering signal."
+    MANOEUVRE = "quick steering from side to side at constant speed"
+    PARAMETERS = {"time_constant": Parameter("s", 0.0, 0.5, 0.0)}
+    MEMORY = ("steering_lag.delta",)
+    time_constant: Array = 0.0
+
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Replaces the steering by its lagged value."""
+        q.delta = lagged(q, self.MEMORY[0], q.delta, self.time_constant)
+
+
+@dataclass(frozen=True)
+class ThrottleLag(Effect):
+    """``time_constant * dr/dt = measured - r``."""
+
+    NAME = "throttle_lag"
+    SUMMARY = "Drive and brakes follow the measured throttle late, with a first-order lag."
+    ADVICE = "Check turbo and engine response, brake pressure build-up, and the stamps of the throttle signal."
+    MANOEUVRE = "steps of throttle and brake on a straight"
+    PARAMETERS = {"time_constant": Parameter("s", 0.0, 0.5, 0.0)}
+    MEMORY = ("throttle_lag.r",)
+    time_constant: Array = 0.0
+
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Replaces the throttle by its lagged value."""
+        q.r = lagged(q, self.MEMORY[0], q.r, self.time_constant)

@@ -1,0 +1,207 @@
+"""What an effect is: named, bounded parameters, stages at which it acts, states of its own, signals that it needs.
+
+At its neutral value an effect is absent: nothing of it is evaluated. The values may be floats, as in a vehicle file, or
+arrays, tensors or symbols, so that a fit can vary many at once or differentiate; those are always evaluated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, ClassVar
+
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.vehicle.single_track import Array, Coefficients, Motion, at_least
+
+CONTEXT_UNITS: dict[str, str] = {
+    "t": "s", "s": "m", "lap_length": "m", "x": "m", "y": "m", "theta": "rad", "roll": "rad",
+}  # fmt: skip
+"""The signals beside state and inputs that effects may read: time since the start of the drive or recording, position
+along the track's centre line (which may count on over the laps) and the length of a lap, pose, measured roll of the car
+(positive with the left side up)."""
+
+LAP = ("s", "lap_length")
+SLOWEST = 1e-3  # m/s; what divides by the speed does not divide by less
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of an effect.
+
+    Attributes:
+        unit: SI unit; ``1`` for a plain number, ``lap`` for a fraction of the lap.
+        lower: smallest admissible value.
+        upper: largest admissible value.
+        neutral: the value at which the effect vanishes; also the default.
+        shape: it says where or how the effect acts and not how much. The effect vanishes with its other parameters, at
+            whatever value this one has.
+        context: the signals that the effect needs once this parameter is not neutral.
+    """
+
+    unit: str
+    lower: float
+    upper: float
+    neutral: float
+    shape: bool = False
+    context: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Base of all effects. The dataclass fields of a subclass are its parameters, described in ``PARAMETERS``.
+
+    A method that carries a stage's name is called after that stage and changes the :class:`Motion`.
+
+    Attributes:
+        NAME: as in vehicle files.
+        SUMMARY: what it is, in one sentence.
+        ADVICE: what a team would do about it.
+        MANOEUVRE: the driving that shows it best.
+        PARAMETERS: the parameters by name.
+        VARIANTS: sets of parameters to be fitted together, the simplest first; empty: all of them.
+        MEMORY: names of its own states. :func:`lagged` settles and integrates them.
+    """
+
+    NAME: ClassVar[str] = ""
+    SUMMARY: ClassVar[str] = ""
+    ADVICE: ClassVar[str] = ""
+    MANOEUVRE: ClassVar[str] = ""
+    PARAMETERS: ClassVar[dict[str, Parameter]] = {}
+    VARIANTS: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    MEMORY: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def variants(cls) -> tuple[tuple[str, ...], ...]:
+        """Sets of parameters to be fitted together, the simplest first."""
+        return cls.VARIANTS or (tuple(cls.PARAMETERS),)
+
+    @classmethod
+    def signals(cls, parameters: Iterable[str] | None = None) -> tuple[str, ...]:
+        """The context that the effect needs when ``parameters`` (all if not given) are not neutral."""
+        names = cls.PARAMETERS if parameters is None else parameters
+        return tuple(dict.fromkeys(signal for name in names for signal in cls.PARAMETERS[name].context))
+
+    @classmethod
+    def unusable(cls, constants: Any) -> str | None:
+        """What is wrong with a car of these constants for the effect to be able to act; ``None`` if nothing is."""
+        return None
+
+    @property
+    def parameters(self) -> dict[str, Array]:
+        """The values by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    @cached_property
+    def active(self) -> frozenset[str]:
+        """The parameters that are off their neutral value; those that shape do not count."""
+        return frozenset(
+            name
+            for name, about in self.PARAMETERS.items()
+            if not about.shape and not _is_number(getattr(self, name), about.neutral)
+        )
+
+    @cached_property
+    def is_neutral(self) -> bool:
+        """Whether the effect is absent."""
+        return bool(self.PARAMETERS) and not self.active
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The context that it needs with its present values."""
+        return self.signals(name for name in self.PARAMETERS if name in self.active)
+
+    @property
+    def carries(self) -> tuple[str, ...]:
+        """Its own states, by name; none while it is absent."""
+        return () if self.is_neutral else self.MEMORY
+
+    def apply(self, stage: str, xp: Any, q: Motion) -> None:
+        """Calls the method named like ``stage``, if the effect has one and is not neutral."""
+        act = getattr(self, stage, None)
+        if act is not None and not self.is_neutral:
+            act(xp, q)
+
+    def read(self, q: Motion, signal: str) -> Array:
+        """A signal of the context.
+
+        Raises:
+            ConfigurationError: it is not known here.
+        """
+        if signal not in q.context:
+            raise ConfigurationError(_lacking(self, signal, q.context))
+        return q.context[signal]
+
+    def lap(self, q: Motion) -> Array:
+        """Track position as a fraction of the lap."""
+        return self.read(q, "s") / self.read(q, "lap_length")
+
+
+def _is_number(value: Array, number: float) -> bool:
+    return isinstance(value, (int, float)) and value == number
+
+
+def initial_memory(effects: Sequence[Effect], r: Array, delta: Array) -> dict[str, Array]:
+    """The own states of ``effects`` on the inputs, settled under throttle ``r`` and steering ``delta``.
+
+    States on anything else hang on the car's motion: ``settled_memory`` finds all of them, and the step functions those
+    that are missing.
+    """
+    zero = Coefficients(*(0.0,) * len(Coefficients._fields))
+    q = Motion(0.0, 0.0, 0.0, r, delta, theta=zero, m=0.0, l_f=0.0, l_r=0.0, h_cg=0.0, F_z0=0.0, load_transfer=False)
+    for effect in effects:
+        effect.apply("inputs", None, q)
+    return q.memory
+
+
+def require_context(effects: Iterable[Effect], available: Iterable[str], where: str) -> None:
+    """Checks that ``where`` knows what ``effects`` need.
+
+    Raises:
+        ConfigurationError: a signal is missing; names the effect, the signal and what there is.
+    """
+    have = set(available)
+    for effect in effects:
+        for signal in effect.needs:
+            if signal not in have:
+                raise ConfigurationError(f"{where}: {_lacking(effect, signal, have)}")
+
+
+def _lacking(effect: Effect, signal: str, have: Container[str]) -> str:
+    known = ", ".join(name for name in CONTEXT_UNITS if name in have) or "none"
+    return (
+        f"effect {effect.NAME} needs the signal {signal} ({CONTEXT_UNITS[signal]}), which is not known here ({known})"
+    )
+
+
+def lagged(q: Motion, name: str, target: Array, time_constant: Array) -> Array:
+    """``target`` behind a first-order lag with the state ``q.memory[name]``; a state that is missing is settled.
+
+    A lag that is quicker than the integrator's step would ring. Its state then reaches the target within the step, and
+    the result lies between the two, for forward Euler as the mean over the step does; with a time constant of 0 it is
+    the target.
+    """
+    resolved = at_least(time_constant, q.h)
+    state = q.memory.setdefault(name, target)
+    q.memory_rate[name] = (target - state) / resolved
+    return target + time_constant / resolved * (state - target)
+
+
+def like(q: Motion, value: Array) -> Array:
+    """``value`` as the kind of array that the motion is made of: torch takes no sine of a float."""
+    return value + 0.0 * q.v_x
+
+
+def section(xp: Any, lap: Array, centre: Array, length: Array) -> Array:
+    """1 within a section of the lap, 0 outside; each edge takes about a fifth of the length.
+
+    Args:
+        xp: array namespace.
+        lap: track position (lap).
+        centre: middle of the section (lap).
+        length: its length (lap).
+    """
+    angle = 2 * math.pi * (lap - centre)
+    away = abs(xp.arctan2(xp.sin(angle), xp.cos(angle))) / (2 * math.pi)
+    return (1 + xp.tanh((length / 2 - away) / (0.1 * length))) / 2

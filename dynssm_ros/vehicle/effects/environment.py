@@ -1,0 +1,137 @@
+"""Environment: the road's slope and the wind."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from dynssm_ros.vehicle.effects.base import LAP, Effect, Parameter, like, section
+from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion
+
+_HARMONICS = 3
+_WAVES = tuple(f"{wave}_{k}" for k in range(1, _HARMONICS + 1) for wave in ("cos", "sin"))
+_SECTION = ("section", "centre", "length")
+_CALM = 1e-6  # (m/s)^2; keeps the slope of a square root finite in still air
+
+
+@dataclass(frozen=True)
+class RoadAngle(Effect):
+    """An angle of the road: everywhere the same, on a section of the lap, as a smooth wave over the lap, or their sum.
+
+    ``cos_k`` and ``sin_k`` are the amplitudes of the ``k``-th harmonic of the lap.
+    """
+
+    PARAMETERS = {
+        "angle": Parameter("rad", -0.5, 0.5, 0.0),
+        "section": Parameter("rad", -0.5, 0.5, 0.0, context=LAP),
+        "centre": Parameter("lap", 0.0, 1.0, 0.5, shape=True),
+        "length": Parameter("lap", 0.01, 0.8, 0.1, shape=True),
+        **dict.fromkeys(_WAVES, Parameter("rad", -0.3, 0.3, 0.0, context=LAP)),
+    }
+    VARIANTS: ClassVar[tuple[tuple[str, ...], ...]] = (("angle",), ("angle", *_SECTION), ("angle", *_WAVES))
+    angle: Array = 0.0
+    section: Array = 0.0
+    centre: Array = 0.5
+    length: Array = 0.1
+    cos_1: Array = 0.0
+    sin_1: Array = 0.0
+    cos_2: Array = 0.0
+    sin_2: Array = 0.0
+    cos_3: Array = 0.0
+    sin_3: Array = 0.0
+
+    def here(self, xp: Any, q: Motion) -> Array:
+        """The angle at the present place (rad)."""
+        angle = like(q, self.angle)
+        if "section" in self.active:
+            angle = angle + self.section * section(xp, self.lap(q), self.centre, self.length)
+        for name in _WAVES:
+            if name in self.active:
+                wave, k = name.split("_")
+                angle = angle + getattr(self, name) * getattr(xp, wave)(2 * math.pi * int(k) * self.lap(q))
+        return angle
+
+
+@dataclass(frozen=True)
+class RoadBank(RoadAngle):
+    """``F_y - m g sin(bank)``, bank as roll: positive with the left side up, so that the car is pulled to the right.
+
+    ``roll_gain`` adds that much of the measured roll of the car. The axle loads stay those of the level road.
+    """
+
+    NAME = "road_bank"
+    SUMMARY = "The road leans to one side, so gravity pulls the car sideways."
+    ADVICE = "Map the banking of the track, or feed the measured roll to the model."
+    MANOEUVRE = "the same stretch at different speeds, straight as far as possible"
+    PARAMETERS = {**RoadAngle.PARAMETERS, "roll_gain": Parameter("1", -2.0, 2.0, 0.0, context=("roll",))}
+    VARIANTS = (*RoadAngle.VARIANTS, ("roll_gain",))
+    roll_gain: Array = 0.0
+
+    def forces(self, xp: Any, q: Motion) -> None:
+        """Adds the weight's part across the car."""
+        bank = self.here(xp, q)
+        if "roll_gain" in self.active:
+            bank = bank + self.roll_gain * self.read(q, "roll")
+        q.F_y = q.F_y - q.m * GRAVITY * xp.sin(bank)
+
+
+@dataclass(frozen=True)
+class RoadGrade(RoadAngle):
+    """``F_x - m g sin(grade)``, positive uphill."""
+
+    NAME = "road_grade"
+    SUMMARY = "The road climbs or falls, so gravity pulls the car back or forth."
+    ADVICE = "Map the height of the track and give the model its slope."
+    MANOEUVRE = "the same stretch with and without throttle"
+    PARAMETERS = RoadAngle.PARAMETERS
+
+    def forces(self, xp: Any, q: Motion) -> None:
+        """Adds the weight's part along the car."""
+        q.F_x = q.F_x - q.m * GRAVITY * xp.sin(self.here(xp, q))
+
+
+@dataclass(frozen=True)
+class Crosswind(Effect):
+    """Wind with the world-fixed velocity ``(x, y)``, the direction in which it blows.
+
+    With ``w`` the wind and ``v`` the car in the body frame and ``a = v - w`` the air that it meets, drag follows the air,
+    ``C_r2 a_x |a_x|`` in place of ``C_r2 v_x |v_x|``, and the side force is ``side C_r2 |a| w_y``, ``arm`` ahead of the
+    centre of gravity. The side force that the car's own drift makes in still air belongs to the nominal model.
+    """
+
+    NAME = "crosswind"
+    SUMMARY = "A steady wind pushes the car, to another side in every direction of driving."
+    ADVICE = "Compare with the weather station; treat laps in wind apart, or give the model the wind."
+    MANOEUVRE = "the same speed in opposite directions"
+    PARAMETERS = {
+        "x": Parameter("m/s", -25.0, 25.0, 0.0, context=("theta",)),
+        "y": Parameter("m/s", -25.0, 25.0, 0.0, context=("theta",)),
+        "side": Parameter("1", 0.0, 100.0, 3.0, shape=True),
+        "arm": Parameter("m", -1.0, 1.0, 0.0, shape=True),
+    }
+    VARIANTS = (("x", "y"), ("x", "y", "side"), ("x", "y", "side", "arm"))
+    x: Array = 0.0
+    y: Array = 0.0
+    side: Array = 3.0
+    arm: Array = 0.0
+
+    def drive(self, xp: Any, q: Motion) -> None:
+        """Lets the drag follow the air."""
+        w_x, _ = self._wind(xp, q)
+        a_x = q.v_x - w_x
+        q.F_rx = q.F_rx - q.theta.C_r2 * (a_x * abs(a_x) - q.v_x * abs(q.v_x))
+
+    def forces(self, xp: Any, q: Motion) -> None:
+        """Adds the side force and its moment."""
+        w_x, w_y = self._wind(xp, q)
+        a_x, a_y = q.v_x - w_x, q.v_y - w_y
+        push = self.side * q.theta.C_r2 * xp.sqrt(a_x * a_x + a_y * a_y + _CALM) * w_y
+        q.F_y = q.F_y + push
+        q.M_z = q.M_z + self.arm * push
+
+    def _wind(self, xp: Any, q: Motion) -> tuple[Array, Array]:
+        """The wind in the body frame (m/s)."""
+        theta = self.read(q, "theta")
+        sin, cos = xp.sin(theta), xp.cos(theta)
+        return cos * self.x + sin * self.y, cos * self.y - sin * self.x

@@ -1,0 +1,57 @@
+"""Loads: what presses the axles on the road."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from dynssm_ros.vehicle.effects.base import Effect, Parameter
+from dynssm_ros.vehicle.single_track import Array, Constants, Motion
+
+
+@dataclass(frozen=True)
+class Downforce(Effect):
+    """``coefficient v_x^2`` more load, the share ``balance`` of it on the front axle."""
+
+    NAME = "downforce"
+    SUMMARY = "The air presses the car down (or lifts it) with the square of the speed, so grip grows with speed."
+    ADVICE = "Add the wings' downforce to the vehicle file; use the balance to trim front against rear."
+    MANOEUVRE = "cornering at the limit at low and at high speed"
+    PARAMETERS = {
+        "coefficient": Parameter("N/(m/s)^2", -0.5, 5.0, 0.0),
+        "balance": Parameter("1", 0.0, 1.0, 0.45, shape=True),
+    }
+    coefficient: Array = 0.0
+    balance: Array = 0.45
+
+    def loads(self, xp: Any, q: Motion) -> None:
+        """Adds to the axle loads."""
+        pressed = self.coefficient * q.v_x * q.v_x
+        q.F_zf = q.F_zf + self.balance * pressed
+        q.F_zr = q.F_zr + (1.0 - self.balance) * pressed
+
+
+@dataclass(frozen=True)
+class LoadTransfer(Effect):
+    """``factor * h_cg``: longitudinal load transfer, and on a double-track car the lateral one too."""
+
+    NAME = "load_transfer"
+    SUMMARY = "Braking and driving move more or less load between the axles than the vehicle file says."
+    ADVICE = "Measure the height of the centre of gravity and correct h_cg; check anti-dive and anti-squat."
+    MANOEUVRE = "braking into corners and accelerating out of them"
+    PARAMETERS = {"factor": Parameter("1", 0.0, 4.0, 1.0)}
+    factor: Array = 1.0
+
+    @classmethod
+    def unusable(cls, constants: Constants) -> str | None:
+        """It scales what must be there."""
+        if constants.load_transfer and constants.h_cg > 0:
+            return None
+        return (
+            f"load_transfer {str(constants.load_transfer).lower()}, h_cg {constants.h_cg:g} m; expected load transfer on "
+            "and h_cg > 0"
+        )
+
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Scales the height of the centre of gravity."""
+        q.h_cg = q.h_cg * self.factor

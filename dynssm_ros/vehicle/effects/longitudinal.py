@@ -1,0 +1,58 @@
+"""Longitudinal: what drives the car and what holds it back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from dynssm_ros.vehicle.effects.base import Effect, Parameter
+from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion
+
+
+@dataclass(frozen=True)
+class Drag(Effect):
+    """``F_rx - coefficient v_x^2``: on top of C_r2."""
+
+    NAME = "drag"
+    SUMMARY = "The air holds the car back more or less than the vehicle file says: a wing, a tow, bodywork."
+    ADVICE = "Check wings, cooling inlets and bodywork; coast down from top speed to measure the drag."
+    MANOEUVRE = "coasting down from top speed"
+    PARAMETERS = {"coefficient": Parameter("N/(m/s)^2", -1.0, 2.0, 0.0)}
+    coefficient: Array = 0.0
+
+    def drive(self, xp: Any, q: Motion) -> None:
+        """Takes the extra drag off the longitudinal force."""
+        q.F_rx = q.F_rx - self.coefficient * q.v_x * q.v_x
+
+
+@dataclass(frozen=True)
+class RollingResistance(Effect):
+    """``F_rx - coefficient m g``: on top of C_r0."""
+
+    NAME = "rolling_resistance"
+    SUMMARY = "The wheels roll harder or easier than the vehicle file says, whatever the speed."
+    ADVICE = "Check tyre pressures, bearings and dragging brakes; let the car roll out to measure the resistance."
+    MANOEUVRE = "rolling out at low speed"
+    PARAMETERS = {"coefficient": Parameter("1", -0.1, 0.2, 0.0)}
+    coefficient: Array = 0.0
+
+    def drive(self, xp: Any, q: Motion) -> None:
+        """Takes the extra resistance off the longitudinal force."""
+        q.F_rx = q.F_rx - self.coefficient * q.m * GRAVITY
+
+
+@dataclass(frozen=True)
+class DriveGain(Effect):
+    """``factor * (C_m1 - C_m2 v_x) r``: drive and brakes alike, resistances not."""
+
+    NAME = "drive_gain"
+    SUMMARY = "Throttle and brake give more or less force than the vehicle file says."
+    ADVICE = "Check the engine map and the brake balance, and the scale of the throttle signal."
+    MANOEUVRE = "full throttle and hard braking on a straight"
+    PARAMETERS = {"factor": Parameter("1", 0.4, 1.6, 1.0)}
+    factor: Array = 1.0
+
+    def drive(self, xp: Any, q: Motion) -> None:
+        """Scales the force of drive and brakes."""
+        q.F_rx = q.F_rx + (self.factor - 1.0) * q.F_d
+        q.F_d = q.F_d * self.factor

@@ -1,0 +1,164 @@
+"""Measurement: what is measured differs from what happens.
+
+The car moves as it does; these effects say what the sensors show of it, and back. A model that starts from measured
+states and predicts measured states goes measured -> true -> step -> measured, in the order of the vehicle file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from dynssm_ros.vehicle.effects.base import Effect, Parameter, lagged
+from dynssm_ros.vehicle.single_track import Array, Motion, State, at_least
+
+
+@dataclass(frozen=True)
+class MeasurementEffect(Effect):
+    """Base of the effects that change what is measured."""
+
+    @property
+    def measures(self) -> bool:
+        """Whether there is anything to change."""
+        return not self.is_neutral
+
+    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """What is measured of the true ``state``."""
+        raise NotImplementedError
+
+    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """The true state of which ``state`` is measured."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class OdometryLeverArm(MeasurementEffect):
+    """Velocity of a point ``x`` ahead and ``y`` left of the centre of gravity: ``v + omega x (x, y)``. Exact."""
+
+    NAME = "odometry_lever_arm"
+    SUMMARY = "The velocity is measured off the centre of gravity, so yawing shows in it."
+    ADVICE = "Measure where the antenna or sensor sits and move its velocity to the centre of gravity."
+    MANOEUVRE = "tight corners to both sides"
+    PARAMETERS = {"x": Parameter("m", -3.0, 3.0, 0.0), "y": Parameter("m", -2.0, 2.0, 0.0)}
+    VARIANTS = (("x",), ("x", "y"))
+    x: Array = 0.0
+    y: Array = 0.0
+
+    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """Velocity at the sensor."""
+        v_x, v_y, omega = state
+        return State(v_x - omega * self.y, v_y + omega * self.x, omega)
+
+    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """Velocity at the centre of gravity."""
+        v_x, v_y, omega = state
+        return State(v_x + omega * self.y, v_y - omega * self.x, omega)
+
+
+@dataclass(frozen=True)
+class OdometryMisalignment(MeasurementEffect):
+    """Velocity in a frame turned by ``angle`` (counter-clockwise) against the car. Exact."""
+
+    NAME = "odometry_misalignment"
+    SUMMARY = "The velocity is measured in a frame turned against the car, so speed ahead shows as speed sideways."
+    ADVICE = "Align the sensor, or correct its heading offset until driving straight shows no sideways speed."
+    MANOEUVRE = "driving straight at different speeds"
+    PARAMETERS = {"angle": Parameter("rad", -0.2, 0.2, 0.0)}
+    angle: Array = 0.0
+
+    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """Velocity in the sensor's frame."""
+        return _turned(xp, state, -self.angle)
+
+    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """Velocity in the car's frame."""
+        return _turned(xp, state, self.angle)
+
+
+def _turned(xp: Any, state: State, angle: Array) -> State:
+    """The velocity turned by ``angle`` (rad, counter-clockwise)."""
+    v_x, v_y, omega = state
+    turn = angle + 0.0 * v_x  # torch takes no sine of a float
+    sin, cos = xp.sin(turn), xp.cos(turn)
+    return State(v_x * cos - v_y * sin, v_x * sin + v_y * cos, omega)
+
+
+@dataclass(frozen=True)
+class OdometryDelay(Effect):
+    """All three states are measured ``delay`` seconds late: ``z(t) = s(t - delay)``.
+
+    From ``z(t)`` on such a measurement moves as the car does under the inputs of then, ``dz/dt = f(z, u(t - delay))``.
+    A late odometry is thus early actuators, and that is how a model steps it. The inputs are delayed by a first-order
+    Pade approximation, whose gain is 1 at all frequencies; with forward Euler steps of at least half the delay it is
+    the mean of the delayed inputs over the step, exactly. Time and place in the context are not delayed.
+
+    A simulated car is not slowed down: its velocity and yaw rate are the true ones, read late. Its pose is not late.
+    """
+
+    NAME = "odometry_delay"
+    SUMMARY = "Velocity and yaw rate are stamped later than they were, so the car seems to answer late."
+    ADVICE = "Stamp the odometry when it is measured, or take its delay off its stamps."
+    MANOEUVRE = "quick changes of steering and throttle"
+    PARAMETERS = {"delay": Parameter("s", 0.0, 0.3, 0.0)}
+    MEMORY = ("odometry_delay.r", "odometry_delay.delta")
+    delay: Array = 0.0
+
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Delays both inputs."""
+        throttle, steering = self.MEMORY
+        q.r = 2 * lagged(q, throttle, q.r, self.delay / 2) - q.r
+        q.delta = 2 * lagged(q, steering, q.delta, self.delay / 2) - q.delta
+
+
+@dataclass(frozen=True)
+class YawRateBias(MeasurementEffect):
+    """``omega + bias`` is measured. Exact."""
+
+    NAME = "yaw_rate_bias"
+    SUMMARY = "The measured yaw rate is off by a constant."
+    ADVICE = "Zero the gyroscope at standstill before each run."
+    MANOEUVRE = "standing still or driving straight"
+    PARAMETERS = {"bias": Parameter("rad/s", -0.3, 0.3, 0.0)}
+    bias: Array = 0.0
+
+    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """Adds the bias."""
+        return state._replace(omega=state.omega + self.bias)
+
+    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """Takes the bias off."""
+        return state._replace(omega=state.omega - self.bias)
+
+
+@dataclass(frozen=True)
+class YawRateLag(MeasurementEffect):
+    """A low-pass filter ``time_constant * dz/dt = omega - z``; ``z`` is measured.
+
+    Its state is how far the measurement lags behind, ``L = omega - z`` with ``dL/dt = domega/dt - L / time_constant``.
+    In a simulation and along a prediction that is exact. Where a prediction starts from one measured row, ``L`` is not
+    known; it starts as if the yaw acceleration of the model had been there for long, ``L = time_constant * domega/dt``.
+    """
+
+    NAME = "yaw_rate_lag"
+    SUMMARY = "The measured yaw rate is low-pass filtered, so it lags behind the car."
+    ADVICE = "Widen the filter of the yaw rate sensor, or account for it where the signal is used."
+    MANOEUVRE = "quick steering from side to side"
+    PARAMETERS = {"time_constant": Parameter("s", 0.0, 0.5, 0.0)}
+    MEMORY = ("yaw_rate_lag.behind",)
+    time_constant: Array = 0.0
+
+    def accelerations(self, xp: Any, q: Motion) -> None:
+        """Says how the lag of the measurement changes."""
+        (name,) = self.MEMORY
+        resolved = at_least(self.time_constant, q.h)
+        behind = q.memory.setdefault(name, self.time_constant * q.omega_dot)
+        q.memory_rate[name] = (self.time_constant * q.omega_dot - behind) / resolved
+
+    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """What the filter gives."""
+        return state._replace(omega=state.omega - memory.get(self.MEMORY[0], 0.0))
+
+    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """What goes into the filter."""
+        return state._replace(omega=state.omega + memory.get(self.MEMORY[0], 0.0))

@@ -1,0 +1,231 @@
+"""The physics of each effect against a closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, motion
+from dynssm_ros.vehicle.effects import build_effect
+from dynssm_ros.vehicle.single_track import GRAVITY, Motion, step_with_memory
+
+AV21 = load_vehicle("av21")
+CONSTANTS, THETA = AV21.constants, Coefficients(*AV21.nominal)
+M, WHEELBASE = CONSTANTS.m, CONSTANTS.l_f + CONSTANTS.l_r
+STATE, APPLIED = State(30.0, 0.4, 0.2), Applied(0.4, 0.05)
+
+
+def act(state: State = STATE, applied: Applied = APPLIED, context: dict[str, float] | None = None, **effects) -> Motion:
+    """The motion with effects given as ``name={parameter: value}``."""
+    built = tuple(build_effect(name, parameters) for name, parameters in effects.items())
+    return motion(np, state, applied, THETA, CONSTANTS, built, context=context)
+
+
+PLAIN = act()
+
+
+def accelerations(q: Motion) -> tuple[float, float, float]:
+    return q.a_x, q.a_y, q.omega_dot
+
+
+def test_steering_gain_and_offset_steer() -> None:
+    assert accelerations(act(steering_gain={"factor": 1.2})) == accelerations(act(applied=Applied(0.4, 0.05 * 1.2)))
+    offset = act(applied=Applied(0.4, 0.05 + 0.01))
+    assert accelerations(act(steering_offset={"offset": 0.01})) == accelerations(offset)
+
+
+def test_drag_takes_its_coefficient_times_speed_squared() -> None:
+    q = act(drag={"coefficient": 0.5})
+    assert q.F_rx - PLAIN.F_rx == pytest.approx(-0.5 * 30.0**2)
+
+
+def test_rolling_resistance_slows_any_mass_alike() -> None:
+    q = act(State(10.0, 0.0, 0.0), Applied(0.0, 0.0), rolling_resistance={"coefficient": 0.02})
+    plain = act(State(10.0, 0.0, 0.0), Applied(0.0, 0.0))
+    assert q.a_x - plain.a_x == pytest.approx(-0.02 * GRAVITY)
+
+
+@pytest.mark.parametrize("r", [0.8, -0.5])
+def test_drive_gain_scales_drive_and_brakes_and_not_the_resistances(r: float) -> None:
+    gained, plain, coasting = (
+        act(applied=Applied(r, 0.0), drive_gain={"factor": 1.3}).F_rx,
+        act(applied=Applied(r, 0.0)).F_rx,
+        act(applied=Applied(0.0, 0.0)).F_rx,
+    )
+    assert gained - coasting == pytest.approx(1.3 * (plain - coasting))
+
+
+def test_mass_divides_what_the_forces_do_and_weighs_on_the_axles() -> None:
+    q = act(State(30.0, 0.0, 0.0), Applied(0.5, 0.0), mass={"factor": 1.25})
+    assert q.a_x == pytest.approx(act(State(30.0, 0.0, 0.0), Applied(0.5, 0.0)).a_x / 1.25)
+    q = act(mass={"factor": 1.25})
+    assert q.F_zf + q.F_zr == pytest.approx(1.25 * M * GRAVITY)
+    assert q.F_fy / PLAIN.F_fy == pytest.approx(q.F_zf / PLAIN.F_zf)
+
+
+def test_yaw_inertia_divides_the_yaw_acceleration_alone() -> None:
+    q = act(yaw_inertia={"factor": 1.6})
+    assert q.omega_dot == pytest.approx(PLAIN.omega_dot / 1.6)
+    assert (q.a_x, q.a_y) == (PLAIN.a_x, PLAIN.a_y)
+
+
+def test_grip_scales_its_own_axle() -> None:
+    front, rear = act(front_grip={"factor": 0.8}), act(rear_grip={"factor": 0.8})
+    assert (front.F_fy, front.F_ry) == (0.8 * PLAIN.F_fy, PLAIN.F_ry)
+    assert (rear.F_fy, rear.F_ry) == (PLAIN.F_fy, 0.8 * PLAIN.F_ry)
+
+
+def test_downforce_adds_to_the_weight_with_speed_squared_and_by_its_balance() -> None:
+    q = act(downforce={"coefficient": 1.5, "balance": 0.4})
+    pressed = 1.5 * 30.0**2
+    assert q.F_zf + q.F_zr == pytest.approx(M * GRAVITY + pressed)
+    assert q.F_zf - PLAIN.F_zf == pytest.approx(0.4 * pressed)
+    assert q.F_ry / PLAIN.F_ry == pytest.approx(q.F_zr / PLAIN.F_zr)
+
+
+def test_load_transfer_scales_what_driving_moves_between_the_axles() -> None:
+    still = M * GRAVITY * CONSTANTS.l_f / WHEELBASE
+    q = act(load_transfer={"factor": 1.5})
+    assert q.F_zr - still == pytest.approx(1.5 * (PLAIN.F_zr - still))
+    assert act(load_transfer={"factor": 0.0}).F_zr == pytest.approx(still)
+
+
+def test_load_transfer_of_a_car_without_any_is_one_clear_line() -> None:
+    expected = "effect load_transfer cannot act: load_transfer false, h_cg 0 m; expected load transfer on and h_cg > 0"
+    with pytest.raises(ConfigurationError, match=expected):
+        load_vehicle("orca").with_effect("load_transfer", {"factor": 1.2})
+    assert load_vehicle("orca").with_effect("load_transfer", {}).active_effects[0].is_neutral
+
+
+def test_relaxing_tyres_reach_their_slip_over_the_distance_rolled() -> None:
+    relaxing = (build_effect("tire_relaxation", {"length": 0.6}),)
+    front, rear = relaxing[0].MEMORY
+    # too heavy to be moved by its tyres, so that speed and slip stay as the slip angles build up
+    heavy = CONSTANTS.model_copy(update={"m": 1e9, "h_cg": 0.0, "load_transfer": False})
+    theta, state = THETA._replace(I_z=1e12), State(20.0, 0.0, 0.0)
+    _, memory = step_with_memory(np, state, {front: 0.0, rear: 0.0}, APPLIED, theta, heavy, 0.03, relaxing, "rk4", 100)
+    assert memory[front] == pytest.approx(APPLIED.delta * (1 - np.exp(-20.0 * 0.03 / 0.6)), rel=1e-3)
+    assert memory[rear] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_relaxing_tyres_pull_by_the_slip_that_they_have_reached() -> None:
+    relaxing = build_effect("tire_relaxation", {"length": 0.6})
+    reached = dict(zip(relaxing.MEMORY, (0.01, -0.02), strict=True))
+    q = motion(np, STATE, APPLIED, THETA, CONSTANTS, (relaxing,), reached)
+    assert (q.alpha_f, q.alpha_r) == pytest.approx((0.01, -0.02))
+
+
+@pytest.mark.parametrize("r", [0.3, -0.4])
+def test_combined_slip_keeps_the_rear_on_the_friction_ellipse(r: float) -> None:
+    plain, q = act(applied=Applied(r, 0.05)), act(applied=Applied(r, 0.05), combined_slip={"strength": 1.0})
+    along = q.F_d / (THETA.D_r * q.F_zr / CONSTANTS.F_z0)
+    assert 0.2 < abs(along) < 0.9
+    assert (q.F_ry / plain.F_ry) ** 2 + along**2 == pytest.approx(1.0)
+    assert q.F_fy == plain.F_fy
+    rolling = act(applied=Applied(0.0, 0.05), combined_slip={"strength": 1.0})
+    assert rolling.F_ry == pytest.approx(act(applied=Applied(0.0, 0.05)).F_ry)
+
+
+def test_combined_slip_beyond_the_ellipse_leaves_a_little() -> None:
+    state = State(5.0, 0.1, 0.1)
+    plain, q = act(state, Applied(1.0, 0.1)), act(state, Applied(1.0, 0.1), combined_slip={"strength": 1.5})
+    assert 0.1 < q.F_ry / plain.F_ry < 0.3
+
+
+def test_bank_pulls_towards_the_lower_side_by_the_weight() -> None:
+    q = act(road_bank={"angle": 0.1})
+    assert q.a_y - PLAIN.a_y == pytest.approx(-GRAVITY * np.sin(0.1))
+    assert (q.a_x, q.omega_dot) == (PLAIN.a_x, PLAIN.omega_dot)
+
+
+def test_measured_roll_is_a_bank() -> None:
+    q = act(context={"roll": 0.05}, road_bank={"roll_gain": 0.8})
+    assert accelerations(q) == pytest.approx(accelerations(act(road_bank={"angle": 0.8 * 0.05})))
+
+
+def test_grade_holds_the_car_back_uphill() -> None:
+    q = act(road_grade={"angle": 0.05})
+    assert q.a_x - PLAIN.a_x == pytest.approx(-GRAVITY * np.sin(0.05))
+    assert (q.a_y, q.omega_dot) == (PLAIN.a_y, PLAIN.omega_dot)
+
+
+def bank_at(s: float, **parameters: float) -> float:
+    q = act(context={"s": s, "lap_length": 2000.0}, road_bank=parameters)
+    return float(np.arcsin((PLAIN.a_y - q.a_y) / GRAVITY))
+
+
+def test_a_banked_section_is_where_the_file_says() -> None:
+    corner = {"section": 0.2, "centre": 0.95, "length": 0.2}  # from 1700 m over the line to 100 m
+    assert bank_at(1900.0, **corner) == pytest.approx(0.2, rel=1e-3)
+    assert bank_at(1900.0 - 2000.0, **corner) == pytest.approx(0.2, rel=1e-3)
+    assert bank_at(1900.0 + 6000.0, **corner) == pytest.approx(0.2, rel=1e-3)
+    assert bank_at(1700.0, **corner) == pytest.approx(0.1, rel=1e-3)
+    assert bank_at(100.0, **corner) == pytest.approx(0.1, rel=1e-3)
+    assert abs(bank_at(900.0, **corner)) < 1e-6
+    assert bank_at(900.0, angle=0.03, **corner) == pytest.approx(0.03, abs=1e-6)
+
+
+def test_a_wave_of_the_bank_has_its_place_and_period() -> None:
+    assert bank_at(0.0, cos_1=0.1) == pytest.approx(0.1)
+    assert bank_at(1000.0, cos_1=0.1) == pytest.approx(-0.1)
+    assert bank_at(1000.0, cos_2=0.1) == pytest.approx(0.1)
+    assert bank_at(2000.0 / 12, sin_3=0.1) == pytest.approx(0.1)
+    both = bank_at(300.0, angle=0.02, cos_1=0.05, sin_2=-0.04)
+    angle = 2 * np.pi * 300 / 2000
+    assert both == pytest.approx(0.02 + 0.05 * np.cos(angle) - 0.04 * np.sin(2 * angle))
+
+
+@pytest.mark.parametrize("theta", [0.0, 0.7, 2.5])
+def test_wind_pushes_in_its_direction_wherever_the_car_heads(theta: float) -> None:
+    state, applied = State(30.0, 0.0, 0.0), Applied(0.0, 0.0)
+    q = act(state, applied, {"theta": theta}, crosswind={"x": 0.0, "y": 4.0, "side": 5.0})
+    plain = act(state, applied)
+    w_x, w_y = 4.0 * np.sin(theta), 4.0 * np.cos(theta)
+    air = np.hypot(30.0 - w_x, -w_y)
+    assert q.F_y - plain.F_y == pytest.approx(5.0 * THETA.C_r2 * air * w_y)
+    assert q.F_x - plain.F_x == pytest.approx(THETA.C_r2 * (30.0**2 - (30.0 - w_x) ** 2))
+    assert q.M_z == plain.M_z
+
+
+def test_wind_as_fast_as_the_car_leaves_no_drag() -> None:
+    q = act(State(20.0, 0.0, 0.0), Applied(0.0, 0.0), {"theta": np.pi / 2}, crosswind={"x": 0.0, "y": 20.0})
+    assert q.F_rx == pytest.approx(-THETA.C_r0)
+
+
+def test_wind_ahead_of_the_centre_of_gravity_turns_the_car() -> None:
+    straight = State(30.0, 0.0, 0.0), Applied(0.0, 0.0), {"theta": 0.0}
+    q, centred = (act(*straight, crosswind={"y": 5.0, "arm": arm}) for arm in (0.3, 0.0))
+    assert q.M_z - centred.M_z == pytest.approx(0.3 * (q.F_y - act(*straight).F_y))
+    assert q.M_z > centred.M_z
+
+
+def test_grip_drifts_with_time_and_never_below_a_tenth() -> None:
+    q = act(context={"t": 100.0}, grip_drift={"rate": -0.002})
+    assert (q.F_fy, q.F_ry) == pytest.approx((0.8 * PLAIN.F_fy, 0.8 * PLAIN.F_ry))
+    assert act(context={"t": 1e4}, grip_drift={"rate": -0.002}).F_fy == pytest.approx(0.1 * PLAIN.F_fy)
+
+
+def test_a_patch_takes_grip_on_its_stretch_of_the_lap_only() -> None:
+    patch = {"factor": 0.6, "centre": 0.25, "length": 0.1}
+    on, edge, off = (act(context={"s": s, "lap_length": 2000.0}, grip_patch=patch) for s in (500, 400, 1500))
+    assert (on.F_fy, on.F_ry) == pytest.approx((0.6 * PLAIN.F_fy, 0.6 * PLAIN.F_ry), rel=1e-3)
+    assert edge.F_fy == pytest.approx(0.8 * PLAIN.F_fy, rel=1e-3)
+    assert (off.F_fy, off.F_ry) == pytest.approx((PLAIN.F_fy, PLAIN.F_ry), rel=1e-6)
+
+
+@pytest.mark.parametrize("omega", [0.1, -0.1])
+def test_a_locked_differential_turns_against_the_yaw_rate(omega: float) -> None:
+    state, applied = State(30.0, 0.0, omega), Applied(0.0, 0.0)
+    q, plain = act(state, applied, locked_differential={"stiffness": 20.0}), act(state, applied)
+    width = 0.55 * WHEELBASE
+    linear = -20.0 * q.F_zr * width**2 * omega / (4 * 30.0)
+    assert q.M_z - plain.M_z == pytest.approx(linear, rel=1e-3)
+    assert (q.F_x, q.F_y) == (plain.F_x, plain.F_y)
+
+
+def test_a_locked_differential_pushes_no_harder_than_the_tyres_grip() -> None:
+    state, applied = State(1.0, 0.0, 2.0), Applied(0.0, 0.0)
+    q, plain = act(state, applied, locked_differential={"stiffness": 60.0}), act(state, applied)
+    friction = THETA.D_r / CONSTANTS.F_z0 * q.F_zr / 2
+    assert plain.M_z - q.M_z == pytest.approx(friction * 0.55 * WHEELBASE, rel=1e-6)
