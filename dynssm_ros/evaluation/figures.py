@@ -15,12 +15,12 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, PercentFormatter, ScalarFormatter
+from matplotlib.ticker import PercentFormatter, ScalarFormatter
 
+from dynssm_ros.evaluation.coefficients import coefficient_unit, range_used, resting
 from dynssm_ros.evaluation.metrics import CHANNELS, Indices, Vector, explained
-from dynssm_ros.evaluation.rollout import Rollout
 from dynssm_ros.evaluation.tables import percent, text
-from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, Vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 
 SYMBOLS = {"v_x": "$v_x$", "v_y": "$v_y$", "omega": r"$\omega$"}
 UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
@@ -29,6 +29,7 @@ NO_MODEL = "#9a9a9a"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#332288", "#882255", "#999933")
 WIDTH = 9.6  # inches; the width of a report's text
 MAX_POINTS = 1500  # more points on a line than this are not seen
+OUTLYING = 3.0  # a model whose largest value exceeds the models' median by this factor may leave the panel
 MAX_BAR = 2.0  # bars end at this multiple of persistence, and say how long they are
 STYLE: dict[Any, Any] = {
     "font.size": 9.5,
@@ -49,7 +50,9 @@ STYLE: dict[Any, Any] = {
 _P = ParamSpec("_P")
 
 
-def _styled(draw: Callable[_P, Figure]) -> Callable[_P, Figure]:
+def styled(draw: Callable[_P, Figure]) -> Callable[_P, Figure]:
+    """Decorator: draws in the package's style."""
+
     @wraps(draw)
     def in_style(*args: _P.args, **kwargs: _P.kwargs) -> Figure:
         with mpl.rc_context(STYLE):
@@ -64,7 +67,7 @@ def model_colours(names: list[str]) -> dict[str, str]:
     return {"persistence": NO_MODEL} | {name: PALETTE[k % len(PALETTE)] for k, name in enumerate(others)}
 
 
-@_styled
+@styled
 def predicted_and_measured(
     time: Vector, measured: Vector, predicted: Mapping[str, Vector], seconds: float = 12.0
 ) -> Figure:
@@ -83,7 +86,7 @@ def predicted_and_measured(
     t = time[shown]
     for k, channel in enumerate(CHANNELS):
         values, errors = axes[k]
-        values.plot(t, measured[shown, k], color=MEASURED, lw=2.2, alpha=0.45, label="measured")
+        values.plot(t, measured[shown, k], color=MEASURED, lw=2.2, alpha=0.75, label="measured")
         for depth, (name, states) in enumerate(predicted.items()):  # the first model lies on top
             style: dict[str, Any] = {"color": colours[name], "lw": 1.0, "zorder": 3 - 0.1 * depth}
             values.plot(t, states[shown, k], label=name, **style)
@@ -96,11 +99,11 @@ def predicted_and_measured(
     for bottom in axes[2]:
         bottom.set_xlabel("time (s)")
     figure.align_ylabels()
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=6)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
 
 
-@_styled
+@styled
 def increments(current: Vector, measured: Vector, predicted: Mapping[str, Vector]) -> Figure:
     """Predicted against measured change of the state, a row of panels per model.
 
@@ -134,20 +137,21 @@ def increments(current: Vector, measured: Vector, predicted: Mapping[str, Vector
             )
             panel.set(xlim=(-limit, limit), ylim=(-limit, limit))
             worth = f"{percent(share[k])} explained" if share[k] > 0 else "none explained"
-            panel.set_title(f"{name}: {SYMBOLS[channel]}, {worth}", fontsize=9.5)
+            panel.set_title(f"{SYMBOLS[channel]}: {worth}", fontsize=9.5)
             panel.set_xlabel(f"measured change ({UNITS[channel]})")
             panel.locator_params(nbins=4)
             panel.ticklabel_format(style="sci", scilimits=(-3, 3), useMathText=True)
-        row[0].set_ylabel("predicted change")
+        row[0].set_ylabel(f"{name}\npredicted change")
     return figure
 
 
-@_styled
-def relative_errors(rmse: Mapping[str, Vector], persistence: Vector) -> Figure:
+@styled
+def relative_errors(rmse: Mapping[str, Vector], std: Mapping[str, Vector], persistence: Vector) -> Figure:
     """One-step RMSE as a share of persistence's; shorter is better, beyond 100 % is worse than no model.
 
     Args:
-        rmse: by model name, each ``(3,)``.
+        rmse: by model name, mean over the seeds, each ``(3,)``.
+        std: its standard deviation over the seeds, 0 for a single one, each ``(3,)``; drawn as whiskers.
         persistence: RMSE of the prediction that nothing changes, shape ``(3,)``.
     """
     names = [name for name in rmse if name != "persistence"] or list(rmse)
@@ -158,14 +162,21 @@ def relative_errors(rmse: Mapping[str, Vector], persistence: Vector) -> Figure:
     longest = 1.0
     small: dict[str, Any] = {"fontsize": 8.5, "bbox": {"facecolor": "white", "lw": 0, "pad": 0.8}}
     for k, name in enumerate(names):
-        share = np.divide(rmse[name], persistence, out=np.full(3, np.nan), where=persistence > 0)
+        share, spread = (
+            np.divide(values[name], persistence, out=np.full(3, np.nan), where=persistence > 0)
+            for values in (rmse, std)
+        )
         drawn = np.minimum(np.nan_to_num(share, nan=0.0, posinf=MAX_BAR), MAX_BAR)
         longest = max(longest, float(drawn.max()))
         places = np.arange(3) - 0.4 + thickness * (k + 0.5)
         panel.barh(places, drawn, 0.86 * thickness, color=colours[name], label=name)
-        for place, value, end in zip(places, share, drawn, strict=True):
+        for place, value, end, whisker in zip(places, share, drawn, spread, strict=True):
             written = (percent(value) if np.isfinite(value) else "not finite") + (" (cut)" if value > end else "")
-            panel.annotate(written, (end, place), (4, 0), textcoords="offset points", va="center", **small)
+            whole = value == end and whisker > 0
+            if whole:
+                panel.errorbar(end, place, xerr=whisker, color=MEASURED, lw=1.0, capsize=2.5)
+            tip = end + whisker if whole else end
+            panel.annotate(written, (tip, place), (4, 0), textcoords="offset points", va="center", **small)
     panel.axvline(1.0, color=MEASURED, lw=1.0, ls="--")
     panel.annotate("persistence", (1.0, -0.55), (4, 0), textcoords="offset points", va="center", **small)
     panel.set_yticks(
@@ -174,34 +185,43 @@ def relative_errors(rmse: Mapping[str, Vector], persistence: Vector) -> Figure:
     panel.set(xlim=(0, 1.12 * longest), ylim=(2.5, -0.7), xlabel="one-step RMSE relative to persistence")
     panel.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
     panel.grid(axis="y", visible=False)
-    figure.legend(loc="outside upper left", ncols=6)
+    figure.legend(loc="outside upper left", ncols=4)
     return figure
 
 
-@_styled
-def rollout_growth(rollouts: Mapping[str, Rollout]) -> Figure:
-    """How the error grows with the time ahead: the three states, and the displacement."""
-    colours = model_colours(list(rollouts))
+@styled
+def rollout_growth(time: Vector, errors: Mapping[str, Vector], std: Mapping[str, Vector]) -> Figure:
+    """How the error grows with the time ahead: the three states, and the displacement.
+
+    Args:
+        time: ahead (s), shape ``(n,)``.
+        errors: by model name, mean over the seeds of the RMSE of the states and of the displacement, each ``(n, 4)``.
+        std: their standard deviation over the seeds, 0 for a single one; drawn as a band.
+    """
+    colours = model_colours(list(errors))
     figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True).ravel()
-    for depth, (name, rollout) in enumerate(rollouts.items()):  # the first model lies on top
-        lines = [rollout.rmse[:, 0], rollout.rmse[:, 1], rollout.rmse[:, 2], rollout.displacement]
-        for panel, values in zip(axes, lines, strict=True):
-            shown = np.where(np.isfinite(values), values, np.nan)
-            panel.plot(rollout.time, shown, color=colours[name], marker="o", ms=3, label=name, zorder=3 - 0.1 * depth)
+    for depth, (name, values) in enumerate(errors.items()):  # the first model lies on top
+        shown = np.where(np.isfinite(values), values, np.nan)
+        style: dict[str, Any] = {"color": colours[name], "zorder": 3 - 0.1 * depth}
+        for k, panel in enumerate(axes):
+            panel.plot(time, shown[:, k], marker="o", ms=3, label=name, **style)
+            if std[name][:, k].any():
+                low, high = shown[:, k] - std[name][:, k], shown[:, k] + std[name][:, k]
+                panel.fill_between(time, low, high, alpha=0.2, lw=0, **style)
     for panel, channel in zip(axes, CHANNELS, strict=False):
         panel.set_title(f"{SYMBOLS[channel]}: RMSE ({UNITS[channel]})")
     axes[3].set_title("Displacement: mean distance (m)")
-    for panel in axes:
+    for k, panel in enumerate(axes):
         panel.set_xlim(left=0.0)
-        panel.set_ylim(bottom=0.0)
+        panel.set_ylim(0.0, room({name: values[:, k] for name, values in errors.items()}))
     for panel in axes[2:]:
         panel.set_xlabel("time ahead (s)")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=6)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
 
 
-@_styled
+@styled
 def adapted_parameters(
     x: Vector, theta: Vector, vehicle: Vehicle | None = None, x_label: str = "time (s)", colour: str = PALETTE[0]
 ) -> Figure:
@@ -223,22 +243,22 @@ def adapted_parameters(
         if vehicle is not None:
             lower, upper = vehicle.lower[k], vehicle.upper[k]
             margin = 0.12 * (upper - lower)
-            panel.axhspan(lower - margin, lower, color="#e9e9e9", lw=0)
+            panel.axhspan(lower - margin, lower, color="#e9e9e9", lw=0, label="outside the bounds")
             panel.axhspan(upper, upper + margin, color="#e9e9e9", lw=0)
-            panel.axhline(vehicle.nominal[k], color=MEASURED, lw=0.8, ls="--")
+            panel.axhline(vehicle.nominal[k], color=MEASURED, lw=0.8, ls="--", label="nominal value")
             panel.set_ylim(lower - margin, upper + margin)
-        panel.plot(abscissa, values[:, k], color=colour, lw=1.0)
+        panel.plot(abscissa, values[:, k], color=colour, lw=1.0, label="adapted")
         panel.set_title(_coefficient_label(name))
         panel.locator_params(axis="y", nbins=4)
     for spare in axes[len(COEFFICIENTS) :]:
         spare.set_axis_off()
-    for lowest in axes[len(COEFFICIENTS) - 3 : len(COEFFICIENTS)]:
+    for lowest in axes[-3:]:
         lowest.set_xlabel(x_label)
-        lowest.tick_params(labelbottom=True)
+    axes[-1].legend(*axes[0].get_legend_handles_labels(), loc="upper left")
     return figure
 
 
-@_styled
+@styled
 def parameter_usage(theta: Vector, vehicle: Vehicle, colour: str = PALETTE[0]) -> Figure:
     """How much of its admissible range each coefficient uses, and whether it rests on a bound.
 
@@ -247,25 +267,22 @@ def parameter_usage(theta: Vector, vehicle: Vehicle, colour: str = PALETTE[0]) -
         vehicle: gives range and nominal value.
         colour: of the bars.
     """
-    span = vehicle.upper - vehicle.lower
-    used = (theta - vehicle.lower) / span
-    low, q1, median, q3, high = np.percentile(used, [1, 25, 50, 75, 99], axis=0)
-    resting = np.mean((used < 0.01) | (used > 0.99), axis=0)
+    low, q1, median, q3, high = np.percentile(range_used(theta, vehicle), [1, 25, 50, 75, 99], axis=0)
+    at_bound = resting(theta, vehicle).mean(axis=0)
     places = np.arange(len(COEFFICIENTS))
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
     panel = figure.subplots()
     panel.barh(places, high - low, 0.3, left=low, color=colour, alpha=0.35, label="1 % to 99 % of the time")
     panel.barh(places, q3 - q1, 0.6, left=q1, color=colour, label="middle half of the time")
     panel.plot(median, places, "|", color="white", ms=8, mew=1.5)
-    nominal = (vehicle.nominal - vehicle.lower) / span
-    panel.plot(nominal, places, "D", color=MEASURED, ms=4.5, mfc="white", label="nominal")
-    for place, share in zip(places, resting, strict=True):
+    panel.plot(range_used(vehicle.nominal, vehicle), places, "D", color=MEASURED, ms=4.5, mfc="white", label="nominal")
+    for place, share in zip(places, at_bound, strict=True):
         if share > 0.01:
             panel.annotate(f"{percent(share)} of the time on a bound", (1.03, place), va="center", fontsize=8.5)
     panel.axvspan(-0.02, 0.0, color="#e9e9e9", lw=0)
     panel.axvspan(1.0, 1.02, color="#e9e9e9", lw=0)
     panel.set_yticks(places, [_symbol(name) for name in COEFFICIENTS])
-    panel.set(xlim=(-0.02, 1.02 if resting.max() <= 0.01 else 1.3), ylim=(len(COEFFICIENTS) - 0.4, -0.6))
+    panel.set(xlim=(-0.02, 1.02 if at_bound.max() <= 0.01 else 1.3), ylim=(len(COEFFICIENTS) - 0.4, -0.6))
     panel.set_xticks(np.linspace(0, 1, 6))
     panel.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
     panel.set_xlabel("position inside the admissible range")
@@ -274,7 +291,7 @@ def parameter_usage(theta: Vector, vehicle: Vehicle, colour: str = PALETTE[0]) -
     return figure
 
 
-@_styled
+@styled
 def latency_histogram(samples: Mapping[str, Vector], unit: str = "µs", what: str = "time per prediction") -> Figure:
     """Distribution of latencies on a logarithmic axis, with median and 99th percentile in the legend.
 
@@ -301,36 +318,36 @@ def latency_histogram(samples: Mapping[str, Vector], unit: str = "µs", what: st
     return figure
 
 
-@_styled
-def error_map(x: Vector, y: Vector, errors: Vector, smooth: int = 1) -> Figure:
-    """Error along the driven track, one map per channel; the largest errors are drawn last.
+@styled
+def regime_errors(labels: Sequence[str], what: str, rmse: Mapping[str, Vector], std: Mapping[str, Vector]) -> Figure:
+    """One-step RMSE in each driving regime, a panel per channel.
 
     Args:
-        x: position of each row (m), shape ``(N,)``.
-        y: likewise.
-        errors: shape ``(N, 3)``.
-        smooth: rows over which the root mean square is taken; 1 shows each row's absolute error.
+        labels: of the ``R`` regimes.
+        what: tells the regimes apart, with its unit.
+        rmse: by model name, mean over the seeds, each ``(R, 3)``.
+        std: its standard deviation over the seeds, 0 for a single one; drawn as whiskers.
     """
-    width, height = float(np.ptp(x)), float(np.ptp(y))
-    shape = np.clip(height / max(width, 1e-9), 0.25, 2.0)
-    figure = Figure(figsize=(WIDTH, 1.3 + 0.29 * WIDTH * shape), layout="constrained")
-    axes = figure.subplots(1, 3, sharex=True, sharey=True)
-    known = np.nan_to_num(errors, nan=0.0, posinf=0.0, neginf=0.0)
+    colours = model_colours(list(rmse))
+    figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
+    axes = figure.subplots(1, 3)
+    places = np.arange(len(labels))
+    for depth, (name, values) in enumerate(rmse.items()):  # the first model lies on top
+        shown = np.where(np.isfinite(values), values, np.nan)
+        shift = 0.06 * (depth - (len(rmse) - 1) / 2)
+        for k, panel in enumerate(axes):
+            panel.errorbar(
+                places + shift, shown[:, k], np.where(std[name][:, k] > 0, std[name][:, k], np.nan), marker="o", ms=3.5,
+                lw=0.8, elinewidth=1.2, capsize=2.5, color=colours[name], label=name, zorder=3 - 0.1 * depth,
+            )  # fmt: skip
     for k, (panel, channel) in enumerate(zip(axes, CHANNELS, strict=True)):
-        size = np.sqrt(np.convolve(known[:, k] ** 2, np.full(smooth, 1 / smooth), mode="same"))
-        order = np.argsort(size)
-        top = max(float(np.percentile(size, 99)), 1e-12)
-        dots = panel.scatter(
-            x[order], y[order], c=size[order], s=7, cmap="viridis_r", vmin=0.0, vmax=top, lw=0, rasterized=True
-        )
-        bar = figure.colorbar(dots, ax=panel, location="top", extend="max", shrink=0.9, aspect=28)
-        bar.set_label(f"{SYMBOLS[channel]} error ({UNITS[channel]})")
-        bar.locator = MaxNLocator(4)
-        bar.update_ticks()
-        panel.set_aspect("equal")
-        panel.set_xlabel("x (m)")
-        panel.locator_params(nbins=5)
-    axes[0].set_ylabel("y (m)")
+        panel.set_title(f"{SYMBOLS[channel]}: RMSE ({UNITS[channel]})")
+        panel.set_xticks(places, labels)
+        panel.set_xlabel(what)
+        panel.set_xlim(-0.5, len(labels) - 0.5)
+        panel.set_ylim(0.0, room({name: values[:, k] for name, values in rmse.items()}))
+        panel.grid(axis="x", visible=False)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
 
 
@@ -364,17 +381,30 @@ def _cut_at_holes(x: Vector, values: Vector) -> tuple[Vector, Vector]:
     return np.insert(x, holes, np.nan), np.insert(values, holes, np.nan, axis=0)
 
 
+def room(models: Mapping[str, Vector]) -> float:
+    """Upper end of an axis on which persistence is seen, and all models but those far worse than most.
+
+    Args:
+        models: magnitudes drawn, by model name, of any shape.
+    """
+    finite = {name: values[np.isfinite(values)] for name, values in models.items()}
+    largest = {name: float(values.max()) for name, values in finite.items() if len(values)}
+    usual = OUTLYING * np.median(list(largest.values())) if largest else 0.0
+    kept = [value for name, value in largest.items() if value <= usual or name == "persistence"]
+    return max(1.08 * max(kept, default=0.0), 1e-12)
+
+
 def _symbol(name: str) -> str:
     stem, _, index = name.partition("_")
     return f"${stem}_{{{index}}}$"
 
 
 def _coefficient_label(name: str) -> str:
-    unit = COEFFICIENT_UNITS[name].replace("^2", "²")
-    return _symbol(name) if unit == "1" else f"{_symbol(name)} ({unit})"
+    unit = coefficient_unit(name)
+    return f"{_symbol(name)} ({unit})" if unit else _symbol(name)
 
 
-@_styled
+@styled
 def loss_components(history: Mapping[str, Sequence[float]], best_epoch: int) -> Figure:
     """The terms of the training objective over the epochs, the paper's loss figure.
 

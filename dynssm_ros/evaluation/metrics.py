@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from statistics import NormalDist
 from time import perf_counter_ns
@@ -62,6 +63,7 @@ def predict_rows(
         np.concatenate([part.state for part in parts]),
         _join([part.theta for part in parts]),
         _join([part.physics for part in parts]),
+        _join([part.variance for part in parts]),
     )
 
 
@@ -88,16 +90,16 @@ def explained(increments: Vector, predicted: Vector) -> Vector:
     return share
 
 
-def coverage(errors: Vector, covariance: Vector, level: float = 0.9) -> Vector:
+def coverage(errors: Vector, variance: Vector, level: float = 0.9) -> Vector:
     """Share of the errors inside the central Gaussian interval of ``level``; equals ``level`` for honest variances.
 
     Args:
         errors: one-step errors, shape ``(N, 3)``.
-        covariance: stated one-step error variances, shape ``(3,)``.
+        variance: stated variances of these errors, shape ``(N, 3)`` or, if the same for all, ``(3,)``.
         level: probability of the interval.
     """
     z = NormalDist().inv_cdf(0.5 + level / 2)
-    share: Vector = np.mean(np.abs(errors) <= z * np.sqrt(covariance), axis=0)
+    share: Vector = np.mean(np.abs(errors) <= z * np.sqrt(variance), axis=0)
     return share
 
 
@@ -118,6 +120,16 @@ def latency_us(model: WindowModel, windows: Vector, calls: int = 200, warm_up: i
         model.predict(window)
         samples[call] = perf_counter_ns() - begin
     return samples[warm_up:] / 1e3
+
+
+def finite(value: float) -> float | None:
+    """``value`` as JSON has it: ``None`` for NaN and infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def by_channel(values: Vector) -> dict[str, float | None]:
+    """Names the entries of a ``(3,)`` array."""
+    return {name: finite(value) for name, value in zip(CHANNELS, values, strict=True)}
 
 
 def _join(parts: list[Vector | None]) -> Vector | None:

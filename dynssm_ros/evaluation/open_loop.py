@@ -10,79 +10,33 @@ from typing import Any
 import numpy as np
 
 from dynssm_ros.errors import ArtifactError, RecordingError
+from dynssm_ros.evaluation.coefficients import coefficient_statistics
+from dynssm_ros.evaluation.lap import first_lap
 from dynssm_ros.evaluation.metrics import (
     BATCH,
-    CHANNELS,
     Indices,
     Tick,
     Vector,
+    by_channel,
     coverage,
     explained,
+    finite,
     gather,
     latency_us,
     max_error,
     predict_rows,
     rmse,
 )
-from dynssm_ros.evaluation.rollout import Rollout, default_horizon, score_rollouts
+from dynssm_ros.evaluation.regimes import Regime, driving_regimes, regime_rmse
+from dynssm_ros.evaluation.rollout import default_horizon, score_rollouts
+from dynssm_ros.evaluation.score import Group, Score, grouped
 from dynssm_ros.runtime.models import WindowModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands
+from dynssm_ros.simulation.lines import ClosedLine
 
 FULL_SIZE_SPEED = 10.0  # a recording that exceeds this speed (m/s) is of a full-size car
 FULL_SIZE_MIN_SPEED = 5.0  # m/s; the published evaluations of full-size cars leave out slower rows
-
-
-@dataclass(frozen=True)
-class Score:
-    """What one model is worth on a recording.
-
-    Attributes:
-        model: what was scored.
-        state: its one-step predictions of the rows after :attr:`Evaluation.rows`, shape ``(N, 3)``.
-        theta: its adapted coefficients, shape ``(N, 17)``; ``None`` if it has none.
-        rmse: one-step root mean square error by channel, shape ``(3,)`` (m/s, m/s, rad/s); so are the next two.
-        max_error: largest absolute one-step error.
-        explained: share of the measured increments that it predicts; 0 for persistence, 1 for a perfect model.
-        coverage_90: share of errors inside the model's own 90 % interval; ``None`` if it states no covariance.
-        rollout: errors over the horizon.
-        latency_us: wall-clock samples of single predictions (us).
-    """
-
-    model: WindowModel
-    state: Vector
-    theta: Vector | None
-    rmse: Vector
-    max_error: Vector
-    explained: Vector
-    coverage_90: Vector | None
-    rollout: Rollout
-    latency_us: Vector
-
-    @property
-    def adapts(self) -> bool:
-        """Whether its coefficients change from row to row."""
-        return self.theta is not None and bool((self.theta != self.theta[0]).any())
-
-    def to_json(self) -> dict[str, Any]:
-        """The entry of one model in ``results.json``; what is not finite becomes ``None``."""
-        p50, p99 = np.percentile(self.latency_us, [50, 99])
-        return {
-            "rmse": by_channel(self.rmse),
-            "max_error": by_channel(self.max_error),
-            "ade": finite(self.rollout.ade),
-            "fde": finite(self.rollout.fde),
-            "parameters": self.model.parameters,
-            "flops": self.model.flops,
-            "latency_us": {"p50": finite(p50), "p99": finite(p99)},
-            "coverage_90": None if self.coverage_90 is None else by_channel(self.coverage_90),
-            "explained": by_channel(self.explained),
-            "rollout": {
-                "time_s": [finite(t) for t in self.rollout.time],
-                "rmse": {name: [finite(v) for v in self.rollout.rmse[:, k]] for k, name in enumerate(CHANNELS)},
-                "displacement": [finite(v) for v in self.rollout.displacement],
-            },
-        }
 
 
 @dataclass(frozen=True)
@@ -95,7 +49,9 @@ class Evaluation:
         split: which part of it was scored, for people.
         min_speed: slower stretches were left out (m/s).
         rows: last row of each window; the predicted rows are ``rows + 1``.
-        scores: by model name, in the order in which the models were given.
+        regimes: how these rows were driven.
+        scores: by label, in the order in which the models were given.
+        line: closed line that the position on the lap is counted along; ``None`` if there is none.
     """
 
     recording: Recording
@@ -103,7 +59,19 @@ class Evaluation:
     split: str
     min_speed: float
     rows: Indices
+    regimes: tuple[Regime, ...]
     scores: dict[str, Score]
+    line: ClosedLine | None
+
+    @property
+    def groups(self) -> dict[str, Group]:
+        """The scores, those of one model with several seeds joined."""
+        return grouped(self.scores)
+
+    @property
+    def steps(self) -> int:
+        """Length of the rollouts in steps."""
+        return len(next(iter(self.scores.values())).rollout.time)
 
     @property
     def current(self) -> Vector:
@@ -136,7 +104,7 @@ class Evaluation:
             "recording": self.name,
             "commands": self.recording.info.commands,
             "horizon_s": round(self.horizon_s, 9),
-            "models": {name: score.to_json() for name, score in self.scores.items()},
+            "models": {name: group.to_json(self.regimes) for name, group in self.groups.items()},
             "split": self.split,
             "sampling_time": self.recording.T_s,
             "min_speed": finite(self.min_speed),
@@ -156,6 +124,7 @@ def evaluate(
     stride: int = 1,
     batch: int = BATCH,
     calls: int = 200,
+    line: ClosedLine | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
     """Scores ``models`` on ``recording``.
@@ -170,6 +139,7 @@ def evaluate(
         stride: a rollout starts at every ``stride``-th usable row.
         batch: windows per call of a model.
         calls: single predictions timed per model.
+        line: closed line that the position on the lap is counted along; the recording's first full lap if ``None``.
         progress: told of the predictions done and all that will be made.
 
     Raises:
@@ -178,8 +148,7 @@ def evaluate(
     """
     for model in models.values():
         check_fit(model, recording)
-    T_s = recording.T_s
-    steps = horizon_steps(default_horizon(T_s) if horizon_s is None else horizon_s, T_s)
+    steps = horizon_steps(default_horizon(recording.T_s) if horizon_s is None else horizon_s, recording.T_s)
     H = max(model.H for model in models.values())
     speed = default_min_speed(recording) if min_speed is None else min_speed
     rows = recording.window_ends(H, 1, speed)
@@ -189,7 +158,27 @@ def evaluate(
             f"recording {name or ', '.join(recording.info.source)} ({split}): no stretch of {H + steps} rows "
             f"(window {H}, horizon {steps}) without a gap at {speed:g} m/s or more among its {len(recording)} rows"
         )
-    total, done = len(models) * (len(rows) + len(starts) * steps), 0
+    tick = _counting(len(models) * (len(rows) + len(starts) * steps), progress)
+    regimes = driving_regimes(recording.matrix[rows])
+    scores = {
+        label: _score(model, recording, rows, regimes, starts, steps, batch, calls, tick)
+        for label, model in models.items()
+    }
+    return Evaluation(
+        recording=recording,
+        name=name or ", ".join(recording.info.source),
+        split=split,
+        min_speed=speed,
+        rows=rows,
+        regimes=regimes,
+        scores=scores,
+        line=first_lap(recording) if line is None else line,
+    )
+
+
+def _counting(total: int, progress: Callable[[int, int], None] | None) -> Tick:
+    """Tells ``progress`` how many of ``total`` predictions are done."""
+    done = 0
 
     def tick(predictions: int) -> None:
         nonlocal done
@@ -197,16 +186,14 @@ def evaluate(
         if progress is not None:
             progress(done, total)
 
-    scores = {
-        label: _score(model, recording, rows, starts, steps, batch, calls, tick) for label, model in models.items()
-    }
-    return Evaluation(recording, name or ", ".join(recording.info.source), split, speed, rows, scores)
+    return tick
 
 
 def _score(
     model: WindowModel,
     recording: Recording,
     rows: Indices,
+    regimes: tuple[Regime, ...],
     starts: Indices,
     steps: int,
     batch: int,
@@ -225,7 +212,9 @@ def _score(
             rmse=rmse(errors),
             max_error=max_error(errors),
             explained=explained(increments, increments + errors),
-            coverage_90=None if model.covariance is None else coverage(errors, model.covariance),
+            coverage_90=None if predicted.variance is None else coverage(errors, predicted.variance),
+            regime_rmse=regime_rmse(regimes, errors),
+            coefficients=coefficient_statistics(predicted.theta, model.vehicle),
             rollout=score_rollouts(model, matrix, starts, steps, recording.T_s, batch, tick),
             latency_us=latency_us(model, gather(matrix, rows[:50], model.H - 1), calls),
         )
@@ -270,13 +259,3 @@ def check_fit(model: WindowModel, recording: Recording) -> None:
         raise ArtifactError(
             f"{where}: commands '{recording.info.commands}', but the model was trained with '{model.commands}'"
         )
-
-
-def finite(value: float) -> float | None:
-    """``value`` as JSON has it: ``None`` for NaN and infinity."""
-    return float(value) if math.isfinite(value) else None
-
-
-def by_channel(values: Vector) -> dict[str, float | None]:
-    """Names the entries of a ``(3,)`` array."""
-    return {name: finite(value) for name, value in zip(CHANNELS, values, strict=True)}

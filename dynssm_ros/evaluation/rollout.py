@@ -94,6 +94,28 @@ def path(velocities: Vector, T_s: float) -> Vector:
     return T_s * np.cumsum(np.stack([v_x * c - v_y * s, v_x * s + v_y * c], axis=-1), axis=-2)
 
 
+def branches(model: WindowModel, matrix: Vector, starts: Indices, steps: int, T_s: float) -> Vector:
+    """Predicted paths that leave the measured one, each at its start.
+
+    Args:
+        model: reads windows of ``model.H`` rows.
+        matrix: the recording's model inputs, shape ``(N, 7)``, without a gap between the first start and the last end.
+        starts: last measured row of each branch, ascending, shape ``(M,)``.
+        steps: length of a branch.
+        T_s: sampling time (s).
+
+    Returns:
+        Positions ``x, y`` (m) from the start of each branch to its end, shape ``(M, steps + 1, 2)``, in the frame of
+        :func:`path` for the measured velocities from ``starts[0]`` on.
+    """
+    predicted = roll_out(model, gather(matrix, starts, model.H - 1, steps), steps)
+    driven = (
+        path(np.concatenate([matrix[starts[0] : start + 1, :3], states]), T_s)
+        for start, states in zip(starts, predicted, strict=True)
+    )
+    return np.stack([np.concatenate([np.zeros((1, 2)), positions])[-steps - 1 :] for positions in driven])
+
+
 def score_rollouts(
     model: WindowModel,
     matrix: Vector,

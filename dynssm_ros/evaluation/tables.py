@@ -11,7 +11,9 @@ import rich.box
 import rich.table
 from rich.markup import escape
 
-Value = float | int | str | None
+from dynssm_ros.evaluation.spread import Spread
+
+Value = float | int | str | Spread | None
 
 
 @dataclass(frozen=True)
@@ -45,16 +47,30 @@ class Column:
 
 @dataclass(frozen=True)
 class Cell:
-    """A value as shown."""
+    """A value as shown.
 
-    text: str
+    Attributes:
+        value: the value itself.
+        spread: how far it varies, stacked below the value where there is little room; empty if it does not.
+        best: whether it is marked.
+    """
+
+    value: str
+    spread: str
     best: bool
-    numeric: bool
+
+    @property
+    def text(self) -> str:
+        """Value and spread in one line."""
+        return f"{self.value} {self.spread}".strip()
 
 
 @dataclass(frozen=True)
 class Table:
-    """Values in rows. ``None``, NaN and infinity show as a dash; numbers have three significant digits."""
+    """Values in rows. ``None``, NaN and infinity show as a dash; numbers have three significant digits.
+
+    The :class:`Spread` of several seeds shows as mean ± standard deviation and is compared by its mean.
+    """
 
     columns: tuple[Column, ...]
     rows: Sequence[Sequence[Value]]
@@ -66,7 +82,7 @@ class Table:
         best = [self._best(k) for k in range(len(self.columns))]
         return [
             [
-                Cell(text(value), best[k] is not None and value == best[k], not isinstance(value, str))
+                Cell(text(value), _spread(value), best[k] is not None and _number(value) == best[k])
                 for k, value in enumerate(row)
             ]
             for row in self.rows
@@ -99,49 +115,68 @@ class Table:
         for k, column in enumerate(self.columns):
             heading = "\n".join(["" if column.group == group else column.group, column.title, column.unit])
             group = column.group
-            if self._numeric(k):
+            if self.numeric(k):
                 shown.add_column(escape(heading), justify="right", no_wrap=True)
             else:
                 longest = max((len(row[k].text) for row in self.cells), default=0)
                 shown.add_column(escape(heading), overflow="fold", min_width=min(longest, 20))  # names in one piece
         for row in self.cells:
-            shown.add_row(*(f"[bold green]{escape(c.text)}[/]" if c.best else escape(c.text) for c in row))
+            texts = [escape(f"{cell.value}\n{cell.spread}".strip()) for cell in row]
+            shown.add_row(*(f"[bold green]{t}[/]" if c.best else t for t, c in zip(texts, row, strict=True)))
         return shown
 
     def markdown(self) -> str:
         """The table as Markdown, best values in bold."""
         head = [column.full_heading for column in self.columns]
-        rule = ["---:" if self._numeric(k) else "---" for k in range(len(head))]
+        rule = ["---:" if self.numeric(k) else "---" for k in range(len(head))]
         body = [[f"**{_plain(c.text)}**" if c.best else _plain(c.text) for c in row] for row in self.cells]
         lines = ["| " + " | ".join(row) + " |" for row in ([_plain(h) for h in head], rule, *body)]
         return "\n".join(lines) + (f"\n\n{self.caption}" if self.caption else "") + "\n"
 
-    def _numeric(self, k: int) -> bool:
+    def numeric(self, k: int) -> bool:
+        """Whether column ``k`` holds numbers, which are aligned at the right."""
         return any(not isinstance(row[k], str) for row in self.rows)
 
-    def _best(self, k: int) -> Value:
+    def _best(self, k: int) -> float | None:
         goal = self.columns[k].best
-        values = [row[k] for row in self.rows]
-        known = [v for v in values if isinstance(v, (int, float)) and math.isfinite(v)]
+        numbers = [_number(row[k]) for row in self.rows]
+        known = [number for number in numbers if number is not None and math.isfinite(number)]
         if goal is None or len(known) < 2:
             return None
         return min(known) if goal == "min" else max(known)
 
 
 def text(value: Value) -> str:
-    """A value as shown: integers and large numbers in full, others with three significant digits."""
+    """A value as shown: integers and large numbers in full, others with three significant digits; the mean of a spread."""
+    if isinstance(value, Spread):
+        return text(value.mean)
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "–"
     if isinstance(value, str):
         return value
     if isinstance(value, int):
         return f"{value:,}"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:#.3g}".rstrip(".")
+    return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:#.3g}".rstrip(".")
 
 
 def percent(share: float) -> str:
     """A share in whole percent."""
     return f"{100 * share:.0f} %"
+
+
+def _spread(value: Value) -> str:
+    """The standard deviation over several seeds, with as many decimals as the mean."""
+    if not isinstance(value, Spread) or value.n == 1 or not math.isfinite(value.std):
+        return ""
+    mean = text(value.mean)
+    return f"± {value.std:.1e}" if "e" in mean else f"± {value.std:,.{len(mean.partition('.')[2])}f}"
+
+
+def _number(value: Value) -> float | None:
+    """What ``value`` is compared by; ``None`` for words and dashes."""
+    if isinstance(value, Spread):
+        return value.mean
+    return None if isinstance(value, str) else value
 
 
 def _plain(cell: str) -> str:

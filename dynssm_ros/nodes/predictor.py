@@ -10,7 +10,6 @@ import time
 from functools import partial
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
@@ -60,7 +59,6 @@ class PredictorNode(Node):
 
         self._prediction = Odometry()
         self._adapted = JointState(name=list(COEFFICIENTS))
-        self._set_covariance()
         self._publish_prediction = self.create_publisher(Odometry, PREDICTION_TOPIC, SENSOR_QOS).publish
         self._publish_parameters = self.create_publisher(JointState, PARAMETERS_TOPIC, SENSOR_QOS).publish
         self._publish_horizon = self.create_publisher(Path, HORIZON_TOPIC, SENSOR_QOS).publish
@@ -107,6 +105,7 @@ class PredictorNode(Node):
             odometry.header.frame_id, odometry.child_frame_id = message.header.frame_id, message.child_frame_id
         twist = odometry.twist.twist
         twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in prediction.state)
+        odometry.twist.covariance = twist_covariance(prediction.variance)
         if prediction.pose is not None:
             set_pose(odometry.pose.pose, *prediction.pose)
         self._publish_prediction(odometry)
@@ -132,10 +131,6 @@ class PredictorNode(Node):
         stamp = header_stamp_ns(message)
         return int(self.get_clock().now().nanoseconds) if stamp is None else stamp
 
-    def _set_covariance(self) -> None:
-        variances = self._predictor.model.covariance
-        self._prediction.twist.covariance = twist_covariance(np.zeros(3) if variances is None else variances)
-
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Opens a new model before it is accepted; a bad one changes nothing."""
         for parameter in parameters:
@@ -156,7 +151,6 @@ class PredictorNode(Node):
         if self._swap is not None:
             self._predictor.swap(self._swap)
             self._swap = None
-            self._set_covariance()
             self.get_logger().info(
                 f"model swapped: {self._predictor.model.name} from {self._predictor.model.artifact.path}"
             )

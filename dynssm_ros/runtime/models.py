@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +30,8 @@ class WindowPrediction(NamedTuple):
     """Adapted coefficients in the order of ``COEFFICIENTS``, shape ``(N, 17)``; ``None`` if the model has none."""
     physics: Vector | None
     """The physics' part of the prediction, shape ``(N, 3)``; ``None`` if the model has no physics."""
+    variance: Vector | None = None
+    """Error variances that the model states with its predictions, shape ``(N, 3)``; ``None`` if it states none."""
 
 
 class WindowModel(Protocol):
@@ -43,8 +46,11 @@ class WindowModel(Protocol):
     """Command protocol that it was trained with; ``None`` if any."""
     parameters: int
     flops: int
-    covariance: Vector | None
-    """One-step error variances ``(3,)`` from validation data, if known."""
+    """Floating-point operations per prediction."""
+
+    @property
+    def vehicle(self) -> Vehicle | None:
+        """Car that it is for; ``None`` if any."""
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Predicts from ``windows`` of shape ``(N, H, 7)``, columns ``WINDOW_COLUMNS``."""
@@ -57,9 +63,9 @@ class Persistence:
     T_s = 0.0
     H = 1
     commands: Commands | None = None
+    vehicle = None
     parameters = 0
     flops = 0
-    covariance: Vector | None = None
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Returns the last state of each window."""
@@ -73,16 +79,15 @@ class SingleTrack:
     H = 1
     commands: Commands | None = None
     parameters = 0
-    covariance: Vector | None = None
 
     def __init__(self, vehicle: Vehicle, integrator: Integrator = "euler", substeps: int = 1) -> None:
         self.vehicle = vehicle
         self.T_s = vehicle.sampling_time
-        self.flops = 90 * substeps * (4 if integrator == "rk4" else 1)  # operations of the stages, counted by hand
         self._theta = vehicle.nominal
         self._effects = vehicle.active_effects
         self._integrator: Integrator = integrator
         self._substeps = substeps
+        self.flops = count_operations(self.predict, np.ones((1, self.H, len(WINDOW_COLUMNS))))
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Steps the physics from the last row of each window."""
@@ -126,7 +131,7 @@ class SingleTrackEwma(SingleTrack):
         errors = following[:, :-1] - windows[:, 1:, :3]
         weights = self.decay ** np.arange(H - 2, -1, -1.0)
         physics = following[:, -1]
-        corrected = physics - np.einsum("h,nhc->nc", weights / weights.sum(), errors)
+        corrected = physics - ((weights / weights.sum())[:, None] * errors).sum(axis=1)
         return WindowPrediction(corrected, np.tile(self._theta, (count, 1)), physics)
 
 
@@ -146,9 +151,10 @@ class OnnxModel:
         self.T_s = card.sampling_time
         self.H = card.window
         self.commands: Commands | None = card.commands
+        self.vehicle = card.vehicle
         self.parameters = card.parameters
         self.flops = card.flops
-        self.covariance: Vector | None = np.array(card.covariance)
+        self._validated = np.array([card.covariance])
         options = ort.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
@@ -163,7 +169,7 @@ class OnnxModel:
         if inputs != [("window", [self.H, len(WINDOW_COLUMNS)])] or "increment" not in self._outputs:
             raise ArtifactError(
                 f"{artifact.onnx}: maps {inputs} to {self._outputs}; expected a window of {self.H} rows and "
-                f"{len(WINDOW_COLUMNS)} columns to increment, theta, physics"
+                f"{len(WINDOW_COLUMNS)} columns to increment, and theta, physics, variance if it has them"
             )
 
         # a single window, as in the node, always has its place in memory
@@ -174,7 +180,7 @@ class OnnxModel:
             self._binding.bind_output(name)
 
     def predict(self, windows: Vector) -> WindowPrediction:
-        """Runs the graph on ``windows``."""
+        """Runs the graph on ``windows``; a graph without variances has those of the validation data everywhere."""
         if len(windows) == 1:
             self._window[...] = windows
             self._session.run_with_iobinding(self._binding)
@@ -183,11 +189,32 @@ class OnnxModel:
             results = self._session.run(self._outputs, {"window": windows.astype(np.float32)})
         by_name = dict(zip(self._outputs, results, strict=True))
         now, theta, physics = windows[:, -1, :3], by_name.get("theta"), by_name.get("physics")
+        variance = by_name.get("variance")
         return WindowPrediction(
             now + by_name["increment"],
             None if theta is None else theta.astype(np.float64),
             None if physics is None else now + physics,
+            self._validated.repeat(len(windows), axis=0) if variance is None else variance.astype(np.float64),
         )
+
+
+def count_operations(call: Callable[[Vector], object], argument: Vector) -> int:
+    """Floating-point operations of ``call(argument)``, as numpy reports them while it executes them.
+
+    Every sum, product, quotient or elementary function of one element that depends on ``argument`` counts once.
+    """
+    count = 0
+
+    class Counted(np.ndarray[Any, np.dtype[np.float64]]):
+        def __array_ufunc__(self, ufunc: np.ufunc, method: Any, *inputs: Any, **options: Any) -> Any:
+            nonlocal count
+            plain = [each.view(np.ndarray) if isinstance(each, Counted) else each for each in inputs]
+            result = np.asarray(getattr(ufunc, method)(*plain, **options))
+            count += result.size if method == "__call__" else plain[0].size  # a reduction visits what it reduces
+            return result.view(Counted)
+
+    call(argument.view(Counted))
+    return count
 
 
 def load_model(name_or_dir: str | Path, vehicle: Vehicle | None = None) -> WindowModel:

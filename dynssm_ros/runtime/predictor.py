@@ -31,6 +31,7 @@ class Prediction:
         state: predicted ``v_x, v_y, omega``, shape ``(3,)``.
         pose: propagated ``x, y, theta`` in the odometry frame; ``None`` if the pose is not mapped.
         theta: adapted coefficients in the order of ``COEFFICIENTS``, shape ``(17,)``; ``None`` if the model has none.
+        variance: stated one-step error variances of the state, shape ``(3,)``; ``None`` if the model states none.
         residual_share: part of the increment that the residual adds to the physics, in [0, 1]; 0 without physics.
     """
 
@@ -38,6 +39,7 @@ class Prediction:
     state: Vector
     pose: Pose | None
     theta: Vector | None
+    variance: Vector | None
     residual_share: float
 
 
@@ -96,15 +98,16 @@ class Predictor:
         window = self.history.window(stamp)
         if isinstance(window, Refusal):
             return window
-        state, theta, physics = self.model.predict(window[None])
+        state, theta, physics, variance = self.model.predict(window[None])
         now, following = window[-1, :3].tolist(), state[0].tolist()  # a few floats are faster than a small array
-        if not _finite(following) or (theta is not None and not _finite(theta[0].tolist())):
+        if not (_finite(following) and _finite_row(theta) and _finite_row(variance)):
             return Refusal.BAD_PREDICTION
         return Prediction(
             stamp + self._period,
             state[0],
             propagate_pose(values, now, following, self.model.T_s),
             None if theta is None else theta[0],
+            None if variance is None else variance[0],
             0.0 if physics is None else self._residual_share(now, following, physics[0].tolist()),
         )
 
@@ -154,6 +157,10 @@ def live_signal_map(model: OnnxModel, signal_map: SignalMap) -> SignalMap:
 
 def _finite(values: Iterable[float]) -> bool:
     return all(map(math.isfinite, values))
+
+
+def _finite_row(part: Vector | None) -> bool:
+    return part is None or _finite(part[0].tolist())
 
 
 def propagate_pose(

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from dynssm_ros.errors import BagError
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.bags import Bag, copy_topics, open_bag, write_bag
@@ -90,7 +88,6 @@ def replay_to_bag(
         raise BagError(f"{out}: is the bag that is replayed; expected another folder to write")
     refusals: Counter[Refusal] = Counter()
     count = 0
-    covariance = twist_covariance(np.zeros(3) if predictor.model.covariance is None else predictor.model.covariance)
     with open_bag(bag) as source, write_bag(out) as sink:
         sink.add_topic(PREDICTION_TOPIC, ODOMETRY)
         sink.add_topic(PARAMETERS_TOPIC, JOINT_STATE)
@@ -100,6 +97,7 @@ def replay_to_bag(
                 continue
             count += 1
             v_x, v_y, omega = outcome.state.tolist()
+            covariance = twist_covariance(outcome.variance)
             message = odometry(outcome.stamp, outcome.pose or (0.0, 0.0, 0.0), (v_x, v_y, omega), covariance, *frames)
             sink.write(PREDICTION_TOPIC, log_time, message)
             if outcome.theta is not None:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 
 import numpy as np
 import pytest
+import yaml
 
+from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.simulation.tracks import load_track
 
 
 @pytest.fixture
@@ -22,6 +28,20 @@ def recording(tmp_path):
     path = tmp_path / "run.parquet"
     Recording(info, time, np.zeros(200, np.int32), columns).save(path)
     return path
+
+
+@pytest.fixture
+def laps(laps_bag, tmp_path):
+    """Two seconds of the simulated car on the club track, less than a lap, as a recording."""
+    path = tmp_path / "laps.parquet"
+    extract([laps_bag], load_signal_map("default"), 50.0).select(slice(0, 100)).save(path)
+    return path
+
+
+@pytest.fixture
+def quick_figures(monkeypatch):
+    """Figures are made but not drawn, which takes most of the time of a report."""
+    monkeypatch.setattr("dynssm_ros.evaluation.report.svg_uri", lambda figure: "data:,")
 
 
 def test_writes_report_results_and_table(dynssm, recording, tmp_path):
@@ -39,6 +59,7 @@ def test_writes_report_results_and_table(dynssm, recording, tmp_path):
     assert "report.html" in shown
 
 
+@pytest.mark.usefixtures("quick_figures")
 def test_holdout_scores_the_last_block_only(dynssm, recording, tmp_path):
     code, _, _ = dynssm("evaluate", recording, "--model", "persistence", "--holdout", "0.25", "--out", tmp_path / "out")
     results = json.loads((tmp_path / "out" / "results.json").read_text())
@@ -49,15 +70,45 @@ def test_holdout_scores_the_last_block_only(dynssm, recording, tmp_path):
     assert results["models"]["persistence"]["rmse"]["v_y"] == pytest.approx(np.sqrt(np.mean(last[:, 1] ** 2)))
 
 
+@pytest.mark.usefixtures("quick_figures")
+def test_several_seeds_become_one_row_and_errors_are_placed_on_the_given_track(dynssm, small_model, laps, tmp_path):
+    other = shutil.copytree(small_model, tmp_path / "again")
+    card = yaml.safe_load((other / "model.yaml").read_text())
+    card["training"]["seed"] = card["architecture"]["training"]["seed"] = 5
+    (other / "model.yaml").write_text(yaml.safe_dump(card))
+    models = ("--model", small_model, "--model", other)
+    code, shown, _ = dynssm("evaluate", laps, *models, "--track", "club", "--out", tmp_path / "out")
+    assert code == 0
+    results = json.loads((tmp_path / "out" / "results.json").read_text())["models"]
+    assert list(results) == ["small"]
+    assert results["small"]["seeds"] == [0, 5]
+    assert results["small"]["std"]["rmse"] == {"v_x": 0.0, "v_y": 0.0, "omega": 0.0}
+    assert "small: n = 2, seeds 0, 5" in " ".join(shown.split())
+    assert "peaks of one model are its own" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_track_that_was_not_driven_is_refused(dynssm, laps, tmp_path):
+    centre = load_track("club").centre.points + 5.0
+    track = tmp_path / "elsewhere.csv"
+    track.write_text("# x_m,y_m,w_tr_right_m,w_tr_left_m\n" + "\n".join(f"{x},{y},0.2,0.2" for x, y in centre))
+    code, _, err = dynssm("evaluate", laps, "--model", "persistence", "--track", track, "--out", tmp_path / "out")
+    assert code == 1
+    assert re.search(r"elsewhere.csv: the recording lies \S+ m \(median\) from its centre line; expected the same", err)
+    assert err.strip().count("\n") == 0
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("--model", "no_such_model"), "no_such_model"),
+        (("--model", "no_such_model"), "model 'no_such_model': neither a model folder nor one of persistence, "),
         (("--model", "single_track"), "needs --vehicle"),
         (("--model", "single_track", "--vehicle", "av21_paper"), "extract the bag at 25 Hz"),
         (("--model", "persistence", "--min-speed", "90"), "at 90 m/s or more"),
         (("--model", "persistence", "--holdout", "-1"), "--holdout -1: expected a fraction"),
         (("--model", "persistence", "--commands", "topics"), "commands 'topics' asked for"),
+        (("--model", "persistence", "--track", "nowhere"), "track 'nowhere' is neither a file nor a built-in name"),
+        (("--model", "persistence", "--track", "club"), "--track club: the recording holds no positions (x, y)"),
     ],
 )
 def test_bad_input_gets_one_line_and_leaves_nothing_behind(dynssm, recording, tmp_path, arguments, expected):

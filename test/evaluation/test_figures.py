@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 import pytest
 
 from dynssm_ros.evaluation import figures
-from dynssm_ros.evaluation.rollout import Rollout
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
 
 
@@ -26,49 +23,49 @@ def run():
     return time, states, predicted
 
 
-def drawn(figure):
-    """Draws the figure and returns its visible axes."""
-    sink = io.BytesIO()
-    figure.savefig(sink, format="png", dpi=40)
-    assert len(sink.getvalue()) > 1000
-    return [axes for axes in figure.axes if axes.axison]
-
-
-def test_predicted_and_measured_shows_three_channels_with_units(run):
+def test_predicted_and_measured_shows_three_channels_with_units(drawn, run):
     time, states, predicted = run
     axes = drawn(figures.predicted_and_measured(time, states, predicted))
     assert [a.get_ylabel() for a in axes[::2]] == ["$v_x$ (m/s)", "$v_y$ (m/s)", r"$\omega$ (rad/s)"]
     assert all(len(a.get_lines()) == 4 for a in axes)
 
 
-def test_increments_leave_out_persistence_and_say_how_much_is_explained(run):
+def test_increments_leave_out_persistence_and_say_how_much_is_explained(drawn, run):
     _, states, predicted = run
     axes = drawn(figures.increments(predicted["persistence"], states, predicted))
     assert len(axes) == 6
     assert axes[0].get_title(loc="left").endswith("100 % explained")
     assert axes[3].get_title(loc="left").endswith("none explained")
+    assert [axes[k].get_ylabel().splitlines()[0] for k in (0, 3)] == ["dynssm", "diverged"]
 
 
-def test_relative_errors_cut_long_bars_but_write_the_true_number():
+def test_relative_errors_cut_long_bars_but_write_the_true_number(drawn):
     rmse = {"m": np.array([0.5, 100.0, np.nan]), "persistence": np.array([1.0, 10.0, 1.0])}
-    (panel,) = drawn(figures.relative_errors(rmse, np.array([1.0, 10.0, 1.0])))
+    std = dict.fromkeys(rmse, np.zeros(3))
+    (panel,) = drawn(figures.relative_errors(rmse, std, np.array([1.0, 10.0, 1.0])))
     assert [bar.get_width() for bar in panel.patches] == [0.5, figures.MAX_BAR, 0.0]
     written = [t.get_text() for t in panel.texts]
     assert written == ["50 %", "1000 % (cut)", "not finite", "persistence"]
 
 
-def test_rollout_growth_draws_states_and_displacement():
+def test_relative_errors_draw_the_spread_over_seeds_as_whiskers(drawn):
+    rmse, std = {"m": np.array([0.5, 1.0, 1.0])}, {"m": np.array([0.1, 0.0, 0.0])}
+    (panel,) = drawn(figures.relative_errors(rmse, std, np.array([1.0, 1.0, 1.0])))
+    (whisker,) = panel.collections
+    np.testing.assert_allclose(whisker.get_segments()[0][:, 0], [0.4, 0.6])
+
+
+def test_rollout_growth_draws_states_displacement_and_the_band_of_several_seeds(drawn):
     grow = np.arange(1.0, 16)
-    rollouts = {
-        "m": Rollout(0.04, 10, np.stack([grow] * 3, axis=1), grow**2),
-        "diverged": Rollout(0.04, 10, np.full((15, 3), np.inf), np.full(15, np.nan)),
-    }
-    axes = drawn(figures.rollout_growth(rollouts))
+    errors = {"m": np.stack([grow, grow, grow, grow**2], axis=1), "diverged": np.full((15, 4), np.inf)}
+    std = {"m": np.full((15, 4), 0.5), "diverged": np.zeros((15, 4))}
+    axes = drawn(figures.rollout_growth(0.04 * grow, errors, std))
     np.testing.assert_array_equal(axes[3].get_lines()[0].get_ydata(), grow**2)
+    assert [len(a.collections) for a in axes] == [1] * 4
     assert [a.get_xlabel() for a in axes] == ["", "", "time ahead (s)", "time ahead (s)"]
 
 
-def test_adapted_parameters_shade_what_is_outside_the_bounds():
+def test_adapted_parameters_shade_what_is_outside_the_bounds(drawn):
     car = load_vehicle("orca")
     time = np.arange(100) * 0.02
     theta = car.nominal + 0.1 * (car.upper - car.lower) * np.sin(time)[:, None]
@@ -81,13 +78,13 @@ def test_adapted_parameters_shade_what_is_outside_the_bounds():
     assert axes[-1].get_title(loc="left") == "$I_{z}$ (kg m²)"
 
 
-def test_adapted_parameters_need_no_vehicle_and_cut_lines_at_gaps():
+def test_adapted_parameters_need_no_vehicle_and_cut_lines_at_gaps(drawn):
     time = 0.02 * np.r_[0:50, 100:150]
     axes = drawn(figures.adapted_parameters(time, np.ones((100, 17))))
     assert np.isnan(axes[0].get_lines()[0].get_ydata()).sum() == 1
 
 
-def test_parameter_usage_names_coefficients_that_rest_on_a_bound():
+def test_parameter_usage_names_coefficients_that_rest_on_a_bound(drawn):
     car = load_vehicle("orca")
     theta = np.tile(0.5 * (car.lower + car.upper), (100, 1))
     theta[:25, 3] = car.upper[3]
@@ -96,7 +93,7 @@ def test_parameter_usage_names_coefficients_that_rest_on_a_bound():
     assert [t.get_text() for t in panel.get_yticklabels()][3] == "$E_{f}$"
 
 
-def test_latency_histogram_counts_every_call():
+def test_latency_histogram_counts_every_call(drawn):
     samples = {"a": np.geomspace(10, 20, 200), "b": np.full(50, 700.0)}
     figure = figures.latency_histogram(samples)
     (panel,) = drawn(figure)
@@ -105,14 +102,20 @@ def test_latency_histogram_counts_every_call():
     assert "b: p50 700 µs, p99 700 µs" in [t.get_text() for t in figure.legends[0].get_texts()]
 
 
-def test_error_map_draws_the_largest_error_last():
-    angle = np.linspace(0, 2 * np.pi, 200)
-    errors = np.zeros((200, 3))
-    errors[17] = [-2.0, 3.0, np.inf]
-    axes = drawn(figures.error_map(100 * np.cos(angle), 60 * np.sin(angle), errors))
-    dots = axes[0].collections[0]
-    assert dots.get_array()[-1] == 2.0
-    np.testing.assert_allclose(dots.get_offsets()[-1], [100 * np.cos(angle[17]), 60 * np.sin(angle[17])])
+def test_regime_errors_name_the_regimes_and_let_only_outliers_leave(drawn):
+    labels = ["0–20", "20–40"]
+    rmse = {"m": np.full((2, 3), 1.0), "n": np.full((2, 3), 2.0), "far": np.full((2, 3), 50.0)}
+    std = {"m": np.full((2, 3), 0.5), "n": np.zeros((2, 3)), "far": np.zeros((2, 3))}
+    axes = drawn(figures.regime_errors(labels, "speed (m/s)", rmse, std))
+    assert [t.get_text() for t in axes[0].get_xticklabels()] == labels
+    assert [a.get_xlabel() for a in axes] == ["speed (m/s)"] * 3
+    assert all(2.0 < a.get_ylim()[1] < 3.0 for a in axes)
+
+
+def test_persistence_never_leaves_a_panel_not_even_beside_perfect_models(drawn):
+    rmse = {"a": np.full((1, 3), 1e-16), "b": np.full((1, 3), 1e-16), "persistence": np.full((1, 3), 0.5)}
+    axes = drawn(figures.regime_errors(["braking"], "throttle", rmse, dict.fromkeys(rmse, np.zeros((1, 3)))))
+    assert all(0.5 < a.get_ylim()[1] < 0.6 for a in axes)
 
 
 def test_liveliest_stretch_is_where_the_states_change_and_never_spans_a_gap():

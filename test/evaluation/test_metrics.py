@@ -18,7 +18,6 @@ class Average:
     """Predicts the mean state of its window; remembers the shapes it was called with."""
 
     H = 4
-    covariance = None
 
     def __init__(self):
         self.shapes = []

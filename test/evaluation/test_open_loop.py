@@ -39,14 +39,15 @@ def recording():
 class Model:
     """Predicts the present state plus ``offset``."""
 
-    parameters, flops = 123, 456
+    parameters, flops, vehicle = 123, 456, None
 
-    def __init__(self, H=1, offset=0.0, T_s=0.0, commands=None, covariance=None, name="model"):
+    def __init__(self, H=1, offset=0.0, T_s=0.0, commands=None, variance=None, name="model"):
         self.H, self.offset, self.T_s, self.commands, self.name = H, offset, T_s, commands, name
-        self.covariance = covariance
+        self.variance = variance
 
     def predict(self, windows):
-        return WindowPrediction(windows[:, -1, :3] + self.offset, None, None)
+        variance = None if self.variance is None else np.tile(self.variance, (len(windows), 1))
+        return WindowPrediction(windows[:, -1, :3] + self.offset, None, None, variance)
 
 
 def test_all_models_are_scored_on_the_rows_that_the_longest_window_allows(recording):
@@ -97,7 +98,7 @@ def test_progress_counts_up_to_all_predictions(recording):
 
 
 def test_json_follows_the_contract(recording):
-    models = {"persistence": Persistence(), "m": Model(covariance=np.ones(3))}
+    models = {"persistence": Persistence(), "m": Model(variance=np.ones(3))}
     content = evaluate(recording, models, name="run.parquet", horizon_s=0.2, calls=3).to_json()
     assert content["recording"] == "run.parquet"
     assert content["commands"] == "none"
@@ -109,11 +110,14 @@ def test_json_follows_the_contract(recording):
     assert set(entry["latency_us"]) == {"p50", "p99"}
     assert entry["ade"] < entry["fde"] == pytest.approx(entry["rollout"]["displacement"][-1])
     assert len(entry["rollout"]["time_s"]) == 5
+    assert set(entry["regimes"]) == {"speed", "lateral_acceleration", "throttle"}
+    assert entry["regimes"]["throttle"] == {"coasting": {"rows": len(recording) - 1, "rmse": entry["rmse"]}}
+    assert (entry["coefficients"], entry["seeds"], entry["std"]) == (None, [], None)
     assert content["models"]["persistence"]["coverage_90"] is None
 
 
 def test_what_is_not_finite_is_null_in_json(recording):
-    bad = {"nan": Model(offset=np.nan), "huge": Model(offset=1e200), "inf": Model(offset=np.inf, covariance=np.ones(3))}
+    bad = {"nan": Model(offset=np.nan), "huge": Model(offset=1e200), "inf": Model(offset=np.inf, variance=np.ones(3))}
     entries = json.loads(json.dumps(evaluate(recording, bad, calls=3).to_json(), allow_nan=False))["models"]
     assert entries["nan"]["rmse"] == {"v_x": None, "v_y": None, "omega": None}
     assert entries["nan"]["ade"] is None
@@ -124,8 +128,26 @@ def test_what_is_not_finite_is_null_in_json(recording):
 
 def test_coverage_uses_the_model_s_own_variances(recording):
     increments = np.diff(recording.matrix[:, :3], axis=0)
-    honest = evaluate(recording, {"m": Model(covariance=increments.var(axis=0))}, calls=3).scores["m"]
+    honest = evaluate(recording, {"m": Model(variance=increments.var(axis=0))}, calls=3).scores["m"]
     np.testing.assert_allclose(honest.coverage_90, 0.9, atol=3 * np.sqrt(0.09 / len(increments)))
+
+
+def test_coverage_uses_the_variance_of_each_prediction():
+    class Knowing(Model):
+        """Reads from the throttle how large the coming step is."""
+
+        def predict(self, windows):
+            return super().predict(windows)._replace(variance=np.tile(windows[:, -1, 3:4] ** 2, (1, 3)))
+
+    rng, N = np.random.default_rng(3), 4000
+    size = np.where(np.arange(N) % 2 == 0, 1.0, 0.1)
+    restless = make_recording(np.cumsum(rng.normal(size=(N, 3)) * np.roll(size, 1)[:, None], axis=0))
+    restless.columns["r_fb"][:] = size
+    models = {"knowing": Knowing(), "constant": Model(variance=np.full(3, np.mean(size**2)))}
+    scores = evaluate(restless, models, min_speed=-np.inf, calls=3).scores
+    within = 3 * np.sqrt(0.09 / N)
+    np.testing.assert_allclose(scores["knowing"].coverage_90, 0.9, atol=within)
+    assert (np.abs(scores["constant"].coverage_90 - 0.9) > within).all()  # right on average, wrong at each step
 
 
 def test_another_sampling_time_is_refused_with_the_rate_to_extract_at(recording):

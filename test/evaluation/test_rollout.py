@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.evaluation.rollout import default_horizon, path, roll_out, score_rollouts
+from dynssm_ros.evaluation.rollout import branches, default_horizon, path, roll_out, score_rollouts
 from dynssm_ros.runtime.models import Persistence, WindowPrediction
 from dynssm_ros.runtime.predictor import propagate_pose
 
@@ -82,6 +82,23 @@ def test_persistence_under_constant_acceleration_errs_by_half_a_t_squared():
     np.testing.assert_allclose(scored.displacement, a * scored.time**2 / 2, rtol=1e-12)
     assert scored.fde == pytest.approx(a * 0.6**2 / 2)
     assert scored.ade == pytest.approx(np.mean(a * scored.time**2 / 2))
+
+
+def test_branches_of_a_perfect_model_lie_on_the_measured_path(planted):
+    starts, steps = np.array([20, 30, 45]), 10
+    driven = np.concatenate([np.zeros((1, 2)), path(planted[20:56, :3], T_s)])
+    for start, branch in zip(starts, branches(Truth(), planted, starts, steps, T_s), strict=True):
+        np.testing.assert_allclose(branch, driven[start - 20 : start - 20 + steps + 1], atol=1e-12)
+
+
+def test_branches_leave_the_measured_path_by_the_error_of_the_rollout(planted):
+    starts, steps = np.arange(5, 65, 10), 10
+    model = Truth(bias=0.1)
+    driven = np.concatenate([np.zeros((1, 2)), path(planted[5:66, :3], T_s)])
+    apart = branches(model, planted, starts, steps, T_s) - driven[(starts - 5)[:, None] + np.arange(steps + 1)]
+    np.testing.assert_allclose(apart[:, 0], 0.0, atol=1e-12)
+    scored = score_rollouts(model, planted, starts, steps, T_s)
+    np.testing.assert_allclose(np.linalg.norm(apart[:, 1:], axis=2).mean(axis=0), scored.displacement, rtol=1e-9)
 
 
 def test_path_of_constant_velocity_is_the_polygon_inside_a_circle():

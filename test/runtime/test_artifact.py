@@ -159,6 +159,25 @@ def test_the_graph_of_another_model_is_an_error_on_opening(folder: Path) -> None
     assert "expected a window of 9 rows and 7 columns" in refusal(folder, deploy)
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_graph_that_states_variances_is_believed_and_else_those_of_the_validation_data_hold(
+    folder: Path, count: int
+) -> None:
+    windows = np.random.default_rng(0).normal(size=(count, 5, 7))
+    plain = deploy(folder).predict(windows)
+    np.testing.assert_array_equal(plain.variance, np.tile(open_artifact(folder).card.covariance, (count, 1)))
+
+    graph = onnx.load(folder / ONNX)
+    graph.graph.node.append(onnx.helper.make_node("Mul", ["increment", "increment"], ["variance"]))
+    graph.graph.output.append(onnx.helper.make_tensor_value_info("variance", onnx.TensorProto.FLOAT, ["N", 3]))
+    onnx.save(graph, folder / ONNX)
+    certify(folder)
+    stated = deploy(folder).predict(windows)
+    np.testing.assert_allclose(stated.variance, (stated.state - windows[:, -1, :3]) ** 2, rtol=1e-5)
+    assert stated.variance.dtype == np.float64
+    np.testing.assert_array_equal(stated.state, plain.state)
+
+
 def test_a_graph_without_the_increment_is_an_error_on_opening(folder: Path) -> None:
     graph = onnx.load(folder / ONNX)
     index = next(k for k, output in enumerate(graph.graph.output) if output.name == "increment")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma, load_model
+from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma, count_operations, load_model
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.vehicle import Coefficients, State, load_vehicle, step
 
@@ -59,6 +61,38 @@ def test_a_changing_bias_is_followed_within_the_memory_of_the_average() -> None:
     state, following = windows(rows[45:], model.H)
     left = model.predict(state).state[:, 1] - following[:, 1]
     assert abs(left[-1]) < 1e-12
+
+
+def test_baselines_state_no_variances() -> None:
+    given, _ = windows(drive(np.zeros(3)), SingleTrackEwma.H)
+    for model in (Persistence(), SingleTrack(CAR), SingleTrackEwma(CAR)):
+        assert model.predict(given).variance is None
+
+
+@pytest.mark.parametrize(
+    ("call", "count"),
+    [
+        (lambda x: x, 0),
+        (lambda x: np.sin(x) * 2.0 + x, 15),
+        (lambda x: x * (np.sin(2.0) ** 2 + np.arange(5.0)), 5),  # constants are known beforehand
+        (lambda x: x.sum() / 2.0, 6),
+        (lambda x: np.stack([x, x]).T, 0),
+        (lambda x: np.arctan2(x[:2], abs(x[:2])), 4),
+    ],
+)
+def test_operations_on_the_argument_are_counted_one_by_one(call: Callable[[np.ndarray], object], count: int) -> None:
+    assert count_operations(call, np.linspace(0.1, 1.0, 5)) == count
+
+
+def test_operations_of_the_single_track_are_those_of_its_stages() -> None:
+    euler = SingleTrack(CAR).flops
+    ewma = SingleTrackEwma(CAR)
+    # another step costs all but the sums that make the inputs (2) and the new state (3), and two sums of increments
+    assert SingleTrack(CAR, substeps=2).flops - euler == euler - 2 - 3 + 2 * 3
+    assert count_operations(SingleTrack(CAR).predict, np.ones((7, 1, 7))) == 7 * euler
+    # of each channel: the errors, their weighting and its sum, then the correction
+    assert ewma.flops == ewma.H * euler + 3 * (3 * (ewma.H - 1) + 1)
+    assert Persistence().flops == 0
 
 
 @pytest.mark.parametrize("name", ["single_track", "single_track_ewma"])

@@ -107,6 +107,7 @@ def test_the_prediction_is_the_models_for_the_window_one_sampling_time_ahead(dri
     np.testing.assert_allclose(alone.state[0], among_others.state[1], rtol=0, atol=1e-6)
     assert outcome.theta is not None
     np.testing.assert_array_equal(outcome.theta, alone.theta[0])
+    np.testing.assert_array_equal(outcome.variance, alone.variance[0])
     assert outcome.stamp == drive.stamp - PERIOD + PERIOD
     assert 0.0 <= outcome.residual_share <= 1.0
 
@@ -170,7 +171,7 @@ def test_a_signal_that_never_came_is_missing(small_model: Path) -> None:
     assert predictor.predict(START + PERIOD, {"v_x": 1.0, "v_y": 0.0, "omega": 0.0}) is Refusal.MISSING
 
 
-@pytest.mark.parametrize("spoilt", ["state", "theta"])
+@pytest.mark.parametrize("spoilt", ["state", "theta", "variance"])
 def test_a_model_that_yields_nan_yields_no_prediction_until_it_is_well_again(
     drive: Drive, monkeypatch: pytest.MonkeyPatch, spoilt: str
 ) -> None:
@@ -292,6 +293,11 @@ def test_without_a_pose_there_is_no_horizon(drive: Drive) -> None:
     assert isinstance(outcome, Prediction)
     assert outcome.pose is None
     assert drive.predictor.horizon(outcome, 10) == []
+
+
+def test_a_model_that_states_no_variances_still_predicts(drive: Drive, still: Still) -> None:
+    drive.predictor.swap(still)
+    assert drive.fill().variance is None
 
 
 @pytest.mark.parametrize(("physics", "share"), [(0.0, 0.0), (1e-3, 0.5)])

@@ -9,7 +9,7 @@ import pytest
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.models import OnnxModel, WindowPrediction
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.replay import replay, replay_to_bag
 from dynssm_ros.signals.bags import open_bag
@@ -52,8 +52,33 @@ def test_the_new_bag_holds_predictions_parameters_and_on_request_the_inputs(
     assert stamp.sec * 10**9 + stamp.nanosec == pytest.approx(log_time + 20_000_000, abs=10_000)
     assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
     variances = message.twist.covariance[[0, 7, 35]]
-    np.testing.assert_allclose(variances, predictor.model.covariance)
+    np.testing.assert_allclose(variances, predictor.model.artifact.card.covariance)
     assert parameters.name == list(COEFFICIENTS)
+
+
+def test_the_covariance_in_the_bag_is_the_one_stated_with_each_prediction(
+    predictor: Predictor, laps_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    well = predictor.model.predict
+
+    def of_the_speed(windows: np.ndarray) -> WindowPrediction:
+        return well(windows)._replace(variance=np.abs(windows[:, -1, :3]))
+
+    monkeypatch.setattr(predictor.model, "predict", of_the_speed)
+    replay_to_bag(laps_bag, predictor, tmp_path / "out", with_inputs=True)
+    with open_bag(tmp_path / "out") as bag:
+        predicted = {
+            log_time: bag.decode(topic, raw).twist.covariance[[0, 7, 35]]
+            for topic, log_time, raw in bag.messages(["/dynssm/prediction"])
+        }
+        measured = {
+            log_time: bag.decode(topic, raw).twist.twist for topic, log_time, raw in bag.messages(["/vehicle/odometry"])
+        }
+    assert len({tuple(variances) for variances in predicted.values()}) > 900
+    for log_time, variances in predicted.items():
+        twist = measured[log_time]
+        now = [twist.linear.x, twist.linear.y, twist.angular.z]
+        np.testing.assert_allclose(variances, np.abs(now), rtol=1e-12)
 
 
 def test_a_bag_without_the_topics_leaves_nothing_behind(predictor: Predictor, orca_bag: Path, tmp_path: Path) -> None:

@@ -1,0 +1,97 @@
+"""Driving regimes: how the errors differ between slow and fast, straight and cornering, braking and accelerating."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.ticker import MaxNLocator
+
+from dynssm_ros.evaluation.metrics import Vector, rmse
+from dynssm_ros.signals.inputs import applied_inputs
+
+COASTING = 0.02  # applied throttle (fraction) that neither drives nor brakes to speak of
+QUANTITIES = {"speed": "speed", "lateral_acceleration": "lateral acceleration", "throttle": "throttle"}
+"""What the regimes are told apart by, with their titles."""
+
+
+@dataclass(frozen=True)
+class Regime:
+    """Rows that were driven alike.
+
+    Attributes:
+        quantity: what tells this regime from its neighbours, one of :data:`QUANTITIES`.
+        label: its range, or a word for it.
+        unit: of the range; empty with a word.
+        member: which of the scored rows belong to it, shape ``(N,)``; at least one does.
+    """
+
+    quantity: str
+    label: str
+    unit: str
+    member: npt.NDArray[np.bool_] = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        """Label and unit."""
+        return f"{self.label} {self.unit}".strip()
+
+    @property
+    def short(self) -> str:
+        """The label where there is little room."""
+        return self.label.replace(" to ", "–")
+
+    @property
+    def rows(self) -> int:
+        """How many rows belong to it."""
+        return int(self.member.sum())
+
+
+def driving_regimes(rows: Vector) -> tuple[Regime, ...]:
+    """The regimes that occur in ``rows``.
+
+    Speed ``v_x`` and lateral acceleration ``|v_x omega|`` are divided at round numbers over their range; the applied
+    throttle tells braking, coasting (within 2 % of zero) and accelerating.
+
+    Args:
+        rows: the model's input rows from which the steps start, shape ``(N, 7)``, ``N > 0``.
+
+    Returns:
+        Regimes by quantity, ascending; each row belongs to one regime of every quantity.
+    """
+    v_x, omega = rows[:, 0], rows[:, 2]
+    throttle = np.asarray(applied_inputs(rows.T).r)
+    kinds = np.digitize(throttle, [-COASTING, np.nextafter(COASTING, 1.0)])
+    return (
+        *_bins("speed", v_x, "m/s"),
+        *_bins("lateral_acceleration", np.abs(v_x * omega), "m/s²"),
+        *_members("throttle", ("braking", "coasting", "accelerating"), "", kinds),
+    )
+
+
+def regime_rmse(regimes: tuple[Regime, ...], errors: Vector) -> Vector:
+    """One-step RMSE in each regime.
+
+    Args:
+        regimes: ``R`` of them.
+        errors: of all scored rows, shape ``(N, 3)``.
+
+    Returns:
+        Shape ``(R, 3)`` (m/s, m/s, rad/s).
+    """
+    return np.stack([rmse(errors[regime.member]) for regime in regimes])
+
+
+def _bins(quantity: str, values: Vector, unit: str) -> Iterator[Regime]:
+    edges = MaxNLocator(nbins=4, steps=[1, 2, 2.5, 5, 10]).tick_values(float(values.min()), float(values.max()))
+    labels = tuple(f"{low:g} to {high:g}" for low, high in pairwise(edges))
+    yield from _members(quantity, labels, unit, np.digitize(values, edges[1:-1]))
+
+
+def _members(quantity: str, labels: tuple[str, ...], unit: str, index: npt.NDArray[np.intp]) -> Iterator[Regime]:
+    for k, label in enumerate(labels):
+        if (index == k).any():
+            yield Regime(quantity, label, unit, index == k)

@@ -1,0 +1,40 @@
+"""One measure over several seeds: mean and standard deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Vector = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and spread of a number that was measured with several seeds.
+
+    Attributes:
+        mean: over the seeds.
+        std: sample standard deviation over the seeds; 0 for a single one.
+        n: number of seeds.
+    """
+
+    mean: float
+    std: float
+    n: int
+
+
+def mean_and_std(values: Sequence[Vector]) -> tuple[Vector, Vector]:
+    """Mean and sample standard deviation over ``values``, entry by entry; a single one has no spread."""
+    stacked = np.stack(values)
+    with np.errstate(over="ignore", invalid="ignore"):  # a run that diverged has no finite mean
+        spread = stacked.std(axis=0, ddof=1) if len(stacked) > 1 else np.zeros_like(stacked[0])
+        return stacked.mean(axis=0), spread
+
+
+def spreads(values: Sequence[Vector]) -> list[Spread]:
+    """A :class:`Spread` for each entry of the arrays ``values``, one array per seed."""
+    mean, std = mean_and_std(values)
+    return [Spread(float(m), float(s), len(values)) for m, s in zip(mean.ravel(), std.ravel(), strict=True)]
