@@ -1,11 +1,11 @@
-"""``dynssm bench``: latency and throughput of a model on this machine."""
+"""``dynssm bench``: latency and throughput of models on this machine, side by side."""
 
 from __future__ import annotations
 
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +15,7 @@ import numpy.typing as npt
 import typer
 
 from dynssm_ros.cli.console import JsonOption, console, progress_bar
+from dynssm_ros.evaluation.tables import Column, Table
 from dynssm_ros.files import write_json
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
 from dynssm_ros.runtime.models import OnnxModel
@@ -28,35 +29,77 @@ _WARM_UP, _BLOCK = 50, 200  # calls
 
 
 def bench(
-    model: Annotated[Path, typer.Option(help="Model folder.")],
+    model: Annotated[
+        list[Path], typer.Option(help="Model folder; repeat to compare with the first.", metavar="DIR", file_okay=False)
+    ],
     rate: Annotated[float, typer.Option(help="Odometry rate of the live part (Hz).", min=1.0, max=1000.0)] = 100.0,
-    duration: Annotated[float, typer.Option(help="Length of the live part (s).", min=2.0)] = 15.0,
+    duration: Annotated[float, typer.Option(help="Length of the live part of each model (s).", min=2.0)] = 15.0,
     calls: Annotated[int, typer.Option(help="Predictions that are timed.", min=100)] = 2000,
     json: JsonOption = None,
 ) -> None:
-    """Measure the predictor on one core, against eager torch in the same run, and the live node through DDS."""
-    artifact = open_artifact(model)
-    drive = sample_drive(artifact, rate, duration + 2 * artifact.card.window * artifact.card.sampling_time)
-    with one_core():
-        predictor, torch_eager = time_predictions(artifact, drive, calls)
-    with progress_bar("live") as progress:
-        live = measure_node(artifact, drive, duration, progress)
-    result = {
-        "predictor_us": percentiles(predictor, 1e6),
-        "torch_us": percentiles(torch_eager, 1e6),
-        "torch_over_predictor": float(np.median(torch_eager) / np.median(predictor)),
-        **live,
+    """Measure predictors on one core, against eager torch in the same run, and the live node through DDS."""
+    artifacts = open_artifacts(model)
+    drives = {
+        name: sample_drive(artifact, rate, duration + 2 * artifact.card.window * artifact.card.sampling_time)
+        for name, artifact in artifacts.items()
     }
+    with one_core():
+        times = time_predictions([(artifact, drives[name]) for name, artifact in artifacts.items()], calls)
+    results: dict[str, dict[str, Any]] = {}
+    for (name, artifact), (predictor, torch_eager) in zip(artifacts.items(), times, strict=True):
+        with progress_bar(f"live {name}") as progress:
+            live = measure_node(artifact, drives[name], duration, progress)
+        results[name] = {
+            "predictor_us": percentiles(predictor, 1e6),
+            "torch_us": percentiles(torch_eager, 1e6),
+            "torch_over_predictor": float(np.median(torch_eager) / np.median(predictor)),
+            **live,
+        }
+    first = next(iter(results))
     if json is not None:
-        write_json(json, result)
+        write_json(json, results[first] | {"models": results})
+    console.print(comparison(results).rich())
     console.print(
-        f"predictor, one core: p50 {result['predictor_us']['p50']:.1f} us, p99 {result['predictor_us']['p99']:.1f} us; "
-        f"eager torch takes {result['torch_over_predictor']:.1f} times as long (p50 {result['torch_us']['p50']:.1f} us)\n"
-        f"node, odometry published to prediction received at {result['rate_hz']:.1f} Hz: "
-        f"p50 {result['node_latency_ms']['p50']:.2f} ms, p99 {result['node_latency_ms']['p99']:.2f} ms, "
-        f"{result['dropped']} dropped",
+        f"predictor: one sample in, window cut and model run, on one core; torch: the model alone, eagerly; node: odometry "
+        f"published at {rate:g} Hz to prediction received; to first: predictor p50 over that of {first}",
+        markup=False,
         soft_wrap=True,
     )
+
+
+def open_artifacts(folders: list[Path]) -> dict[str, Artifact]:
+    """The models by name; where two folders hold models of the same name, the folders tell them apart."""
+    opened = {str(folder): open_artifact(folder) for folder in folders}
+    called = [artifact.card.name for artifact in opened.values()]
+    return {
+        given if called.count(artifact.card.name) > 1 else artifact.card.name: artifact
+        for given, artifact in opened.items()
+    }
+
+
+def comparison(results: dict[str, dict[str, Any]]) -> Table:
+    """What was measured as a table, a row for each model."""
+    columns = (
+        Column("model"),
+        *(Column(title, "us", group="predictor", best="min") for title in ("p50", "p99")),
+        Column("to first", group="predictor"),
+        Column("p50", "us", group="torch", best="min"),
+        *(Column(title, "ms", group="node", best="min") for title in ("p50", "p99")),
+        Column("lost", group="node"),
+    )
+    first = next(iter(results.values()))["predictor_us"]["p50"]
+    rows = [
+        [
+            name,
+            *each["predictor_us"].values(),
+            each["predictor_us"]["p50"] / first,
+            each["torch_us"]["p50"],
+            *each["node_latency_ms"].values(),
+            each["dropped"],
+        ]
+        for name, each in results.items()
+    ]
+    return Table(columns, rows)
 
 
 def sample_drive(artifact: Artifact, rate: float, duration: float) -> Recording:
@@ -78,15 +121,24 @@ def sample_drive(artifact: Artifact, rate: float, duration: float) -> Recording:
     return Recording(info, time_ns, np.zeros(len(t), dtype=np.int32), columns)
 
 
-def time_predictions(artifact: Artifact, drive: Recording, calls: int) -> tuple[Vector, Vector]:
-    """Times of single predictions (s): the whole predictor (sample in, window cut, model run), and eager torch alone.
+def time_predictions(models: Sequence[tuple[Artifact, Recording]], calls: int) -> list[tuple[Vector, Vector]]:
+    """Times of single predictions (s) of each model on its drive.
 
-    Both are timed in one run, block by block in turn, because machines are noisy; not call by call, because each would
-    find its data driven out of the caches by the other.
+    For each model there are two: the whole predictor (sample in, window cut, model run), and eager torch alone. All are
+    timed in one run, block by block in turn, because machines are noisy; not call by call, because each would find its
+    data driven out of the caches by the others.
     """
-    from dynssm_ros.learning.export import eager_prediction
+    timed = [call for artifact, drive in models for call in (_predictor_call(artifact, drive), _eager_call(artifact))]
+    times: list[list[float]] = [[] for _ in timed]
+    for _ in range(-(-calls // _BLOCK)):
+        for call, kept in zip(timed, times, strict=True):
+            block = [call() for _ in range(_WARM_UP + _BLOCK)]
+            kept.extend(block[_WARM_UP:])
+    arrays = [np.array(each) for each in times]
+    return list(zip(arrays[::2], arrays[1::2], strict=True))
 
-    run_eager = eager_prediction(artifact)
+
+def _predictor_call(artifact: Artifact, drive: Recording) -> Callable[[], float]:
     predictor = Predictor(OnnxModel(artifact), load_signal_map("default"))
     samples = _samples(drive)
 
@@ -97,17 +149,20 @@ def time_predictions(artifact: Artifact, drive: Recording, calls: int) -> tuple[
         predictor.predict(stamp, odometry)
         return time.perf_counter() - begin
 
-    def predict_eagerly() -> float:
+    return predict
+
+
+def _eager_call(artifact: Artifact) -> Callable[[], float]:
+    from dynssm_ros.learning.export import eager_prediction
+
+    run_eager = eager_prediction(artifact)
+
+    def predict() -> float:
         begin = time.perf_counter()
         run_eager()
         return time.perf_counter() - begin
 
-    times: tuple[list[float], list[float]] = ([], [])
-    for _ in range(-(-calls // _BLOCK)):
-        for call, kept in zip((predict, predict_eagerly), times, strict=True):
-            block = [call() for _ in range(_WARM_UP + _BLOCK)]
-            kept.extend(block[_WARM_UP:])
-    return np.array(times[0]), np.array(times[1])
+    return predict
 
 
 def measure_node(

@@ -32,7 +32,7 @@ from dynssm_ros.simulation.laps import simulate, write_run
 from dynssm_ros.simulation.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 
-VEHICLE, MODEL, SIGNALS = "av21", "dynssm_av21_errors", "default"
+VEHICLE, MODEL, SIGNALS = "av21", "dynssm_av21", "default"
 TRAINING_TRACK, TEST_TRACK = "road_course", "oval"
 TRAINING_TIME, TEST_TIME, LIVE_TIME = 600.0, 120.0, 15.0  # s
 NOISE = (0.02, 0.01, 0.002)  # m/s, m/s, rad/s

@@ -15,7 +15,7 @@ from dynssm_ros.vehicle import load_vehicle
 
 def train(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings of one car.", metavar="R.parquet...")],
-    model: Annotated[str, typer.Option(help="Model: name of a shipped one (dynssm_av21, ridge_av21, ...) or a file.")],
+    model: Annotated[str, typer.Option(help="Model: name of a shipped one (dynssm_av21, ddm_av21, ...) or a file.")],
     vehicle: VehicleOption,
     out: Annotated[Path, typer.Option(help="Model folder to write.", file_okay=False)],
     holdout: Annotated[
@@ -24,35 +24,36 @@ def train(
     ] = 0.0,
     commands: CommandsOption = None,
     seed: Annotated[int | None, typer.Option(help="Instead of the model file's.", min=0)] = None,
-    epochs: Annotated[int | None, typer.Option(help="Instead of the model file's.", min=1)] = None,
+    epochs: Annotated[int | None, typer.Option(help="Instead of the model file's, in each stage.", min=1)] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
 ) -> None:
     """Train a model on recordings and write its folder: card, weights, ONNX, metrics, loss picture."""
     from dynssm_ros.evaluation.figures import loss_components
     from dynssm_ros.learning.configuration import load_model_config
     from dynssm_ros.learning.export import check_replaceable, save_artifact
-    from dynssm_ros.learning.training import check_device
+    from dynssm_ros.learning.training import check_device, checkpoints
     from dynssm_ros.learning.training import train as fit
 
     check_device(device)
     out = out if out.name else out.absolute()  # "." has no name to put the checkpoint beside
     check_replaceable(out)
-    config = load_model_config(model)
     given = {key: value for key, value in (("seed", seed), ("epochs", epochs)) if value is not None}
-    config = config.model_copy(update={"training": config.training.model_copy(update=given)})
+    config = load_model_config(model).with_training(**given)
     data = concatenate([Recording.load(path).with_commands(commands).split_last(holdout)[0] for path in recordings])
     checkpoint = out.with_name(f"{out.name}.checkpoint.pt")
     with progress_bar("training") as progress:
         try:
             trained = fit(data, config, load_vehicle(vehicle), checkpoint, device, progress)
         except KeyboardInterrupt:
-            errors.print(f"interrupted; the same command continues from {checkpoint.name}")
+            kept = [path for path in checkpoints(config, checkpoint) if path.is_file()] or [checkpoint]
+            errors.print(f"interrupted; the same command continues from {kept[-1].name}")
             raise typer.Exit(130) from None
     artifact = save_artifact(trained, out, {"holdout": holdout, "device": device})
     if trained.history:
         with replacing(out / "losses.png") as aside:
             loss_components(trained.history, trained.best_epoch).savefig(aside, dpi=150)
-    checkpoint.unlink(missing_ok=True)
+    for path in checkpoints(config, checkpoint):
+        path.unlink(missing_ok=True)
     if trained.resumed_from:
         console.print(f"continued from epoch {trained.resumed_from}")
     v_x, v_y, omega = trained.validation_rmse

@@ -1,4 +1,4 @@
-"""Windows of a recording as tensors, and the blocked split into training and validation."""
+"""Windows of a recording as tensors, and their split into training and validation."""
 
 from __future__ import annotations
 
@@ -41,18 +41,24 @@ class Windows:
 
 
 def split_windows(recording: Recording, H: int, config: TrainingConfig) -> tuple[Windows, Windows]:
-    """Training and validation windows from alternating blocks in time; no row serves both.
+    """Training and validation windows: by alternating blocks in time, so that no row serves both, or at random.
+
+    The random split is drawn for the last rows of the windows, so that it is the same one for windows of any length.
 
     Raises:
         RecordingError: too little motion to train on.
     """
-    block = max(1, round(config.validation_block / recording.T_s))
-    blocks = np.arange(len(recording)) // block
-    validation = (blocks % config.validation_every == config.validation_every - 1).astype(np.intp)
     ends = recording.window_ends(H, min_speed=config.min_speed)
-    cumulated = np.concatenate([[0], np.cumsum(validation)])
-    inside = cumulated[ends + 2] - cumulated[ends - H + 1]
-    training, held = ends[inside == 0], ends[inside == H + 1]
+    if config.validation == "random":
+        drawn = np.random.default_rng(config.seed).random(len(recording)) * config.validation_every < 1
+        training, held = ends[~drawn[ends]], ends[drawn[ends]]
+    else:
+        block = max(1, round(config.validation_block / recording.T_s))
+        blocks = np.arange(len(recording)) // block
+        validation = (blocks % config.validation_every == config.validation_every - 1).astype(np.intp)
+        cumulated = np.concatenate([[0], np.cumsum(validation)])
+        inside = cumulated[ends + 2] - cumulated[ends - H + 1]
+        training, held = ends[inside == 0], ends[inside == H + 1]
     if len(training) < config.batch_size or len(held) == 0:
         raise RecordingError(
             f"recording {', '.join(recording.info.source)}: {len(training)} training and {len(held)} validation windows "

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from dynssm_ros.learning.configuration import ModelConfig, PhysicsConfig
 from dynssm_ros.learning.encoders import Fusion
+from dynssm_ros.learning.memory import ErrorMemory, Hindcast, Increments, centred, limited
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle
@@ -17,7 +18,7 @@ from dynssm_ros.vehicle.effects import initial_memory
 from dynssm_ros.vehicle.single_track import increment
 
 INPUTS = len(WINDOW_COLUMNS)
-_LARGEST_ERROR = 8.0  # in units of s_delta; beyond it an encoder learns nothing more from the size
+_UNTRAINED = 1e-6  # weights of an output that is to have no say at first, and yet passes gradients on
 
 
 class Output(NamedTuple):
@@ -33,6 +34,8 @@ class Output(NamedTuple):
     """Normalised parameter deviation, Eq. (20), ``(B, 17)``."""
     correction: Tensor | None
     """Normalised output of the residual network, Eq. (28), ``(B, 3)``."""
+    variance: Tensor | None = None
+    """Stated variance of the prediction's error, ``(B, 3)``; ``None``: constant."""
 
 
 class _Torch:
@@ -86,19 +89,19 @@ class ParameterHead(nn.Module):
     lower: Tensor
     upper: Tensor
 
-    def __init__(self, config: ModelConfig, vehicle: Vehicle, latent: int) -> None:
+    def __init__(self, config: ModelConfig, vehicle: Vehicle, inputs: int) -> None:
         super().__init__()
         assert config.adaptation is not None
         self.alpha = config.adaptation.alpha
-        self.condition = nn.Sequential(nn.Linear(latent + INPUTS, config.adaptation.hidden), nn.SiLU())
+        self.condition = nn.Sequential(nn.Linear(inputs, config.adaptation.hidden), nn.SiLU())
         self.deviate = nn.Linear(config.adaptation.hidden, len(COEFFICIENTS))
-        nn.init.normal_(self.deviate.weight, std=1e-3)  # training starts from the nominal car
+        nn.init.normal_(self.deviate.weight, std=_UNTRAINED)  # training starts from the nominal car
         nn.init.zeros_(self.deviate.bias)
         self.register_buffer("lower", torch.tensor(vehicle.lower, dtype=torch.float32))
         self.register_buffer("upper", torch.tensor(vehicle.upper, dtype=torch.float32))
 
     def forward(self, latent: Tensor, latest: Tensor, nominal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """``z_t``, the latest normalised input and theta_0 to ``(theta, normalised deviation, c_t)``."""
+        """``z_t``, the latest encoder input and theta_0 to ``(theta, normalised deviation, c_t)``."""
         conditioned = self.condition(torch.cat([latent, latest], dim=-1))
         admissible = self.upper - self.lower
         shift = torch.tanh(self.deviate(conditioned)) * (self.alpha * admissible)
@@ -118,7 +121,7 @@ class GatedResidual(nn.Module):
         self.gate = nn.Linear(features, 3)
         last = self.network[-1]
         assert isinstance(last, nn.Linear)
-        nn.init.normal_(last.weight, std=1e-3)  # training starts from the physics alone
+        nn.init.normal_(last.weight, std=_UNTRAINED)  # training starts from the physics alone
         nn.init.zeros_(last.bias)
 
     def forward(self, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -128,7 +131,12 @@ class GatedResidual(nn.Module):
 
 
 class DynSSM(nn.Module):
-    """The whole model; components whose configuration is left out are absent (the paper's ablations)."""
+    """The whole model; components whose configuration is left out are absent (the paper's ablations).
+
+    The paper's model sees normalised states and adds the residual to the physics. Beyond it, each a switch: the encoders
+    see increments and the physics' past errors (``inputs``), the physics carries its recent errors forward (``memory``),
+    and predictions in hindsight scale the prediction and state its variance (``hindcast``).
+    """
 
     mean: Tensor
     std: Tensor
@@ -143,13 +151,18 @@ class DynSSM(nn.Module):
         self.register_buffer("mean", torch.tensor(normalisation.input_mean))
         self.register_buffer("std", torch.tensor(normalisation.input_std))
         self.register_buffer("increment_scale", torch.tensor(normalisation.increment_scale))
-        self.fusion = Fusion(INPUTS + (3 if config.physics_errors else 0), config.ssm, config.gru, config.fusion)
+        self.changes = Increments(normalisation)
+        width = Increments.FEATURES if config.inputs.features == "increments" else INPUTS
+        width += 3 if config.inputs.physics_errors else 0
+        self.fusion = Fusion(width, config.ssm, config.gru, config.fusion)
         self.physics = PhysicsLayer(vehicle, config.physics) if config.physics else None
-        self.head = ParameterHead(config, vehicle, latent) if config.adaptation else None
+        self.head = ParameterHead(config, vehicle, latent + width) if config.adaptation else None
+        self.memory = ErrorMemory(config.memory) if config.memory else None
+        self.hindcast = Hindcast(config.hindcast) if config.hindcast else None
         conditioned = config.adaptation.hidden if config.adaptation else latent
         self.residual = None
         if config.residual:
-            features = conditioned + INPUTS
+            features = conditioned + width
             features += len(COEFFICIENTS) if self.head else 0
             features += 6 if self.physics else 0
             self.residual = GatedResidual(features, config.residual.hidden, config.residual.scale)
@@ -158,61 +171,121 @@ class DynSSM(nn.Module):
 
     def forward(self, window: Tensor) -> Output:
         """Raw windows ``(B, H, 7)`` to predictions."""
-        normalised = (window - self.mean) / self.std
-        latest = normalised[:, -1]
-        raw = window[:, -1]
-        seen = torch.cat([normalised, self._past_errors(window)], dim=-1) if self.config.physics_errors else normalised
+        increments = self.changes.states(window)
+        seen = self._seen(window, increments)
+        latest = seen[:, -1]
         conditioned = self.fusion(seen)
-        theta = deviation = increment = None
+        theta = deviation = None
         if self.head is not None:
             theta, deviation, conditioned = self.head(conditioned, latest, self.nominal)
         elif self.physics is not None:
             theta = self.nominal.expand(window.shape[0], -1)  # not len(), which an export would freeze
-        if self.physics is not None:
-            increment = self.physics(raw, theta)
-        if self.residual is None:
-            assert increment is not None
-            return Output(increment, increment, theta, deviation, None)
-        q = self._residual_input(conditioned, deviation, raw, latest, increment)
-        scaled, correction = self.residual(q)
-        added = self.increment_scale * scaled
-        return Output(added if increment is None else increment + added, increment, theta, deviation, correction)
+        step = self._step(window, increments, theta)
+        correction = None
+        moved = step.expected
+        if self.residual is not None:
+            scaled, correction = self.residual(self._residual_input(conditioned, deviation, window, latest, step))
+            added = self.increment_scale * scaled
+            moved = added if moved is None else moved + added
+        assert moved is not None
+        variance = None
+        if self.hindcast is not None and step.hindcasts is not None:
+            happened = increments[:, -step.hindcasts.shape[1] :]
+            # the network must not learn to lean on it, so training does without
+            if self.hindcast.config.trust and not self.training:
+                moved = moved * self.hindcast.trust(step.hindcasts, happened)
+            if self.hindcast.config.uncertainty:
+                variance = self.hindcast.spread(step.hindcasts, happened) * self.increment_scale.square()
+        return Output(moved, step.physics, theta, deviation, correction, variance)
 
-    def _past_errors(self, window: Tensor) -> Tensor:
-        """One-step errors of the nominal physics over the window in units of ``s_delta``, ``(B, H, 3)``.
+    def _seen(self, window: Tensor, increments: Tensor) -> Tensor:
+        """What the encoders read, ``(B, rows, features)``."""
+        changes, errors = self.config.inputs.features == "increments", self.config.inputs.physics_errors
+        rows = self.changes(window, increments) if changes else (window - self.mean) / self.std
+        if errors:
+            assert self.physics is not None
+            past = increments - self.physics(window[:, :-1], self.nominal) / self.increment_scale
+            rows = torch.cat([rows[:, -past.shape[1] :], limited(centred(past))], dim=-1)
+        return rows if self.config.inputs.rows is None else rows[:, -self.config.inputs.rows :]
 
-        Row ``k`` holds the error of the step that led to it; the first row, whose step is not in the window, is zero.
-        """
-        assert self.physics is not None
-        before, after = window[:, :-1], window[:, 1:, :3]
-        errors = (after - before[..., :3] - self.physics(before, self.nominal)) / self.increment_scale
-        bounded = errors.clamp(-_LARGEST_ERROR, _LARGEST_ERROR)
-        return torch.cat([torch.zeros_like(bounded[:, :1]), bounded], dim=1)
+    def _step(self, window: Tensor, increments: Tensor, theta: Tensor | None) -> _Step:
+        """The physics with the coefficients ``theta``, and with its memory if it has one."""
+        if self.physics is None or theta is None:
+            return _Step()
+        if self.memory is None:
+            physics = self.physics(window[:, -1], theta)
+            return _Step(physics, physics)
+        # the car as it is taken to be now, over the whole window: its errors are those of these coefficients
+        over = self.physics(window, theta[:, None]) / self.increment_scale
+        steps = self.hindcast.config.steps if self.hindcast is not None else 0
+        q, error, mean = self.memory(increments, over, steps)
+        physics = over[:, -1]
+        return _Step(
+            physics * self.increment_scale,
+            q[:, -1] * self.increment_scale,
+            q[:, :-1] if steps else None,
+            torch.cat([physics + mean, error - mean], dim=-1),
+        )
 
     def _residual_input(
-        self, conditioned: Tensor, deviation: Tensor | None, raw: Tensor, latest: Tensor, increment: Tensor | None
+        self, conditioned: Tensor, deviation: Tensor | None, window: Tensor, latest: Tensor, step: _Step
     ) -> Tensor:
-        """``q_t = [c_t, normalised deviation, h_t, physics state, physics increment]``, Eq. (27)."""
+        """``q_t = [c_t, normalised deviation, h_t, physics state, physics increment]``, Eq. (27).
+
+        With a memory its bounded outlook stands in for the physics' state and increment.
+        """
         assert self.config.residual is not None
-        standardised = self.config.residual.inputs == "normalised"
-        parts = [conditioned, latest if standardised else raw]
+        raw = self.config.residual.inputs == "raw"
+        now = window[:, -1]
+        parts = [conditioned, now if raw else latest]
         if deviation is not None:
             parts.append(deviation)
-        if increment is not None:
-            if standardised:
-                parts += [latest[:, :3] + increment / self.std[:3], increment / self.increment_scale]
-            else:
-                parts += [raw[:, :3] + increment, increment]
+        if step.outlook is not None:
+            parts.append(limited(step.outlook))
+        elif step.physics is not None and raw:
+            parts += [now[:, :3] + step.physics, step.physics]
+        elif step.physics is not None:
+            following = (now[:, :3] + step.physics - self.mean[:3]) / self.std[:3]
+            parts += [following, step.physics / self.increment_scale]
         return torch.cat(parts, dim=-1)
 
+    @torch.no_grad()
+    def fit_hindcast(self, window: Tensor, target: Tensor) -> None:
+        """Fits trust and variance to validation windows ``(N, H, 7)`` and their measured increments ``(N, 3)``."""
+        if self.hindcast is None:
+            return
+        increments = self.changes.states(window)
+        hindcasts = self._step(window, increments, self.eval()(window).theta).hindcasts
+        assert hindcasts is not None
+        happened = increments[:, -hindcasts.shape[1] :]
+        freely = self.train()(window).increment / self.increment_scale  # a training step does without trust
+        self.hindcast.fit_trust(hindcasts, happened, freely, target / self.increment_scale)
+        errors = (self.eval()(window).increment - target) / self.increment_scale
+        self.hindcast.fit_variance(hindcasts, happened, errors)
+
     def for_deployment(self) -> DynSSM:
-        """Switches the state-space layers to their recurrence; returns itself."""
+        """Switches the state-space layers to their recurrence and freezes what does not change; returns itself."""
         if self.fusion.ssm is not None:
             self.fusion.ssm.for_deployment()
+        if self.memory is not None:
+            self.memory.freeze()
         return self.eval()
 
 
+class _Step(NamedTuple):
+    """What the physics says of the next step, for ``B`` windows."""
+
+    physics: Tensor | None = None
+    """Its increment ``(B, 3)``."""
+    expected: Tensor | None = None
+    """The same with its memory, if it has one."""
+    hindcasts: Tensor | None = None
+    """Predictions in hindsight of the last steps, ``(B, steps, 3)`` in units of ``s_delta``."""
+    outlook: Tensor | None = None
+    """Physics with its mean error, and the last error about that mean, ``(B, 6)`` in units of ``s_delta``."""
+
+
 def nominal_parameters(config: PhysicsConfig, vehicle: Vehicle) -> Tensor:
-    """theta_0 after the configuration: the vehicle's nominal values or the middle of the bounds, ``(17,)``."""
-    values = vehicle.nominal if config.nominal == "vehicle" else (vehicle.lower + vehicle.upper) / 2
+    """theta_0 after the configuration: the middle of the bounds or the vehicle's (calibrated) nominal values, ``(17,)``."""
+    values = (vehicle.lower + vehicle.upper) / 2 if config.nominal == "mid_range" else vehicle.nominal
     return torch.tensor(values, dtype=torch.float32)

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -19,12 +20,13 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from dynssm_ros import configuration
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import replacing
 from dynssm_ros.learning.configuration import ModelConfig
 from dynssm_ros.learning.dataset import Windows
-from dynssm_ros.learning.dynssm import DynSSM
-from dynssm_ros.learning.ridge import Ridge
+from dynssm_ros.learning.dynssm import DynSSM, Output
+from dynssm_ros.learning.models import build_model
 from dynssm_ros.learning.training import Trained
 from dynssm_ros.runtime.artifact import (
     CARD,
@@ -43,6 +45,17 @@ TOLERANCE = 1e-5
 _GRU_INITIAL_STATE = 5  # among the inputs of ONNX's GRU
 
 
+def deployed_outputs(output: Output) -> dict[str, Tensor]:
+    """What the deployed graph computes, by the names of its outputs."""
+    named = {
+        "increment": output.increment,
+        "theta": output.theta,
+        "physics": output.physics,
+        "variance": output.variance,
+    }
+    return {name: value for name, value in named.items() if value is not None}
+
+
 class _Deployed(nn.Module):
     """The outputs that are deployed, as a flat tuple."""
 
@@ -52,8 +65,7 @@ class _Deployed(nn.Module):
         self.model = model.for_deployment() if isinstance(model, DynSSM) else model
 
     def forward(self, window: Tensor) -> tuple[Tensor, ...]:
-        output = self.model(window)
-        return tuple(value for value in (output.increment, output.theta, output.physics) if value is not None)
+        return tuple(deployed_outputs(self.model(window)).values())
 
 
 def save_artifact(trained: Trained, out: Path, training: dict[str, object] | None = None) -> Artifact:
@@ -75,13 +87,9 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
         save_file({name: value.contiguous() for name, value in model.state_dict().items()}, folder / WEIGHTS)
         export_onnx(model, sample, folder / ONNX)
         difference = check_export(model, sample, folder / ONNX, np.array(trained.normalisation.state_scale))
-        metrics = {
-            "validation_rmse": dict(zip(("v_x", "v_y", "omega"), trained.validation_rmse, strict=True)),
-            "windows": dict(zip(("training", "validation"), trained.windows, strict=True)),
-            "best_epoch": trained.best_epoch,
-            "onnx_difference": difference,
-            "history": trained.history,
-        }
+        metrics = _metrics(trained) | {"onnx_difference": difference}
+        if trained.start is not None:
+            metrics["start"] = _metrics(trained.start)
         (folder / METRICS).write_text(json.dumps(metrics, indent=1), encoding="utf-8")
         physics = config.physics
         card = ModelCard(
@@ -96,7 +104,7 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
             substeps=physics.substeps if physics else 1,
             normalisation=trained.normalisation,
             covariance=tuple(value**2 for value in trained.validation_rmse),
-            parameters=sum(p.numel() for p in model.parameters() if p.requires_grad),
+            parameters=sum(p.numel() for p in model.parameters()),
             flops=count_flops(model, config.H),
             training={"recordings": list(trained.recording.info.source), "seed": config.training.seed}
             | (training or {}),
@@ -104,6 +112,15 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
         )
         write_card(card, folder)
     return open_artifact(out)
+
+
+def _metrics(trained: Trained) -> dict[str, Any]:
+    return {
+        "validation_rmse": dict(zip(("v_x", "v_y", "omega"), trained.validation_rmse, strict=True)),
+        "windows": dict(zip(("training", "validation"), trained.windows, strict=True)),
+        "best_epoch": trained.best_epoch,
+        "history": trained.history,
+    }
 
 
 def check_replaceable(out: Path) -> None:
@@ -117,15 +134,11 @@ def check_replaceable(out: Path) -> None:
 
 
 def export_onnx(model: nn.Module, sample: Tensor, file: Path) -> None:
-    """Writes the deployed graph: input ``window`` (N, H, 7), outputs ``increment``, and ``theta``, ``physics`` if any."""
+    """Writes the deployed graph: input ``window`` (N, H, 7), outputs ``increment``, and what else it has."""
     deployed = _Deployed(model)
     with torch.no_grad():
         output = deployed.model(sample[:1])
-    names = [
-        n
-        for n, v in (("increment", output.increment), ("theta", output.theta), ("physics", output.physics))
-        if v is not None
-    ]
+    names = list(deployed_outputs(output))
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")  # the exporter's own deprecations are not the user's concern
@@ -182,12 +195,8 @@ def count_flops(model: nn.Module, H: int) -> int:
 def load_torch(artifact: Artifact) -> nn.Module:
     """The trained model back in torch, for comparison and further training."""
     card = artifact.card
-    config = ModelConfig.model_validate(card.architecture)
-    model = (
-        Ridge(config.H, card.normalisation)
-        if card.kind == "ridge"
-        else DynSSM(config, card.vehicle, card.normalisation)
-    )
+    config = configuration.validate(ModelConfig, card.architecture, f"{artifact.path / CARD}: architecture")
+    model = build_model(config, card.vehicle, card.normalisation)
     try:
         model.load_state_dict(load_file(artifact.weights))
     except RuntimeError as error:

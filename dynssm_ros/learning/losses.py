@@ -16,8 +16,8 @@ Scales = tuple[Tensor, Tensor]
 
 def scales(config: LossConfig, normalisation: Normalisation) -> Scales:
     """``(s_y, s_delta)`` of shape ``(3,)`` as the configuration defines them."""
-    target = normalisation.state_scale if config.scale == "target" else normalisation.increment_scale
-    return torch.tensor(target), torch.tensor(normalisation.increment_scale)
+    units = {"target": normalisation.state_scale, "increment": normalisation.increment_scale, "none": (1.0, 1.0, 1.0)}
+    return torch.tensor(units[config.scale]), torch.tensor(normalisation.increment_scale)
 
 
 def objective(output: Output, target: Tensor, config: LossConfig, by: Scales) -> dict[str, Tensor]:

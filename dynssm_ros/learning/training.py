@@ -6,7 +6,7 @@ import hashlib
 import math
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,15 @@ from torch import Tensor, nn
 from dynssm_ros import __version__
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.files import replacing
-from dynssm_ros.learning.configuration import LossConfig, ModelConfig
+from dynssm_ros.learning.augmentation import Augmentation
+from dynssm_ros.learning.calibration import calibrate
+from dynssm_ros.learning.configuration import LossConfig, ModelConfig, TrainingConfig
 from dynssm_ros.learning.dataset import Windows, normalisation, split_windows
+from dynssm_ros.learning.ddm import DDM
 from dynssm_ros.learning.dynssm import DynSSM
+from dynssm_ros.learning.fthd import freeze, physics_loss
 from dynssm_ros.learning.losses import COMPONENTS, Scales, objective, scales
+from dynssm_ros.learning.models import build_model, modelled_vehicle
 from dynssm_ros.learning.ridge import Ridge
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.recording import Recording
@@ -39,6 +44,7 @@ class Trained:
 
     config: ModelConfig
     vehicle: Vehicle
+    """The car as the model has it; see :func:`modelled_vehicle`."""
     recording: Recording
     model: nn.Module
     normalisation: Normalisation
@@ -49,6 +55,9 @@ class Trained:
     windows: tuple[int, int]
     """Number of training and validation windows."""
     resumed_from: int = 0
+    """Epochs that were already done, of all stages together."""
+    start: Trained | None = None
+    """The model that fine-tuning started from."""
 
 
 def train(
@@ -61,8 +70,10 @@ def train(
 ) -> Trained:
     """Trains a model; ``checkpoint`` is kept up to date and continued from if it belongs to the same training.
 
+    Fine-tuning has two stages with a checkpoint each, see :func:`checkpoints`; a stage that is done is not repeated.
+
     Args:
-        recording: training data; validation blocks are taken out of it.
+        recording: training data; validation windows are taken out of it.
         config: the model file.
         vehicle: the car whose coefficients are adapted.
         checkpoint: file beside the result; the caller removes it once the result is saved.
@@ -73,24 +84,74 @@ def train(
         RecordingError: another sampling time than the vehicle's, or too little data.
         ConfigurationError: the training diverges at once.
     """
+    if config.fine_tuning is None:
+        return _train(recording, config, vehicle, checkpoint, device, progress)
+    start = config.fine_tuning.starts_from
+    stages = (start.training.epochs, config.training.epochs)
+    files = checkpoints(config, checkpoint)
+    ddm = _train(recording, start, vehicle, files[0], device, _stage(progress, start.name, 0, stages))
+    return _train(recording, config, vehicle, files[1], device, _stage(progress, config.name, 1, stages), ddm)
+
+
+def checkpoints(config: ModelConfig, checkpoint: Path) -> list[Path]:
+    """The files that a training with ``checkpoint`` keeps, in the order of its stages."""
+    return [checkpoint] if config.fine_tuning is None else [checkpoint.with_suffix(".start.pt"), checkpoint]
+
+
+def _stage(progress: Progress | None, name: str, stage: int, epochs: tuple[int, ...]) -> Progress | None:
+    """Progress of one of several stages, in epochs of all."""
+    if progress is None:
+        return None
+    before = sum(epochs[:stage])
+    return lambda done, _, words: progress(before + done, sum(epochs), f"{name}: {words}")
+
+
+def _train(
+    recording: Recording,
+    config: ModelConfig,
+    vehicle: Vehicle,
+    checkpoint: Path,
+    device: str,
+    progress: Progress | None,
+    start: Trained | None = None,
+) -> Trained:
+    """One stage; ``start`` is the outcome of the stage before."""
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
     torch.set_num_threads(1)  # batches are small: more threads wait for each other longer than they compute
     torch.manual_seed(config.training.seed)
-    training, validation = split_windows(recording, config.H, config.training)
-    scale = normalisation(recording, training)
-    if config.kind == "ridge":
-        ridge = Ridge(config.H, scale)
-        ridge.fit(*training.batch(slice(None)), penalty=config.ridge_penalty)
-        run = _Run(ridge, {}, 0, 0)
+    if config.physics is not None and config.physics.nominal == "calibrated":
+        vehicle = calibrate(recording, vehicle, min_speed=config.training.min_speed).vehicle
+    vehicle = modelled_vehicle(config, vehicle)
+    rows = config.H if start is None else config.H + 1  # FTHD compares the predictions of neighbouring windows
+    training, validation = split_windows(recording, rows, config.training)
+    scale = normalisation(recording, training) if start is None else start.normalisation
+    model = build_model(config, vehicle, scale)
+    if isinstance(model, Ridge):
+        model.fit(*training.batch(slice(None)), penalty=config.ridge_penalty)
+        run = _Run(model, {}, 0, 0)
     else:
-        run = _Optimisation(config, vehicle, scale, training, validation, checkpoint, torch.device(device)).run(
+        if start is not None:
+            _take_over(start, model, config)
+        optimisation = _Optimisation if start is None else _FineTuning
+        run = optimisation(config, vehicle, model, scale, training, validation, checkpoint, torch.device(device)).run(
             progress
         )
     model = run.model.cpu().eval()
+    if isinstance(model, DynSSM):
+        model.fit_hindcast(*validation.batch(slice(None)))
     return Trained(
-        config, vehicle, recording, model, scale, run.history, run.best_epoch, validation_rmse(model, validation),
-        (len(training), len(validation)), run.resumed_from,
+        config, vehicle, recording, model, scale, run.history, run.best_epoch,
+        validation_rmse(model, replace(validation, H=config.H)), (len(training), len(validation)),
+        run.resumed_from + (start.resumed_from if start else 0), start,
     )  # fmt: skip
+
+
+def _take_over(start: Trained, model: nn.Module, config: ModelConfig) -> None:
+    """Gives ``model`` the weights of ``start`` and freezes as many layers as its configuration says."""
+    assert isinstance(model, DDM)
+    assert config.fine_tuning is not None
+    model.load_state_dict(start.model.state_dict())
+    freeze(model, config.fine_tuning.frozen)
 
 
 def check_device(device: str) -> None:
@@ -132,12 +193,13 @@ class _State:
 
 
 class _Optimisation:
-    """Adam with a cosine schedule over shuffled batches."""
+    """Adam over shuffled batches."""
 
     def __init__(
         self,
         config: ModelConfig,
         vehicle: Vehicle,
+        model: nn.Module,
         scale: Normalisation,
         training: Windows,
         validation: Windows,
@@ -145,20 +207,22 @@ class _Optimisation:
         device: torch.device,
     ) -> None:
         assert config.loss is not None
-        self.name = config.name
+        self.config = config
         self.loss: LossConfig = config.loss
         self.settings = config.training
-        self.model = DynSSM(config, vehicle, scale).to(device)
+        self.model = model.to(device)
         s_y, s_delta = scales(config.loss, scale)
         self.scales: Scales = (s_y.to(device), s_delta.to(device))
         self.training, self.validation = training.to(device), validation.to(device)
+        self.trained = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         self.optimiser = torch.optim.AdamW(
-            self.model.parameters(), lr=config.training.learning_rate, weight_decay=config.training.weight_decay
+            self.trained, lr=config.training.learning_rate, weight_decay=config.training.weight_decay
         )
-        self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-            self.optimiser, config.training.epochs, config.training.learning_rate * _LEARNING_RATE_FLOOR
-        )
+        self.schedule = _schedule(config.training, self.optimiser)
         self.shuffle = torch.Generator().manual_seed(config.training.seed)
+        self.augmentation = Augmentation(
+            config.training.augmentation, vehicle.sampling_time, self.scales[1], self.shuffle
+        )
         self.checkpoint = checkpoint
         self.identity = _identity(config, vehicle, training)
         self.state = _State(history={f"{part}/{term}": [] for part in ("train", "validation") for term in COMPONENTS})
@@ -171,6 +235,8 @@ class _Optimisation:
         """
         resumed_from = self._resume()
         state, settings = self.state, self.settings
+        if state.epoch == 0:  # the calibrated car itself is the first candidate
+            self._keep_if_better(self._validate()["prediction"])
         while state.epoch < settings.epochs and state.epoch - state.best_epoch < settings.patience:
             trained = self._epoch()
             validated = self._validate()
@@ -180,24 +246,27 @@ class _Optimisation:
             for part, terms in (("train", trained), ("validation", validated)):
                 for term, value in terms.items():
                     state.history[f"{part}/{term}"].append(value)
-            if validated["prediction"] < state.best_loss:
-                state.best_loss, state.best_epoch = validated["prediction"], state.epoch
-                state.best = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
+            self._keep_if_better(validated["prediction"])
             self.schedule.step()
             self._save()
             if progress is not None:
                 progress(
                     state.epoch,
                     settings.epochs,
-                    f"validation {validated['prediction']:.4f}, best {state.best_loss:.4f}",
+                    f"validation {validated['prediction']:.4g}, best {state.best_loss:.4g}",
                 )
-        if not state.best:
+        if state.epoch == 0:
             raise ConfigurationError(
-                f"model {self.name}: diverged in the first epoch; expected a smaller learning_rate than "
+                f"model {self.config.name}: diverged in the first epoch; expected a smaller learning_rate than "
                 f"{settings.learning_rate:g}"
             )
         self.model.load_state_dict(state.best)
         return _Run(self.model, state.history, state.best_epoch, resumed_from)
+
+    def _keep_if_better(self, loss: float) -> None:
+        if loss < self.state.best_loss:
+            self.state.best_loss, self.state.best_epoch = loss, self.state.epoch
+            self.state.best = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
 
     def _epoch(self) -> dict[str, float]:
         self.model.train()
@@ -205,12 +274,13 @@ class _Optimisation:
         batches = torch.split(order, self.settings.batch_size)
         totals = dict.fromkeys(COMPONENTS, 0.0)
         for index in batches:
-            window, target = self.training.batch(index)
-            terms = objective(self.model(window), target, self.loss, self.scales)
+            window, target = self.augmentation(*self.training.batch(index))
+            terms = self._terms(window, target)
             loss = torch.stack(list(terms.values())).sum()
             self.optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
-            nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
+            if self.settings.gradient_clip is not None:
+                nn.utils.clip_grad_norm_(self.trained, self.settings.gradient_clip)
             self.optimiser.step()
             for term, value in terms.items():
                 totals[term] += value.item() * len(index) / len(order)
@@ -220,9 +290,10 @@ class _Optimisation:
     def _validate(self) -> dict[str, float]:
         self.model.eval()
         window, target = self.validation.batch(slice(None))
-        return {
-            term: value.item() for term, value in objective(self.model(window), target, self.loss, self.scales).items()
-        }
+        return {term: value.item() for term, value in self._terms(window, target).items()}
+
+    def _terms(self, window: Tensor, target: Tensor) -> dict[str, Tensor]:
+        return objective(self.model(window), target, self.loss, self.scales)
 
     def _save(self) -> None:
         content: dict[str, Any] = vars(self.state) | {
@@ -253,6 +324,25 @@ class _Optimisation:
         self.shuffle.set_state(content["shuffle"].cpu())
         self.state = _State(**{name: content[name] for name in vars(self.state)})
         return self.state.epoch
+
+
+class _FineTuning(_Optimisation):
+    """FTHD's second stage, with the physics loss. Windows have ``H + 1`` rows."""
+
+    def _terms(self, window: Tensor, target: Tensor) -> dict[str, Tensor]:
+        assert self.config.fine_tuning is not None
+        assert isinstance(self.model, DDM)
+        output = self.model(window[:, 1:])
+        disagreement = physics_loss(self.model, window, output, self.scales[0])
+        terms = objective(output, target, self.loss, self.scales)
+        return terms | {"physics": self.config.fine_tuning.physics * disagreement}
+
+
+def _schedule(settings: TrainingConfig, optimiser: torch.optim.Optimizer) -> torch.optim.lr_scheduler.LRScheduler:
+    if settings.schedule == "constant":
+        return torch.optim.lr_scheduler.ConstantLR(optimiser, factor=1.0)
+    floor = settings.learning_rate * _LEARNING_RATE_FLOOR
+    return torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs, floor)
 
 
 def _identity(config: ModelConfig, vehicle: Vehicle, training: Windows) -> str:

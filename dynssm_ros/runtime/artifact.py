@@ -25,6 +25,7 @@ from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle.parameters import Vehicle
 from dynssm_ros.vehicle.single_track import Integrator
 
+ModelKind = Literal["dynssm", "ridge", "ddm", "fthd"]
 FORMAT_VERSION = 1
 CARD, WEIGHTS, ONNX, METRICS = "model.yaml", "weights.safetensors", "model.onnx", "metrics.json"
 
@@ -50,7 +51,7 @@ class ModelCard(StrictModel):
 
     format_version: int = Field(default=FORMAT_VERSION, ge=1)
     name: str
-    kind: Literal["dynssm", "ridge"] = Field(description="which model class the weights belong to")
+    kind: ModelKind = Field(description="which model class the weights belong to")
     architecture: dict[str, Any] = Field(description="the model configuration it was trained from")
     vehicle: Vehicle
     sampling_time: float = Field(gt=0, description="T_s (s)")
@@ -61,7 +62,7 @@ class ModelCard(StrictModel):
     substeps: int = Field(default=1, ge=1)
     normalisation: Normalisation
     covariance: tuple[float, float, float] = Field(description="one-step error variances on validation data")
-    parameters: int = Field(ge=0, description="trainable parameters")
+    parameters: int = Field(ge=0, description="weights that training finds")
     flops: int = Field(ge=0, description="floating-point operations per prediction")
     training: dict[str, Any] = Field(default_factory=dict, description="data, split, seed, epochs")
     checksums: dict[str, str] = Field(description="SHA-256 of the other files")

@@ -17,6 +17,7 @@ H: 4
 ssm: {channels: 4, states: 2}
 gru: {hidden: 4}
 fusion: {hidden: 8, latent: 8}
+physics: {nominal: mid_range}
 adaptation: {hidden: 8}
 residual: {hidden: [8]}
 training: {epochs: 4, batch_size: 64}

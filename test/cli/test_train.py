@@ -34,7 +34,7 @@ def test_an_interrupted_training_says_how_to_go_on_and_does(
 
     def interrupted(self: training._Optimisation) -> dict[str, float]:
         epochs[0] += 1
-        if epochs[0] == 3:
+        if epochs[0] == 4:  # the first is of the untrained model
             raise KeyboardInterrupt
         return validate(self)
 
@@ -53,6 +53,36 @@ def test_an_interrupted_training_says_how_to_go_on_and_does(
     assert "continued" not in out
     assert (tmp_path / "model" / "weights.safetensors").read_bytes() == resumed
     assert len(json.loads((tmp_path / "model" / "metrics.json").read_text())["history"]["train/prediction"]) == 4
+
+
+def test_fine_tuning_takes_one_command_and_goes_on_in_the_stage_where_it_was(
+    dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "tiny_ddm.yaml").write_text("{base: ddm_orca, name: tiny_ddm, dense: {layers: 2, width: 8}}")
+    (tmp_path / "tiny.yaml").write_text(
+        "{base: fthd_orca, name: tiny, dense: {layers: 2, width: 8}, fine_tuning: {starts_from: tiny_ddm, frozen: 1}}"
+    )
+    train_epoch, epochs = training._Optimisation._epoch, [0]
+
+    def interrupted(self: training._Optimisation) -> dict[str, float]:
+        epochs[0] += 1
+        if epochs[0] in (2, 5):  # in the first stage, and in the second
+            raise KeyboardInterrupt
+        return train_epoch(self)
+
+    monkeypatch.setattr(training._Optimisation, "_epoch", interrupted)
+    for kept in ("model.checkpoint.start.pt", "model.checkpoint.pt"):
+        status, _, err = dynssm(*arguments, "--epochs", 2, "--seed", 7)
+        assert status == 130
+        assert err.split("\n")[-2] == f"interrupted; the same command continues from {kept}"
+    status, out, _ = dynssm(*arguments, "--epochs", 2, "--seed", 7)
+    assert status == 0
+    assert "continued from epoch 3" in out
+    assert not list(tmp_path.glob("*.pt"))
+    card = open_artifact(tmp_path / "model").card
+    assert card.kind == "fthd"
+    stages = (card.architecture, card.architecture["fine_tuning"]["starts_from"])
+    assert [(each["training"]["seed"], each["training"]["epochs"]) for each in stages] == [(7, 2), (7, 2)]
 
 
 def test_seed_epochs_and_commands_of_the_command_line_win(dynssm: Run, arguments: list[str], tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ SMALL: dict[str, Any] = {
     "ssm": {"channels": 4, "states": 2},
     "gru": {"hidden": 4},
     "fusion": {"hidden": 8, "latent": 6},
-    "physics": {},
+    "physics": {"nominal": "mid_range"},  # so that there is something to learn
     "adaptation": {"hidden": 6, "alpha": 0.5},
     "residual": {"hidden": [8], "scale": 1.0},
     "loss": {"parameters": 0.001},
@@ -35,6 +36,27 @@ SMALL: dict[str, Any] = {
         "patience": 10,
         "min_speed": 0.0,
         "validation_block": 1.0,
+    },
+}
+
+SMALL_DDM: dict[str, Any] = {
+    "name": "small_ddm",
+    "kind": "ddm",
+    "H": 4,
+    "gru": {"hidden": 3, "layers": 2},
+    "dense": {"layers": 2, "width": 6},
+    "physics": {"load_transfer": False},
+    "loss": {"scale": "none", "parameters": 0.0},
+    "training": {
+        "epochs": 3,
+        "batch_size": 64,
+        "learning_rate": 0.005,
+        "schedule": "constant",
+        "gradient_clip": None,
+        "patience": 10,
+        "min_speed": 0.0,
+        "validation": "random",
+        "validation_every": 5,
     },
 }
 
@@ -57,14 +79,36 @@ def orca() -> Vehicle:
 def make_config() -> MakeConfig:
     """The small model with other blocks; ``None`` leaves a block out, a mapping changes fields of it."""
 
-    def make(**changes: Any) -> ModelConfig:
-        content = dict(SMALL)
-        for key, value in changes.items():
-            both = isinstance(value, dict) and isinstance(content.get(key), dict)
-            content[key] = content[key] | value if both else value
-        return ModelConfig.model_validate(content)
+    return partial(_changed, SMALL)
+
+
+@pytest.fixture(scope="session")
+def make_ddm() -> MakeConfig:
+    """The small DDM with other blocks."""
+    return partial(_changed, SMALL_DDM)
+
+
+@pytest.fixture(scope="session")
+def make_fthd() -> MakeConfig:
+    """The small DDM fine-tuned for two epochs, with other fields of ``fine_tuning``; ``start`` changes the DDM's blocks."""
+
+    def make(start: dict[str, Any] | None = None, **changes: Any) -> ModelConfig:
+        ddm = _changed(SMALL_DDM, **start or {}).model_dump()
+        settings = {"starts_from": ddm, "frozen": 2, "physics": 0.1} | changes
+        training = ddm["training"] | {"epochs": 2, "learning_rate": 0.002}
+        return ModelConfig.model_validate(
+            ddm | {"name": "small_fthd", "kind": "fthd", "training": training, "fine_tuning": settings}
+        )
 
     return make
+
+
+def _changed(base: dict[str, Any], **changes: Any) -> ModelConfig:
+    content = dict(base)
+    for key, value in changes.items():
+        both = isinstance(value, dict) and isinstance(content.get(key), dict)
+        content[key] = content[key] | value if both else value
+    return ModelConfig.model_validate(content)
 
 
 def smooth(rng: np.random.Generator, N: int, mean: float, std: float, over: int) -> np.ndarray:

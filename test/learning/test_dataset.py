@@ -29,7 +29,7 @@ def counting(N: int, segments: list[int], slow: list[int] = ()) -> Recording:  #
     return Recording(info, (np.arange(N) * T_s * 1e9).astype(np.int64), np.cumsum(segment, dtype=np.int32), columns)
 
 
-def training(**changes: float) -> TrainingConfig:
+def training(**changes: float | str) -> TrainingConfig:
     fields = {"epochs": 1, "batch_size": 1, "learning_rate": 0.1, "patience": 1, "min_speed": 5.0}
     return TrainingConfig.model_validate(fields | {"validation_block": 20 * T_s, "validation_every": 3} | changes)
 
@@ -62,6 +62,30 @@ def test_no_row_serves_both_and_no_window_crosses_a_gap_or_a_slow_stretch(
             touched = np.arange(end - H + 1, end + 2)
             assert len(set(recording.segment[touched])) == 1
             assert (recording["v_x"][touched] >= 5.0).all()
+
+
+@given(seed=st.integers(0, 1000), every=st.integers(2, 8), segments=st.lists(st.integers(1, 399), max_size=3))
+@settings(max_examples=30)
+def test_a_random_split_has_every_window_once_and_is_the_same_for_windows_of_any_length(
+    seed: int, every: int, segments: list[int]
+) -> None:
+    recording, how = counting(400, segments), training(validation="random", validation_every=every, seed=seed)
+    (train, held), (longer_train, longer_held) = (split_windows(recording, H, how) for H in (3, 4))
+    assert sorted([*train.ends.tolist(), *held.ends.tolist()]) == recording.window_ends(3, min_speed=5.0).tolist()
+    assert set(longer_train.ends.tolist()) <= set(train.ends.tolist())
+    assert set(longer_held.ends.tolist()) <= set(held.ends.tolist())
+    assert torch.equal(split_windows(recording, 3, how)[1].ends, held.ends)
+
+
+def test_a_random_split_holds_out_one_window_in_n_as_the_seed_says() -> None:
+    recording = counting(5000, [])
+    by_seed = [
+        split_windows(recording, 5, training(validation="random", validation_every=5, seed=seed))[1].ends.tolist()
+        for seed in (0, 1)
+    ]
+    for held in by_seed:
+        assert len(held) == pytest.approx(1000, abs=4 * np.sqrt(5000 * 0.2 * 0.8))
+    assert len(set(by_seed[0]) & set(by_seed[1])) == pytest.approx(200, abs=60)
 
 
 def test_without_gaps_only_windows_on_a_border_are_lost() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,15 @@ import onnx
 import onnxruntime as ort
 import pytest
 import torch
+import yaml
 
-from dynssm_ros.errors import ArtifactError
+from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.learning import export as export_module
 from dynssm_ros.learning.configuration import ModelConfig
 from dynssm_ros.learning.dataset import Windows
 from dynssm_ros.learning.export import TOLERANCE, check_export, check_replaceable, load_torch, save_artifact
 from dynssm_ros.learning.training import Trained, train
-from dynssm_ros.runtime.artifact import Artifact, checksum
+from dynssm_ros.runtime.artifact import Artifact, checksum, open_artifact
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
@@ -34,19 +36,28 @@ KINDS: dict[str, dict[str, Any]] = {
     "no_residual": {"residual": None},
     "neural_only": {"physics": None, "adaptation": None},
     "ridge": {"kind": "ridge"},
+    "ddm": {},
+    "fthd": {},
 }
 
 
 @pytest.fixture(scope="module")
 def trained(
-    laps: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path_factory: pytest.TempPathFactory
+    laps: Recording,
+    make_config: MakeConfig,
+    make_ddm: MakeConfig,
+    make_fthd: MakeConfig,
+    orca: Vehicle,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Callable[[str], Trained]:
     """Trained models of each kind, two epochs old."""
     made: dict[str, Trained] = {}
 
     def get(kind: str) -> Trained:
         if kind not in made:
-            config = make_config(**KINDS[kind], training={"epochs": 2, "learning_rate": 0.03})
+            rivals = {"ddm": make_ddm, "fthd": make_fthd}
+            config = rivals[kind]() if kind in rivals else make_config(**KINDS[kind])
+            config = config.with_training(epochs=2, learning_rate=0.03)
             made[kind] = train(laps, config, orca, tmp_path_factory.mktemp(kind) / "checkpoint.pt")
         return made[kind]
 
@@ -113,7 +124,7 @@ def test_the_trained_model_is_left_as_it_was(trained: Callable[[str], Trained], 
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
 
 
-@pytest.mark.parametrize("kind", ["whole", "neural_only", "ridge"])
+@pytest.mark.parametrize("kind", ["whole", "neural_only", "ridge", "ddm", "fthd"])
 def test_the_weights_come_back(trained: Callable[[str], Trained], laps: Recording, tmp_path: Path, kind: str) -> None:
     original = trained(kind)
     loaded = load_torch(save_artifact(original, tmp_path / "model"))
@@ -149,6 +160,17 @@ def test_operations_of_a_ridge_are_two_per_weight(trained: Callable[[str], Train
     card = save_artifact(trained("ridge"), tmp_path / "model").card
     assert card.flops == 2 * 4 * 7 * 3
     assert card.parameters == 4 * 7 * 3 + 3
+
+
+@pytest.mark.parametrize("kind", ["ddm", "fthd"])
+def test_operations_of_a_ddm_are_those_of_its_matrix_products(
+    trained: Callable[[str], Trained], tmp_path: Path, kind: str
+) -> None:
+    card = save_artifact(trained(kind), tmp_path / "model").card
+    gru = 4 * ((7 + 3) * 9 + (3 + 3) * 9)
+    dense = 4 * 3 * 6 + 6 * 6 + 6 * 17
+    assert card.flops == 2 * (gru + dense)
+    assert card.parameters == gru // 4 + 4 * 9 + dense + 6 + 6 + 17  # frozen or not
 
 
 def test_operations_of_a_dynssm_are_those_of_its_matrix_products(artifact: Artifact) -> None:
@@ -201,6 +223,16 @@ def test_what_is_no_model_folder_is_not_replaced(
     with pytest.raises(ArtifactError, match="not replaced"):
         check_replaceable(out)
     check_replaceable(tmp_path / "new")
+
+
+def test_an_architecture_that_this_version_does_not_know_is_one_clear_line(artifact: Artifact, tmp_path: Path) -> None:
+    folder = shutil.copytree(artifact.path, tmp_path / "model")
+    card = yaml.safe_load((folder / "model.yaml").read_text())
+    card["architecture"]["attention"] = {"heads": 4}
+    (folder / "model.yaml").write_text(yaml.safe_dump(card))
+    with pytest.raises(ConfigurationError, match=r"model\.yaml: architecture: attention: Extra inputs") as refused:
+        load_torch(open_artifact(folder))
+    assert "\n" not in str(refused.value)
 
 
 def test_a_graph_that_differs_from_the_model_is_refused(

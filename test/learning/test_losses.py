@@ -49,6 +49,10 @@ def test_or_in_units_of_the_increment() -> None:
     assert terms(scale="increment")["prediction"] == pytest.approx(expected / 6)
 
 
+def test_or_as_it_is() -> None:
+    assert terms(scale="none")["prediction"] == pytest.approx(float((ERROR**2).sum()) / 6)
+
+
 def test_the_robust_prediction_term_is_twice_hubers_so_that_small_errors_count_the_same() -> None:
     e = np.array([2 / 4, 1 / 5, 0.5 / 8, 0.0, 0.1 / 5, 4 / 8])
     delta = 0.3

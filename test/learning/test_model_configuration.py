@@ -44,10 +44,10 @@ def write(folder: Path, name: str, content: dict[str, Any]) -> Path:
 
 
 def test_base_gives_what_a_file_leaves_out_block_by_block(tmp_path: Path) -> None:
-    write(tmp_path, "middle", {"base": "dynssm_av21", "H": 9, "training": {"epochs": 7}})
+    write(tmp_path, "middle", {"base": "dynssm_av21", "H": 40, "training": {"epochs": 7}})
     config = load_model_config(write(tmp_path, "leaf", {"base": "middle", "name": "leaf", "ssm": None}))
     shipped = load_model_config("dynssm_av21")
-    assert (config.name, config.H, config.ssm) == ("leaf", 9, None)
+    assert (config.name, config.H, config.ssm) == ("leaf", 40, None)
     assert config.training == shipped.training.model_copy(update={"epochs": 7})
     assert config.gru == shipped.gru
 
@@ -70,15 +70,20 @@ def test_a_base_that_does_not_exist_is_named(tmp_path: Path) -> None:
         ({"fusion": None}, "needs the blocks fusion and loss"),
         ({"loss": None}, "needs the blocks fusion and loss"),
         ({"physics": None}, "adaptation needs physics to adapt"),
-        ({"physics": None, "adaptation": None, "residual": None}, "without physics there must be a residual network"),
+        ({"physics": None, "adaptation": None}, "inputs.physics_errors and memory need physics"),
+        (
+            {"physics": None, "adaptation": None, "residual": None, "memory": None, "hindcast": None},
+            "without physics there must be a residual network",
+        ),
         ({"adaptation": None, "residual": None}, "nothing to learn"),
         ({"adaptation": {"alpha": 1.5}}, "adaptation.alpha: Input should be less than or equal to 1 (got 1.5)"),
         ({"H": 0}, "H: Input should be greater than or equal to 1 (got 0)"),
         ({"gru": {"width": 3}}, "gru.width: Extra inputs are not permitted (got 3)"),
         ({"residual": {"hidden": []}}, "residual.hidden"),
         ({"training": {"validation_every": 1}}, "training.validation_every"),
-        ({"loss": {"scale": "state"}}, "loss.scale: Input should be 'target' or 'increment' (got 'state')"),
-        ({"kind": "transformer"}, "kind: Input should be 'dynssm' or 'ridge'"),
+        ({"loss": {"scale": "state"}}, "loss.scale: Input should be 'target', 'increment' or 'none' (got 'state')"),
+        ({"kind": "transformer"}, "kind: Input should be 'dynssm', 'ridge', 'ddm' or 'fthd'"),
+        ({"dense": {"layers": 2, "width": 4}}, "kind dynssm has no dense"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_field_and_value(
@@ -89,6 +94,49 @@ def test_what_does_not_fit_is_refused_with_field_and_value(
         load_model_config(path)
     assert str(path) in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("base", "changes", "expected"),
+    [
+        ("ddm_av21", {"dense": None}, "kind ddm needs the blocks gru and dense and physics and loss"),
+        ("ddm_av21", {"residual": {"hidden": [8], "scale": 1.0}}, "kind ddm has no residual"),
+        ("ddm_av21", {"memory": {"taps": 3}}, "kind ddm has no memory"),
+        ("ddm_av21", {"fine_tuning": {"starts_from": "ddm_av21", "frozen": 1, "physics": 0.1}}, "has no fine_tuning"),
+        ("ddm_av21", {"training": {"validation": "none"}}, "training.validation: Input should be 'blocks' or 'random'"),
+        ("fthd_av21", {"fine_tuning": None}, "kind fthd needs the blocks gru and dense and physics and loss and fine_"),
+        ("fthd_av21", {"fine_tuning": {"starts_from": "dynssm_av21"}}, "dynssm_av21 is of kind dynssm; expected ddm"),
+        ("fthd_av21", {"fine_tuning": {"starts_from": "ddm_mars"}}, "'ddm_mars' is neither a file nor a shipped name"),
+        ("fthd_av21", {"fine_tuning": {"starts_from": "fthd_av21"}}, "fine_tuning.starts_from.fine_tuning.starts_from"),
+        ("fthd_av21", {"fine_tuning": {"frozen": 4}}, "frozen: 4 leaves nothing to train of GRU, 2 dense layers"),
+        ("fthd_av21", {"dense": {"width": 9}}, "dense: differs from that of ddm_av21, which fine_tuning starts from"),
+        ("fthd_av21", {"training": {"seed": 3}}, "seed: differs from that of ddm_av21"),
+    ],
+)
+def test_what_does_not_fit_a_rival_is_refused(
+    tmp_path: Path, base: str, changes: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=re.escape(expected)) as refused:
+        load_model_config(write(tmp_path, "bad", {"base": base, **changes}))
+    assert "\n" not in str(refused.value)
+
+
+def test_the_model_that_fine_tuning_starts_from_is_read_with_it(tmp_path: Path) -> None:
+    write(tmp_path, "ddm_own", {"base": "ddm_av21", "name": "ddm_own", "training": {"epochs": 7}})
+    settings = {"fine_tuning": {"starts_from": "ddm_own"}, "training": {"epochs": 3}}
+    config = load_model_config(write(tmp_path, "own", {"base": "fthd_av21", **settings}))
+    assert config.fine_tuning is not None
+    assert config.fine_tuning.starts_from == load_model_config(tmp_path / "ddm_own.yaml")
+    assert (config.training.epochs, config.fine_tuning.starts_from.training.epochs) == (3, 7)
+
+
+def test_other_training_settings_hold_in_all_stages() -> None:
+    shipped = load_model_config("fthd_av21")
+    config = shipped.with_training(seed=5)
+    assert config.fine_tuning is not None
+    assert config.training.seed == config.fine_tuning.starts_from.training.seed == 5
+    assert config.with_training(seed=0) == shipped
+    assert config.training.epochs == shipped.training.epochs
 
 
 def test_a_configuration_cannot_be_changed_behind_a_model(make_config: Any) -> None:

@@ -21,12 +21,15 @@ from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.learning import training as training_module
 from dynssm_ros.learning.configuration import ModelConfig
 from dynssm_ros.learning.dataset import split_windows
+from dynssm_ros.learning.dynssm import DynSSM
 from dynssm_ros.learning.training import Trained, check_device, train
+from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.vehicle import Vehicle
 
 MakeConfig = Callable[..., ModelConfig]
+UNIT = Normalisation(input_mean=(0.0,) * 7, input_std=(1.0,) * 7, state_scale=(1.0,) * 3, increment_scale=(1.0,) * 3)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +76,7 @@ def test_history_and_progress_tell_of_every_epoch(
     trained = train(short, make_config(), orca, checkpoint, progress=lambda *args: told.append(args))
     assert [args[:2] for args in told] == [(1, 3), (2, 3), (3, 3)]
     validation = trained.history["validation/prediction"]
-    assert told[-1][2] == f"validation {validation[-1]:.4f}, best {min(validation):.4f}"
+    assert told[-1][2] == f"validation {validation[-1]:.4g}, best {min(validation):.4g}"
     assert {len(values) for values in trained.history.values()} == {3}
     assert trained.best_epoch == 1 + validation.index(min(validation))
 
@@ -81,7 +84,7 @@ def test_history_and_progress_tell_of_every_epoch(
 def test_the_best_epoch_is_kept_and_measured(
     short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
 ) -> None:
-    config = make_config(training={"epochs": 8, "patience": 2, "learning_rate": 0.3})
+    config = make_config(training={"epochs": 8, "patience": 2, "learning_rate": 0.03})
     trained = train(short, config, orca, checkpoint)
     validation = trained.history["validation/prediction"]
     assert validation[-1] > min(validation)
@@ -91,6 +94,28 @@ def test_the_best_epoch_is_kept_and_measured(
     scaled = (error / torch.tensor(trained.normalisation.increment_scale)).square().mean().item()
     assert scaled == pytest.approx(min(validation), rel=1e-5)
     np.testing.assert_allclose(trained.validation_rmse, error.square().mean(0).sqrt().numpy(), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("schedule", "last"), [("cosine", 0.02 * 0.005), ("constant", 0.005)])
+def test_the_learning_rate_takes_the_course_of_the_schedule(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path, schedule: str, last: float
+) -> None:
+    train(short, make_config(training={"schedule": schedule}), orca, checkpoint)
+    assert torch.load(checkpoint, weights_only=True)["optimiser"]["param_groups"][0]["lr"] == pytest.approx(last)
+
+
+def test_gradients_are_clipped_if_the_model_file_says_so(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path: Path
+) -> None:
+    moved = {}
+    for clip in (1e-12, 1.0, None):
+        config = make_config(training={"epochs": 1, "gradient_clip": clip})
+        torch.manual_seed(config.training.seed)
+        start = DynSSM(config, orca, UNIT).fusion.mix[0].weight
+        end = train(short, config, orca, tmp_path / f"{clip}.pt").model.state_dict()["fusion.mix.0.weight"]
+        moved[clip] = (end - start).abs().max().item()
+    assert moved[1e-12] < 1e-4 < moved[1.0]
+    assert moved[None] != moved[1.0]
 
 
 # --- interrupted --------------------------------------------------------------------------------
