@@ -4,13 +4,14 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test colcon-test clean
+.PHONY: help setup demo paper test colcon-test clean
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT ?= out/demo
 JOBS ?= 2
+DYNSSM_DATA ?= ../shared/data
 PYTHON ?= python3 python3.12 python3.11 python3.10
 SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))
 
@@ -23,12 +24,17 @@ endif
 help: ## this list
 	@echo "make TARGET, where TARGET is one of"
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
-	@echo "Variables: OUT=$(OUT) (folder of the demo), JOBS=$(JOBS) (test processes), PYTHON=... (interpreter, 3.10 to 3.12)"
+	@echo "Variables: OUT=$(OUT) (folder of the demo; of paper out/paper), JOBS=$(JOBS) (processes),"
+	@echo "  DYNSSM_DATA=$(DYNSSM_DATA) (measured logs and tracks), ARGS=... (options of dynssm paper), PYTHON=... (interpreter, 3.10 to 3.12)"
 
 setup: $(STAMP) ## the virtual environment alone
 
 demo: $(STAMP) ## from simulated laps to a live prediction and its report
 	@$(BIN)/dynssm demo --out "$(OUT)"
+
+paper: OUT = out/paper
+paper: $(STAMP) ## docs/results.md measured anew, about an hour on two cores; continues after a kill
+	@$(BIN)/dynssm paper --out "$(OUT)" --results docs/results.md --data "$(DYNSSM_DATA)" --jobs $(JOBS) $(ARGS)
 
 test: $(STAMP) ## style, types and all tests
 	@set -x

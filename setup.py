@@ -49,6 +49,7 @@ setup(
         "pyyaml>=6.0.1",
         "rosbags>=0.11.6",  # bags without a ROS installation
         "mcap>=1.1.1",  # what a cut MCAP file still holds
+        "joblib>=1.4",  # steps of `dynssm paper` side by side
         "typer>=0.20",
         "rich>=14.3",
         "matplotlib>=3.9",  # the figures and ...

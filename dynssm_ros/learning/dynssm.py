@@ -190,7 +190,7 @@ class DynSSM(nn.Module):
         assert moved is not None
         variance = None
         if self.hindcast is not None and step.hindcasts is not None:
-            happened = increments[:, -step.hindcasts.shape[1] :]
+            happened = increments[:, -self.hindcast.config.steps :]
             # the network must not learn to lean on it, so training does without
             if self.hindcast.config.trust and not self.training:
                 moved = moved * self.hindcast.trust(step.hindcasts, happened)
@@ -257,7 +257,7 @@ class DynSSM(nn.Module):
         increments = self.changes.states(window)
         hindcasts = self._step(window, increments, self.eval()(window).theta).hindcasts
         assert hindcasts is not None
-        happened = increments[:, -hindcasts.shape[1] :]
+        happened = increments[:, -self.hindcast.config.steps :]
         freely = self.train()(window).increment / self.increment_scale  # a training step does without trust
         self.hindcast.fit_trust(hindcasts, happened, freely, target / self.increment_scale)
         errors = (self.eval()(window).increment - target) / self.increment_scale

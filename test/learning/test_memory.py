@@ -76,7 +76,11 @@ def test_untrained_memory_is_the_physics_less_its_average_error(
 ) -> None:
     baseline = SingleTrackEwma(orca)
     config = make_config(
-        H=31, memory={"taps": 30, "decay": 0.9}, residual=None, adaptation={"hidden": 4, "alpha": 1e-9}
+        H=31,
+        physics={"nominal": "vehicle"},
+        memory={"taps": 30, "decay": 0.9},
+        residual=None,
+        adaptation={"hidden": 4, "alpha": 1e-9},
     )
     model = DynSSM(config, orca, SCALES).eval()
     given = disturbed(windows(drive(orca, 200), 31), torch.tensor([0.01, 0.02, -0.03]))
