@@ -16,6 +16,7 @@ from dynssm_ros.cli.demo import demo
 from dynssm_ros.cli.evaluate import evaluate
 from dynssm_ros.cli.extract import extract
 from dynssm_ros.cli.paper import paper
+from dynssm_ros.cli.race import race
 from dynssm_ros.cli.replay import replay
 from dynssm_ros.cli.simulate import simulate
 from dynssm_ros.cli.train import train
@@ -31,7 +32,7 @@ app = typer.Typer(
 # click's base of all usage errors, wherever typer keeps its click
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
-for command in (demo, simulate, extract, calibrate, train, evaluate, replay, bench, paper):
+for command in (demo, simulate, extract, calibrate, train, evaluate, replay, race, bench, paper):
     app.command()(command)
 
 

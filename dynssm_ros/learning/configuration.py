@@ -230,6 +230,8 @@ class ModelConfig(StrictModel):
             raise ValueError("inputs.physics_errors and memory need physics, whose errors they are")
         if rows < 1 or (self.inputs.rows or 1) > rows:
             raise ValueError(f"inputs.rows: {self.inputs.rows}; a window of {self.H} rows has {rows} of them")
+        if changes and self.residual is not None and self.residual.inputs == "raw":
+            raise ValueError("residual.inputs: raw goes with inputs as in the paper; expected normalised")
         if self.hindcast is not None and self.memory is None:
             raise ValueError("hindcast needs memory, which predicts in hindsight")
         needed = 1 + (self.memory.taps if self.memory else 0) + (self.hindcast.steps if self.hindcast else 0)

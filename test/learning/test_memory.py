@@ -188,9 +188,13 @@ def test_training_does_without_trust(
     ("text", "message"),
     [
         ("base: dynssm_orca_neural_only\ninputs: {physics_errors: true}", "need physics"),
+        ("base: dynssm_av21\nresidual: {inputs: raw}", "residual.inputs: raw goes with inputs as in the paper"),
         ("base: dynssm_av21_paper\nmemory: {taps: 15}", "H: 15 rows; memory and hindcast reach back over 16"),
         ("base: dynssm_av21_paper\nhindcast: {steps: 3}", "hindcast needs memory"),
-        ("base: dynssm_av21_paper\ninputs: {features: increments, rows: 15}", "a window of 15 rows has 14 of them"),
+        (
+            "base: dynssm_av21_paper\nresidual: {inputs: normalised}\ninputs: {features: increments, rows: 15}",
+            "a window of 15 rows has 14 of them",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused(text: str, message: str, tmp_path: Path) -> None:
