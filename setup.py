@@ -49,6 +49,7 @@ setup(
         "pyyaml>=6.0.1",
         "rosbags>=0.11.6",  # bags without a ROS installation
         "mcap>=1.1.1",  # what a cut MCAP file still holds
+        "casadi>=3.7",  # the controller of `dynssm race`: derivatives of the vehicle equations, and the DAQP solver
         "joblib>=1.4",  # steps of `dynssm paper` side by side
         "typer>=0.20",
         "rich>=14.3",
@@ -59,7 +60,6 @@ setup(
         # ROS 2 Jazzy as wheels, for machines without it; a sourced ROS installation provides the same modules
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "test": [
-            "casadi",  # the third back end of the vehicle equations
             "hypothesis",
             "mypy",
             "pytest",

@@ -1,0 +1,1 @@
+"""Nonlinear model predictive control and closed-loop laps. Casadi is imported here."""

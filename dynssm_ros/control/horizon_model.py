@@ -1,0 +1,127 @@
+"""The car inside the controller: the package's one single-track source, stepped and differentiated by casadi."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State
+from dynssm_ros.vehicle.single_track import Constants, Integrator, StageEffect, step_with_memory
+
+Vector = npt.NDArray[np.float64]
+
+STATES = ("x", "y", "theta", "v_x", "v_y", "omega", "r", "delta")
+"""Pose (m, m, rad), velocities (m/s, m/s, rad/s), what the actuators do (fraction, rad). The effects' own follow."""
+INPUTS = ("increment of r", "increment of delta")
+CONTEXT = ("t", "s", "lap_length")
+"""What effects may read beside the pose: time (s), track position and length of the lap (m)."""
+PARAMETERS = len(COEFFICIENTS) + 3 + len(CONTEXT)
+"""Per step: the 17 coefficients, the correction of ``v_x, v_y, omega``, the context."""
+
+
+@dataclass(frozen=True)
+class Car:
+    """The physics that a model steps by.
+
+    Attributes:
+        constants: mass and geometry.
+        T_s: length of a step (s).
+        effects: physics beyond the nominal model; they may read the pose and ``CONTEXT``.
+        integrator: of the step.
+        substeps: of the integrator.
+    """
+
+    constants: Constants
+    T_s: float
+    effects: Sequence[StageEffect] = ()
+    integrator: Integrator = "euler"
+    substeps: int = 1
+
+    @property
+    def memory(self) -> tuple[str, ...]:
+        """Names of the effects' own states."""
+        return tuple(name for effect in self.effects for name in getattr(effect, "carries", ()))
+
+
+class HorizonModel:
+    """One step of ``car`` and its Jacobians, for all steps of a horizon at once.
+
+    The velocities move by the single-track step plus the correction; the pose moves by the mean velocity of the step at
+    its middle heading, as the live predictor's does.
+
+    Args:
+        car: what is stepped.
+        N: steps of the horizon.
+    """
+
+    def __init__(self, car: Car, N: int) -> None:
+        self.car = car
+        self.N = N
+        self.size = len(STATES) + len(car.memory)
+        import casadi as ca  # takes a while, and most of the command line does without
+
+        x, u, p = ca.SX.sym("x", self.size), ca.SX.sym("u", len(INPUTS)), ca.SX.sym("p", PARAMETERS)
+        following = self._following(x, u, p)
+        outputs = [following, ca.jacobian(following, x), ca.jacobian(following, u)]
+        self._step = ca.Function("step", [x, u, p], [following])
+        self._stages = ca.Function("stage", [x, u, p], [ca.densify(each) for each in outputs]).map(N)
+
+    def step(self, x: Vector, u: Vector, p: Vector) -> Vector:
+        """The state one step on, shape ``(size,)``.
+
+        Args:
+            x: state in the order of ``STATES`` and the car's memory, shape ``(size,)``.
+            u: increments of throttle and steering, shape ``(2,)``.
+            p: coefficients, correction and context, shape ``(PARAMETERS,)``.
+        """
+        return np.asarray(self._step(x, u, p)).ravel()
+
+    def linearised(self, x: Vector, u: Vector, p: Vector) -> tuple[Vector, Vector, Vector]:
+        """All steps at their own point: the states after them and the Jacobians by state and input.
+
+        Args:
+            x: states before the steps, shape ``(N, size)``.
+            u: increments, shape ``(N, 2)``.
+            p: parameters of the steps, shape ``(N, PARAMETERS)``.
+
+        Returns:
+            Shapes ``(N, size)``, ``(N, size, size)``, ``(N, size, 2)``.
+        """
+        following, by_x, by_u = (np.asarray(each) for each in self._stages(x.T, u.T, p.T))
+        return (
+            following.T,
+            by_x.reshape(self.size, self.N, self.size).transpose(1, 0, 2),
+            by_u.reshape(self.size, self.N, len(INPUTS)).transpose(1, 0, 2),
+        )
+
+    def _following(self, x: Any, u: Any, p: Any) -> Any:
+        import casadi as ca
+
+        car = self.car
+        x_pos, y_pos, heading, *motion = ca.vertsplit(x)
+        now, applied = State(*motion[:3]), Applied(motion[3] + u[0], motion[4] + u[1])
+        parameters = iter(ca.vertsplit(p))
+        theta, correction, context = (list(islice(parameters, n)) for n in (len(COEFFICIENTS), 3, len(CONTEXT)))
+        state, memory = step_with_memory(
+            ca,
+            now,
+            dict(zip(car.memory, motion[5:], strict=True)),
+            applied,
+            Coefficients(*theta),
+            car.constants,
+            car.T_s,
+            car.effects,
+            car.integrator,
+            car.substeps,
+            {"x": x_pos, "y": y_pos, "theta": heading, **dict(zip(CONTEXT, context, strict=True))},
+        )
+        state = State(*(value + by for value, by in zip(state, correction, strict=True)))
+        v_x, v_y, turn = ((a + b) / 2 * car.T_s for a, b in zip(now, state, strict=True))
+        c, s = ca.cos(heading + turn / 2), ca.sin(heading + turn / 2)
+        pose = (x_pos + v_x * c - v_y * s, y_pos + v_x * s + v_y * c, heading + turn)
+        return ca.vertcat(*pose, *state, *applied, *(memory[name] for name in car.memory))

@@ -1,0 +1,195 @@
+"""Any model behind the controller: what it says of the present becomes coefficients and a correction for the horizon."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.control.horizon_model import INPUTS, STATES, Car
+from dynssm_ros.control.nmpc import Adapted, Plan
+from dynssm_ros.errors import ArtifactError, ConfigurationError
+from dynssm_ros.runtime.models import OnnxModel, Persistence, SingleTrack, SingleTrackEwma, WindowModel, load_model
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
+from dynssm_ros.simulation.double_track import DoubleTrack
+from dynssm_ros.simulation.plant import PlantKind
+from dynssm_ros.vehicle import Coefficients, State, Vehicle, load_vehicle, step
+
+Vector = npt.NDArray[np.float64]
+
+TRUE = "true"
+UNTRAINED = tuple(each.name for each in (Persistence, SingleTrack, SingleTrackEwma))
+SHARED = ("m", "l_f", "l_r")  # what makes it the same car
+_MEASURED = slice(STATES.index("v_x"), len(STATES))  # of the controller's state: what a window's row begins with
+
+
+class Knowledge(Protocol):
+    """What the controller asks of a model."""
+
+    name: str
+    car: Car
+    """The physics that its coefficients are for."""
+    H: int
+    """Rows of history that it reads; 0: none."""
+
+    def read(self, rows: Vector, outlook: Plan | None) -> Adapted:
+        """Coefficients and correction for the horizon.
+
+        Args:
+            rows: history with the columns ``WINDOW_COLUMNS``, the present last, shape ``(k, 7)``. The command in the
+                last row is the one that the last plan has for now.
+            outlook: the last plan as it stands now; ``None`` at the start.
+        """
+
+
+class Fixed:
+    """Coefficients that never change, and no correction."""
+
+    H = 0
+
+    def __init__(self, name: str, car: Car, theta: Vector) -> None:
+        self.name = name
+        self.car = car
+        self._adapted = Adapted(theta, np.zeros(3))
+
+    def read(self, rows: Vector, outlook: Plan | None) -> Adapted:
+        """The same, whatever happens."""
+        return self._adapted
+
+
+class Adaptive:
+    """A model that reads a history window and predicts the next state.
+
+    Its coefficients, and what it adds to the single-track step with them, hold over the horizon; a model without
+    coefficients corrects the nominal car. Until the window is full the nominal car drives, without a correction.
+
+    Args:
+        model: the model.
+        vehicle: the nominal car of a model that has none of its own.
+        along_horizon: reads the model anew at each step of the last plan instead, as if that had been driven.
+    """
+
+    def __init__(self, model: WindowModel, vehicle: Vehicle, along_horizon: bool = False) -> None:
+        own = model.vehicle or vehicle
+        card = model.artifact.card if isinstance(model, OnnxModel) else None
+        self.name = model.name
+        self.H = model.H
+        self.car = Car(
+            own.constants,
+            own.sampling_time,
+            own.active_effects,
+            "euler" if card is None else card.integrator,
+            1 if card is None else card.substeps,
+        )
+        self._model = model
+        self._along_horizon = along_horizon
+        self._nominal = Adapted(own.nominal, np.zeros(3))
+
+    def read(self, rows: Vector, outlook: Plan | None) -> Adapted:
+        """See :class:`Knowledge`. What is not finite is replaced by the nominal car."""
+        if len(rows) < self.H:
+            return self._nominal
+        windows = rows[None, -self.H :]
+        if self._along_horizon and outlook is not None:
+            ahead = np.concatenate([rows, _planned_rows(outlook)])
+            N = len(outlook.u)
+            windows = np.stack([ahead[k : k + self.H] for k in range(len(rows) - self.H, len(rows) - self.H + N)])
+        if self._model.commands == "none":
+            windows = windows.copy()
+            windows[..., 5:] = 0.0
+        adapted = self._of(windows)
+        return adapted if all(np.all(np.isfinite(part)) for part in adapted) else self._nominal
+
+    def _of(self, windows: Vector) -> Adapted:
+        said = self._model.predict(windows)
+        theta = self._nominal.theta if said.theta is None else said.theta
+        physics = self._nominal_step(windows[:, -1]) if said.physics is None else said.physics
+        correction = said.state - physics
+        if len(windows) == 1:
+            return Adapted(np.atleast_2d(theta)[0], correction[0])
+        return Adapted(theta, correction)
+
+    def _nominal_step(self, rows: Vector) -> Vector:
+        """The nominal car's next states, shape ``(N, 3)``."""
+        car, now = self.car, rows.T
+        following = step(
+            np,
+            State(*now[:3]),
+            applied_inputs(now),
+            Coefficients(*self._nominal.theta),
+            car.constants,
+            car.T_s,
+            car.effects,
+            car.integrator,
+            car.substeps,
+        )
+        return np.stack(following, axis=1)
+
+
+def _planned_rows(plan: Plan) -> Vector:
+    """Window rows of the plan's steps after the first, shape ``(N - 1, 7)``."""
+    return np.concatenate([plan.x[1:-1, _MEASURED], plan.u[1:]], axis=1)
+
+
+def true_model(vehicle: Vehicle, plant: PlantKind) -> Fixed:
+    """The plant's own model: its coefficients, effects and wheels. Steps of 1 ms become two of Runge and Kutta."""
+    first = (DoubleTrack.of(vehicle.constants),) if plant == "double_track" else ()
+    effects = (*first, *vehicle.active_effects)
+    if plant == "euler":
+        return Fixed(TRUE, Car(vehicle.constants, vehicle.sampling_time, effects), vehicle.nominal)
+    return Fixed(TRUE, Car(vehicle.constants, vehicle.sampling_time, effects, "rk4", 2), vehicle.nominal)
+
+
+def load_knowledge(
+    name_or_path: str, known: Vehicle, driven: Vehicle, plant: PlantKind, along_horizon: bool = False
+) -> Knowledge:
+    """What the controller is to know of the car.
+
+    Args:
+        name_or_path: ``true``, the plant's own model; a vehicle file (``.yaml``), the single-track car with its
+            coefficients; else as :func:`~dynssm_ros.runtime.models.load_model`.
+        known: the vehicle as its file describes it.
+        driven: the same with what the plant has beyond that.
+        plant: how that is simulated.
+        along_horizon: see :class:`Adaptive`.
+
+    Raises:
+        ArtifactError: the model is damaged, or of another car or sampling time.
+        ConfigurationError: no such model, or a vehicle file of another car.
+    """
+    if name_or_path == TRUE:
+        return true_model(driven, plant)
+    if Path(name_or_path).suffix == ".yaml":
+        model: WindowModel = SingleTrack(load_vehicle(name_or_path))
+        model.name = Path(name_or_path).stem
+    elif Path(name_or_path).is_dir() or name_or_path in UNTRAINED:
+        model = load_model(name_or_path, known)
+    else:
+        raise ConfigurationError(
+            f"model '{name_or_path}': neither a model folder nor one of {', '.join((TRUE, *UNTRAINED))} nor a vehicle file"
+        )
+    _check_car(name_or_path, model, known)
+    return Adaptive(model, known, along_horizon)
+
+
+def _check_car(given: str, model: WindowModel, vehicle: Vehicle) -> None:
+    error = ArtifactError if isinstance(model, OnnxModel) else ConfigurationError
+    if model.T_s and abs(model.T_s - vehicle.sampling_time) > 1e-9:
+        raise error(
+            f"model {given}: sampling time {model.T_s:g} s; expected that of vehicle {vehicle.name}, "
+            f"{vehicle.sampling_time:g} s"
+        )
+    for name in SHARED:
+        own = getattr(vehicle.constants, name)
+        its = own if model.vehicle is None else getattr(model.vehicle.constants, name)
+        if abs(its - own) > 1e-6 * own:
+            raise error(
+                f"model {given}: of another vehicle ({name} = {its:g}); expected that of {vehicle.name} "
+                f"({name} = {own:g})"
+            )
+
+
+assert WINDOW_COLUMNS[:5] == (*STATES[3:6], "r_fb", "delta_fb"), "a window's row begins like the controller's state"
+assert len(INPUTS) == 2, "and ends with the increments"

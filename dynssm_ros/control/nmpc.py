@@ -1,0 +1,357 @@
+"""Nonlinear model predictive control of a car on a track, one quadratic program per control step (real-time iteration).
+
+The plan of the step before, moved on by one step, is where dynamics, borders and reference are linearised (multiple
+shooting: its gaps are closed by the program). The states are then eliminated, so that what is left to optimise are the
+``2 N`` increments of throttle and steering and a slack per soft constraint: a dense program for an active-set solver.
+
+Actuator limits are hard; the borders, and the speed at the end of the horizon where the objective asks for it, are soft
+with a linear penalty, so that a program is feasible wherever the car is.
+
+Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control", 2005.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, PARAMETERS, STATES, HorizonModel
+from dynssm_ros.control.reference import Reference
+from dynssm_ros.simulation.tracks import Track
+from dynssm_ros.vehicle import COEFFICIENTS, Applied
+from dynssm_ros.vehicle.parameters import InputLimits
+
+Vector = npt.NDArray[np.float64]
+Objective = Literal["tracking", "progress"]
+Status = Literal["solved", "infeasible", "late"]
+
+V_X, R, DELTA = (STATES.index(name) for name in ("v_x", "r", "delta"))
+_FIRST_ROUNDS = 10  # programs that the first plan takes to settle
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What the controller minimises, summed over the steps of the horizon.
+
+    Attributes:
+        along: of the squared distance from the reference point along the line (1/m^2).
+        across: likewise across it (1/m^2).
+        progress: gain per metre that the horizon's last point lies further along the line (1/m).
+        throttle: of the squared increment of the throttle (1).
+        steering: of the squared increment of the steering (1/rad^2).
+        border: price of the distance beyond a border (1/m), and of its square (1/m^2).
+        top_speed: likewise of speed above the line's own at the end of the horizon (s/m, s^2/m^2); 0: not bounded.
+    """
+
+    along: float
+    across: float
+    progress: float
+    throttle: float = 0.005
+    steering: float = 1.0
+    border: float = 10.0
+    top_speed: float = 0.0
+
+
+WEIGHTS: Mapping[Objective, Weights] = {
+    # Q and R of the literature: bayesrace and Deep Dynamics
+    "tracking": Weights(along=1.0, across=1.0, progress=0.0),
+    # a point of the last plan draws as the reference does, so that no plan strays from where it was linearised
+    "progress": Weights(along=1.0, across=1.0, progress=0.15, top_speed=10.0),
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the controller works.
+
+    Attributes:
+        objective: ``tracking`` follows the reference at its own speed; ``progress`` goes as far as it can between the
+            borders, and not faster at the end of the horizon than the reference is there.
+        N: steps of the horizon.
+        deadline: time (s) after which a plan comes too late and is not used.
+        margin: distance to keep between the car's centre and the borders (m).
+    """
+
+    objective: Objective = "tracking"
+    N: int = 15
+    deadline: float = math.inf
+    margin: float = 0.0
+
+    @property
+    def weights(self) -> Weights:
+        """Those of the objective."""
+        return WEIGHTS[self.objective]
+
+
+class Adapted(NamedTuple):
+    """What a model says of the steps of the horizon."""
+
+    theta: Vector
+    """Coefficients, shape ``(17,)`` for all steps or ``(N, 17)``."""
+    correction: Vector
+    """Added to the stepped ``v_x, v_y, omega`` (m/s, m/s, rad/s), shape ``(3,)`` or ``(N, 3)``."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A horizon.
+
+    Attributes:
+        x: states in the order of ``STATES`` and the car's memory, shape ``(N + 1, size)``.
+        u: increments of throttle (fraction) and steering (rad), shape ``(N, 2)``.
+        status: whether it was solved, or why it is the plan of the step before, moved on.
+    """
+
+    x: Vector
+    u: Vector
+    status: Status = "solved"
+
+    def shifted(self) -> Plan:
+        """The same plan one step later; the last step is repeated with the inputs held."""
+        return Plan(np.concatenate([self.x[1:], self.x[-1:]]), np.concatenate([self.u[1:], np.zeros((1, len(INPUTS)))]))
+
+
+class _Program(NamedTuple):
+    """A quadratic program: minimise ``z' H z / 2 + g' z`` with ``low <= A z <= high`` and ``z_low <= z <= z_high``."""
+
+    H: Vector
+    g: Vector
+    A: Vector
+    low: Vector
+    high: Vector
+    z_low: Vector
+    z_high: Vector
+
+
+class Nmpc:
+    """The controller of one car on one track; it remembers its last plan.
+
+    Args:
+        model: the car inside.
+        limits: of the actuators.
+        reference: the line.
+        track: whose borders hold.
+        settings: how it works.
+        clock: time now (s), of any origin, by which a plan is late.
+    """
+
+    def __init__(
+        self,
+        model: HorizonModel,
+        limits: InputLimits,
+        reference: Reference,
+        track: Track,
+        settings: Settings,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        import casadi as ca  # takes a while, and most of the command line does without
+
+        if model.N != settings.N:
+            raise ValueError(f"the model has {model.N} steps, the settings {settings.N}")
+        self.model = model
+        self.settings = settings
+        self._limits = limits
+        self._reference = reference
+        self._track = track
+        self._clock = clock
+        self._plan: Plan | None = None
+        self._on_track = self._on_line = 0.0
+        N = settings.N
+        self._variables = 2 * N + N + 1  # increments, slacks of the borders, slack of the speed
+        self._rows = 2 * N + 2 * N + 1  # actuators, both borders, speed
+        shape = {"h": ca.Sparsity.dense(self._variables, self._variables)}
+        shape["a"] = ca.Sparsity.dense(self._rows, self._variables)
+        self._solver = ca.conic("program", "daqp", shape, {"error_on_fail": False})
+
+    @property
+    def outlook(self) -> Plan | None:
+        """The plan as it stands before the next step: the last one, moved on."""
+        return None if self._plan is None else self._plan.shifted()
+
+    def plan(self, now: Vector, adapted: Adapted, t: float = 0.0) -> Plan:
+        """Plans from ``now`` on.
+
+        Args:
+            now: present state in the order of ``STATES`` and the car's memory, shape ``(size,)``.
+            adapted: what the model says; see :class:`Adapted`.
+            t: time since the start of the drive (s), for effects that read it.
+
+        Returns:
+            The plan whose first step is to be driven. It is finite and within the actuators' limits, whatever came in.
+        """
+        began = self._clock()
+        first, sound = self._plan is None, bool(np.all(np.isfinite(now)))
+        if not sound:  # what is not measured is taken as it was planned
+            now = np.where(np.isfinite(now), now, 0.0 if self._plan is None else self._plan.x[1])
+        self._locate(now)
+        guess = self._first_guess(now) if self._plan is None else self._plan.shifted()
+        plan = guess if sound else None
+        for _ in range(_FIRST_ROUNDS if first else 1):
+            plan = None if plan is None else self._improved(now, plan, adapted, t)
+        if plan is None:
+            plan = self._held(now, guess, adapted, t, "infeasible")
+        self._plan = plan
+        if not first and self._clock() - began > self.settings.deadline:
+            return self._held(now, guess, adapted, t, "late")
+        return plan
+
+    def command(self, plan: Plan) -> Applied:
+        """Absolute throttle and steering of the plan's first step, within the limits."""
+        reach = self._limits.steering_rate * self.model.car.T_s
+        turn = min(max(plan.u[0, 1], -reach), reach)  # the solver's tolerance is 1e-6
+        return Applied(*self._within(plan.x[0, R] + plan.u[0, 0], plan.x[0, DELTA] + turn))
+
+    def _locate(self, now: Vector) -> None:
+        near = self._plan is not None
+        self._on_track = float(self._track.project(now[:2], self._on_track if near else None)[0])
+        self._on_line = float(self._reference.line.project(now[:2], self._on_line if near else None)[0])
+
+    def _first_guess(self, now: Vector) -> Plan:
+        """Along the reference at its own speed."""
+        N, line = self.settings.N, self._reference.line
+        s = self._reference.ahead(self._on_line, self._times(0))
+        x = np.tile(now, (N + 1, 1))
+        x[1:, :2] = line.position(s)[1:]
+        heading = line.heading(s)
+        x[1:, 2] = now[2] + np.cumsum((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi)
+        x[1:, V_X] = np.maximum(self._reference.speed_at(s)[1:], now[V_X])
+        return Plan(x, np.zeros((N, len(INPUTS))))
+
+    def _times(self, first: int) -> Vector:
+        """Times of the steps ``first`` to ``N`` from now (s)."""
+        return np.arange(first, self.settings.N + 1, dtype=np.float64) * self.model.car.T_s
+
+    def _parameters(self, adapted: Adapted, t: float) -> Vector:
+        p = np.empty((self.settings.N, PARAMETERS))
+        p[:, : len(COEFFICIENTS)] = adapted.theta
+        p[:, len(COEFFICIENTS) : -len(CONTEXT)] = adapted.correction
+        p[:, -3] = t + self._times(0)[:-1]
+        p[:, -2] = self._on_track
+        p[:, -1] = self._track.length
+        return p
+
+    def _improved(self, now: Vector, guess: Plan, adapted: Adapted, t: float) -> Plan | None:
+        """The solution of the program around ``guess``; ``None`` if there is none."""
+        x = np.concatenate([now[None], guess.x[1:]])
+        following, by_x, by_u = self.model.linearised(x[:-1], guess.u, self._parameters(adapted, t))
+        if not all(np.all(np.isfinite(each)) for each in (following, by_x, by_u)):
+            return None
+        offset, slope = _condensed(x, guess.u, following, by_x, by_u)
+        program = self._program(now, x, offset, slope)
+        if not all(np.all(np.isfinite(each)) for each in program[:3]):
+            return None
+        solution = self._solver(
+            h=program.H, g=program.g, a=program.A, lba=program.low, uba=program.high, lbx=program.z_low,
+            ubx=program.z_high,
+        )  # fmt: skip
+        u = np.asarray(solution["x"]).ravel()[: 2 * self.settings.N]
+        states = offset + slope @ u
+        if not (self._solver.stats()["success"] and np.all(np.isfinite(u)) and np.all(np.isfinite(states))):
+            return None
+        return Plan(states, u.reshape(-1, len(INPUTS)))
+
+    def _program(self, now: Vector, guess: Vector, offset: Vector, slope: Vector) -> _Program:
+        """The program in increments and slacks; states are ``offset + slope @ increments``."""
+        N, w = self.settings.N, self.settings.weights
+        positions, moves = offset[1:, :2], slope[1:, :2]
+        at = self._reference_points(guess)
+        point, heading = self._reference.line.position(at), self._reference.line.heading(at)
+        tangent, normal = _directions(heading)
+        H, g = np.zeros((self._variables,) * 2), np.zeros(self._variables)
+        for direction, weight in ((tangent, w.along), (normal, w.across)):
+            errors = np.einsum("ki,ki->k", direction, positions - point)
+            by_u = np.einsum("ki,kij->kj", direction, moves)
+            H[: 2 * N, : 2 * N] += 2 * weight * by_u.T @ by_u
+            g[: 2 * N] += 2 * weight * by_u.T @ errors
+        g[: 2 * N] -= w.progress * tangent[-1] @ moves[-1]
+        diagonal = np.concatenate([np.tile([w.throttle, w.steering], N), np.full(N, w.border), [max(w.top_speed, 1.0)]])
+        H[np.diag_indices(self._variables)] += 2 * diagonal
+        g[2 * N : 3 * N] = w.border
+        g[3 * N] = w.top_speed
+
+        A = np.zeros((self._rows, self._variables))
+        low, high = np.full(self._rows, -np.inf), np.full(self._rows, np.inf)
+        for k, (bounds, held) in enumerate(((self._limits.throttle, now[R]), (self._limits.steering, now[DELTA]))):
+            rows = slice(k * N, (k + 1) * N)
+            A[rows, k : 2 * N : 2] = np.tri(N)
+            low[rows], high[rows] = bounds[0] - held, bounds[1] - held
+        self._add_borders(A[2 * N : 4 * N], low[2 * N : 4 * N], high[2 * N : 4 * N], guess, positions, moves)
+        if w.top_speed > 0:
+            A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -1.0
+            high[-1] = self._reference.speed_at(at[-1]) - offset[-1, V_X]
+
+        reach = self._limits.steering_rate * self.model.car.T_s
+        span = self._limits.throttle[1] - self._limits.throttle[0]
+        z_low = np.concatenate([np.tile([-span, -reach], N), np.zeros(N + 1)])
+        z_high = np.concatenate([np.tile([span, reach], N), np.full(N + 1, np.inf)])
+        return _Program(H, g, A, low, high, z_low, z_high)
+
+    def _reference_points(self, guess: Vector) -> Vector:
+        """Where on the line the steps of the horizon are compared with it (m), shape ``(N,)``."""
+        if self.settings.objective == "tracking":
+            return self._reference.ahead(self._on_line, self._times(1))
+        return self._reference.line.project(guess[1:, :2], _along(guess[:, :2], self._on_line))[0]
+
+    def _add_borders(
+        self, A: Vector, low: Vector, high: Vector, guess: Vector, positions: Vector, moves: Vector
+    ) -> None:
+        """Half planes at the feet of the guessed positions on the centre line; both sides share a step's slack."""
+        N = self.settings.N
+        s = self._track.project(guess[1:, :2], _along(guess[:, :2], self._on_track))[0]
+        foot = self._track.centre.position(s)
+        normal = _directions(self._track.centre.heading(s))[1]
+        right, left = (width - self.settings.margin for width in self._track.widths(s))
+        lateral = np.einsum("ki,ki->k", normal, positions - foot)
+        by_u = np.einsum("ki,kij->kj", normal, moves)
+        A[:, : 2 * N] = np.concatenate([by_u, by_u])
+        A[:N, 2 * N : 3 * N], A[N:, 2 * N : 3 * N] = -np.eye(N), np.eye(N)
+        high[:N], low[N:] = left - lateral, -right - lateral
+
+    def _held(self, now: Vector, guess: Plan, adapted: Adapted, t: float, status: Status) -> Plan:
+        """The inputs of ``guess`` from ``now`` on, within the limits, and where they lead."""
+        x, u = np.tile(now, (self.settings.N + 1, 1)), np.zeros_like(guess.u)
+        for k, p in enumerate(self._parameters(adapted, t)):
+            u[k] = np.subtract(self._within(*(x[k, [R, DELTA]] + guess.u[k])), x[k, [R, DELTA]])
+            following = self.model.step(x[k], u[k], p)
+            x[k + 1] = following if np.all(np.isfinite(following)) else guess.x[k + 1]
+        return Plan(x, u, status)
+
+    def _within(self, r: float, delta: float) -> tuple[float, float]:
+        return (
+            float(min(max(r, self._limits.throttle[0]), self._limits.throttle[1])),
+            float(min(max(delta, self._limits.steering[0]), self._limits.steering[1])),
+        )
+
+
+def _condensed(x: Vector, u: Vector, following: Vector, by_x: Vector, by_u: Vector) -> tuple[Vector, Vector]:
+    """Eliminates the states: they are ``offset + slope @ increments``.
+
+    Returns:
+        Shapes ``(N + 1, size)`` and ``(N + 1, size, 2 N)``.
+    """
+    N, size = len(u), x.shape[1]
+    gaps = following - np.einsum("kij,kj->ki", by_x, x[:-1]) - np.einsum("kij,kj->ki", by_u, u)
+    offset, slope = np.empty((N + 1, size)), np.zeros((N + 1, size, 2 * N))
+    offset[0] = x[0]
+    for k in range(N):
+        offset[k + 1] = by_x[k] @ offset[k] + gaps[k]
+        slope[k + 1] = by_x[k] @ slope[k]
+        slope[k + 1, :, 2 * k : 2 * k + 2] += by_u[k]
+    return offset, slope
+
+
+def _along(positions: Vector, s: float) -> Vector:
+    """About where positions after the first lie on a line (m), the first being at ``s``; shape ``(N,)``."""
+    return np.asarray(s + np.cumsum(np.hypot(*np.diff(positions, axis=0).T)))
+
+
+def _directions(heading: Vector) -> tuple[Vector, Vector]:
+    """Unit vectors along and to the left of ``heading``, each ``(N, 2)``."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.stack([c, s], axis=1), np.stack([-s, c], axis=1)

@@ -1,0 +1,240 @@
+"""The table, the figures and the report of a race."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dynssm_ros.control.race import Course, Race
+from dynssm_ros.evaluation.coefficients import coefficient_unit
+from dynssm_ros.evaluation.figures import MEASURED, SYMBOLS, UNITS, WIDTH, model_colours, styled
+from dynssm_ros.evaluation.metrics import CHANNELS
+from dynssm_ros.evaluation.report import Report, Section
+from dynssm_ros.evaluation.tables import Column, Table, Value
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, motion
+from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDelay
+from dynssm_ros.vehicle.single_track import Motion
+
+_STAMPS = 0.5  # s between the time stamps on the map
+VIOLATION = "A violation is the car's centre of gravity outside the borders at any sample."
+
+
+def race_json(races: Sequence[Race]) -> dict[str, Any]:
+    """The result for programs."""
+    course = races[0].course
+    return {
+        "track": course.track.name,
+        "track_length_m": course.track.length,
+        "vehicle": course.vehicle.name,
+        "effects": [entry.model_dump() for entry in course.vehicle.effects],
+        "plant": course.plant,
+        "objective": course.settings.objective,
+        "line": course.reference.name,
+        "line_lap_time_s": course.reference.lap_time,
+        "horizon": course.settings.N,
+        "laps": course.laps,
+        "models": {race.name: race.to_json() for race in races},
+    }
+
+
+def race_table(races: Sequence[Race]) -> Table:
+    """One row per model."""
+    columns = (
+        Column("model", brief=True),
+        Column("lap", "s", best="min", brief=True),
+        Column("violation", brief=True),
+        Column("outside", "m"),
+        Column("v_x", "m/s", "mean", "max", brief=True),
+        Column("|v_y|", "m/s", "mean"),
+        Column("|ω|", "rad/s", "mean"),
+        Column("steering variation", "rad"),
+        Column("p50", "ms", "control step", brief=True),
+        Column("p99", "ms", "control step", brief=True),
+        Column("infeasible", "", "plans"),
+        Column("late", "", "plans"),
+        Column("missing", "", "plans", brief=True),
+    )
+    return Table(columns, [_row(race) for race in races], VIOLATION)
+
+
+def _row(race: Race) -> list[Value]:
+    figures = race.to_json()
+    return [
+        race.name,
+        figures["lap_time_s"],
+        "yes" if figures["violation"] else "no",
+        figures["outside_m"],
+        figures["mean_v_x"],
+        figures["mean_abs_v_y"],
+        figures["mean_abs_omega"],
+        figures["steering_total_variation"],
+        figures["solve_ms"]["p50"],
+        figures["solve_ms"]["p99"],
+        race.infeasible,
+        race.late,
+        race.infeasible + race.late,
+    ]
+
+
+def race_report(races: Sequence[Race]) -> Report:
+    """The race as a page."""
+    course = races[0].course
+    sections = [
+        Section(
+            "Trajectories",
+            f"The path of each model between the borders, with a mark every {_STAMPS:g} s; the line that the controller "
+            "follows is dashed.",
+            trajectories(races),
+        ),
+        Section(
+            "State and commands", "Velocities and what the controller commanded, over the position on the lap.",
+            profiles(races),
+        ),
+        Section(
+            "Forces", "Lateral forces of front and rear axle and the drive force, as the driven car's own equations give "
+            "them for its states and commands.", forces(races),
+        ),
+        Section(
+            "Coefficients",
+            "What each model told the controller, step by step: the coefficients that it moves and what it adds to the "
+            "stepped velocities.",
+            coefficients(races),
+        ),
+    ]  # fmt: skip
+    return Report(f"Race on {course.track.name}", summary(races), sections, _protocol(course), race_table(races))
+
+
+def summary(races: Sequence[Race]) -> str:
+    """The result in a sentence or two."""
+    done = [race for race in races if race.completed]
+    lost = [f"{race.name} {race.failure}" for race in races if not race.completed]
+    outside = [race.name for race in done if race.outside > 0]
+    text = f"No model completed {_laps(races[0].course)}."
+    if done:
+        best = min(done, key=lambda race: float(np.mean(race.lap_times)))
+        text = f"{best.name} is the fastest with {np.mean(best.lap_times):.2f} s a lap."
+    if outside:
+        text += f" Outside the borders: {', '.join(outside)}."
+    return text + (f" Not completed: {'; '.join(lost)}." if lost else "")
+
+
+def _laps(course: Course) -> str:
+    return "a lap" if course.laps == 1 else f"{course.laps} laps"
+
+
+def _protocol(course: Course) -> dict[str, str]:
+    settings, effects = course.settings, course.vehicle.effects
+    return {
+        "Track": f"{course.track.name}, {course.track.length:.4g} m, {_laps(course)}",
+        "Plant": f"{course.vehicle.name}, {course.plant}"
+        + (f", with {', '.join(entry.name for entry in effects)}" if effects else ""),
+        "Start": "rolling, actuators at zero; the first lap counts from there. Until its window is full a model drives "
+        "with its nominal coefficients",
+        "Line": f"{course.reference.name}, {course.reference.line.length:.4g} m, {course.reference.lap_time:.3f} s at its "
+        "own speed",
+        "Controller": f"{settings.objective}, {settings.N} steps of {course.vehicle.sampling_time:g} s, late after "
+        f"{1e3 * settings.deadline:g} ms; {settings.weights}",
+        "Time": "of a control step: model and plan together, the processor's time on one core",
+        "Violation": VIOLATION,
+    }
+
+
+@styled
+def trajectories(races: Sequence[Race]) -> Figure:
+    """Paths on the track with marks at equal times.
+
+    Args:
+        races: on one course.
+    """
+    course, colours = races[0].course, model_colours([race.name for race in races])
+    figure = Figure(figsize=(WIDTH, 0.75 * WIDTH), layout="constrained")
+    axes = figure.subplots()
+    for border in (course.track.left_border, course.track.right_border):
+        axes.plot(*np.concatenate([border, border[:1]]).T, color=MEASURED, lw=1.0)
+    line = course.reference.line.points
+    axes.plot(
+        *np.concatenate([line, line[:1]]).T, color="#777777", lw=0.8, ls="--", label=f"{course.reference.name} line"
+    )
+    T_s = course.vehicle.sampling_time
+    every = max(1, round(_stamp_period(races) / T_s))
+    for race in races:
+        axes.plot(*race.pose[:, :2].T, color=colours[race.name], label=race.name)
+        marks = race.pose[::every]
+        axes.plot(*marks[:, :2].T, ".", color=colours[race.name], ms=4)
+    for k in range(0, len(races[0].time), 2 * every):
+        x, y = (float(value) for value in races[0].pose[k, :2])
+        axes.annotate(f"{races[0].time[k]:.3g} s", (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7)
+    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+def _stamp_period(races: Sequence[Race]) -> float:
+    """Time between marks: ``_STAMPS``, or more where a lap takes minutes."""
+    return _STAMPS * max(1, round(max(float(race.time[-1]) for race in races) / (40 * _STAMPS)))
+
+
+@styled
+def profiles(races: Sequence[Race]) -> Figure:
+    """State and commands over the position on the track."""
+    rows = [(f"{SYMBOLS[c]} ({UNITS[c]})", k, "state") for k, c in enumerate(CHANNELS)]
+    rows += [("throttle", 0, "command"), ("steering (rad)", 1, "command")]
+    return _panels(races, [(label, [getattr(race, what)[:, k] for race in races]) for label, k, what in rows])
+
+
+@styled
+def forces(races: Sequence[Race]) -> Figure:
+    """Axle and drive forces of the driven car over the position on the track."""
+    driven = [_motion(race) for race in races]
+    rows = {"F_fy": "$F_{fy}$ (N)", "F_ry": "$F_{ry}$ (N)", "F_d": "$F_d$ (N)"}
+    return _panels(races, [(label, [getattr(each, name) for each in driven]) for name, label in rows.items()])
+
+
+def _motion(race: Race) -> Motion:
+    """The driven car's equations of motion at what was driven; states of effects are settled."""
+    course = race.course
+    x, y, theta = race.pose.T
+    context = {"t": race.time, "s": race.s, "lap_length": course.track.length, "x": x, "y": y, "theta": theta}
+    effects = [
+        effect for effect in course.vehicle.active_effects if not isinstance(effect, (MeasurementEffect, OdometryDelay))
+    ]
+    nominal = Coefficients(*course.vehicle.nominal)
+    state, command = State(*race.state.T), Applied(*race.command.T)
+    return motion(np, state, command, nominal, course.vehicle.constants, effects, context=context)
+
+
+@styled
+def coefficients(races: Sequence[Race]) -> Figure:
+    """The coefficients that any model moves, and the corrections, over the position on the track."""
+    moving = [k for k in range(len(COEFFICIENTS)) if any(np.ptp(race.theta[:, k]) > 0 for race in races)]
+    rows = [
+        (f"{COEFFICIENTS[k]} ({coefficient_unit(COEFFICIENTS[k])})", [race.theta[:, k] for race in races])
+        for k in moving
+    ]
+    rows += [
+        (f"{SYMBOLS[c]} added ({UNITS[c]})", [race.correction[:, k] for race in races]) for k, c in enumerate(CHANNELS)
+    ]
+    return _panels(races, rows)
+
+
+def _panels(races: Sequence[Race], rows: list[tuple[str, list[Any]]]) -> Figure:
+    """A panel per row, over the distance driven."""
+    colours = model_colours([race.name for race in races])
+    columns = 1 if len(rows) <= 6 else 2
+    lines = -(-len(rows) // columns)
+    figure = Figure(figsize=(WIDTH, 0.6 + 1.35 * lines), layout="constrained")
+    axes = figure.subplots(lines, columns, sharex=True, squeeze=False)
+    for panel, (label, values) in zip(axes.T.flat, rows, strict=False):
+        for race, series in zip(races, values, strict=True):
+            panel.plot(race.s - race.s[0], series, color=colours[race.name], lw=1.0, label=race.name)
+        panel.set_ylabel(label)
+    for spare in list(axes.T.flat)[len(rows) :]:
+        spare.set_visible(False)
+    for bottom in axes[-1]:
+        bottom.set_xlabel("driven along the centre line (m)")
+    figure.align_ylabels()
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure

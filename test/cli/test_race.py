@@ -1,0 +1,43 @@
+"""``dynssm race`` from the shell's point of view."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+SHORT = ("--vehicle", "orca", "--track", "club", "--plant", "euler", "--line", "centre", "--pace", "0.8")
+
+
+def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
+    out, result = tmp_path / "race", tmp_path / "race.json"
+    models = ("--model", "true", "--model", "persistence")
+    status, text, _ = dynssm("race", *SHORT, *models, "--out", out, "--json", result)
+    assert status == 0
+    assert "true" in text
+    content = json.loads(result.read_text())
+    assert content == json.loads((out / "results.json").read_text())
+    assert (content["track"], content["plant"], content["objective"]) == ("club", "euler", "tracking")
+    assert list(content["models"]) == ["true", "persistence"]
+    assert content["models"]["true"]["completed"]
+    assert (out / "report.html").stat().st_size > 50_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--model", "oracle"], "neither a model folder nor one of true"),
+        (["--model", "true", "--model", "true"], "given twice"),
+        (["--model", "true", "--scale", "1", "--lap-length", "20"], "expected one of them"),
+        (["--model", "true", "--line", "racing", "--lap-length", "1"], "expected more than twice the margin"),
+        (["--model", "true", "--start-offset", "0.5"], "expected it on the road"),
+        (["--model", "true", "--objective", "glory"], "Invalid value for '--objective'"),
+        (["--model", "single_track", "--effect", "rocket"], "unknown effect 'rocket'"),
+    ],
+)
+def test_what_cannot_be_raced_is_one_line(dynssm, tmp_path, arguments, complaint):
+    status, _, err = dynssm("race", *SHORT, *arguments, "--out", tmp_path / "race")
+    assert status == 1
+    assert err.count("\n") == 1
+    assert complaint in err
+    assert not (tmp_path / "race").exists()

@@ -1,0 +1,169 @@
+"""The controller, against closed forms and its limits."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.optimize import fsolve
+
+from dynssm_ros.control.nmpc import Adapted
+from dynssm_ros.simulation.plant import Pose, make_plant
+from dynssm_ros.vehicle import Applied, Coefficients, State, motion
+
+
+def nominal(vehicle):
+    return Adapted(vehicle.nominal, np.zeros(3))
+
+
+def state_vector(pose, state, feedback=(0.0, 0.0)):
+    return np.array([*pose, *state, *feedback])
+
+
+def steady_turn(vehicle, speed, yaw_rate):
+    """Sideways velocity, throttle and steering at which the car turns steadily."""
+    theta = Coefficients(*vehicle.nominal)
+
+    def rates(unknown):
+        q = motion(np, State(speed, unknown[0], yaw_rate), Applied(*unknown[1:]), theta, vehicle.constants)
+        return [q.a_x, q.a_y, q.omega_dot]
+
+    return fsolve(rates, [0.0, 0.3, 0.06 * np.sign(yaw_rate)], xtol=1e-12)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_circle_is_held_with_the_inputs_of_the_steady_turn(symmetric_orca, circle, controller, side):
+    """Radius 1 m at 1.5 m/s: after the transient the car turns as Newton's equations say, on the line."""
+    track, reference = circle(side)
+    nmpc, feedback = controller(track, reference), Applied(0.0, 0.0)
+    plant = make_plant(symmetric_orca, "rk4", Pose(1.0, 0.0, side * np.pi / 2), State(1.5, 0.0, side * 1.5))
+    for k in range(60):
+        now = state_vector(plant.pose, plant.state, feedback)
+        feedback = nmpc.command(nmpc.plan(now, nominal(symmetric_orca), 0.02 * k))
+        plant.advance(feedback)
+    speed = np.hypot(plant.state.v_x, plant.state.v_y)
+    assert speed == pytest.approx(1.5, rel=2e-3)
+    assert np.hypot(*plant.pose[:2]) == pytest.approx(1.0, abs=2e-3)
+    v_y, r, delta = steady_turn(symmetric_orca, plant.state.v_x, plant.state.omega)
+    assert plant.state.v_y == pytest.approx(v_y, rel=0.02)
+    assert feedback.r == pytest.approx(r, rel=0.02)
+    assert feedback.delta == pytest.approx(delta, rel=0.02)
+
+
+@pytest.mark.parametrize("objective", ["tracking", "progress"])
+def test_left_and_right_are_mirror_images(symmetric_orca, circle, controller, objective):
+    plans = []
+    for side in (1, -1):
+        nmpc = controller(*circle(side), objective)
+        now = state_vector((1.03, 0.0, side * 1.7), (1.4, side * 0.02, side * 1.2), (0.2, side * 0.05))
+        nmpc.plan(now, nominal(symmetric_orca))
+        plans.append(nmpc.plan(now, nominal(symmetric_orca)))
+    left, right = plans
+    assert left.status == right.status == "solved"
+    np.testing.assert_allclose(left.u, right.u * [1, -1], atol=1e-6)
+    np.testing.assert_allclose(left.x, right.x * [1, -1, -1, 1, -1, -1, 1, -1], atol=1e-6)
+
+
+@pytest.mark.parametrize("objective", ["tracking", "progress"])
+def test_plans_stay_within_the_actuators(orca, club, club_line, controller, objective):
+    """From far beside the line and at odd headings the actuators are wanted at their stops and not beyond."""
+    limits, reached = orca.inputs, []
+    reach = limits.steering_rate * orca.sampling_time
+    for lateral, turn, s in ((-0.15, -0.6, 1.0), (0.15, -0.6, 5.0), (-0.15, 0.6, 5.0)):
+        nmpc = controller(club, club_line, objective)
+        (x, y), heading = club.centre.position(s, lateral), float(club.centre.heading(s))
+        now = state_vector((x, y, heading + turn), (1.0, 0.0, 0.0), (0.3, 0.1))
+        for _ in range(3):
+            plan = nmpc.plan(now, nominal(orca))
+            r, delta = 0.3 + np.cumsum(plan.u[:, 0]), 0.1 + np.cumsum(plan.u[:, 1])
+            assert limits.throttle[0] - 1e-6 <= r.min() <= r.max() <= limits.throttle[1] + 1e-6
+            assert limits.steering[0] - 1e-6 <= delta.min() <= delta.max() <= limits.steering[1] + 1e-6
+            assert np.max(np.abs(plan.u[:, 1])) <= reach + 1e-6
+            reached.append(np.max(np.abs(plan.u[:, 1])))
+    assert max(reached) > 0.99 * reach
+
+
+def test_the_plan_is_where_the_car_goes(orca, club, club_line, controller):
+    """On an undisturbed car the gaps of multiple shooting close: the plan is the simulation of its inputs."""
+    nmpc = controller(club, club_line)
+    (x, y), heading = club_line.line.position(0.0), float(club_line.line.heading(0.0))
+    now = state_vector((x, y, heading), (float(club_line.speed_at(0.0)), 0.0, 0.0))
+    for _ in range(15):
+        plan = nmpc.plan(now, nominal(orca))
+        nmpc._plan = type(plan)(np.concatenate([now[None], plan.x[:-1]]), np.concatenate([plan.u[:1], plan.u[:-1]]))
+    parameters = nmpc._parameters(nominal(orca), 0.0)
+    for k, u in enumerate(plan.u):
+        np.testing.assert_allclose(nmpc.model.step(plan.x[k], u, parameters[k]), plan.x[k + 1], atol=2e-3)
+
+
+def test_borders_bend_the_plan(orca, circle, controller):
+    """A line that runs 5 cm outside of the road is left for the road."""
+    track, _ = circle()
+    _, outside = circle(radius=1.25)
+    nmpc = controller(track, outside)
+    now = state_vector((1.15, 0.0, np.pi / 2), (1.5, 0.0, 1.4), (0.2, 0.06))
+    for _ in range(5):
+        plan = nmpc.plan(now, nominal(orca))
+    assert np.max(np.hypot(*plan.x[:, :2].T)) == pytest.approx(1.18, abs=0.012)  # 2 cm short of the border
+
+
+def test_progress_is_faster_than_the_line_and_ends_as_slow(orca, circle, controller):
+    track, reference = circle(speed=1.5)
+    nmpc = controller(track, reference, "progress")
+    now = state_vector((1.0, 0.0, np.pi / 2), (1.3, 0.0, 1.3), (0.2, 0.06))
+    for _ in range(5):
+        plan = nmpc.plan(now, nominal(orca))
+    assert plan.x[-1, 3] == pytest.approx(1.5, abs=0.05)
+    assert np.max(plan.x[:, 3]) > 1.5
+
+
+def test_an_infeasible_program_gives_the_plan_before_moved_on(orca, club, club_line, controller):
+    nmpc = controller(club, club_line)
+    (x, y), heading = club_line.line.position(0.0), float(club_line.line.heading(0.0))
+    now = state_vector((x, y, heading), (float(club_line.speed_at(0.0)), 0.0, 0.0))
+    before = nmpc.plan(now, nominal(orca))
+    now = before.x[1]
+    for bad in (np.nan, np.inf, 1e300):
+        plan = nmpc.plan(now, Adapted(np.full(17, bad), np.zeros(3)))
+        assert plan.status == "infeasible"
+        np.testing.assert_allclose(plan.u[0], before.u[1], atol=1e-12)
+        assert np.all(np.isfinite(plan.x))
+        nmpc._plan = before
+    assert nmpc.plan(now, nominal(orca)).status == "solved"
+
+
+def test_a_wheel_beyond_its_stop_is_infeasible_and_commanded_to_the_stop(orca, club, club_line, controller):
+    nmpc = controller(club, club_line)
+    (x, y), heading = club_line.line.position(0.0), float(club_line.line.heading(0.0))
+    now = state_vector((x, y, heading), (1.5, 0.0, 0.0), (0.0, 0.8))
+    plan = nmpc.plan(now, nominal(orca))
+    assert plan.status == "infeasible"
+    assert nmpc.command(plan).delta == orca.inputs.steering[1]
+
+
+def test_nothing_that_is_measured_makes_a_command_that_is_not_finite(orca, club, club_line, controller):
+    nmpc = controller(club, club_line)
+    (x, y), heading = club_line.line.position(0.0), float(club_line.line.heading(0.0))
+    good = state_vector((x, y, heading), (1.5, 0.0, 0.0))
+    nmpc.plan(good, nominal(orca))
+    for k in range(len(good)):
+        now = good.copy()
+        now[k] = np.nan
+        plan = nmpc.plan(now, nominal(orca))
+        command = nmpc.command(plan)
+        assert plan.status == "infeasible"
+        assert np.all(np.isfinite(command))
+        assert orca.inputs.throttle[0] <= command.r <= orca.inputs.throttle[1]
+        assert orca.inputs.steering[0] <= command.delta <= orca.inputs.steering[1]
+    assert nmpc.plan(good, nominal(orca)).status == "solved"
+
+
+def test_a_late_plan_is_not_driven(orca, club, club_line, controller):
+    """A clock that jumps a second per look makes every plan late but the first, which has nothing to fall back on."""
+    ticks = itertools.count()
+    nmpc = controller(club, club_line, deadline=0.5, clock=lambda: float(next(ticks)))
+    (x, y), heading = club_line.line.position(0.0), float(club_line.line.heading(0.0))
+    now = state_vector((x, y, heading), (1.5, 0.0, 0.0))
+    before = nmpc.plan(now, nominal(orca))
+    plan = nmpc.plan(before.x[1], nominal(orca))
+    assert (before.status, plan.status) == ("solved", "late")
+    np.testing.assert_allclose(plan.u[0], before.u[1], atol=1e-12)

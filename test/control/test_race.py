@@ -1,0 +1,93 @@
+"""Laps in closed loop."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dynssm_ros.control.learned import load_knowledge, true_model
+from dynssm_ros.control.nmpc import Settings
+from dynssm_ros.control.race import Course, Start, race
+from dynssm_ros.control.report import race_json, race_report, race_table, summary
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.simulation.laps import SimulationError
+
+
+@pytest.fixture(scope="module")
+def course(orca, club, club_line):
+    return Course(orca, club, "euler", club_line, Settings("tracking", 15, 0.02, 0.02))
+
+
+@pytest.fixture(scope="module")
+def lap(course, orca):
+    """A lap of the true model; the car has 5 cm to make up at the start."""
+    return race(replace(course, start=Start(lateral=0.05)), true_model(orca, "euler"))
+
+
+def test_the_true_model_completes_a_lap_close_to_what_the_line_allows(lap, course):
+    assert lap.completed
+    assert lap.outside == 0.0
+    assert (lap.infeasible, lap.late) == (0, 0)
+    assert lap.lap_times[0] == pytest.approx(course.reference.lap_time, rel=0.03)
+    assert len(lap.time) == int(lap.lap_times[0] / 0.02) + 2
+
+
+def test_commands_respect_the_actuators(lap, orca):
+    limits = orca.inputs
+    assert limits.throttle[0] <= lap.command[:, 0].min() < lap.command[:, 0].max() <= limits.throttle[1]
+    assert np.max(np.abs(lap.command[:, 1])) <= limits.steering[1]
+    assert np.max(np.abs(np.diff(lap.command[:, 1], prepend=0.0))) <= limits.steering_rate * 0.02 + 1e-9
+
+
+def test_the_json_is_that_of_the_contract(lap):
+    content = race_json([lap])
+    assert content["track"] == "club"
+    figures = content["models"]["true"]
+    assert {
+        "lap_time_s", "violation", "mean_v_x", "mean_abs_v_y", "mean_abs_omega", "steering_total_variation", "solve_ms",
+        "completed",
+    } <= set(figures)  # fmt: skip
+    assert (figures["violation"], figures["completed"]) == (False, True)
+    assert figures["lap_time_s"] == lap.lap_times[0]
+    assert figures["mean_v_x"] == pytest.approx(np.mean(lap.state[:, 0]))
+    assert figures["steering_total_variation"] == pytest.approx(
+        abs(lap.command[0, 1]) + np.sum(np.abs(np.diff(lap.command[:, 1])))
+    )
+    assert 0 < figures["solve_ms"]["p50"] <= figures["solve_ms"]["p99"]
+
+
+def test_the_report_shows_every_model(lap, course, orca, tmp_path):
+    other = replace(lap, name="other", theta=lap.theta * np.linspace(1, 1.1, len(lap.time))[:, None], failure="spins")
+    race_report([lap, other]).save(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    for words in ("Trajectories", "Coefficients", "other", "Forces", "rolling"):
+        assert words in text
+    assert "Not completed: other spins" in summary([lap, other])
+    assert len(race_table([lap, other]).cells) == 2
+
+
+def test_a_car_that_leaves_the_road_is_stopped_and_said_so(course, orca):
+    """Towards the border at top speed, no controller keeps the 1:43 car on the road."""
+    lost = race(replace(course, start=Start(s=1.0, speed=12.0)), true_model(orca, "euler"))
+    assert not lost.completed
+    assert lost.outside > 0
+    assert lost.to_json()["lap_time_s"] is None
+    assert "after" in lost.failure
+
+
+@pytest.mark.parametrize(
+    ("start", "complaint"),
+    [
+        (Start(lateral=0.5), "expected it on the road, -0.2 to 0.2 m"),
+        (Start(speed=0.0), "expected a rolling start"),
+    ],
+)
+def test_impossible_starts_are_refused(course, orca, start, complaint):
+    with pytest.raises(SimulationError, match=complaint):
+        race(replace(course, start=start), true_model(orca, "euler"))
+
+
+def test_a_model_that_needs_what_is_not_measured_is_refused(course, orca):
+    banked = orca.with_effect("road_bank", {"roll_gain": 1.0})
+    with pytest.raises(ConfigurationError, match="needs the signal roll"):
+        race(course, load_knowledge("single_track", banked, banked, "euler"))
