@@ -60,7 +60,7 @@ def calibrate(
     for combination in result.unidentified:
         terms = " ".join(f"{weight:+g} {name}" for name, weight in combination.items())
         console.print(f"not determined by these data: {terms} (in units of their ranges)", soft_wrap=True)
-    console.print(f"{out} written")
+    console.print(f"{out} written", soft_wrap=True)
 
 
 def coefficient_table(result: Calibration) -> Table:

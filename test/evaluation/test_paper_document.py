@@ -82,9 +82,22 @@ def scores():
 def make(scores):
     """Results of the study ``unseen`` alone; keywords replace parts."""
     plan = load_plan()
-    study = plan.studies["unseen"].model_copy(update={"models": MODELS})
+    study = plan.studies["unseen"].model_copy(update={"models": MODELS, "splits": tuple(SPLITS)})
+    right = plan.splits["right"]
+    third = right.model_copy(update={"test": {SPLITS["straight"]: next(iter(right.test.values()))}})
+    seeds = {
+        name: model.model_copy(update={"seeds": 1 if name == "ddm_av21" else None})
+        for name, model in plan.models.items()
+    }
     cars = {name: car.model_copy(update={"coefficients": "unseen"}) for name, car in plan.cars.items()}
-    plan = plan.model_copy(update={"studies": {"unseen": study}, "cars": cars})
+    plan = plan.model_copy(
+        update={
+            "studies": {"unseen": study},
+            "cars": cars,
+            "models": seeds,
+            "splits": plan.splits | {"straight": third},
+        }
+    )
     cost = {"parameters": 10, "flops": 20, "latency_us": {"p50": 5.0, "p99": 6.0}, "integrator": "euler", "substeps": 1}
 
     def results(**changes):

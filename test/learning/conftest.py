@@ -25,7 +25,7 @@ SMALL: dict[str, Any] = {
     "ssm": {"channels": 4, "states": 2},
     "gru": {"hidden": 4},
     "fusion": {"hidden": 8, "latent": 6},
-    "physics": {"nominal": "mid_range"},  # so that there is something to learn
+    "physics": {},
     "adaptation": {"hidden": 6, "alpha": 0.5},
     "residual": {"hidden": [8], "scale": 1.0},
     "loss": {"parameters": 0.001},
