@@ -11,6 +11,7 @@ from dynssm_ros.learning.configuration import load_model_config
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.training import train
 from dynssm_ros.nodes.live import run_live
+from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, load_signal_map
@@ -41,7 +42,8 @@ def test_every_odometry_message_after_the_first_window_gets_a_prediction(
     run = run_live(model, tmp_path / "bag", 0.04, rate=speed, duration=seconds)
     assert len(run.sent) >= seconds * rate
     assert run.missing() == []
-    assert min(run.predicted) - run.T_s == sorted(run.sent)[round(14 * 0.04 * rate)]
+    before_the_first = round((open_artifact(model).card.window - 1) * 0.04 * rate)
+    assert min(run.predicted) - run.T_s == sorted(run.sent)[before_the_first]
     # and they are predictions of this car: two epochs do not beat persistence everywhere, but they are as close
     rows = {int(t): k for k, t in enumerate(driving.time)}
     stamps = [s for s in run.predicted if s in rows and s - run.T_s in rows]
