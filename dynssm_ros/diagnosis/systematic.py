@@ -1,0 +1,126 @@
+"""How much of an error is systematic: repeats at the same place lap after lap, or follows from the signals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.diagnosis.windows import Windows
+from dynssm_ros.evaluation.metrics import CHANNELS
+
+Vector = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+_FOLDS = 5
+_PLACES = 20
+_RIDGE = 3.0
+_SURE = 3.0  # standard errors by which the explanation must be better than none
+
+
+@dataclass(frozen=True)
+class Systematic:
+    """What of the errors at the end of the windows is no noise.
+
+    Attributes:
+        share: of the squared error, by channel, that the signals and the place foretell where they were not fitted to,
+            shape ``(3,)``.
+        by_place: the same from the place on the lap alone; NaN without laps.
+        sure: by how many standard errors the whole is better than no explanation.
+        pattern: the signals that the errors go with most, by channel, with their correlation.
+    """
+
+    share: Vector
+    by_place: Vector
+    sure: float
+    pattern: dict[str, dict[str, float]]
+
+    @property
+    def is_there(self) -> bool:
+        """Whether there is any beyond chance."""
+        return self.sure > _SURE
+
+
+def systematic(windows: Windows, errors: Vector, block: Indices) -> Systematic:
+    """Explains errors by what was going on and where.
+
+    Args:
+        windows: the simulations.
+        errors: theirs, shape ``(W, K, 3)``.
+        block: number of the block in time of each window, shape ``(W,)``; blocks are left out as a whole.
+    """
+    y = errors[:, -1] / np.maximum(np.sqrt((errors[:, -1] ** 2).mean(axis=0)), 1e-12)
+    y = np.clip(y, -4.0, 4.0)
+    signals = _signals(windows)
+    X = _features(np.stack(list(signals.values()), axis=1))
+    places = _places(windows)
+    fold = block * _FOLDS // (block.max() + 1)
+    alone = None if places is None else _foretold(places, y, fold)
+    both = _foretold(X if places is None else np.concatenate([X, places], axis=1), y, fold)
+    better = ((y**2) - (y - both) ** 2).sum(axis=1)
+    sums = np.bincount(block, better)
+    sure = float(sums.sum() / max(np.sqrt((sums**2).sum()), 1e-12))
+    return Systematic(
+        _share(y, both),
+        np.full(3, np.nan) if alone is None else _share(y, alone),
+        sure,
+        {
+            channel: {name: round(value, 2) for name, value in _strongest(signals, y[:, c]).items()}
+            for c, channel in enumerate(CHANNELS)
+        },
+    )
+
+
+def _signals(windows: Windows) -> dict[str, Vector]:
+    """What was going on in each window, on average."""
+    at = windows.starts[:, None] + np.arange(windows.steps)
+    v_x, v_y, omega, r, delta, r_cmd, delta_cmd = windows.data.rows[:, at].mean(axis=2)
+    change = windows.data.rows[:, windows.starts + windows.steps] - windows.data.rows[:, windows.starts]
+    span = windows.steps * windows.data.T_s
+    return {
+        "speed": v_x,
+        "lateral acceleration": v_x * omega,
+        "longitudinal acceleration": change[0] / span,
+        "yaw acceleration": change[2] / span,
+        "steering": delta + delta_cmd,
+        "steering speed": change[4] / span,
+        "throttle": r + r_cmd,
+        "sideslip": v_y / np.maximum(v_x, 0.1),
+        "time": windows.time,
+    }
+
+
+def _features(signals: Vector) -> Vector:
+    spread = signals.std(axis=0)
+    z = (signals - signals.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    pairs = [z[:, i] * z[:, j] for i in range(z.shape[1]) for j in range(i, z.shape[1])]
+    return np.concatenate([np.ones((len(z), 1)), z, np.stack(pairs, axis=1)], axis=1)
+
+
+def _places(windows: Windows) -> Vector | None:
+    if "s" not in windows.data.context:
+        return None
+    here = windows.context(windows.steps // 2)
+    bin_ = np.minimum((here["s"] / here["lap_length"] * _PLACES).astype(int), _PLACES - 1)
+    return np.asarray(np.eye(_PLACES)[bin_])
+
+
+def _foretold(X: Vector, y: Vector, fold: Indices) -> Vector:
+    """What ridge regression on the other parts says of each part."""
+    out = np.zeros_like(y)
+    for part in np.unique(fold):
+        rest = fold != part
+        H = X[rest].T @ X[rest] + _RIDGE * np.eye(X.shape[1])
+        out[~rest] = X[~rest] @ np.linalg.solve(H, X[rest].T @ y[rest])
+    return np.asarray(np.clip(out, -4.0, 4.0))
+
+
+def _share(y: Vector, foretold: Vector) -> Vector:
+    left = ((y - foretold) ** 2).sum(axis=0) / np.maximum((y**2).sum(axis=0), 1e-12)
+    return np.asarray(np.maximum(0.0, 1.0 - left))
+
+
+def _strongest(signals: dict[str, Vector], y: Vector) -> dict[str, float]:
+    known = {name: float(np.corrcoef(x, y)[0, 1]) for name, x in signals.items() if x.std() > 0 and y.std() > 0}
+    return dict(sorted(known.items(), key=lambda item: -abs(item[1]))[:3])
