@@ -18,7 +18,7 @@ from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import load_vehicle
 
-pytestmark = [pytest.mark.xdist_group("dds"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
 
 def test_bench_writes_what_the_contract_promises(small_model: Path, tmp_path: Path) -> None:

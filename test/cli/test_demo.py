@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from dynssm_ros.cli import demo
 from dynssm_ros.cli.main import app
 
-pytestmark = [pytest.mark.xdist_group("dds"), pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.live, pytest.mark.timeout(240)]
 
 
 def test_the_demo_goes_the_whole_way_and_ends_with_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -13,7 +14,7 @@ import pytest
 from dynssm_ros.nodes.live import LiveRun, collecting, isolated_environment, predictor_process
 from dynssm_ros.signals.messages import PREDICTION_TOPIC
 
-pytestmark = [pytest.mark.xdist_group("dds"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
 
 def _player(*parameters: str) -> list[str]:
@@ -57,3 +58,10 @@ def test_a_bag_of_types_that_are_not_installed_names_the_way_out(putnam: Path) -
     assert result.returncode == 1
     assert "raptor_dbw_msgs" in result.stderr
     assert "dynssm extract" in result.stderr
+
+
+def test_a_domain_in_use_is_not_drawn_again() -> None:
+    domain = int(isolated_environment()["ROS_DOMAIN_ID"])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
+        participant.bind(("", 7400 + 250 * domain + 10))
+        assert all(int(isolated_environment()["ROS_DOMAIN_ID"]) != domain for _ in range(200))

@@ -21,7 +21,7 @@ from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.signals.standard import recording_to_bag
 from dynssm_ros.vehicle import COEFFICIENTS
 
-pytestmark = [pytest.mark.xdist_group("dds"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
 H = 5
 

@@ -18,7 +18,7 @@ from dynssm_ros.signals.signal_map import STATE_SIGNALS, load_signal_map
 from dynssm_ros.signals.standard import recording_to_bag
 from dynssm_ros.vehicle import load_vehicle
 
-pytestmark = [pytest.mark.xdist_group("dds"), pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.live, pytest.mark.timeout(180)]
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from dynssm_ros.simulation.laps import drive
 from dynssm_ros.simulation.tracks import load_track
 from dynssm_ros.vehicle import load_vehicle
 
-pytestmark = [pytest.mark.xdist_group("dds"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
 PERIOD = 20_000_000  # ns
 
