@@ -101,6 +101,17 @@ class HindcastConfig(StrictModel):
     uncertainty: bool = Field(
         default=True, description="variance that follows the recent errors, instead of a constant"
     )
+    folds: int = Field(
+        default=1,
+        ge=1,
+        description="stretches of the recording; the variance is fitted to the errors on each by a model trained on the rest "
+        "for a quarter of the epochs. 1: to those on the validation blocks, whose laps the model knows",
+    )
+
+    @property
+    def parts(self) -> int:
+        """How many further models are trained for it."""
+        return self.folds if self.uncertainty and self.folds > 1 else 0
 
 
 class PhysicsConfig(StrictModel):

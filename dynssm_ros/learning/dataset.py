@@ -69,6 +69,12 @@ def split_windows(recording: Recording, H: int, config: TrainingConfig) -> tuple
     return Windows(matrix, torch.tensor(training), H), Windows(matrix, torch.tensor(held), H)
 
 
+def all_windows(recording: Recording, H: int, min_speed: float) -> Windows:
+    """Every window of ``recording`` at ``min_speed`` (m/s) or more."""
+    matrix = torch.tensor(recording.matrix, dtype=torch.float32)
+    return Windows(matrix, torch.tensor(recording.window_ends(H, min_speed=min_speed)), H)
+
+
 def normalisation(recording: Recording, windows: Windows) -> Normalisation:
     """Scales from the training windows.
 

@@ -250,18 +250,32 @@ class DynSSM(nn.Module):
         return torch.cat(parts, dim=-1)
 
     @torch.no_grad()
-    def fit_hindcast(self, window: Tensor, target: Tensor) -> None:
-        """Fits trust and variance to validation windows ``(N, H, 7)`` and their measured increments ``(N, 3)``."""
-        if self.hindcast is None:
-            return
+    def fit_trust(self, window: Tensor, target: Tensor) -> None:
+        """Fits trust to validation windows ``(N, H, 7)`` and their measured increments ``(N, 3)``."""
+        assert self.hindcast is not None
+        hindcasts, happened = self._hindsight(window)
+        freely = self.train()(window).increment / self.increment_scale  # a training step does without trust
+        self.hindcast.fit_trust(hindcasts, happened, freely, target / self.increment_scale)
+
+    @torch.no_grad()
+    def errors(self, window: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors in hindsight ``(N, steps, 3)`` and of the predictions ``(N, 3)`` on windows and measured increments."""
+        hindcasts, happened = self._hindsight(window)
+        return (hindcasts - happened) * self.increment_scale, self.eval()(window).increment - target
+
+    @torch.no_grad()
+    def fit_variance(self, past: Tensor, errors: Tensor) -> None:
+        """Fits the stated variance to what :meth:`errors` gives."""
+        assert self.hindcast is not None
+        self.hindcast.fit_variance(past / self.increment_scale, errors / self.increment_scale)
+
+    def _hindsight(self, window: Tensor) -> tuple[Tensor, Tensor]:
+        """Predictions of the last steps of windows and what happened, each ``(N, steps, 3)`` in units of ``s_delta``."""
+        assert self.hindcast is not None
         increments = self.changes.states(window)
         hindcasts = self._step(window, increments, self.eval()(window).theta).hindcasts
         assert hindcasts is not None
-        happened = increments[:, -self.hindcast.config.steps :]
-        freely = self.train()(window).increment / self.increment_scale  # a training step does without trust
-        self.hindcast.fit_trust(hindcasts, happened, freely, target / self.increment_scale)
-        errors = (self.eval()(window).increment - target) / self.increment_scale
-        self.hindcast.fit_variance(hindcasts, happened, errors)
+        return hindcasts, increments[:, -self.hindcast.config.steps :]
 
     def for_deployment(self) -> DynSSM:
         """Switches the state-space layers to their recurrence and freezes what does not change; returns itself."""

@@ -123,8 +123,9 @@ class Hindcast(nn.Module):
 
     *Trust* scales the prediction of each channel by the regression of what happened on what was predicted, with a prior
     of one: where recent increments could be predicted it stays, where they could not it shrinks towards "no change".
-    *Uncertainty* is a constant and a share of the recent squared errors. The weight of the prior and the variance are
-    fitted on validation data, so that trust costs nothing at home and 90 % intervals cover 90 %.
+    *Uncertainty* is a constant and a share of the recent squared errors. The weight of the prior is fitted on validation
+    data, so that trust costs next to nothing at home, and the variance on data that the model knows as little as the next
+    lap, so that 90 % intervals cover 90 % there.
     """
 
     prior: Tensor
@@ -169,15 +170,14 @@ class Hindcast(nn.Module):
         self.prior.copy_(torch.tensor(candidates)[affordable.int().argmax(dim=0)])
 
     @torch.no_grad()
-    def fit_variance(self, hindcasts: Tensor, happened: Tensor, errors: Tensor) -> None:
+    def fit_variance(self, past: Tensor, errors: Tensor) -> None:
         """Fits the variance: the most likely mixture of a constant and the recent errors, scaled to cover 90 %.
 
         Args:
-            hindcasts: predictions in hindsight ``(N, steps, 3)``.
-            happened: the measured increments that they are of.
+            past: errors of the predictions in hindsight ``(N, steps, 3)``.
             errors: of the predictions themselves, ``(N, 3)``.
         """
-        square, recent = errors.square(), _mean_square(hindcasts - happened)
+        square, recent = errors.square(), _mean_square(past)
         tiny = torch.finfo(square.dtype).tiny
         mean, of_recent = square.mean(dim=0).clamp(min=tiny), recent.mean(dim=0).clamp(min=tiny)
         shares = torch.linspace(0.0, 0.95, 20)

@@ -20,7 +20,7 @@ from dynssm_ros.files import replacing
 from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.calibration import calibrate
 from dynssm_ros.learning.configuration import LossConfig, ModelConfig, TrainingConfig
-from dynssm_ros.learning.dataset import Windows, normalisation, split_windows
+from dynssm_ros.learning.dataset import Windows, all_windows, normalisation, split_windows
 from dynssm_ros.learning.ddm import DDM
 from dynssm_ros.learning.dynssm import DynSSM
 from dynssm_ros.learning.fthd import freeze, physics_loss
@@ -36,6 +36,7 @@ Progress = Callable[[int, int, str], None]
 """Called after each epoch with epochs done, epochs at most, and a line about them."""
 
 _LEARNING_RATE_FLOOR = 0.02  # the cosine schedule ends at this fraction of the learning rate
+_SHORTER = 4  # how many times fewer epochs the models have that only tell how large errors are on unknown laps
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ def train(
 ) -> Trained:
     """Trains a model; ``checkpoint`` is kept up to date and continued from if it belongs to the same training.
 
-    Fine-tuning has two stages with a checkpoint each, see :func:`checkpoints`; a stage that is done is not repeated.
+    Some trainings have several stages with a checkpoint each, see :func:`checkpoints`: fine-tuning, and the models whose
+    errors on a part that they do not know say how far the prediction can be trusted. A stage that is done is not repeated.
 
     Args:
         recording: training data; validation windows are taken out of it.
@@ -84,18 +86,37 @@ def train(
         RecordingError: another sampling time than the vehicle's, or too little data.
         ConfigurationError: the training diverges at once.
     """
-    if config.fine_tuning is None:
-        return _train(recording, config, vehicle, checkpoint, device, progress)
-    start = config.fine_tuning.starts_from
-    stages = (start.training.epochs, config.training.epochs)
     files = checkpoints(config, checkpoint)
-    ddm = _train(recording, start, vehicle, files[0], device, _stage(progress, start.name, 0, stages))
-    return _train(recording, config, vehicle, files[1], device, _stage(progress, config.name, 1, stages), ddm)
+    if config.fine_tuning is not None:
+        start = config.fine_tuning.starts_from
+        stages: tuple[int, ...] = (start.training.epochs, config.training.epochs)
+        ddm = _train(recording, start, vehicle, files[0], device, _stage(progress, start.name, 0, stages))
+        return _train(recording, config, vehicle, files[1], device, _stage(progress, config.name, 1, stages), ddm)
+    parts = config.hindcast.parts if config.hindcast else 0
+    if not parts:
+        return _train(recording, config, vehicle, checkpoint, device, progress)
+    shorter = config.with_training(epochs=max(1, config.training.epochs // _SHORTER))
+    stages = (config.training.epochs, *[shorter.training.epochs] * parts)
+    trained = _train(recording, config, vehicle, checkpoint, device, _stage(progress, config.name, 0, stages))
+    errors = []
+    for k, file in enumerate(files[1:]):
+        unknown = np.arange(len(recording)) * parts // len(recording) == k
+        report = _stage(progress, f"{config.name} without part {k + 1} of {parts}", k + 1, stages)
+        without = _train(recording.select(~unknown), shorter, vehicle, file, device, report)
+        assert isinstance(without.model, DynSSM)
+        part = recording.select(unknown)
+        errors.append(without.model.errors(*all_windows(part, config.H, config.training.min_speed).batch(slice(None))))
+    assert isinstance(trained.model, DynSSM)
+    trained.model.fit_variance(*(torch.cat(each) for each in zip(*errors, strict=True)))
+    return trained
 
 
 def checkpoints(config: ModelConfig, checkpoint: Path) -> list[Path]:
     """The files that a training with ``checkpoint`` keeps, in the order of its stages."""
-    return [checkpoint] if config.fine_tuning is None else [checkpoint.with_suffix(".start.pt"), checkpoint]
+    if config.fine_tuning is not None:
+        return [checkpoint.with_suffix(".start.pt"), checkpoint]
+    parts = config.hindcast.parts if config.hindcast else 0
+    return [checkpoint, *[checkpoint.with_suffix(f".part{k + 1}.pt") for k in range(parts)]]
 
 
 def _stage(progress: Progress | None, name: str, stage: int, epochs: tuple[int, ...]) -> Progress | None:
@@ -137,8 +158,10 @@ def _train(
             progress
         )
     model = run.model.cpu().eval()
-    if isinstance(model, DynSSM):
-        model.fit_hindcast(*validation.batch(slice(None)))
+    if isinstance(model, DynSSM) and model.hindcast is not None:
+        held = validation.batch(slice(None))
+        model.fit_trust(*held)
+        model.fit_variance(*model.errors(*held))
     return Trained(
         config, vehicle, recording, model, scale, run.history, run.best_epoch,
         validation_rmse(model, replace(validation, H=config.H)), (len(training), len(validation)),

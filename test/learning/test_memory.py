@@ -145,7 +145,7 @@ def test_stated_variance_follows_the_recent_errors_and_covers_nine_in_ten() -> N
     level = torch.tensor([0.5, 2.0]).repeat(20_000)[:, None, None]  # a calm and a rough stretch
     errors = level * torch.randn(40_000, 15, 3, generator=generator)
     past, now = errors[:, :14], errors[:, 14]
-    hindcast.fit_variance(past, torch.zeros_like(past), now)
+    hindcast.fit_variance(past, now)
     std = hindcast.spread(past, torch.zeros_like(past)).sqrt()
     inside = now.abs() <= 1.645 * std
     np.testing.assert_allclose(inside.float().mean(0), 0.9, atol=0.005)
@@ -160,7 +160,7 @@ def test_constant_errors_get_a_constant_variance() -> None:
     hindcast = Hindcast(HindcastConfig(steps=14))
     generator = torch.Generator().manual_seed(0)
     errors = torch.randn(20_000, 15, 3, generator=generator)
-    hindcast.fit_variance(errors[:, :14], torch.zeros(20_000, 14, 3), errors[:, 14])
+    hindcast.fit_variance(errors[:, :14], errors[:, 14])
     constant, share = hindcast.variance
     assert (share < 0.1 * constant).all()
 
