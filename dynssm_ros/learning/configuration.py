@@ -98,6 +98,11 @@ class HindcastConfig(StrictModel):
         gt=0,
         description="least weight of full trust, in squared increments of size s_delta; validation picks",
     )
+    limit: float | None = Field(
+        default=None,
+        gt=0,
+        description="largest residual, in root mean squares of the errors that the physics made over these steps; null: any",
+    )
     uncertainty: bool = Field(
         default=True, description="variance that follows the recent errors, instead of a constant"
     )

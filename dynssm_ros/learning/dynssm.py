@@ -181,21 +181,23 @@ class DynSSM(nn.Module):
         elif self.physics is not None:
             theta = self.nominal.expand(window.shape[0], -1)  # not len(), which an export would freeze
         step = self._step(window, increments, theta)
+        # the network must not learn to lean on hindsight, so training does without
+        judge, hindsight = None if self.training else self.hindcast, step.hindsight
         correction = None
         moved = step.expected
         if self.residual is not None:
             scaled, correction = self.residual(self._residual_input(conditioned, deviation, window, latest, step))
+            if judge is not None and hindsight is not None:
+                scaled = judge.limited(scaled, *hindsight)
             added = self.increment_scale * scaled
             moved = added if moved is None else moved + added
         assert moved is not None
         variance = None
-        if self.hindcast is not None and step.hindcasts is not None:
-            happened = increments[:, -self.hindcast.config.steps :]
-            # the network must not learn to lean on it, so training does without
-            if self.hindcast.config.trust and not self.training:
-                moved = moved * self.hindcast.trust(step.hindcasts, happened)
+        if self.hindcast is not None and hindsight is not None:
+            if judge is not None and judge.config.trust:
+                moved = moved * judge.trust(*hindsight)
             if self.hindcast.config.uncertainty:
-                variance = self.hindcast.spread(step.hindcasts, happened) * self.increment_scale.square()
+                variance = self.hindcast.spread(*hindsight) * self.increment_scale.square()
         return Output(moved, step.physics, theta, deviation, correction, variance)
 
     def _seen(self, window: Tensor, increments: Tensor) -> Tensor:
@@ -223,7 +225,7 @@ class DynSSM(nn.Module):
         return _Step(
             physics * self.increment_scale,
             q[:, -1] * self.increment_scale,
-            q[:, :-1] if steps else None,
+            (q[:, :-1], increments[:, -steps:]) if steps else None,
             torch.cat([physics + mean, error - mean], dim=-1),
         )
 
@@ -254,7 +256,8 @@ class DynSSM(nn.Module):
         """Fits trust to validation windows ``(N, H, 7)`` and their measured increments ``(N, 3)``."""
         assert self.hindcast is not None
         hindcasts, happened = self._hindsight(window)
-        freely = self.train()(window).increment / self.increment_scale  # a training step does without trust
+        self.hindcast.trust_fully()
+        freely = self.eval()(window).increment / self.increment_scale
         self.hindcast.fit_trust(hindcasts, happened, freely, target / self.increment_scale)
 
     @torch.no_grad()
@@ -271,11 +274,10 @@ class DynSSM(nn.Module):
 
     def _hindsight(self, window: Tensor) -> tuple[Tensor, Tensor]:
         """Predictions of the last steps of windows and what happened, each ``(N, steps, 3)`` in units of ``s_delta``."""
-        assert self.hindcast is not None
         increments = self.changes.states(window)
-        hindcasts = self._step(window, increments, self.eval()(window).theta).hindcasts
-        assert hindcasts is not None
-        return hindcasts, increments[:, -self.hindcast.config.steps :]
+        hindsight = self._step(window, increments, self.eval()(window).theta).hindsight
+        assert hindsight is not None
+        return hindsight
 
     def for_deployment(self) -> DynSSM:
         """Switches the state-space layers to their recurrence and freezes what does not change; returns itself."""
@@ -293,8 +295,8 @@ class _Step(NamedTuple):
     """Its increment ``(B, 3)``."""
     expected: Tensor | None = None
     """The same with its memory, if it has one."""
-    hindcasts: Tensor | None = None
-    """Predictions in hindsight of the last steps, ``(B, steps, 3)`` in units of ``s_delta``."""
+    hindsight: tuple[Tensor, Tensor] | None = None
+    """The last steps as predicted in hindsight and as they happened, each ``(B, steps, 3)`` in units of ``s_delta``."""
     outlook: Tensor | None = None
     """Physics with its mean error, and the last error about that mean, ``(B, 6)`` in units of ``s_delta``."""
 

@@ -20,6 +20,7 @@ _LIMIT = 4.0  # in units of s_delta; beyond it the encoders learn nothing more f
 _INPUT_CHANGE = 0.1  # what an input changes in a step, as a share of its standard deviation
 _LARGEST_TRUST = 1.2
 _PRIORS = 8  # candidates, each three times the one before
+_FULL_TRUST = 1e12  # a prior that no evidence moves
 _PREMIUM = 0.01  # what trust may cost at home
 _COVERED, _QUANTILE = 0.9, 1.6448536  # the share of errors within this many standard deviations
 
@@ -123,6 +124,7 @@ class Hindcast(nn.Module):
 
     *Trust* scales the prediction of each channel by the regression of what happened on what was predicted, with a prior
     of one: where recent increments could be predicted it stays, where they could not it shrinks towards "no change".
+    *Limit*: a residual that is larger than the errors that it is there to correct is not believed.
     *Uncertainty* is a constant and a share of the recent squared errors. The weight of the prior is fitted on validation
     data, so that trust costs next to nothing at home, and the variance on data that the model knows as little as the next
     lap, so that 90 % intervals cover 90 % there.
@@ -142,6 +144,18 @@ class Hindcast(nn.Module):
     def trust(self, predicted: Tensor, happened: Tensor) -> Tensor:
         """Factor of the prediction ``(B, 3)`` from hindcasts and what happened, each ``(B, steps, 3)``."""
         return _regression(predicted, happened, self.prior)
+
+    def limited(self, residual: Tensor, predicted: Tensor, happened: Tensor) -> Tensor:
+        """``residual`` ``(B, 3)`` squeezed smoothly below the errors in hindsight, all in units of ``s_delta``."""
+        if self.config.limit is None:
+            return residual
+        errors = torch.sqrt(_mean_square(predicted - happened) + torch.finfo(residual.dtype).tiny)
+        largest: Tensor = self.config.limit * errors
+        return largest * torch.tanh(residual / largest)
+
+    def trust_fully(self) -> None:
+        """Lets no evidence speak against the predictions."""
+        self.prior.fill_(_FULL_TRUST)
 
     def spread(self, predicted: Tensor, happened: Tensor) -> Tensor:
         """Variance of the prediction's error ``(B, 3)``, in units of ``s_delta`` squared."""

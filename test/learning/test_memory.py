@@ -201,3 +201,18 @@ def test_what_cannot_be_is_refused(text: str, message: str, tmp_path: Path) -> N
     (tmp_path / "m.yaml").write_text(f"{text}\nname: m\n")
     with pytest.raises(ConfigurationError, match=message):
         load_model_config(tmp_path / "m.yaml")
+
+
+def test_a_residual_is_not_believed_beyond_the_errors_that_it_is_there_to_correct() -> None:
+    generator = torch.Generator().manual_seed(0)
+    happened = torch.randn(2000, 14, 3, generator=generator)
+    residual = torch.randn(2000, 3, generator=generator)
+    hindcast = Hindcast(HindcastConfig(steps=14, limit=1.0))
+    small = hindcast.limited(residual, happened + 0.01 * torch.randn(2000, 14, 3, generator=generator), happened)
+    assert small.abs().max() < 0.02
+    large = hindcast.limited(residual, happened + 100.0, happened)
+    np.testing.assert_allclose(large, residual, rtol=1e-3)
+    assert torch.equal(
+        hindcast.limited(residual, happened, happened).abs() < 1e-10, torch.ones(2000, 3, dtype=torch.bool)
+    )
+    assert Hindcast(HindcastConfig(steps=14)).limited(residual, happened, happened) is residual
