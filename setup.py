@@ -75,6 +75,7 @@ setup(
             "dynssm = dynssm_ros.cli.main:main",
             "predictor = dynssm_ros.nodes.predictor:main",
             "player = dynssm_ros.nodes.player:main",
+            "controller = dynssm_ros.nodes.controller:main",
             "simulator = dynssm_ros.nodes.simulator:main",
         ],
     },

@@ -18,9 +18,9 @@ ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def table(head: str) -> dict[str, list[str]]:
-    """The README's table whose first column is headed ``head``: cells by the code in the first cell."""
-    lines = README.splitlines()
+def table(head: str, text: str = README) -> dict[str, list[str]]:
+    """The table of ``text`` whose first column is headed ``head``: cells by the code in the first cell."""
+    lines = text.splitlines()
     start = next(k for k, line in enumerate(lines) if line.startswith(f"| {head} |"))
     rows = {}
     for line in lines[start + 2 :]:
@@ -37,19 +37,30 @@ def test_every_command_is_described_and_every_described_one_exists() -> None:
     assert described == registered
 
 
-def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_file() -> None:
-    tree = ast.parse((ROOT / "dynssm_ros" / "nodes" / "predictor.py").read_text(encoding="utf-8"))
-    declared = {
-        node.args[1].value: node.args[2].value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "describe"
-        if isinstance(node.args[1], ast.Constant) and isinstance(node.args[2], ast.Constant)
+def declared_parameters(node: str) -> dict[str, object]:
+    """What a node declares: default values by name."""
+    tree = ast.parse((ROOT / "dynssm_ros" / "nodes" / f"{node}.py").read_text(encoding="utf-8"))
+    return {
+        call.args[1].value: call.args[2].value
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and ast.unparse(call.func) in ("describe", "choose")
+        if isinstance(call.args[1], ast.Constant) and isinstance(call.args[2], ast.Constant)
     }
+
+
+def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_file() -> None:
+    declared = declared_parameters("predictor")
     assert {name: cells[0].strip("`") for name, cells in table("parameter").items()} == {
         name: str(value) for name, value in declared.items()
     }
     shipped = yaml.safe_load((ROOT / "config" / "predictor.yaml").read_text())["/**"]["ros__parameters"]
     assert shipped == declared
+
+
+def test_the_parameters_of_the_controller_are_those_of_its_page() -> None:
+    page = (ROOT / "docs" / "controller.md").read_text(encoding="utf-8")
+    described = {name: cells[0].strip("`") for name, cells in table("parameter", page).items()}
+    assert described == {name: str(value) for name, value in declared_parameters("controller").items()}
 
 
 def test_the_topics_are_those_of_the_default_signal_map_and_of_the_node() -> None:

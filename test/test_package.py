@@ -7,7 +7,7 @@ import importlib.util
 import re
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -165,7 +165,7 @@ def test_every_module_and_template_is_installed(arguments: dict[str, Any]) -> No
 
 def test_commands_lead_to_functions(arguments: dict[str, Any]) -> None:
     targets = dict(script.split(" = ") for script in arguments["entry_points"]["console_scripts"])
-    assert targets.keys() == {"dynssm", "predictor", "player", "simulator"}
+    assert targets.keys() == {"dynssm", "predictor", "player", "simulator", "controller"}
     for target in targets.values():
         module, _, function = target.partition(":")
         path = (ROOT / module.replace(".", "/")).with_suffix(".py")
@@ -226,8 +226,8 @@ class Recorder:
 
 
 @pytest.fixture
-def launch_file(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """The launch file over recording stand-ins of launch and launch_ros."""
+def load_launch(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
+    """Loads a launch file over recording stand-ins of launch and launch_ros."""
     names = {
         "launch": ["LaunchContext", "LaunchDescription"],
         "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction"],
@@ -241,14 +241,23 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
         for name in classes:
             setattr(module, name, type(name, (Recorder,), {}))
         monkeypatch.setitem(sys.modules, module_name, module)
-    return execute(ROOT / "launch" / "predictor.launch.py")
+    return lambda name: execute(ROOT / "launch" / name)
+
+
+@pytest.fixture
+def launch_file(load_launch: Callable[[str], ModuleType]) -> ModuleType:
+    return load_launch("predictor.launch.py")
+
+
+def all_launched(launch_file: ModuleType, **given: str) -> list[Recorder]:
+    """The nodes that the launch file starts when these arguments are given."""
+    *declared, function = launch_file.generate_launch_description().positional[0]
+    values = {argument.positional[0]: argument.named["default_value"] for argument in declared}
+    return function.named["function"](SimpleNamespace(launch_configurations=values | given))
 
 
 def launched(launch_file: ModuleType, **given: str) -> Recorder:
-    """The node that the launch file starts when these arguments are given."""
-    *declared, function = launch_file.generate_launch_description().positional[0]
-    values = {argument.positional[0]: argument.named["default_value"] for argument in declared}
-    (node,) = function.named["function"](SimpleNamespace(launch_configurations=values | given))
+    (node,) = all_launched(launch_file, **given)
     return node
 
 
@@ -281,3 +290,42 @@ def test_launch_arguments_override_the_parameters_file(launch_file: ModuleType) 
     node = launched(launch_file, model="out/model", signals="av21", use_sim_time="true").named
     assert node["parameters"][1] == {"model": "out/model", "signals": "av21", "use_sim_time": True}
     assert launched(launch_file, use_sim_time="false").named["parameters"][1] == {"use_sim_time": False}
+
+
+def declared_parameters(node: str) -> dict[str, object]:
+    """What a node declares: default values by name."""
+    tree = ast.parse((ROOT / PACKAGE / "nodes" / f"{node}.py").read_text(encoding="utf-8"))
+    return {
+        call.args[1].value: ast.literal_eval(call.args[2])
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and ast.unparse(call.func) in ("describe", "choose")
+        if isinstance(call.args[1], ast.Constant)
+    }
+
+
+def test_controller_launch_file_starts_the_stack_that_is_asked_for(load_launch: Callable[[str], ModuleType]) -> None:
+    file = load_launch("controller.launch.py")
+    *declared, _ = file.generate_launch_description().positional[0]
+    assert all(argument.named["description"] for argument in declared)
+    nodes = {node.named["executable"]: node.named for node in all_launched(file, model="out/model", pace="0.7")}
+    assert {name: node["name"] for name, node in nodes.items()} == {
+        "controller": "controller",
+        "simulator": "simulator",
+        "predictor": "dynssm",
+    }
+    assert nodes["predictor"]["parameters"] == [{"model": "out/model"}]
+    assert nodes["simulator"]["parameters"][0]["driver"] == "external"
+    assert nodes["controller"]["parameters"][0]["pace"] == 0.7
+    (alone,) = all_launched(file, simulator="false")
+    assert alone.named["executable"] == "controller"
+
+
+def test_controller_launch_file_passes_only_parameters_that_there_are(
+    load_launch: Callable[[str], ModuleType],
+) -> None:
+    for node in all_launched(load_launch("controller.launch.py"), model="out/model"):
+        known = declared_parameters(node.named["executable"])
+        for name, value in node.named["parameters"][0].items():
+            assert type(value) is type(known[name]), name
+            if name not in ("driver", "model"):
+                assert value == known[name], "the launch file's defaults are the node's"

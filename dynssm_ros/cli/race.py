@@ -8,18 +8,18 @@ from typing import Annotated
 import typer
 
 from dynssm_ros.cli.console import JsonOption, VehicleOption, console, progress_bar
+from dynssm_ros.control.animation import animate
 from dynssm_ros.control.learned import Knowledge, load_knowledge
 from dynssm_ros.control.nmpc import Objective, Settings
-from dynssm_ros.control.race import Course, Start
+from dynssm_ros.control.race import Course, Race, Start
 from dynssm_ros.control.race import race as drive
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.report import race_json, race_report, race_table, summary
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.files import write_json
 from dynssm_ros.simulation.plant import PlantKind
-from dynssm_ros.simulation.racing_line import CAR_WIDTH
 from dynssm_ros.simulation.tracks import Track, load_track
-from dynssm_ros.vehicle import Vehicle, load_vehicle
+from dynssm_ros.vehicle import load_vehicle
 from dynssm_ros.vehicle.effects import parse_effect
 
 
@@ -76,8 +76,12 @@ def race(
     start: Annotated[float, typer.Option(help="Where the car starts on the centre line (m).")] = 0.0,
     start_offset: Annotated[float, typer.Option(help="How far left of the line it starts (m).")] = 0.0,
     start_speed: Annotated[
-        float | None, typer.Option(help="How fast it starts (m/s).", show_default="the line's own speed")
+        float | None,
+        typer.Option(help="How fast it starts (m/s); 0: from standstill.", show_default="the line's own speed"),
     ] = None,
+    animation: Annotated[
+        bool, typer.Option("--animation", help="Also write race.gif, the cars on the track at equal times.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Drive laps in closed loop: a predictive controller with each model in turn, on a simulated car."""
@@ -89,17 +93,12 @@ def race(
     knowledge = [load_knowledge(name, car, driven, plant, along_horizon) for name in model]
     _told_apart(knowledge, model)
     reference = load_reference(line, car, course_track, pace)
-    settings = Settings(objective, horizon, car.sampling_time, _half_width(car))
+    settings = Settings.of(car, objective, horizon)
     course = Course(driven, course_track, plant, reference, settings, laps, Start(start, start_offset, start_speed))
-    races = []
-    with progress_bar("racing") as progress:
-        for k, each in enumerate(knowledge):
-
-            def update(done: int, total: int, words: str, k: int = k) -> None:
-                progress(k * total + done, len(knowledge) * total, words)
-
-            races.append(drive(course, each, update))
+    races = _driven(course, knowledge)
     race_report(races).save(out / "report.html")
+    if animation:
+        animate(races, out / "race.gif")
     result = race_json(races)
     for path in (out / "results.json", json):
         if path is not None:
@@ -109,6 +108,19 @@ def race(
     console.print(f"{out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)
 
 
+def _driven(course: Course, knowledge: list[Knowledge]) -> list[Race]:
+    """A race of each."""
+    races = []
+    with progress_bar("racing") as progress:
+        for k, each in enumerate(knowledge):
+
+            def update(done: int, total: int, words: str, k: int = k) -> None:
+                progress(k * total + done, len(knowledge) * total, words)
+
+            races.append(drive(course, each, update))
+    return races
+
+
 def _sized(track: Track, scale: float | None, lap_length: float | None) -> Track:
     """The track at the size asked for."""
     if scale is not None and lap_length is not None:
@@ -116,11 +128,6 @@ def _sized(track: Track, scale: float | None, lap_length: float | None) -> Track
     if lap_length is not None:
         scale = lap_length / track.length
     return track if scale is None else track.scaled(scale)
-
-
-def _half_width(vehicle: Vehicle) -> float:
-    """What the controller keeps between the car's centre and the borders (m)."""
-    return CAR_WIDTH * (vehicle.constants.l_f + vehicle.constants.l_r) / 2
 
 
 def _told_apart(knowledge: list[Knowledge], given: list[str]) -> None:

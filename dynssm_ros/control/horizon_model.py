@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State
-from dynssm_ros.vehicle.single_track import Constants, Integrator, StageEffect, step_with_memory
+from dynssm_ros.simulation.external import Creeping
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.effects.base import SLOWEST
+from dynssm_ros.vehicle.single_track import Constants, Integrator, StageEffect, at_least, step_with_memory
 
 Vector = npt.NDArray[np.float64]
 
@@ -41,6 +43,21 @@ class Car:
     effects: Sequence[StageEffect] = ()
     integrator: Integrator = "euler"
     substeps: int = 1
+
+    @classmethod
+    def of(
+        cls, vehicle: Vehicle, integrator: Integrator = "euler", substeps: int = 1, first: Sequence[StageEffect] = ()
+    ) -> Car:
+        """The car of a vehicle file, also at low speed, where a step of T_s is too long for the tyres.
+
+        Args:
+            vehicle: the car with its effects.
+            integrator: of the step.
+            substeps: of the integrator.
+            first: acts before the vehicle's own effects.
+        """
+        effects = (*first, *vehicle.active_effects, Creeping(vehicle, "euler"))
+        return cls(vehicle.constants, vehicle.sampling_time, effects, integrator, substeps)
 
     @property
     def memory(self) -> tuple[str, ...]:
@@ -104,7 +121,8 @@ class HorizonModel:
 
         car = self.car
         x_pos, y_pos, heading, *motion = ca.vertsplit(x)
-        now, applied = State(*motion[:3]), Applied(motion[3] + u[0], motion[4] + u[1])
+        # standing still the slip angles have no derivative
+        now, applied = State(at_least(motion[0], SLOWEST), *motion[1:3]), Applied(motion[3] + u[0], motion[4] + u[1])
         parameters = iter(ca.vertsplit(p))
         theta, correction, context = (list(islice(parameters, n)) for n in (len(COEFFICIENTS), 3, len(CONTEXT)))
         state, memory = step_with_memory(

@@ -76,13 +76,7 @@ class Adaptive:
         card = model.artifact.card if isinstance(model, OnnxModel) else None
         self.name = model.name
         self.H = model.H
-        self.car = Car(
-            own.constants,
-            own.sampling_time,
-            own.active_effects,
-            "euler" if card is None else card.integrator,
-            1 if card is None else card.substeps,
-        )
+        self.car = Car.of(own) if card is None else Car.of(own, card.integrator, card.substeps)
         self._model = model
         self._along_horizon = along_horizon
         self._nominal = Adapted(own.nominal, np.zeros(3))
@@ -105,27 +99,27 @@ class Adaptive:
     def _of(self, windows: Vector) -> Adapted:
         said = self._model.predict(windows)
         theta = self._nominal.theta if said.theta is None else said.theta
-        physics = self._nominal_step(windows[:, -1]) if said.physics is None else said.physics
+        physics = stepped(self.car, windows[:, -1], theta) if said.physics is None else said.physics
         correction = said.state - physics
         if len(windows) == 1:
             return Adapted(np.atleast_2d(theta)[0], correction[0])
         return Adapted(theta, correction)
 
-    def _nominal_step(self, rows: Vector) -> Vector:
-        """The nominal car's next states, shape ``(N, 3)``."""
-        car, now = self.car, rows.T
-        following = step(
-            np,
-            State(*now[:3]),
-            applied_inputs(now),
-            Coefficients(*self._nominal.theta),
-            car.constants,
-            car.T_s,
-            car.effects,
-            car.integrator,
-            car.substeps,
-        )
-        return np.stack(following, axis=1)
+
+def stepped(car: Car, rows: Vector, theta: Vector) -> Vector:
+    """Next states of ``car`` (m/s, m/s, rad/s), shape ``(k, 3)``.
+
+    Args:
+        car: what is stepped.
+        rows: with the columns ``WINDOW_COLUMNS``, shape ``(k, 7)``.
+        theta: coefficients, shape ``(17,)`` or ``(k, 17)``.
+    """
+    now = rows.T
+    following = step(
+        np, State(*now[:3]), applied_inputs(now), Coefficients(*np.transpose(theta)), car.constants, car.T_s, car.effects,
+        car.integrator, car.substeps,
+    )  # fmt: skip
+    return np.stack(following, axis=1)
 
 
 def _planned_rows(plan: Plan) -> Vector:
@@ -136,10 +130,8 @@ def _planned_rows(plan: Plan) -> Vector:
 def true_model(vehicle: Vehicle, plant: PlantKind) -> Fixed:
     """The plant's own model: its coefficients, effects and wheels. Steps of 1 ms become two of Runge and Kutta."""
     first = (DoubleTrack.of(vehicle.constants),) if plant == "double_track" else ()
-    effects = (*first, *vehicle.active_effects)
-    if plant == "euler":
-        return Fixed(TRUE, Car(vehicle.constants, vehicle.sampling_time, effects), vehicle.nominal)
-    return Fixed(TRUE, Car(vehicle.constants, vehicle.sampling_time, effects, "rk4", 2), vehicle.nominal)
+    car = Car.of(vehicle) if plant == "euler" else Car.of(vehicle, "rk4", 2, first)
+    return Fixed(TRUE, car, vehicle.nominal)
 
 
 def load_knowledge(

@@ -4,7 +4,7 @@ The plan of the step before, moved on by one step, is where dynamics, borders an
 shooting: its gaps are closed by the program). The states are then eliminated, so that what is left to optimise are the
 ``2 N`` increments of throttle and steering and a slack per soft constraint: a dense program for an active-set solver.
 
-Actuator limits are hard; the borders, and the speed at the end of the horizon where the objective asks for it, are soft
+Actuator limits are hard; the borders, and speed and slip at the end of the horizon where the objective asks for it, are soft
 with a linear penalty, so that a program is feasible wherever the car is.
 
 Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control", 2005.
@@ -23,9 +23,12 @@ import numpy.typing as npt
 
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, PARAMETERS, STATES, HorizonModel
 from dynssm_ros.control.reference import Reference
+from dynssm_ros.simulation.racing_line import CAR_WIDTH
 from dynssm_ros.simulation.tracks import Track
-from dynssm_ros.vehicle import COEFFICIENTS, Applied
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, Vehicle
+from dynssm_ros.vehicle.effects.base import SLOWEST
 from dynssm_ros.vehicle.parameters import InputLimits
+from dynssm_ros.vehicle.single_track import shape
 
 Vector = npt.NDArray[np.float64]
 Objective = Literal["tracking", "progress"]
@@ -33,6 +36,7 @@ Status = Literal["solved", "infeasible", "late"]
 
 V_X, R, DELTA = (STATES.index(name) for name in ("v_x", "r", "delta"))
 _FIRST_ROUNDS = 10  # programs that the first plan takes to settle
+_GRIP_USED = 0.95  # share of the rear tyres' force in a car that is not sliding: there is hardly more, and no way back
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,8 @@ class Weights:
         throttle: of the squared increment of the throttle (1).
         steering: of the squared increment of the steering (1/rad^2).
         border: price of the distance beyond a border (1/m), and of its square (1/m^2).
-        top_speed: likewise of speed above the line's own at the end of the horizon (s/m, s^2/m^2); 0: not bounded.
+        ending: price of speed above the line's own at the end of the horizon (s/m), of rear slip there beyond its bound
+            (1/rad), and of the larger of their squares (s^2/m^2, 1/rad^2); 0: neither is bounded.
     """
 
     along: float
@@ -55,14 +60,14 @@ class Weights:
     throttle: float = 0.005
     steering: float = 1.0
     border: float = 10.0
-    top_speed: float = 0.0
+    ending: float = 0.0
 
 
 WEIGHTS: Mapping[Objective, Weights] = {
     # Q and R of the literature: bayesrace and Deep Dynamics
     "tracking": Weights(along=1.0, across=1.0, progress=0.0),
     # a point of the last plan draws as the reference does, so that no plan strays from where it was linearised
-    "progress": Weights(along=1.0, across=1.0, progress=0.15, top_speed=10.0),
+    "progress": Weights(along=1.0, across=1.0, progress=0.15, ending=10.0),
 }
 
 
@@ -72,16 +77,30 @@ class Settings:
 
     Attributes:
         objective: ``tracking`` follows the reference at its own speed; ``progress`` goes as far as it can between the
-            borders, and not faster at the end of the horizon than the reference is there.
+            borders, to where it can go on from: no faster than the reference is there, and not sliding.
         N: steps of the horizon.
         deadline: time (s) after which a plan comes too late and is not used.
         margin: distance to keep between the car's centre and the borders (m).
+        slip: slip angle of the rear axle from which on the car slides (rad).
     """
 
     objective: Objective = "tracking"
     N: int = 15
     deadline: float = math.inf
     margin: float = 0.0
+    slip: float = math.inf
+
+    @classmethod
+    def of(cls, vehicle: Vehicle, objective: Objective = "tracking", N: int = 15) -> Settings:
+        """For a car: a plan has a control period of time, half the car stays within the borders.
+
+        Args:
+            vehicle: the car as its file describes it.
+            objective: see above.
+            N: steps of the horizon.
+        """
+        half_width = CAR_WIDTH * (vehicle.constants.l_f + vehicle.constants.l_r) / 2
+        return cls(objective, N, vehicle.sampling_time, half_width, _sliding(Coefficients(*vehicle.nominal)))
 
     @property
     def weights(self) -> Weights:
@@ -163,8 +182,8 @@ class Nmpc:
         self._plan: Plan | None = None
         self._on_track = self._on_line = 0.0
         N = settings.N
-        self._variables = 2 * N + N + 1  # increments, slacks of the borders, slack of the speed
-        self._rows = 2 * N + 2 * N + 1  # actuators, both borders, speed
+        self._variables = 2 * N + N + 1  # increments, slacks of the borders, slack of the end
+        self._rows = 2 * N + 2 * N + 3  # actuators, both borders, slip to both sides and speed at the end
         shape = {"h": ca.Sparsity.dense(self._variables, self._variables)}
         shape["a"] = ca.Sparsity.dense(self._rows, self._variables)
         self._solver = ca.conic("program", "daqp", shape, {"error_on_fail": False})
@@ -174,18 +193,24 @@ class Nmpc:
         """The plan as it stands before the next step: the last one, moved on."""
         return None if self._plan is None else self._plan.shifted()
 
-    def plan(self, now: Vector, adapted: Adapted, t: float = 0.0) -> Plan:
+    def forget(self) -> None:
+        """Drops the last plan."""
+        self._plan = None
+
+    def plan(self, now: Vector, adapted: Adapted, t: float = 0.0, began: float | None = None) -> Plan:
         """Plans from ``now`` on.
 
         Args:
             now: present state in the order of ``STATES`` and the car's memory, shape ``(size,)``.
             adapted: what the model says; see :class:`Adapted`.
             t: time since the start of the drive (s), for effects that read it.
+            began: when the control step began, by the clock, to which the deadline counts; now if not given.
 
         Returns:
-            The plan whose first step is to be driven. It is finite and within the actuators' limits, whatever came in.
+            The plan whose first step is to be driven, from ``now`` with what is not finite in it replaced by what was
+            planned. It is finite and within the actuators' limits, whatever came in.
         """
-        began = self._clock()
+        began = self._clock() if began is None else began
         first, sound = self._plan is None, bool(np.all(np.isfinite(now)))
         if not sound:  # what is not measured is taken as it was planned
             now = np.where(np.isfinite(now), now, 0.0 if self._plan is None else self._plan.x[1])
@@ -196,7 +221,7 @@ class Nmpc:
             plan = None if plan is None else self._improved(now, plan, adapted, t)
         if plan is None:
             plan = self._held(now, guess, adapted, t, "infeasible")
-        self._plan = plan
+        self._plan = plan if sound or not first else None
         if not first and self._clock() - began > self.settings.deadline:
             return self._held(now, guess, adapted, t, "late")
         return plan
@@ -210,17 +235,17 @@ class Nmpc:
     def _locate(self, now: Vector) -> None:
         near = self._plan is not None
         self._on_track = float(self._track.project(now[:2], self._on_track if near else None)[0])
-        self._on_line = float(self._reference.line.project(now[:2], self._on_line if near else None)[0])
+        self._on_line = float(self._reference.project(now[:2], self._on_line if near else None))
 
     def _first_guess(self, now: Vector) -> Plan:
         """Along the reference at its own speed."""
         N, line = self.settings.N, self._reference.line
-        s = self._reference.ahead(self._on_line, self._times(0))
+        s = self._reference.within_reach(self._on_line, self._times(0), float(now[V_X]))
         x = np.tile(now, (N + 1, 1))
         x[1:, :2] = line.position(s)[1:]
         heading = line.heading(s)
         x[1:, 2] = now[2] + np.cumsum((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi)
-        x[1:, V_X] = np.maximum(self._reference.speed_at(s)[1:], now[V_X])
+        x[:-1, V_X] = np.diff(s) / self.model.car.T_s
         return Plan(x, np.zeros((N, len(INPUTS))))
 
     def _times(self, first: int) -> Vector:
@@ -236,6 +261,7 @@ class Nmpc:
         p[:, -1] = self._track.length
         return p
 
+    @np.errstate(over="ignore", invalid="ignore")  # what comes of it is looked at
     def _improved(self, now: Vector, guess: Plan, adapted: Adapted, t: float) -> Plan | None:
         """The solution of the program around ``guess``; ``None`` if there is none."""
         x = np.concatenate([now[None], guess.x[1:]])
@@ -270,10 +296,10 @@ class Nmpc:
             H[: 2 * N, : 2 * N] += 2 * weight * by_u.T @ by_u
             g[: 2 * N] += 2 * weight * by_u.T @ errors
         g[: 2 * N] -= w.progress * tangent[-1] @ moves[-1]
-        diagonal = np.concatenate([np.tile([w.throttle, w.steering], N), np.full(N, w.border), [max(w.top_speed, 1.0)]])
+        diagonal = np.concatenate([np.tile([w.throttle, w.steering], N), np.full(N, w.border), [max(w.ending, 1.0)]])
         H[np.diag_indices(self._variables)] += 2 * diagonal
         g[2 * N : 3 * N] = w.border
-        g[3 * N] = w.top_speed
+        g[3 * N] = w.ending
 
         A = np.zeros((self._rows, self._variables))
         low, high = np.full(self._rows, -np.inf), np.full(self._rows, np.inf)
@@ -282,9 +308,12 @@ class Nmpc:
             A[rows, k : 2 * N : 2] = np.tri(N)
             low[rows], high[rows] = bounds[0] - held, bounds[1] - held
         self._add_borders(A[2 * N : 4 * N], low[2 * N : 4 * N], high[2 * N : 4 * N], guess, positions, moves)
-        if w.top_speed > 0:
-            A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -1.0
-            high[-1] = self._reference.speed_at(at[-1]) - offset[-1, V_X]
+        if w.ending > 0:
+            slip, by_u = self._rear_slip(offset[-1], slope[-1])
+            A[-3:, : 2 * N] = np.stack([by_u, -by_u, slope[-1, V_X]])
+            A[-3:, -1] = -1.0
+            bound, top_speed = self.settings.slip, float(self._reference.speed_at(at[-1]))
+            high[-3:] = bound - slip, bound + slip, top_speed - offset[-1, V_X]
 
         reach = self._limits.steering_rate * self.model.car.T_s
         span = self._limits.throttle[1] - self._limits.throttle[0]
@@ -292,11 +321,20 @@ class Nmpc:
         z_high = np.concatenate([np.tile([span, reach], N), np.full(N + 1, np.inf)])
         return _Program(H, g, A, low, high, z_low, z_high)
 
+    def _rear_slip(self, x: Vector, slope: Vector) -> tuple[float, Vector]:
+        """Slip angle of the rear axle (rad) at the state ``x``, shape ``(size,)``, and how it varies with that state."""
+        v_x, v_y, omega = x[V_X : V_X + 3]
+        l_r = self.model.car.constants.l_r
+        across, along = l_r * omega - v_y, max(v_x, SLOWEST)
+        by_across, by_along = along / (along**2 + across**2), -across / (along**2 + across**2)
+        moves = slope[V_X : V_X + 3]
+        return math.atan2(across, along), by_across * (l_r * moves[2] - moves[1]) + by_along * moves[0]
+
     def _reference_points(self, guess: Vector) -> Vector:
         """Where on the line the steps of the horizon are compared with it (m), shape ``(N,)``."""
         if self.settings.objective == "tracking":
-            return self._reference.ahead(self._on_line, self._times(1))
-        return self._reference.line.project(guess[1:, :2], _along(guess[:, :2], self._on_line))[0]
+            return self._reference.within_reach(self._on_line, self._times(1), float(guess[0, V_X]))
+        return self._reference.project(guess[1:, :2], _along(guess[:, :2], self._on_line))
 
     def _add_borders(
         self, A: Vector, low: Vector, high: Vector, guess: Vector, positions: Vector, moves: Vector
@@ -327,6 +365,13 @@ class Nmpc:
             float(min(max(r, self._limits.throttle[0]), self._limits.throttle[1])),
             float(min(max(delta, self._limits.steering[0]), self._limits.steering[1])),
         )
+
+
+def _sliding(theta: Coefficients) -> float:
+    """Slip angle (rad) at which the rear tyres give ``_GRIP_USED`` of what they can."""
+    slip = np.linspace(0.0, 1.0, 1001)
+    force = np.sin(theta.C_r * shape(np, theta.B_r, theta.E_r, slip))
+    return float(slip[np.argmax(force >= _GRIP_USED * np.max(force))])
 
 
 def _condensed(x: Vector, u: Vector, following: Vector, by_x: Vector, by_u: Vector) -> tuple[Vector, Vector]:

@@ -1,6 +1,6 @@
 """Laps in closed loop: a plant, a model in the controller, and what is measured of them.
 
-The car starts rolling, on the line at the line's own speed unless said otherwise, with its actuators at zero. A model
+The car starts on the line at the line's own speed unless said otherwise, with its actuators at zero. A model
 that reads a history drives with its nominal coefficients until its window is full. Time runs from the start; a lap is
 done when the car is once around on the centre line.
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -19,16 +18,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dynssm_ros.control.horizon_model import STATES, HorizonModel
 from dynssm_ros.control.learned import Knowledge
-from dynssm_ros.control.nmpc import Nmpc, Settings
+from dynssm_ros.control.nmpc import Settings
+from dynssm_ros.control.pilot import Pilot
 from dynssm_ros.control.reference import Reference
+from dynssm_ros.simulation.external import Creeping
 from dynssm_ros.simulation.laps import SimulationError
-from dynssm_ros.simulation.plant import SCALAR, PlantKind, Pose, make_plant
+from dynssm_ros.simulation.plant import PlantKind, Pose, make_plant
 from dynssm_ros.simulation.tracks import Track
-from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
-from dynssm_ros.vehicle.effects import require_context
-from dynssm_ros.vehicle.single_track import settled_memory
+from dynssm_ros.vehicle import Applied, State, Vehicle
 
 Vector = npt.NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -44,7 +42,7 @@ class Start:
     Attributes:
         s: on the centre line (m).
         lateral: beside the line that is followed (m, positive left).
-        speed: along the line (m/s); ``None``: the line's own there.
+        speed: along the line (m/s), 0: standing; ``None``: the line's own there.
     """
 
     s: float = 0.0
@@ -78,10 +76,22 @@ class Course:
         """Pose and motion at the start.
 
         Raises:
-            SimulationError: the start is not on the road, or standing.
+            SimulationError: the road is too narrow for the car; the start is not on it, or backwards; more than a lap of
+                a line for one.
         """
+        if self.laps > 1 and self.reference.standing:
+            raise SimulationError(
+                f"{self.laps} laps of line {self.reference.name}, which starts from standstill; expected 1"
+            )
+        narrow = int(np.argmin(self.track.width_left + self.track.width_right))
+        width = float(self.track.width_left[narrow] + self.track.width_right[narrow])
+        if not width > 2 * self.settings.margin:
+            raise SimulationError(
+                f"track {self.track.name} is {width:.3g} m wide at s = {self.track.centre.s[narrow]:.4g} m; expected more "
+                f"than {2 * self.settings.margin:.3g} m, the width of {self.vehicle.name}"
+            )
         line = self.reference.line
-        at = float(line.project(self.track.centre.position(self.start.s))[0])
+        at = float(self.reference.project(self.track.centre.position(self.start.s)))
         x, y = (float(value) for value in line.position(at, self.start.lateral))
         s, lateral = (float(value) for value in self.track.project([x, y]))
         right, left = (float(width) for width in self.track.widths(s))
@@ -91,8 +101,8 @@ class Course:
                 f"it on the road, {-right:.3g} to {left:.3g} m"
             )
         v_x = float(self.reference.speed_at(at)) if self.start.speed is None else self.start.speed
-        if not v_x > 0:
-            raise SimulationError(f"start at {v_x:g} m/s; expected a rolling start, more than 0")
+        if not 0 <= v_x < math.inf:
+            raise SimulationError(f"start at {v_x:g} m/s; expected 0 or more")
         return Pose(x, y, float(line.heading(at))), State(v_x, 0.0, v_x * float(line.curvature(at)))
 
 
@@ -174,10 +184,67 @@ class Race:
         }
 
 
+class _Drive:
+    """The car of a race on its way."""
+
+    def __init__(self, course: Course, knowledge: Knowledge) -> None:
+        pose, state = course.starting()
+        vehicle, track = course.vehicle, course.track
+        # the processor's time, so that what else runs on the machine changes no simulated lap
+        self.pilot = Pilot(knowledge, vehicle.inputs, course.reference, track, course.settings, time.thread_time)
+        self._car = make_plant(vehicle, course.plant, pose, state, (Creeping(vehicle, course.plant),), track.length)
+        self._course = course
+        self._feedback = Applied(0.0, 0.0)
+        self._limit = PATIENCE * course.laps * course.reference.lap_time
+        self._rows: list[tuple[Any, ...]] = []
+        self.s, self._lateral = (float(value) for value in track.project(pose[:2]))
+        self.start, self.goal = self.s, self.s + course.laps * track.length
+
+    def step(self) -> str | None:
+        """Drives on by T_s; once it is over, why: a failure, or nothing."""
+        t, car = len(self._rows) * self._course.vehicle.sampling_time, self._car
+        decision = self.pilot.step(t, car.pose, car.measured, self._feedback)
+        self._rows.append(
+            (t, car.pose, car.state, decision.command, self.s, self._lateral, decision.theta, decision.correction,
+             decision.seconds)
+        )  # fmt: skip
+        failure = self._failure(t)
+        if failure or self.s >= self.goal:
+            return failure
+        car.advance(decision.command, self.s % self._course.track.length)
+        self._feedback = decision.command
+        if not all(map(math.isfinite, (*car.pose, *car.state))):
+            return f"its motion is not finite after {t:.2f} s"
+        at, self._lateral = (float(value) for value in self._course.track.project(car.pose[:2], near=self.s))
+        self.s += math.remainder(at - self.s, self._course.track.length)
+        return None
+
+    def result(self, name: str, failure: str) -> Race:
+        """What was driven."""
+        time, pose, state, command, s, lateral, theta, correction, solve = (
+            np.array(column) for column in zip(*self._rows, strict=True)
+        )
+        counts = self.pilot.counts
+        return Race(
+            name, self._course, time, pose, state, command, s, lateral, theta, correction, solve,
+            counts["infeasible"], counts["late"], failure,
+        )  # fmt: skip
+
+    def _failure(self, t: float) -> str:
+        """Why the drive ends before its time; empty if it does not."""
+        track, state, s = self._course.track, self._car.state, self.s
+        right, left = (float(width) for width in track.widths(s))
+        if max(self._lateral - left, -right - self._lateral) > LOST * (left + right):
+            return f"leaves the track after {t:.2f} s at s = {s % track.length:.4g} m"
+        if state.v_x < abs(state.v_y):
+            return f"spins after {t:.2f} s at s = {s % track.length:.4g} m"
+        if t > self._limit:
+            return f"takes longer than {self._limit:.3g} s"
+        return ""
+
+
 def race(course: Course, knowledge: Knowledge, progress: Progress | None = None) -> Race:
     """Drives the laps of ``course`` with ``knowledge`` in the controller.
-
-    A plan's time is the processor's: what else runs on the machine changes no simulated lap.
 
     Args:
         course: what to drive.
@@ -185,85 +252,12 @@ def race(course: Course, knowledge: Knowledge, progress: Progress | None = None)
         progress: told of the millimetres driven, of how many, and of a few words.
 
     Raises:
-        SimulationError: the start is not on the road.
+        SimulationError: the road is too narrow for the car, or the start is not on it.
         ConfigurationError: the model's physics needs a signal that there is not.
     """
-    vehicle, track, T_s = course.vehicle, course.track, course.vehicle.sampling_time
-    pose, state = course.starting()
-    require_context(
-        [effect for effect in knowledge.car.effects if hasattr(effect, "needs")],  # type: ignore[misc]
-        ("t", "s", "lap_length", "x", "y", "theta"),
-        f"model {knowledge.name}",
-    )
-    car = make_plant(vehicle, course.plant, pose, state, lap_length=track.length)
-    model = HorizonModel(knowledge.car, course.settings.N)
-    controller = Nmpc(model, vehicle.inputs, course.reference, track, course.settings, time.thread_time)
-    feedback = Applied(0.0, 0.0)
-    memory: Vector | None = None
-    history: deque[Vector] = deque(maxlen=max(knowledge.H, 1))
-    log: list[tuple[float, Pose, State, Applied, float, float, Vector, Vector, float]] = []
-    status = {"solved": 0, "infeasible": 0, "late": 0}
-    first, lateral = (float(value) for value in track.project(pose[:2]))
-    s, goal, failure = first, first + course.laps * track.length, ""
-    limit = PATIENCE * course.laps * course.reference.lap_time
-    while True:
-        now_t = len(log) * T_s
-        began = time.thread_time()
-        seen = car.measured
-        outlook = controller.outlook
-        increments = np.zeros(2) if outlook is None else outlook.u[0]
-        history.append(np.array([*seen, *feedback, *increments]))
-        adapted = knowledge.read(np.array(history), outlook)
-        if memory is None:
-            memory = _settled(knowledge, seen, feedback, adapted.theta, car.pose, now_t, s, track)
-        now = np.array([*car.pose, *seen, *feedback, *memory])
-        plan = controller.plan(now, adapted, now_t)
-        command = controller.command(plan)
-        status[plan.status] += 1
-        history[-1][5:] = np.subtract(command, feedback)
-        memory = plan.x[1, len(STATES) :]
-        theta, correction = (np.atleast_2d(part)[0] for part in adapted)
-        log.append((now_t, car.pose, car.state, command, s, lateral, theta, correction, time.thread_time() - began))
-        failure = _failure(course, log[-1], limit)
-        if failure or s >= goal:
-            break
-        car.advance(command, s % track.length)
-        feedback = command
-        if not all(map(math.isfinite, (*car.pose, *car.state))):
-            failure = f"its motion is not finite after {now_t:.2f} s"
-            break
-        on_track, lateral = (float(value) for value in track.project(car.pose[:2], near=s))
-        s += math.remainder(on_track - s, track.length)
+    drive = _Drive(course, knowledge)
+    while (failure := drive.step()) is None:
         if progress is not None:
-            progress(round(1e3 * max(min(s, goal) - first, 0.0)), round(1e3 * (goal - first)), knowledge.name)
-    times, poses, states, commands, along, beside, theta_log, correction_log, solve = (
-        np.array(column) for column in zip(*log, strict=True)
-    )
-    return Race(
-        knowledge.name, course, times, poses, states, commands, along, beside, theta_log, correction_log, solve,
-        status["infeasible"], status["late"], failure,
-    )  # fmt: skip
-
-
-def _settled(
-    knowledge: Knowledge, seen: State, feedback: Applied, theta: Vector, pose: Pose, t: float, s: float, track: Track
-) -> Vector:
-    """The memory of the model's effects at the start."""
-    car = knowledge.car
-    context = {"t": t, "s": s, "lap_length": track.length, **pose._asdict()}
-    coefficients = Coefficients(*(float(value) for value in np.atleast_2d(theta)[0]))
-    memory = settled_memory(SCALAR, seen, feedback, coefficients, car.constants, car.effects, None, context)
-    return np.array([memory[name] for name in car.memory])
-
-
-def _failure(course: Course, row: tuple[Any, ...], limit: float) -> str:
-    """Why the drive ends before its time; empty if it does not."""
-    t, _, state, _, s, lateral = row[:6]
-    right, left = (float(width) for width in course.track.widths(s))
-    if max(lateral - left, -right - lateral) > LOST * (left + right):
-        return f"leaves the track after {t:.2f} s at s = {s % course.track.length:.4g} m"
-    if state.v_x <= abs(state.v_y):
-        return f"spins or stops after {t:.2f} s at s = {s % course.track.length:.4g} m"
-    if t > limit:
-        return f"takes longer than {limit:.3g} s"
-    return ""
+            done = min(max(drive.s, drive.start), drive.goal) - drive.start
+            progress(round(1e3 * done), round(1e3 * (drive.goal - drive.start)), knowledge.name)
+    return drive.result(knowledge.name, failure)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from dynssm_ros.simulation.lines import ClosedLine, Floats
 from dynssm_ros.simulation.racing_line import line_of
-from dynssm_ros.simulation.speed_profile import speed_profile, vehicle_limits
+from dynssm_ros.simulation.speed_profile import Limits, speed_profile, vehicle_limits
 from dynssm_ros.simulation.tracks import Track, TrackError
 from dynssm_ros.vehicle import Vehicle
 
@@ -19,44 +19,104 @@ Vector = npt.NDArray[np.float64]
 
 COLUMNS = ("s_m", "x_m", "y_m", "v_mps")
 MIN_POINTS = 10
+_RUN_UP = 0.1  # share of the lap before a line's first point from which a drive begins with that point
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
     """A closed line with the speed at its points.
 
+    A line whose first speed is 0 is that of one lap from a standing start: it ends at the speed of its last point, and
+    what follows is driven at that. Places on the line (m) count on over the laps.
+
     Attributes:
         name: ``centre``, ``racing`` or the file that it came from.
         line: where to drive.
-        speed: at the points of the line (m/s), shape ``(N,)``. One of them may be 0 (a standing start).
+        speed: at the points of the line (m/s), shape ``(N,)``.
+        limits: of the car that follows it; ``None``: it can do anything.
     """
 
     name: str
     line: ClosedLine
     speed: Vector
+    limits: Limits | None = None
+
+    @property
+    def standing(self) -> bool:
+        """Whether it starts from standstill."""
+        return bool(self.speed[0] == 0)
 
     @property
     def lap_time(self) -> float:
         """Time of a lap at the line's own speed (s)."""
         return float(self._time[-1])
 
+    @cached_property
+    def full_throttle_time(self) -> float:
+        """Time of a lap (s) at the line's own speed as far as full throttle reaches that.
+
+        The car is taken to corner and to brake as well as the line asks, so no car of these limits is faster on it.
+        """
+        if self.limits is None:
+            return self.lap_time
+        speed, steps = self._grid_speed.copy(), np.diff(self._grid)
+        for _ in range(1 if self.standing else 2):  # around once more to meet the speed at the start
+            for k, step in enumerate(steps):
+                gain = float(np.interp(speed[k], self.limits.speed, self.limits.drive))
+                speed[k + 1] = min(speed[k + 1], float(np.sqrt(speed[k] ** 2 + 2 * gain * step)))
+            if not self.standing:
+                speed[0] = speed[-1]
+        return float(np.sum(2 * steps / (speed[1:] + speed[:-1])))
+
+    def project(self, points: npt.ArrayLike, near: Floats | None = None) -> Vector:
+        """Places of ``points`` (m, shape ``(..., 2)``) on the line, shape ``(...)``.
+
+        Args:
+            points: positions.
+            near: places (m) to search around and to count on from; ``None``: on the first lap, just before its start
+                rather than at its end.
+        """
+        s, length = self.line.project(points, near)[0], self.line.length
+        around = length * (0.5 - _RUN_UP) if near is None else near
+        return np.asarray(s + length * np.round((around - s) / length))
+
     def speed_at(self, s: Floats) -> Vector:
-        """Speed (m/s) at ``s`` (m, periodic)."""
-        return np.asarray(np.interp(s, self.line.s, self.speed, period=self.line.length))
+        """Speed (m/s) at ``s`` (m)."""
+        return np.asarray(np.interp(s if self.standing else s % self.line.length, self._grid, self._grid_speed))
+
+    def within_reach(self, s: float, times: Vector, v: float) -> Vector:
+        """Places (m) that a car with speed ``v`` (m/s) at ``s`` (m) is to reach after ``times`` (s).
+
+        They are those of :meth:`ahead`, but none beyond what full throttle reaches. A car that is asked for what is far
+        out of its reach, as at a standing start, would take every short cut to get closer.
+        """
+        places = self.ahead(s, times)
+        if self.limits is None:
+            return places
+        gain = float(np.interp(v, self.limits.speed, self.limits.drive))
+        return np.minimum(places, s + v * times + gain / 2 * times**2)
 
     def ahead(self, s: float, times: Vector) -> Vector:
-        """Arc lengths (m, in ``[0, length)``) that are reached ``times`` (s) after ``s`` at the line's own speed."""
-        start = np.interp(s % self.line.length, self._grid, self._time)
-        return np.asarray(np.interp((start + times) % self.lap_time, self._time, self._grid))
+        """Places (m) that are reached ``times`` (s) after ``s`` (m) at the line's own speed."""
+        length = self.line.length
+        laps = 0.0 if self.standing else np.floor(s / length)
+        at = np.interp(s - laps * length, self._grid, self._time) + times
+        over, rest = (0.0, at) if self.standing else np.divmod(at, self.lap_time)
+        beyond = np.maximum(rest - self.lap_time, 0.0) * self._grid_speed[-1]
+        return np.asarray((laps + over) * length + np.interp(rest, self._time, self._grid) + beyond)
 
     @cached_property
     def _grid(self) -> Vector:
         return np.append(self.line.s, self.line.length)
 
     @cached_property
+    def _grid_speed(self) -> Vector:
+        return np.append(self.speed, self.speed[-1 if self.standing else 0])
+
+    @cached_property
     def _time(self) -> Vector:
-        """Time at which each point of the grid is reached (s); the speed changes linearly between points."""
-        speed = np.append(self.speed, self.speed[0])
+        """Time at which each point of the grid is reached (s); the speed changes linearly in time between points."""
+        speed = self._grid_speed
         return np.concatenate([[0.0], np.cumsum(2 * np.diff(self._grid) / (speed[1:] + speed[:-1]))])
 
 
@@ -73,16 +133,16 @@ def load_reference(name_or_path: str, vehicle: Vehicle, track: Track, pace: floa
     Raises:
         TrackError: neither of the names nor a file; a file that is no line; a road that is too narrow for the car.
     """
-    path = Path(name_or_path)
+    path, limits = Path(name_or_path), vehicle_limits(vehicle)
     if path.is_file():
-        return _read(path, pace)
+        return _read(path, pace, limits)
     if name_or_path not in ("centre", "racing"):
         raise TrackError(f"line '{name_or_path}' is neither centre, racing nor a file {','.join(COLUMNS)}")
     line = line_of("centre" if name_or_path == "centre" else "racing", vehicle, track)
-    return Reference(name_or_path, line, speed_profile(line, vehicle_limits(vehicle).scaled(pace)))
+    return Reference(name_or_path, line, speed_profile(line, limits.scaled(pace)), limits)
 
 
-def _read(path: Path, pace: float) -> Reference:
+def _read(path: Path, pace: float, limits: Limits) -> Reference:
     """A line from a file; a last row that closes the loop is left out."""
     try:
         table = np.loadtxt(path, delimiter=",", comments="#", ndmin=2)
@@ -99,4 +159,4 @@ def _read(path: Path, pace: float) -> Reference:
         points, speed, steps = points[:-1], speed[:-1], steps[:-1]
     if np.min(steps) == 0 or np.min(speed) < 0 or np.any((speed + np.roll(speed, 1)) == 0):
         raise TrackError(f"{path}: points or speeds that stand still; expected a line that moves on from row to row")
-    return Reference(path.stem, ClosedLine(points), speed)
+    return Reference(path.stem, ClosedLine(points), speed, limits)

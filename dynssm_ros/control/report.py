@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from dynssm_ros.evaluation.report import Report, Section
 from dynssm_ros.evaluation.tables import Column, Table, Value
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, motion
 from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDelay
-from dynssm_ros.vehicle.single_track import Motion
+from dynssm_ros.vehicle.single_track import Motion, shape
 
 _STAMPS = 0.5  # s between the time stamps on the map
 VIOLATION = "A violation is the car's centre of gravity outside the borders at any sample."
@@ -34,6 +34,7 @@ def race_json(races: Sequence[Race]) -> dict[str, Any]:
         "objective": course.settings.objective,
         "line": course.reference.name,
         "line_lap_time_s": course.reference.lap_time,
+        "line_full_throttle_s": course.reference.full_throttle_time,
         "horizon": course.settings.N,
         "laps": course.laps,
         "models": {race.name: race.to_json() for race in races},
@@ -100,7 +101,8 @@ def race_report(races: Sequence[Race]) -> Report:
         Section(
             "Coefficients",
             "What each model told the controller, step by step: the coefficients that it moves and what it adds to the "
-            "stepped velocities.",
+            "stepped velocities. Where the driven car has effects that amount to a change of a coefficient, the dashed line "
+            "is what it comes to with them.",
             coefficients(races),
         ),
     ]  # fmt: skip
@@ -131,15 +133,20 @@ def _protocol(course: Course) -> dict[str, str]:
         "Track": f"{course.track.name}, {course.track.length:.4g} m, {_laps(course)}",
         "Plant": f"{course.vehicle.name}, {course.plant}"
         + (f", with {', '.join(entry.name for entry in effects)}" if effects else ""),
-        "Start": "rolling, actuators at zero; the first lap counts from there. Until its window is full a model drives "
-        "with its nominal coefficients",
+        "Start": f"{_start(course)}, actuators at zero; the first lap counts from there. Until its window is full a model "
+        "drives with its nominal coefficients",
         "Line": f"{course.reference.name}, {course.reference.line.length:.4g} m, {course.reference.lap_time:.3f} s at its "
-        "own speed",
+        f"own speed, {course.reference.full_throttle_time:.3f} s with no more than full throttle",
         "Controller": f"{settings.objective}, {settings.N} steps of {course.vehicle.sampling_time:g} s, late after "
         f"{1e3 * settings.deadline:g} ms; {settings.weights}",
         "Time": "of a control step: model and plan together, the processor's time on one core",
         "Violation": VIOLATION,
     }
+
+
+def _start(course: Course) -> str:
+    speed = course.starting()[1].v_x
+    return "standing" if speed == 0 else f"rolling at {speed:.3g} m/s"
 
 
 @styled
@@ -193,7 +200,7 @@ def forces(races: Sequence[Race]) -> Figure:
     return _panels(races, [(label, [getattr(each, name) for each in driven]) for name, label in rows.items()])
 
 
-def _motion(race: Race) -> Motion:
+def _motion(race: Race, with_effects: bool = True) -> Motion:
     """The driven car's equations of motion at what was driven; states of effects are settled."""
     course = race.course
     x, y, theta = race.pose.T
@@ -203,7 +210,31 @@ def _motion(race: Race) -> Motion:
     ]
     nominal = Coefficients(*course.vehicle.nominal)
     state, command = State(*race.state.T), Applied(*race.command.T)
-    return motion(np, state, command, nominal, course.vehicle.constants, effects, context=context)
+    constants = course.vehicle.constants
+    return motion(np, state, command, nominal, constants, effects if with_effects else [], context=context)
+
+
+def driven_coefficients(race: Race) -> dict[str, Any]:
+    """What the effects of the driven car amount to, as values of coefficients that come to the same, by name.
+
+    Slip angles that effects shift are shifts ``S_h``; lateral forces that they scale are peaks ``D``. Values are of shape
+    ``(n,)``, and not a number where a force is too small to tell. Only those that effects change.
+    """
+    nominal = Coefficients(*race.course.vehicle.nominal)
+    plain, driven = _motion(race, with_effects=False), _motion(race)
+    found: dict[str, Any] = {}
+    for axle in "fr":
+        B, C, D, E = (getattr(nominal, f"{name}_{axle}") for name in "BCDE")
+        S_h, S_v = (getattr(nominal, f"S_{name}{axle}") for name in "hv")
+        shift = getattr(driven, f"alpha_{axle}") - getattr(plain, f"alpha_{axle}")
+        force = S_v + D * np.sin(C * shape(np, B, E, getattr(driven, f"alpha_{axle}")))
+        told = np.abs(force) > 0.1 * D
+        load = getattr(driven, f"F_z{axle}") / driven.F_z0
+        found[f"S_h{axle}"] = S_h + shift
+        found[f"D_{axle}"] = np.where(
+            told, D * getattr(driven, f"F_{axle}y") / load / np.where(told, force, 1.0), np.nan
+        )
+    return {name: v for name, v in found.items() if np.nanmax(np.abs(v - getattr(nominal, name)), initial=0.0) > 1e-9}
 
 
 @styled
@@ -217,11 +248,18 @@ def coefficients(races: Sequence[Race]) -> Figure:
     rows += [
         (f"{SYMBOLS[c]} added ({UNITS[c]})", [race.correction[:, k] for race in races]) for k, c in enumerate(CHANNELS)
     ]
-    return _panels(races, rows)
+    longest = max(races, key=lambda race: race.s[-1] - race.s[0])
+    driven = {f"{name} ({coefficient_unit(name)})": values for name, values in driven_coefficients(longest).items()}
+    return _panels(races, rows, driven, longest)
 
 
-def _panels(races: Sequence[Race], rows: list[tuple[str, list[Any]]]) -> Figure:
-    """A panel per row, over the distance driven."""
+def _panels(
+    races: Sequence[Race],
+    rows: list[tuple[str, list[Any]]],
+    dashed: Mapping[str, Any] | None = None,
+    along: Race | None = None,
+) -> Figure:
+    """A panel per row, over the distance driven; dashed lines by the label of the row, of the race ``along``."""
     colours = model_colours([race.name for race in races])
     columns = 1 if len(rows) <= 6 else 2
     lines = -(-len(rows) // columns)
@@ -230,6 +268,8 @@ def _panels(races: Sequence[Race], rows: list[tuple[str, list[Any]]]) -> Figure:
     for panel, (label, values) in zip(axes.T.flat, rows, strict=False):
         for race, series in zip(races, values, strict=True):
             panel.plot(race.s - race.s[0], series, color=colours[race.name], lw=1.0, label=race.name)
+        if along is not None and label in (dashed or {}):
+            panel.plot(along.s - along.s[0], (dashed or {})[label], color=MEASURED, lw=1.0, ls="--", zorder=1)
         panel.set_ylabel(label)
     for spare in list(axes.T.flat)[len(rows) :]:
         spare.set_visible(False)

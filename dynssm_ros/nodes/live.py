@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -132,19 +132,18 @@ def _is_free(domain: int) -> bool:
 
 
 @contextmanager
-def predictor_process(
-    model: Path, parameters: Mapping[str, object] | None = None, environment: Mapping[str, str] | None = None
+def node_process(
+    node: str, parameters: Mapping[str, object] | None = None, environment: Mapping[str, str] | None = None
 ) -> Iterator[subprocess.Popen[str]]:
-    """Starts the predictor node as a process of its own; interrupts it in the end.
+    """Starts a node of this package as a process of its own; interrupts it in the end.
 
     Args:
-        model: model folder.
-        parameters: further ROS parameters of the node.
+        node: its module: ``predictor``, ``simulator``, ``controller``.
+        parameters: ROS parameters.
         environment: of the process.
     """
-    arguments = [f"{name}:={value}" for name, value in {"model": model, **(parameters or {})}.items()]
-    command = [sys.executable, "-m", "dynssm_ros.nodes.predictor", "--ros-args"]
-    command += [part for argument in arguments for part in ("-p", argument)]
+    arguments = [part for name, value in (parameters or {}).items() for part in ("-p", f"{name}:={value}")]
+    command = [sys.executable, "-m", f"dynssm_ros.nodes.{node}", *(["--ros-args", *arguments] if arguments else [])]
     process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)  # noqa: S603 - own module
     try:
         yield process
@@ -155,6 +154,13 @@ def predictor_process(
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
+
+
+def predictor_process(
+    model: Path, parameters: Mapping[str, object] | None = None, environment: Mapping[str, str] | None = None
+) -> AbstractContextManager[subprocess.Popen[str]]:
+    """Starts the predictor with a model folder; see :func:`node_process`."""
+    return node_process("predictor", {"model": model, **(parameters or {})}, environment)
 
 
 @contextmanager

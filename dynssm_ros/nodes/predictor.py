@@ -10,7 +10,7 @@ import time
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import SetParametersResult
@@ -20,7 +20,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError, UserError
-from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class, run, set_pose, set_stamp
+from dynssm_ros.nodes.support import SENSOR_QOS, describe, diagnostics, message_class, run, set_pose, set_stamp
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.health import Health
 from dynssm_ros.runtime.models import OnnxModel
@@ -159,16 +159,10 @@ class PredictorNode(Node):
         now = time.monotonic()
         level, words = self._health.verdict(now)
         values = {"model": self._predictor.model.name, "model folder": str(self._predictor.model.artifact.path)}
-        status = DiagnosticStatus(
-            level=bytes([level]),
-            name=f"{self.get_fully_qualified_name()}: prediction",
-            message=words,
-            hardware_id=self._predictor.model.artifact.card.vehicle.name,
-            values=[KeyValue(key=key, value=value) for key, value in (values | self._health.values(now)).items()],
+        vehicle = self._predictor.model.artifact.card.vehicle.name
+        self._publish_diagnostics(
+            diagnostics(self, "prediction", vehicle, level, words, values | self._health.values(now))
         )
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._publish_diagnostics(array)
 
 
 def main(args: list[str] | None = None) -> None:

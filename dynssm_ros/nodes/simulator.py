@@ -19,7 +19,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.nodes.support import SENSOR_QOS, describe, run, set_pose, set_stamp
+from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, run, set_pose, set_stamp
 from dynssm_ros.signals.decoding import decoders
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -47,10 +47,10 @@ class SimulatorNode(Node):
         )
         track = describe(self, "track", "club", "Track: built-in name or CSV file.", read_only=True)
         scale = describe(self, "scale", 1.0, "Size of the track.", (1e-4, 1e4), read_only=True)
-        self._plant: PlantKind = self._choice("plant", "euler", get_args(PlantKind), "How the car is modelled.")
-        self._line: LineKind = self._choice("line", "centre", get_args(LineKind), "What the own driver follows.")
-        self._driver: DriverKind = self._choice(
-            "driver", "pure_pursuit", get_args(DriverKind), f"The own one, or whoever sends {COMMAND_TOPIC}."
+        self._plant: PlantKind = choose(self, "plant", "euler", get_args(PlantKind), "How the car is modelled.")
+        self._line: LineKind = choose(self, "line", "centre", get_args(LineKind), "What the own driver follows.")
+        self._driver: DriverKind = choose(
+            self, "driver", "pure_pursuit", get_args(DriverKind), f"The own one, or whoever sends {COMMAND_TOPIC}."
         )
         self._seed = describe(self, "seed", 0, "Of the driver's variation and the noise.", read_only=True)
         noise = describe(
@@ -62,7 +62,7 @@ class SimulatorNode(Node):
         variation = describe(self, "variation", 0.5, "How much speed and line vary.", (0.0, 1.0), read_only=True)
         self._rate = describe(self, "rate", 1.0, "Speed factor over real time.", (0.01, 100.0), read_only=True)
         watchdog = describe(
-            self, "watchdog", 0.2, "Age of an external command from which on the car brakes (s).", (0.01, 10.0),
+            self, "watchdog", 0.2, "Age of an external command, in the car's time, at which it brakes (s).", (0.01, 10.0),
             read_only=True,
         )  # fmt: skip
         if len(noise) != 3 or not all(0 <= std < math.inf for std in noise):
@@ -76,7 +76,7 @@ class SimulatorNode(Node):
         self._style = Style(aggressiveness, variation)
         self._noise = np.array(noise)
         self._rng = np.random.default_rng([self._seed, 1])  # apart from the driver's, as in `dynssm simulate`
-        self._commands = CommandHolder(self._vehicle, watchdog, time.monotonic)
+        self._commands = CommandHolder(self._vehicle, watchdog, lambda: time.monotonic() * self._rate)
         self._obeyed = self._on_road = True
 
         self._publish_feedback = self.create_publisher(JointState, FEEDBACK_TOPIC, SENSOR_QOS).publish
@@ -95,12 +95,6 @@ class SimulatorNode(Node):
             f"{self._vehicle.name} on {self._track.name} ({self._track.length:.4g} m), plant {self._plant}, "
             f"driver {self._driver}, {1 / self._period:.4g} Hz"
         )
-
-    def _choice(self, name: str, default: str, allowed: tuple[str, ...], description: str) -> Any:
-        value = describe(self, name, default, f"{description} One of: {', '.join(allowed)}.", read_only=True)
-        if value not in allowed:
-            raise ConfigurationError(f"parameter {name}: '{value}'; expected {' or '.join(allowed)}")
-        return value
 
     def _drive(self) -> Iterator[Sample]:
         if self._driver == "external":
@@ -130,9 +124,9 @@ class SimulatorNode(Node):
         """Actuators first, as a predictor needs them when the odometry arrives."""
         stamp = self._first_stamp + round(self._count * self._vehicle.sampling_time * 1e9)
         self._count += 1
-        self._publish_feedback(_actuators(stamp, sample.feedback))
+        self._publish_feedback(actuators(stamp, sample.feedback))
         if self._driver == "pure_pursuit":
-            self._publish_command(_actuators(stamp, sample.command))
+            self._publish_command(actuators(stamp, sample.command))
         else:
             self._tell(sample)
         self._publish_odometry(
@@ -150,12 +144,6 @@ class SimulatorNode(Node):
             words = "is back on" if on_road else "leaves"
             self.get_logger().warning(f"{self._vehicle.name} {words} the road at s = {sample.s:.4g} m")
         self._obeyed, self._on_road = obeyed, on_road
-
-
-def _actuators(stamp: int, applied: Applied) -> JointState:
-    message = JointState(name=["throttle", "steering"], position=[float(applied.r), float(applied.delta)])
-    set_stamp(message.header, stamp)
-    return message
 
 
 def _odometry(stamp: int, sample: Sample, measured: State) -> Odometry:

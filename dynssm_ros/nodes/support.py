@@ -5,16 +5,19 @@ from __future__ import annotations
 import importlib
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError, UserError
+from dynssm_ros.vehicle import Applied
 
 NodeType = TypeVar("NodeType", bound=Node)
 
@@ -52,6 +55,41 @@ def describe(
     return node.declare_parameter(name, default, descriptor).value
 
 
+def choose(node: Node, name: str, default: str, allowed: tuple[str, ...], description: str) -> Any:
+    """Declares a read-only parameter that is one of a few words, and returns it.
+
+    Raises:
+        ConfigurationError: it is none of them.
+    """
+    value = describe(node, name, default, f"{description} One of: {', '.join(allowed)}.", read_only=True)
+    if value not in allowed:
+        raise ConfigurationError(f"parameter {name}: '{value}'; expected {' or '.join(allowed)}")
+    return value
+
+
+def actuators(stamp: int, applied: Applied) -> JointState:
+    """Throttle and steering as a message with ``stamp`` (ns)."""
+    message = JointState(name=["throttle", "steering"], position=[float(applied.r), float(applied.delta)])
+    set_stamp(message.header, stamp)
+    return message
+
+
+def diagnostics(
+    node: Node, part: str, hardware: str, level: int, words: str, values: Mapping[str, str]
+) -> DiagnosticArray:
+    """What ``node`` says of its ``part``, stamped now."""
+    status = DiagnosticStatus(
+        level=bytes([level]),
+        name=f"{node.get_fully_qualified_name()}: {part}",
+        message=words,
+        hardware_id=hardware,
+        values=[KeyValue(key=key, value=value) for key, value in values.items()],
+    )
+    array = DiagnosticArray(status=[status])
+    array.header.stamp = node.get_clock().now().to_msg()
+    return array
+
+
 def set_stamp(header: Any, stamp: int) -> None:
     """Writes ``stamp`` (ns) into a message header."""
     header.stamp.sec, header.stamp.nanosec = divmod(stamp, 1_000_000_000)
@@ -87,6 +125,9 @@ def run(
         sys.exit(1)
     except (KeyboardInterrupt, ExternalShutdownException):
         return
+    except RuntimeError:  # what was interrupted in the middle of its work finds rclpy shut down
+        if rclpy.ok():
+            raise
     finally:
         if node is not None:
             node.destroy_node()

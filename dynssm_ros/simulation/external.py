@@ -11,7 +11,7 @@ from dynssm_ros.simulation.laps import Sample, SimulationError
 from dynssm_ros.simulation.plant import RK4_STEP, PlantKind, Pose, make_plant
 from dynssm_ros.simulation.tracks import Track
 from dynssm_ros.vehicle import Applied, State, Vehicle
-from dynssm_ros.vehicle.single_track import Motion
+from dynssm_ros.vehicle.single_track import Array, Motion
 
 Clock = Callable[[], float]
 
@@ -69,12 +69,24 @@ class Creeping:
 
     def apply(self, stage: str, xp: Any, q: Motion) -> None:
         """Sets the rates of the state such that it rolls within one step."""
-        if stage != "accelerations" or q.v_x > self.speed:
+        if stage != "accelerations":
             return
         omega = q.v_x * xp.tan(q.delta) / (q.l_f + q.l_r)
-        q.a_x = max(q.a_x, -q.v_x / self._step)
-        q.a_y = (q.l_r * omega - q.v_y) / self._step
-        q.omega_dot = (omega - q.omega) / self._step
+        rest = -q.v_x / self._step
+        rolling = (
+            _chosen(q.a_x > rest, q.a_x, rest),
+            (q.l_r * omega - q.v_y) / self._step,
+            (omega - q.omega) / self._step,
+        )
+        creeps = q.v_x <= self.speed
+        q.a_x, q.a_y, q.omega_dot = (
+            _chosen(creeps, *pair) for pair in zip(rolling, (q.a_x, q.a_y, q.omega_dot), strict=True)
+        )
+
+
+def _chosen(condition: Array, one: Array, other: Array) -> Array:
+    """``one`` where ``condition`` holds, else ``other``; also of casadi symbols."""
+    return condition * one + (1 - condition) * other
 
 
 def drive_by_commands(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from PIL import Image
 
 SHORT = ("--vehicle", "orca", "--track", "club", "--plant", "euler", "--line", "centre", "--pace", "0.8")
 
@@ -12,7 +13,7 @@ SHORT = ("--vehicle", "orca", "--track", "club", "--plant", "euler", "--line", "
 def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
     out, result = tmp_path / "race", tmp_path / "race.json"
     models = ("--model", "true", "--model", "persistence")
-    status, text, _ = dynssm("race", *SHORT, *models, "--out", out, "--json", result)
+    status, text, _ = dynssm("race", *SHORT, *models, "--out", out, "--json", result, "--animation")
     assert status == 0
     assert "true" in text
     content = json.loads(result.read_text())
@@ -21,6 +22,8 @@ def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
     assert list(content["models"]) == ["true", "persistence"]
     assert content["models"]["true"]["completed"]
     assert (out / "report.html").stat().st_size > 50_000
+    with Image.open(out / "race.gif") as animation:
+        assert animation.n_frames == 120
 
 
 @pytest.mark.parametrize(
@@ -30,6 +33,8 @@ def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
         (["--model", "true", "--model", "true"], "given twice"),
         (["--model", "true", "--scale", "1", "--lap-length", "20"], "expected one of them"),
         (["--model", "true", "--line", "racing", "--lap-length", "1"], "expected more than twice the margin"),
+        (["--model", "true", "--lap-length", "1"], "m, the width of orca"),
+        (["--model", "true", "--start-speed", "-1"], "expected 0 or more"),
         (["--model", "true", "--start-offset", "0.5"], "expected it on the road"),
         (["--model", "true", "--objective", "glory"], "Invalid value for '--objective'"),
         (["--model", "single_track", "--effect", "rocket"], "unknown effect 'rocket'"),

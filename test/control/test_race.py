@@ -8,7 +8,8 @@ import pytest
 from dynssm_ros.control.learned import load_knowledge, true_model
 from dynssm_ros.control.nmpc import Settings
 from dynssm_ros.control.race import Course, Start, race
-from dynssm_ros.control.report import race_json, race_report, race_table, summary
+from dynssm_ros.control.reference import Reference
+from dynssm_ros.control.report import driven_coefficients, race_json, race_report, race_table, summary
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.laps import SimulationError
 
@@ -79,7 +80,7 @@ def test_a_car_that_leaves_the_road_is_stopped_and_said_so(course, orca):
     ("start", "complaint"),
     [
         (Start(lateral=0.5), "expected it on the road, -0.2 to 0.2 m"),
-        (Start(speed=0.0), "expected a rolling start"),
+        (Start(speed=-1.0), "expected 0 or more"),
     ],
 )
 def test_impossible_starts_are_refused(course, orca, start, complaint):
@@ -87,7 +88,40 @@ def test_impossible_starts_are_refused(course, orca, start, complaint):
         race(replace(course, start=start), true_model(orca, "euler"))
 
 
+def test_a_standing_start_takes_off_with_all_there_is(course, orca):
+    """At full throttle the 1:43 car gains C_m1 - C_r0 over its mass at first: 5.7 m/s^2, less with speed."""
+    start = race(replace(course, start=Start(speed=0.0)), true_model(orca, "euler"))
+    assert start.completed
+    assert start.outside == 0.0
+    gain = np.diff(start.state[:, 0])[:6] / 0.02
+    assert np.max(gain) == pytest.approx((0.287 - 0.0518) / 0.041, rel=0.05)
+    assert np.all(gain[1:] > 4.5)
+
+
+def test_a_line_for_one_lap_is_not_driven_twice(course, orca, club_line):
+    standing = Reference("launch", club_line.line, np.where(club_line.line.s > 0, club_line.speed, 0.0))
+    with pytest.raises(SimulationError, match="2 laps of line launch, which starts from standstill; expected 1"):
+        race(replace(course, reference=standing, laps=2), true_model(orca, "euler"))
+
+
 def test_a_model_that_needs_what_is_not_measured_is_refused(course, orca):
     banked = orca.with_effect("road_bank", {"roll_gain": 1.0})
     with pytest.raises(ConfigurationError, match="needs the signal roll"):
         race(course, load_knowledge("single_track", banked, banked, "euler"))
+
+
+def test_what_effects_amount_to_is_told_as_coefficients(lap, course, orca):
+    """Less grip all over is a smaller peak, a steering offset a shift of the front slip angle."""
+    slick = orca.with_effect("front_grip", {"factor": 0.8}).with_effect("steering_offset", {"offset": 0.01})
+    told = driven_coefficients(replace(lap, course=replace(course, vehicle=slick)))
+    assert set(told) == {"D_f", "S_hf"}
+    np.testing.assert_allclose(told["D_f"][np.isfinite(told["D_f"])], 0.8 * 0.192, rtol=1e-9)
+    assert np.mean(np.isfinite(told["D_f"])) > 0.5
+    np.testing.assert_allclose(told["S_hf"], -0.0013 + 0.01, rtol=1e-9)
+    assert driven_coefficients(lap) == {}
+
+
+def test_a_road_narrower_than_the_car_is_refused(course, orca, club):
+    path = replace(club, width_left=club.width_left / 12, width_right=club.width_right / 12)
+    with pytest.raises(SimulationError, match=r"track club is 0.0333 m wide .* more than 0.04 m, the width of orca"):
+        race(replace(course, track=path), true_model(orca, "euler"))

@@ -1,0 +1,169 @@
+"""What a predictor elsewhere says of the car, as the controller's knowledge: its answers come late, singly or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, STATES, Car, HorizonModel
+from dynssm_ros.control.nmpc import Adapted, Plan
+from dynssm_ros.simulation.plant import SCALAR, Pose
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.single_track import settled_memory
+
+Vector = npt.NDArray[np.float64]
+Context = tuple[float, float, float]
+"""Time (s), place on the track (m) and length of the lap (m): what effects may read beside the pose."""
+
+_VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
+_ROUNDING = 1e-5  # of a coefficient's range: predictors compute in single precision
+
+
+class Said(NamedTuple):
+    """What holds now.
+
+    Attributes:
+        adapted: for the horizon.
+        source: in words.
+        age: of the odometry that it rests on (s); infinite for the nominal car.
+    """
+
+    adapted: Adapted
+    source: str
+    age: float
+
+
+class Remote:
+    """The nominal car with the last coefficients of a predictor, and what the predictor adds to a step with them.
+
+    A prediction carries the stamp of the instant that it is for, one T_s after the odometry that it rests on, and the
+    adapted coefficients carry the same. The correction is the predicted state less the car's own step from the same
+    odometry with these coefficients. Both are held until they are older than ``max_age``; then the nominal car is driven.
+
+    Args:
+        vehicle: the car.
+        max_age: how old the odometry behind the coefficients may be (s).
+    """
+
+    name = "predictor"
+    H = 0
+    NOMINAL = "nominal car"
+    ADAPTED = "adapted coefficients"
+    CORRECTED = "nominal car, corrected"
+
+    def __init__(self, vehicle: Vehicle, max_age: float) -> None:
+        self.car = Car.of(vehicle)
+        self._model = HorizonModel(self.car, 1)
+        self._period = round(vehicle.sampling_time * 1e9)
+        self._max_age = max_age * 1e9
+        self._lower, self._upper = vehicle.lower, vehicle.upper
+        self._nothing = Said(Adapted(vehicle.nominal, np.zeros(3)), self.NOMINAL, np.inf)
+        # all by the predicted instant (ns)
+        self._theta: dict[int, Vector] = {}
+        self._state: dict[int, Vector] = {}
+        self._start: dict[int, tuple[Vector, Context]] = {}
+        self.said = self._nothing
+        """What :meth:`read` hands on."""
+
+    def predicted(self, stamp: int, state: Sequence[float]) -> str:
+        """Takes a predicted ``v_x, v_y, omega`` for the instant ``stamp`` (ns).
+
+        Returns:
+            Nothing if it is usable, else what is wrong with it.
+        """
+        values = np.array(state, dtype=np.float64)
+        if not np.all(np.isfinite(values)):
+            return f"state {', '.join(f'{value:g}' for value in values)}; expected finite numbers"
+        self._state[stamp] = values
+        return ""
+
+    def adapted(self, stamp: int, theta: Mapping[str, float]) -> str:
+        """Takes the coefficients, by name, behind the prediction for the instant ``stamp`` (ns).
+
+        Returns:
+            Nothing if they are usable, else what is wrong with them.
+        """
+        missing = [name for name in COEFFICIENTS if name not in theta]
+        if missing:
+            return f"{', '.join(missing)} missing; expected all of {' '.join(COEFFICIENTS)}"
+        values = np.array([theta[name] for name in COEFFICIENTS], dtype=np.float64)
+        for name, value, low, high in zip(COEFFICIENTS, values, self._lower, self._upper, strict=True):
+            slack = _ROUNDING * (high - low)
+            if not low - slack <= value <= high + slack:  # what is not a number neither
+                return f"{name} = {value:g}; expected {low:.4g} to {high:.4g}, the bounds of the vehicle file"
+        self._theta[stamp] = values
+        return ""
+
+    def start(self, pose: Pose, seen: State, applied: Applied, context: Context, memory: Vector | None) -> Vector:
+        """The controller's state, shape ``(size,)``.
+
+        Args:
+            pose: where the car is.
+            seen: its measured velocities.
+            applied: what its actuators do from now on.
+            context: now.
+            memory: states of the car's effects; settled if not given.
+        """
+        if memory is None:
+            car, theta = self.car, Coefficients(*self.said.adapted.theta.tolist())
+            around = dict(zip(CONTEXT, context, strict=True)) | pose._asdict()
+            settled = settled_memory(SCALAR, seen, applied, theta, car.constants, car.effects, None, around)
+            memory = np.array([settled[name] for name in car.memory])
+        return np.array([*pose, *seen, *applied, *memory])
+
+    def measured(self, stamp: int, x: Vector, context: Context) -> None:
+        """Notes where the prediction from the odometry at ``stamp`` (ns) starts.
+
+        Args:
+            stamp: of the odometry.
+            x: the controller's state then, its actuators being those that act from then on, shape ``(size,)``.
+            context: then.
+        """
+        self._start[stamp + self._period] = x, context
+
+    def update(self, stamp: int) -> None:
+        """Chooses what holds for the odometry at ``stamp`` (ns); what is too old for it, or not of its time, is dropped.
+
+        Coefficients go before none, those with a correction before those without, new before old.
+        """
+        following = stamp + self._period
+        kept: tuple[dict[int, Any], ...] = (self._theta, self._state, self._start)
+        for each in kept:
+            for k in [k for k in each if abs(following - k) > self._max_age]:
+                del each[k]
+        correctable = self._state.keys() & self._start.keys()
+        candidates = self._theta.keys() | correctable
+        if not candidates:
+            self.said = self._nothing
+            return
+        best = max(candidates, key=lambda k: (k in self._theta, k in correctable, k))
+        theta = self._theta.get(best, self._nothing.adapted.theta)
+        correction = self._correction(best, theta) if best in correctable else np.zeros(3)
+        source = self.ADAPTED if best in self._theta else self.CORRECTED
+        self.said = Said(Adapted(theta, correction), source, (following - best) / 1e9)
+
+    def read(self, rows: Vector, outlook: Plan | None) -> Adapted:
+        """What was chosen; see :class:`~dynssm_ros.control.learned.Knowledge`."""
+        return self.said.adapted
+
+    def ahead(self, x: Vector, context: Context) -> Vector:
+        """The state one T_s after ``x`` with its actuators held, by what holds now; see :meth:`measured`."""
+        return self._step(x, context, *self.said.adapted)
+
+    def forget(self) -> None:
+        """Drops everything that was heard and measured, as after a jump of time."""
+        self._theta.clear()
+        self._state.clear()
+        self._start.clear()
+        self.said = self._nothing
+
+    def _correction(self, stamp: int, theta: Vector) -> Vector:
+        """What the prediction for ``stamp`` adds to the car's own step with ``theta``; none if that is not finite."""
+        correction = self._state[stamp] - self._step(*self._start[stamp], theta, np.zeros(3))[_VELOCITIES]
+        return correction if np.all(np.isfinite(correction)) else np.zeros(3)
+
+    def _step(self, x: Vector, context: Context, theta: Vector, correction: Vector) -> Vector:
+        return self._model.step(x, np.zeros(len(INPUTS)), np.concatenate([theta, correction, context]))

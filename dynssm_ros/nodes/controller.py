@@ -1,0 +1,170 @@
+"""The live controller: ``ros2 run dynssm_ros controller --ros-args -p vehicle:=orca -p track:=club``.
+
+Answers odometry with absolute throttle and steering; the predictor's coefficients and predictions go into the car that it
+plans with. All driving is in :mod:`dynssm_ros.control`; this node converts, calls and publishes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from typing import Any, get_args
+
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+
+from dynssm_ros.control.nmpc import Objective, Settings
+from dynssm_ros.control.online import Online
+from dynssm_ros.control.reference import load_reference
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, diagnostics, run
+from dynssm_ros.runtime.health import Health, Level
+from dynssm_ros.signals.decoding import decoders, header_stamp_ns
+from dynssm_ros.signals.history import Refusal
+from dynssm_ros.signals.messages import COMMAND_TOPIC, ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.simulation.plant import Pose
+from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.vehicle import State, load_vehicle
+
+HORIZON = (2, 100)
+# a controller that was held up goes on from the newest odometry
+_NEWEST = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
+
+
+class ControllerNode(Node):
+    """Drives one car in real time."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("controller", **options)
+        self._rate: float = describe(
+            self, "rate", 1.0, "Speed of the car's time over real time, as of the simulator.", (0.01, 100.0), read_only=True
+        )  # fmt: skip
+        self._watchdog: float = describe(
+            self, "watchdog", 0.2, "Silence of the odometry at which the car is braked (s).", (0.01, 10.0), read_only=True
+        )  # fmt: skip
+        period = describe(
+            self, "diagnostics_period", 1.0, "Time between /diagnostics (s).", (0.1, 60.0), read_only=True
+        )
+        self._driver = self._make_driver()
+        self._health = Health((ODOMETRY_TOPIC, PREDICTION_TOPIC, PARAMETERS_TOPIC), self._watchdog)
+        self._decoder = decoders(load_signal_map("default"))[ODOMETRY_TOPIC]
+        self._newest: int | None = None  # stamp of the odometry
+
+        self._publish_command = self.create_publisher(JointState, COMMAND_TOPIC, SENSOR_QOS).publish
+        self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
+        # when several messages wait, the executor serves subscriptions in this order
+        self.create_subscription(Odometry, PREDICTION_TOPIC, self._on_prediction, SENSOR_QOS)
+        self.create_subscription(JointState, PARAMETERS_TOPIC, self._on_parameters, SENSOR_QOS)
+        self.create_subscription(Odometry, ODOMETRY_TOPIC, self._on_odometry, _NEWEST)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(self._driver.period / 1e9 / self._rate, self._watch, clock=steady)
+        self.create_timer(period, self._diagnose, clock=steady)
+
+    def _make_driver(self) -> Online:
+        """What the parameters ask for; it has its first step behind it."""
+        vehicle = describe(self, "vehicle", "orca", "Vehicle: shipped name or file.", read_only=True)
+        track = describe(self, "track", "club", "Track: built-in name or CSV file.", read_only=True)
+        scale = describe(self, "scale", 1.0, "Size of the track.", (1e-4, 1e4), read_only=True)
+        line = describe(self, "line", "racing", "What to follow: centre, racing or a file with speeds.", read_only=True)
+        pace = describe(self, "pace", 0.9, "Share of the car's limits in the line's speed.", (0.1, 2.0), read_only=True)
+        objective: Objective = choose(
+            self, "objective", "tracking", get_args(Objective), "To follow the line's speed, or to go as far as can be."
+        )
+        horizon = describe(self, "horizon", 15, "Steps of T_s that are planned ahead.", read_only=True)
+        max_age = describe(
+            self, "max_age", 0.5, "Age to which the predictor's coefficients are held (s).", (0.01, 10.0), read_only=True
+        )  # fmt: skip
+        if not HORIZON[0] <= horizon <= HORIZON[1]:
+            raise ConfigurationError(f"parameter horizon: {horizon}; expected {HORIZON[0]} to {HORIZON[1]}")
+        car = load_vehicle(vehicle)
+        road = load_track(track).scaled(scale)
+        reference = load_reference(line, car, road, pace)
+        settings = replace(Settings.of(car, objective, horizon), deadline=car.sampling_time / self._rate)
+        driver = Online(car, reference, road, settings, max_age, self._watchdog)
+        self.get_logger().info(
+            f"{car.name} on {road.name} ({road.length:.4g} m), {objective} of the {reference.name} line "
+            f"({reference.lap_time:.4g} s a lap at its own speed), {horizon} steps of {car.sampling_time:g} s"
+        )
+        return driver
+
+    def _now(self) -> float:
+        """The car's time (s), of any origin."""
+        return time.monotonic() * self._rate
+
+    def _on_prediction(self, message: Odometry) -> None:
+        self._health.arrived(PREDICTION_TOPIC, self._now())
+        twist = message.twist.twist
+        self._refuse(
+            PREDICTION_TOPIC,
+            self._driver.remote.predicted(_stamp(message), (twist.linear.x, twist.linear.y, twist.angular.z)),
+        )
+
+    def _on_parameters(self, message: JointState) -> None:
+        self._health.arrived(PARAMETERS_TOPIC, self._now())
+        theta = dict(zip(message.name, message.position, strict=False))
+        self._refuse(PARAMETERS_TOPIC, self._driver.remote.adapted(_stamp(message), theta))
+
+    def _refuse(self, topic: str, reason: str) -> None:
+        if reason:
+            self.get_logger().warning(f"{topic}: ignored: {reason}", throttle_duration_sec=1.0)
+
+    def _on_odometry(self, message: Odometry) -> None:
+        stamp, values = _stamp(message), self._decoder.decode(message)
+        pose, seen = Pose(*map(values.__getitem__, Pose._fields)), State(*map(values.__getitem__, State._fields))
+        outcome = self._driver.step(stamp, pose, seen)
+        if isinstance(outcome, Refusal):
+            self._health.refused(outcome, self._now())
+            return
+        self._health.arrived(ODOMETRY_TOPIC, self._now())  # now: a step that took long is no silence of the odometry
+        self._newest = stamp
+        if outcome is not None:
+            self._publish_command(actuators(stamp + self._driver.period, outcome))
+
+    def _watch(self) -> None:
+        """Brakes while odometry is silent."""
+        if not self._silent():
+            return
+        if self._newest is None:
+            stamp = int(self.get_clock().now().nanoseconds)
+        else:
+            stamp = self._newest + self._driver.period + round(self._health.age(ODOMETRY_TOPIC, self._now()) * 1e9)
+        self._publish_command(actuators(stamp, self._driver.brake()))
+
+    def _silent(self) -> bool:
+        return self._health.age(ODOMETRY_TOPIC, self._now()) > self._watchdog
+
+    def _diagnose(self) -> None:
+        now, driver, health = self._now(), self._driver, self._health
+        level, words = driver.verdict()
+        if self._silent():
+            age = health.age(ODOMETRY_TOPIC, now)
+            silence = "nothing received" if math.isinf(age) else f"silent for {age:.1f} s"
+            level, words = Level.ERROR, f"{ODOMETRY_TOPIC}: {silence}: brakes"
+        values = driver.values()
+        for topic in health.topics:
+            values[f"{topic} rate (Hz)"] = f"{health.rate(topic, now):.1f}"
+            values[f"{topic} age (s)"] = f"{health.age(topic, now):.3f}"
+        for refusal, count in health.refusals.items():
+            values[f"odometry refused: {refusal.name.lower()}"] = str(count)
+        self._publish_diagnostics(diagnostics(self, "control", self._driver.vehicle.name, level, words, values))
+
+
+def _stamp(message: Any) -> int:
+    stamp = header_stamp_ns(message)
+    assert stamp is not None, "messages with a header"
+    return stamp
+
+
+def main(args: list[str] | None = None) -> None:
+    """Runs the node; a user error is one line and exit status 1."""
+    run(ControllerNode, args)
+
+
+if __name__ == "__main__":
+    main()
