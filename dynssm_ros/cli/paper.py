@@ -1,4 +1,4 @@
-"""``dynssm paper``: everything that the paper's open-loop evaluation has and more, measured anew, as one document."""
+"""``dynssm paper``: everything that the paper's evaluation has and more, measured anew, as two documents."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from dynssm_ros.cli.console import console, errors, progress_bar
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.paper.document import write
 from dynssm_ros.evaluation.paper.plan import load_plan
+from dynssm_ros.evaluation.paper.race_document import write_races
 from dynssm_ros.evaluation.paper.reference import load_reference
 from dynssm_ros.evaluation.paper.results import Made, read_results
 from dynssm_ros.evaluation.paper.runner import Outcome, code_digest, run
@@ -68,8 +69,14 @@ def paper(
     code = code_digest()
     done = [outcome for outcome in outcomes.values() if outcome.state == "done"]
     made = Made({"Made": _origin(done)}, quick, (sum(outcome.code != code for outcome in done), len(done)))
-    write(read_results(wanted, reference, out, steps, outcomes, made), document)
-    console.print(f"{document} written; {_times(steps, outcomes)}", markup=False, soft_wrap=True)
+    found = read_results(wanted, reference, out, steps, outcomes, made)
+    write(found, document)
+    written = str(document)
+    if wanted.races:
+        races = document.with_name(f"{document.stem}_race.md")
+        write_races(found, out, races)
+        written = f"{document} and {races}"
+    console.print(f"{written} written; {_times(steps, outcomes)}", markup=False, soft_wrap=True)
     failed = [step for step in steps if outcomes[step.key].state == "failed" and outcomes[step.key].cause == step.key]
     if failed:
         raise UserError(

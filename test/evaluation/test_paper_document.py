@@ -102,7 +102,7 @@ def make(scores):
 
     def results(**changes):
         parts = {
-            "plan": plan, "reference": load_reference(), "scores": scores, "costs": dict.fromkeys(MODELS, cost),
+            "plan": plan, "reference": load_reference(), "scores": scores, "races": {}, "costs": dict.fromkeys(MODELS, cost),
             "missing": {}, "reasons": {}, "made": Made({"Made": "today"}),
         }  # fmt: skip
         return Results(**parts | changes)

@@ -19,6 +19,9 @@ from dynssm_ros.vehicle.parameters import EffectEntry
 
 Quantity = Literal["time", "speed", "yaw_rate", "lateral_acceleration"]
 UNTRAINED = (Persistence.name, SingleTrack.name, SingleTrackEwma.name)
+TRUE, MID_RANGE = "true", "mid_range"
+FIXED = (TRUE, MID_RANGE, *UNTRAINED)
+"""Models of a race that need no training: the plant's own, the middle of the bounds, and those on the calibrated car."""
 
 
 class Log(StrictModel):
@@ -120,6 +123,30 @@ class Study(StrictModel):
     seeds: int = Field(ge=1)
 
 
+class Race(StrictModel):
+    """Laps in closed loop; fields as the options of ``dynssm race``."""
+
+    title: str
+    text: str = Field(description="what is asked, in a sentence or two")
+    vehicle: str
+    effects: tuple[EffectEntry, ...] = Field(default=(), description="physics that only the model true knows of")
+    track: str = Field(description="built-in name, or file relative to the data folder")
+    lap_length: float | None = Field(default=None, gt=0, description="that it is scaled to (m)")
+    plant: PlantKind = "euler"
+    objective: Literal["tracking", "progress"] = "tracking"
+    line: str = Field(default="racing", description="centre, racing, or file relative to the data folder")
+    pace: float = Field(default=1.0, gt=0)
+    horizon: int = Field(default=15, ge=2)
+    laps: int = Field(default=1, ge=1)
+    speed: float | None = Field(default=None, ge=0, description="at the start (m/s); null: the line's own")
+    split: str = Field(description="on whose training part the models were trained, with seed 0")
+    commands: Commands = "topics"
+    models: tuple[str, ...] = Field(min_length=1)
+    paper: str | None = Field(default=None, description="the paper's closed-loop table to set beside: a track")
+    ablation: bool = Field(default=False, description="whether it is the paper's closed-loop ablation")
+    figures: tuple[Literal["trajectories", "profiles", "forces", "coefficients"], ...] = ()
+
+
 class Quick(StrictModel):
     """What a run to try things out leaves out."""
 
@@ -138,6 +165,7 @@ class Plan(StrictModel):
     splits: dict[str, Split]
     models: dict[str, Model]
     studies: dict[str, Study]
+    races: dict[str, Race] = Field(default_factory=dict)
     stride: int = Field(ge=1, description="rollouts start at every stride-th row")
     calls: int = Field(ge=1, description="predictions of each model that are timed")
     epochs: int | None = Field(default=None, ge=1, description="in each stage, instead of the model files'")
@@ -161,6 +189,16 @@ class Plan(StrictModel):
             tests = self.tests(study)
             if len(set(tests)) < len(tests):
                 raise ValueError(f"studies.{name}.splits: tests of the same name: {', '.join(tests)}")
+        for name, race in self.races.items():
+            _check(f"races.{name}.split", [race.split], self.splits)
+            trained = [
+                model
+                for study in self.studies.values()
+                if race.split in study.splits and study.commands == race.commands
+                for model in study.models
+                if model in self.models
+            ]
+            _check(f"races.{name}.models", race.models, [*FIXED, *trained])
         return self
 
     def car(self, study: Study) -> Car:
@@ -203,7 +241,8 @@ class Plan(StrictModel):
             name: study.model_copy(update={"seeds": min(study.seeds, quick.seeds), "splits": study.splits[:1]})
             for name, study in self.studies.items()
         }
-        short = {"stride": quick.stride, "epochs": quick.epochs}
+        races = dict(list(self.races.items())[:1])
+        short = {"stride": quick.stride, "epochs": quick.epochs, "races": races}
         return self.model_copy(update={**short, "drives": drives, "studies": studies})
 
 
@@ -217,6 +256,7 @@ def load_plan(path: Path | None = None) -> Plan:
     plan = configuration.validate(Plan, configuration.read_yaml(path), path)
     vehicles = {car.vehicle for car in plan.cars.values()} | {drive.vehicle for drive in plan.drives.values()}
     vehicles |= {model.vehicle for model in plan.models.values() if model.vehicle}
+    vehicles |= {race.vehicle for race in plan.races.values()}
     try:
         for name in plan.models:
             configuration.find_config("models", name)

@@ -12,9 +12,10 @@ import numpy as np
 
 from dynssm_ros.evaluation.metrics import CHANNELS, Vector
 from dynssm_ros.evaluation.paper.plan import Car, Plan, Study
+from dynssm_ros.evaluation.paper.racing import NUMBERS
 from dynssm_ros.evaluation.paper.reference import Reference
 from dynssm_ros.evaluation.paper.runner import Outcome
-from dynssm_ros.evaluation.paper.schedule import COSTS, score_key
+from dynssm_ros.evaluation.paper.schedule import COSTS, race_key, score_key
 from dynssm_ros.evaluation.paper.steps import Step
 from dynssm_ros.evaluation.spread import Spread, spreads
 
@@ -45,6 +46,7 @@ class Results:
         plan: as it was run.
         reference: the paper's numbers.
         scores: content of the steps that evaluate, by their keys, as far as they are done.
+        races: what was driven in closed loop, by the plan's names, as ``dynssm race`` writes it, as far as it is done.
         costs: of the models, by name: parameters, flops, latency_us, integrator.
         missing: why steps are not done, by their titles; steps that only lack others are left out.
         reasons: why scores are not there, by their keys.
@@ -54,6 +56,7 @@ class Results:
     plan: Plan
     reference: Reference
     scores: Mapping[str, Entry]
+    races: Mapping[str, Entry]
     costs: Mapping[str, Entry]
     missing: Mapping[str, str]
     reasons: Mapping[str, str]
@@ -185,6 +188,7 @@ def read_results(
         plan=plan,
         reference=reference,
         scores=scores,
+        races={name: _read(root / race_key(name) / NUMBERS) for name in plan.races if race_key(name) in done},
         costs=_read(root / COSTS)["models"] if COSTS in done else {},
         missing={titles[key]: outcome.reason for key, outcome in lost.items() if outcome.cause == key},
         reasons={key: f"{titles[outcome.cause]}: {outcome.reason}" for key, outcome in lost.items()},

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynssm_ros.evaluation.paper.plan import UNTRAINED, Plan, Split
+from dynssm_ros.evaluation.paper.plan import FIXED, UNTRAINED, Plan, Race, Split
+from dynssm_ros.evaluation.paper.racing import DriveLaps
 from dynssm_ros.evaluation.paper.steps import (
     Calibrate,
     Evaluate,
@@ -45,7 +46,7 @@ def steps_of(plan: Plan, data: Path | None, given: Mapping[str, Path]) -> list[S
         key=COSTS, title="time the models", uses=tuple(step.key for step in steps), trained=trained, calls=plan.calls,
         vehicle=next(iter(plan.cars.values())).vehicle,
     )  # fmt: skip
-    return [*steps, timing]
+    return [*steps, timing, *(_race_step(name, race, data) for name, race in plan.races.items())]
 
 
 COSTS = "costs.json"
@@ -55,6 +56,30 @@ COSTS = "costs.json"
 def score_key(split: str, commands: Commands) -> str:
     """Where the scores of a split lie."""
     return f"scores/{split}.{commands}.json"
+
+
+def model_key(split: str, commands: Commands, model: str, seed: int) -> str:
+    """Where a training lies."""
+    return f"models/{split}.{commands}/{model}.{seed}"
+
+
+def vehicle_key(split: str, commands: Commands) -> str:
+    """Where the car lies that is calibrated on the training part of a split."""
+    return f"vehicles/{split}.{commands}.yaml"
+
+
+def race_key(name: str) -> str:
+    """Where the outcome of a race lies."""
+    return f"races/{name}"
+
+
+def _race_step(name: str, race: Race, data: Path | None) -> DriveLaps:
+    models = {model: model_key(race.split, race.commands, model, 0) for model in race.models if model not in FIXED}
+    return DriveLaps(
+        key=race_key(name), title=f"race {name}", needs=(vehicle_key(race.split, race.commands),),
+        uses=tuple(models.values()), race=race, trained=models, calibrated=vehicle_key(race.split, race.commands),
+        data=data,
+    )  # fmt: skip
 
 
 def _recording_step(plan: Plan, name: str, data: Path | None, given: Mapping[str, Path]) -> Step:
@@ -90,11 +115,11 @@ class _Site:
     @property
     def vehicle(self) -> str:
         """Key of the car that is calibrated here."""
-        return f"vehicles/{self.name}.{self.commands}.yaml"
+        return vehicle_key(self.name, self.commands)
 
     def model(self, name: str, seed: int) -> str:
         """Key of a training here."""
-        return f"models/{self.name}.{self.commands}/{name}.{seed}"
+        return model_key(self.name, self.commands, name, seed)
 
     @property
     def models(self) -> dict[str, range]:

@@ -1,0 +1,112 @@
+"""Races of the plan: driven as planned, and told of with the paper's numbers beside."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import yaml
+
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.evaluation.paper.plan import load_plan
+from dynssm_ros.evaluation.paper.race_document import write_races
+from dynssm_ros.evaluation.paper.racing import NUMBERS
+from dynssm_ros.evaluation.paper.reference import load_reference
+from dynssm_ros.evaluation.paper.results import Made, read_results
+from dynssm_ros.evaluation.paper.runner import Outcome
+from dynssm_ros.evaluation.paper.schedule import race_key, steps_of
+from dynssm_ros.vehicle import load_vehicle, save_vehicle
+
+RACE = {
+    "title": "A lap",
+    "text": "T.",
+    "track": "club",
+    "models": ("true", "single_track"),
+    "figures": ("coefficients",),
+}
+
+
+@pytest.fixture(scope="module")
+def plan():
+    """The shipped plan with one short race."""
+    shipped = load_plan()
+    race = shipped.races["ethz_mobil"].model_copy(update=RACE)
+    return shipped.model_copy(update={"races": {"lap": race}})
+
+
+@pytest.fixture(scope="module")
+def root(plan, tmp_path_factory):
+    """A run in which nothing but the calibration and the race is done."""
+    folder = tmp_path_factory.mktemp("run")
+    step = race_step(plan)
+    save_vehicle(load_vehicle("orca"), folder / step.calibrated, "The car itself.")
+    step.make(folder, frozenset())
+    return folder
+
+
+def race_step(plan):
+    return next(step for step in steps_of(plan, None, {}) if step.key == race_key("lap"))
+
+
+def document(plan, root, outcomes, path):
+    steps = steps_of(plan, None, {})
+    lost = Outcome("failed", reason="a comet", cause=steps[0].key)
+    all_outcomes = {step.key: outcomes.get(step.key, lost) for step in steps}
+    results = read_results(plan, load_reference(), root, steps, all_outcomes, Made({"Made": "now"}))
+    write_races(results, root, path)
+    return path.read_text()
+
+
+def test_models_without_training_drive_and_those_that_are_not_there_are_left_out(plan, root):
+    driven = json.loads((root / race_key("lap") / NUMBERS).read_text())
+    assert list(driven["models"]) == ["true", "single_track"]
+    assert driven["models"]["true"]["completed"]
+    assert driven["models"]["true"]["lap_time_s"] == pytest.approx(driven["line_lap_time_s"], rel=0.05)
+    # the calibrated car is the car itself here, so both drive alike but for the integrator
+    assert driven["models"]["single_track"]["lap_time_s"] == pytest.approx(
+        driven["models"]["true"]["lap_time_s"], rel=0.01
+    )
+    assert (root / race_key("lap") / "coefficients.png").stat().st_size > 10_000
+
+
+def test_the_document_sets_the_papers_rows_beside(plan, root, tmp_path):
+    text = document(plan, root, {race_key("lap"): Outcome("done")}, tmp_path / "results_race.md")
+    rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| ")]
+    assert ["| DynSSM, the paper's", "4.88"] in [row[:2] for row in rows]
+    assert any(row[0] == "| the plant's own model" for row in rows)
+    assert "Lap time against the plant's own model: `single_track`" in text
+    assert (tmp_path / "results_race_lap_coefficients.png").is_file()
+    assert "](results_race_lap_coefficients.png)" in text
+
+
+def test_a_race_that_could_not_be_driven_says_why(plan, root, tmp_path):
+    text = document(plan, root, {}, tmp_path / "results_race.md")
+    assert "*Not measured*: extract putnam: a comet." in text or "*Not measured*: " in text
+    assert "a comet" in text
+
+
+def test_what_decides_the_laps_is_in_the_recipe(plan):
+    step = race_step(plan)
+    assert step.recipe()["race"]["pace"] == 1.0
+    assert "text" not in step.recipe()["race"]
+    assert set(step.uses) == set(step.trained.values()) == set()
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"split": "moon"}, "races.lap.split: 'moon' is not one of"),
+        (
+            {"models": ["true", "dynssm_av21"]},
+            "races.lap.models: 'dynssm_av21' is not one of true, mid_range, persistence, single_track",
+        ),
+    ],
+)
+def test_names_of_a_race_exist(tmp_path, plan, change, expected):
+    content = plan.model_dump(mode="json")
+    content["races"]["lap"] |= change
+    path = tmp_path / "plan.yaml"
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(ConfigurationError, match=r"races\.lap") as error:
+        load_plan(path)
+    assert expected in str(error.value)
