@@ -66,9 +66,9 @@ def paper(
 
         outcomes = run(steps, out, jobs, told)
     document = out / "results.md" if results is None else results
-    code = code_digest()
-    done = [outcome for outcome in outcomes.values() if outcome.state == "done"]
-    made = Made({"Made": _origin(done)}, quick, (sum(outcome.code != code for outcome in done), len(done)))
+    done = [(step, outcomes[step.key]) for step in steps if outcomes[step.key].state == "done"]
+    stale = sum(outcome.code != code_digest(type(step)) for step, outcome in done)
+    made = Made({"Made": _origin([outcome for _, outcome in done])}, quick, (stale, len(done)))
     found = read_results(wanted, reference, out, steps, outcomes, made)
     write(found, document)
     written = str(document)

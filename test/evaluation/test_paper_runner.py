@@ -9,7 +9,8 @@ import pytest
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.paper.plan import Drive
-from dynssm_ros.evaluation.paper.runner import code_digest, run
+from dynssm_ros.evaluation.paper.racing import DriveLaps
+from dynssm_ros.evaluation.paper.runner import _reached, code_digest, run
 from dynssm_ros.evaluation.paper.steps import Simulate, Step, UnavailableError
 from dynssm_ros.signals.recording import Recording
 
@@ -126,7 +127,7 @@ def test_a_recipe_that_cannot_be_known_fails_the_step(made):
 def test_records_tell_time_and_code(made, tmp_path):
     outcomes, _ = made(write("a"))
     record = json.loads((tmp_path / "records" / "a.json").read_text())
-    assert record["code"] == outcomes["a"].code == code_digest()
+    assert record["code"] == outcomes["a"].code == code_digest(type(write("a")))
     assert record["seconds"] == outcomes["a"].seconds >= 0.0
     again, _ = made(write("a"))
     assert (again["a"].code, again["a"].seconds, again["a"].fresh) == (record["code"], record["seconds"], False)
@@ -145,3 +146,12 @@ def test_two_processes_make_what_one_makes(tmp_path):
         one, two = (Recording.load(tmp_path / folder / name) for folder in ("one", "two"))
         assert (one.matrix == two.matrix).all()
     assert (Recording.load(tmp_path / "one" / "a.parquet").matrix != one.matrix).any()
+
+
+def test_the_code_of_a_step_is_what_it_imports_from_the_rooms_that_compute():
+    modules = set(_reached(Simulate.__module__, {}))
+    assert {"dynssm_ros.simulation.laps", "dynssm_ros.learning.dynssm", "dynssm_ros.vehicle.single_track"} <= modules
+    assert "dynssm_ros.simulation.external" not in modules  # drives live
+    assert not any(".nodes." in name or ".diagnosis." in name for name in modules)
+    assert "dynssm_ros.control.nmpc" in _reached(DriveLaps.__module__, {})
+    assert code_digest(Simulate) != code_digest(DriveLaps)

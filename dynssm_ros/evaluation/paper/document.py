@@ -146,6 +146,8 @@ def _study(comparison: Comparison, results: Results, pictures: dict[str, str]) -
         yield tables.ablation_table(comparison, results).markdown()
         if f"ablations_{comparison.name}" in pictures:
             yield f"![Ablations against the full model]({pictures[f'ablations_{comparison.name}']})"
+    if comparison.study.remark:
+        yield comparison.study.remark
 
 
 def _coefficients(results: Results, data: str) -> Iterator[str]:

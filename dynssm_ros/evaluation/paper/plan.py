@@ -117,6 +117,7 @@ class Study(StrictModel):
 
     title: str
     text: str = Field(description="what is asked, in a sentence or two")
+    remark: str = Field(default="", description="what its authors make of the outcome, with the date")
     splits: tuple[str, ...] = Field(min_length=1)
     commands: Commands
     models: tuple[str, ...] = Field(min_length=1)

@@ -19,7 +19,8 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.paper.steps import Step, UnavailableError
 from dynssm_ros.files import replacing, write_json
 
-_COMPUTING = ("vehicle", "signals", "learning", "runtime", "simulation")  # rooms
+_PACKAGE = Path(__file__).parents[2]
+_COMPUTING = ("vehicle", "signals", "learning", "runtime", "simulation", "control")  # rooms
 
 
 @dataclass(frozen=True)
@@ -53,18 +54,38 @@ class Told(Protocol):
 
 
 @cache
-def code_digest() -> str:
-    """Names the code that outputs depend on: the rooms that compute, less comments, layout and docstrings.
+def code_digest(kind: type[Step]) -> str:
+    """Names the code that the outputs of a kind of step depend on, less comments, layout and docstrings.
 
-    Outputs are not remade because of it, or a corrected word would cost an hour; but what is shown of them can say that
-    they are of other code than the present.
+    That is its own module and all that this imports from the rooms that compute, directly or by others. Outputs are not
+    remade because of it, or a corrected word would cost an hour; but what is shown of them can say that they are of other
+    code than the present.
     """
-    package = Path(__file__).parents[2]
     total = hashlib.sha256()
-    for room in _COMPUTING:
-        for file in sorted((package / room).rglob("*.py")):
-            total.update(ast.dump(_Bare().visit(ast.parse(file.read_text(encoding="utf-8")))).encode())
+    for _, source in sorted(_reached(kind.__module__, {}).items()):
+        total.update(ast.dump(_Bare().visit(ast.parse(source))).encode())
     return total.hexdigest()
+
+
+def _reached(module: str, found: dict[str, str]) -> dict[str, str]:
+    """Texts of ``module`` and of what it imports, by their names; imports count wherever they stand."""
+    file = _file(module)
+    if module in found or file is None:
+        return found
+    found[module] = file.read_text(encoding="utf-8")
+    for node in ast.walk(ast.parse(found[module])):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            for name in (node.module, *(f"{node.module}.{alias.name}" for alias in node.names)):
+                parts = name.split(".")
+                if parts[0] == _PACKAGE.name and len(parts) > 1 and parts[1] in _COMPUTING:
+                    _reached(name, found)
+    return found
+
+
+def _file(module: str) -> Path | None:
+    """Where the text of a module of the package is; ``None`` if it is not one."""
+    path = _PACKAGE.parent.joinpath(*module.split("."))
+    return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
 
 
 class _Bare(ast.NodeTransformer):
@@ -147,15 +168,14 @@ def _side_by_side(
 
     if not steps:
         return
-    code = code_digest()
     with parallel_config("loky", inner_max_num_threads=1):
         yield from Parallel(n_jobs=min(jobs, len(steps)), return_as="generator_unordered")(
-            delayed(_make)(step, root, there, identities[step.key], code) for step in steps
+            delayed(_make)(step, root, there, identities[step.key]) for step in steps
         )
 
 
-def _make(step: Step, root: Path, there: frozenset[str], name: str, code: str) -> tuple[str, Outcome]:
-    begin = time.monotonic()
+def _make(step: Step, root: Path, there: frozenset[str], name: str) -> tuple[str, Outcome]:
+    begin, code = time.monotonic(), code_digest(type(step))
     try:
         step.make(root, there)
     except UserError as error:

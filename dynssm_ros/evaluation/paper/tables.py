@@ -141,18 +141,23 @@ def ablation_table(comparison: Comparison, results: Results) -> Table:
 
 
 def better_ablations(comparison: Comparison) -> str:
-    """Says which ablations beat the full model by more than the spread of both over the seeds."""
+    """Says which ablations beat the full model by more than the spread of both over the seeds.
+
+    A variant that was trained once is taken to vary as the full model does.
+    """
     full = comparison.rmse(comparison.car.full)
-    if min(comparison.seeds(model) for model in (comparison.car.full, *comparison.ablations.values())) < 2:
-        return "Not every variant was trained with several seeds, so the spread over seeds is not known."
+    if comparison.seeds(comparison.car.full) < 2:
+        return "The full model was trained once, so the spread over seeds is not known."
     found = []
     for lacking, model in comparison.ablations.items():
+        once = comparison.seeds(model) < 2
         for channel, own, whole in zip(CHANNELS, comparison.rmse(model), full, strict=True):
-            if whole.mean - own.mean > math.hypot(own.std, whole.std):
-                found.append(f"{comparison.variants[lacking]} in {TITLES[channel]} ({text(own)} against {text(whole)})")
+            if whole.mean - own.mean > math.hypot(whole.std if once else own.std, whole.std):
+                percent = _percentage(1 - own.mean / whole.mean)
+                found.append(f"{comparison.variants[lacking]} in {TITLES[channel]} by {text(percent)} %")
     if not found:
         return "No ablation is better than the full model beyond the spread over seeds."
-    return f"Better than the full model beyond the spread over seeds: {'; '.join(found)}."
+    return f"Better than the full model beyond the spread over seeds: {', '.join(found)}."
 
 
 def coefficient_table(comparison: Comparison, results: Results) -> Table | None:
