@@ -19,6 +19,7 @@ from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDe
 from dynssm_ros.vehicle.single_track import Motion, shape
 
 _STAMPS = 0.5  # s between the time stamps on the map
+_MOVED = 1e-3  # share of its value by which a coefficient moves for that to be shown
 VIOLATION = "A violation is the car's centre of gravity outside the borders at any sample."
 
 
@@ -239,18 +240,17 @@ def driven_coefficients(race: Race) -> dict[str, Any]:
 
 @styled
 def coefficients(races: Sequence[Race]) -> Figure:
-    """The coefficients that any model moves, and the corrections, over the position on the track."""
-    moving = [k for k in range(len(COEFFICIENTS)) if any(np.ptp(race.theta[:, k]) > 0 for race in races)]
-    rows = [
-        (f"{COEFFICIENTS[k]} ({coefficient_unit(COEFFICIENTS[k])})", [race.theta[:, k] for race in races])
-        for k in moving
-    ]
+    """The coefficients that a model or the driven car's effects move, and the corrections, over the position on the track."""
+    longest = max(races, key=lambda race: race.s[-1] - race.s[0])
+    driven = driven_coefficients(longest)
+    moved = np.any([np.ptp(race.theta, axis=0) > _MOVED * np.max(np.abs(race.theta), axis=0) for race in races], axis=0)
+    moving = [k for k, name in enumerate(COEFFICIENTS) if moved[k] or name in driven]
+    labels = {name: f"{name} ({unit})" if (unit := coefficient_unit(name)) else name for name in COEFFICIENTS}
+    rows = [(labels[COEFFICIENTS[k]], [race.theta[:, k] for race in races]) for k in moving]
     rows += [
         (f"{SYMBOLS[c]} added ({UNITS[c]})", [race.correction[:, k] for race in races]) for k, c in enumerate(CHANNELS)
     ]
-    longest = max(races, key=lambda race: race.s[-1] - race.s[0])
-    driven = {f"{name} ({coefficient_unit(name)})": values for name, values in driven_coefficients(longest).items()}
-    return _panels(races, rows, driven, longest)
+    return _panels(races, rows, {labels[name]: values for name, values in driven.items()}, longest)
 
 
 def _panels(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +18,7 @@ Vector = npt.NDArray[np.float64]
 Values = dict[str, float]
 
 MASS_STD = 0.01  # of the mass: vehicle files do not say how well it was weighed
+_LIGHTEST = 0.1  # of the nominal mass
 _ON_BOUND = 1e-3  # of the range, that a nominal value keeps from its bounds
 
 
@@ -26,7 +29,7 @@ class Car:
     Attributes:
         vehicle: as the file has it; its own effects always act, before those of ``effects``.
         moved: how far each of the 17 coefficients, and then the mass, is off its nominal value, in standard
-            deviations of what is known of it; shape ``(18,)``.
+            deviations of what is known of it; shape ``(18,)``. Those that are positive move as logarithms.
         effects: values by effect and parameter, in the order in which they act.
     """
 
@@ -40,16 +43,30 @@ class Car:
         return cls(vehicle, np.zeros(len(COEFFICIENTS) + 1), {})
 
     @property
+    def limits(self) -> tuple[Vector, Vector]:
+        """The least and the largest of :attr:`moved`."""
+        vehicle, known, scales = self.vehicle, knowledge(self.vehicle), _scaling(self.vehicle)
+        margin = _ON_BOUND * (vehicle.upper - vehicle.lower)
+        nominal = np.where(scales, vehicle.nominal, 1.0)
+        bounds = [
+            np.where(scales, nominal * np.log(np.where(scales, b, 1.0) / nominal), b - vehicle.nominal) / known
+            for b in (vehicle.lower + margin, vehicle.upper - margin)
+        ]
+        mass = np.log([_LIGHTEST, 1.0 / _LIGHTEST]) / MASS_STD
+        return np.append(bounds[0], mass[0]), np.append(bounds[1], mass[1])
+
+    @property
     def theta(self) -> Coefficients:
         """The coefficients, inside their bounds."""
-        wanted = self.vehicle.nominal + self.moved[:-1] * knowledge(self.vehicle)
-        margin = _ON_BOUND * (self.vehicle.upper - self.vehicle.lower)
-        return Coefficients(*np.clip(wanted, self.vehicle.lower + margin, self.vehicle.upper - margin).tolist())
+        step = np.clip(self.moved, *self.limits)[:-1] * knowledge(self.vehicle)
+        nominal, scales = self.vehicle.nominal, _scaling(self.vehicle)
+        grown = nominal * np.exp(np.where(scales, step / np.where(scales, nominal, 1.0), 0.0))
+        return Coefficients(*np.where(scales, grown, nominal + step).tolist())
 
     @property
     def constants(self) -> VehicleConstants:
         """Mass and geometry."""
-        factor = max(1.0 + MASS_STD * float(self.moved[-1]), 0.1)
+        factor = float(np.exp(MASS_STD * np.clip(self.moved, *self.limits)[-1]))
         return self.vehicle.constants.model_copy(update={"m": self.vehicle.constants.m * factor})
 
     @property
@@ -76,6 +93,42 @@ class Car:
         for name, values in self.effects.items():
             vehicle = vehicle.with_effect(name, values)
         return vehicle
+
+
+class Fleet(NamedTuple):
+    """``P`` cars as one, whose values are arrays of shape ``(P, 1)`` that broadcast against ``W`` simulations.
+
+    What is the same in all of them stays a number.
+    """
+
+    theta: Coefficients
+    constants: Any
+    effects: tuple[Effect, ...]
+
+    @classmethod
+    def of(cls, cars: Sequence[Car]) -> Fleet:
+        """Cars of one vehicle with the same effects in the same order."""
+        first = cars[0]
+        if len(cars) == 1:
+            return cls(first.theta, first.constants, first.active)
+        theta = Coefficients(*map(_together, zip(*(car.theta for car in cars), strict=True)))
+        constants = SimpleNamespace(**dict(first.constants) | {"m": _together([car.constants.m for car in cars])})
+        own = [
+            EFFECTS[name](**{key: _together([car.effects[name][key] for car in cars]) for key in values})
+            for name, values in first.effects.items()
+        ]
+        return cls(theta, constants, (*first.vehicle.active_effects, *own))
+
+
+def _together(values: Sequence[float]) -> Any:
+    """The number that all are, or a column of them."""
+    column = np.array(values)
+    return float(column[0]) if (column == column[0]).all() else column[:, None]
+
+
+def _scaling(vehicle: Vehicle) -> npt.NDArray[np.bool_]:
+    """The coefficients that move as logarithms, so that an effect that multiplies can make up for them exactly."""
+    return np.asarray((vehicle.lower >= 0) & (vehicle.nominal > 0))
 
 
 def knowledge(vehicle: Vehicle) -> Vector:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -12,9 +12,10 @@ import numpy.typing as npt
 from dynssm_ros.diagnosis.candidates import candidates
 from dynssm_ros.diagnosis.car import Car, knowledge
 from dynssm_ros.diagnosis.gain import Gain, measure
+from dynssm_ros.diagnosis.noticeable import noticeable, room
 from dynssm_ros.diagnosis.place import driven_line, lap_context, lap_number
 from dynssm_ros.diagnosis.selection import Refined, Search, Selection
-from dynssm_ros.diagnosis.study import Fit, Study, unit
+from dynssm_ros.diagnosis.study import Fit, Study, per_unit
 from dynssm_ros.diagnosis.systematic import Systematic, systematic
 from dynssm_ros.diagnosis.windows import WARM_UP, Track, Windows
 from dynssm_ros.errors import ConfigurationError, RecordingError
@@ -33,11 +34,14 @@ Say = Callable[[str], None]
 
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
-_MOST = 1500  # windows in the fit
+_COMPARED = 13  # rows of each simulation, at most: more hang together
+_MOST = 500  # windows in the fit, evenly spread: more would cost time and tell little
+_MEASURED = 3000  # in the held-out rows
 _LEAST = 24  # windows with which a fit can begin
 _LEAST_LAPS = 3  # with which whole laps are held out
+_TRIED = 300  # windows with which the integrator is chosen
 _CLEARLY = 20.0  # difference of twice the log-likelihood for which another integrator is taken than Runge-Kutta
-_GIVEN, _RECALIBRATED, _EXTENDED = "as given", "recalibrated", "extended"
+GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
 
 @dataclass(frozen=True)
@@ -73,8 +77,9 @@ class Diagnosis:
         causes: the strongest first.
         vehicle: the vehicle with effects and refitted nominal values.
         gain: on the held-out rows.
-        before: systematic part of the errors of the car as given, ``after`` of the extended one, both on the rows of
-            the fit.
+        left: what is systematic in the errors of the extended car, on the rows of the fit.
+        noticeable: how far off neutral each effect that is not named would have to be to be named (the unit of its
+            first parameter).
         selection: how it was found.
         car: the extended car as fitted.
         std: standard deviations of the 17 coefficients and of the mass, relative to what was known of them.
@@ -87,8 +92,8 @@ class Diagnosis:
     causes: tuple[Cause, ...]
     vehicle: Vehicle
     gain: Gain
-    before: Systematic
-    after: Systematic
+    left: Systematic
+    noticeable: Mapping[str, float]
     selection: Selection
     car: Car
     std: Vector
@@ -98,8 +103,9 @@ class Diagnosis:
 
     def to_json(self, vehicle_path: str) -> dict[str, Any]:
         """For programs; ``vehicle_path`` is where the extended vehicle was written."""
-        at = self.gain.horizon
-        rmse = {name: by_channel(values[at]) for name, values in self.gain.rmse.items()}
+        gain = self.gain
+        at = gain.horizon
+        rmse = {name: by_channel(values[at]) for name, values in gain.rmse.items()}
         return {
             "verdict": self.verdict,
             "causes": [
@@ -119,25 +125,34 @@ class Diagnosis:
                 for cause in self.causes
             ],
             "gain": {
-                "horizon_s": float(self.gain.horizons[at]),
-                "before": rmse[_GIVEN],
-                "recalibrated": rmse[_RECALIBRATED],
-                "after": rmse[_EXTENDED],
-                "reduction": by_channel(self.gain.reduction[at]),
-                "interval_95": {
-                    channel: [float(low), float(high)]
-                    for channel, low, high in zip(CHANNELS, *self.gain.interval[:, at], strict=True)
-                },
+                "horizon_s": float(gain.horizons[at]),
+                "before": rmse[GIVEN],
+                "recalibrated": rmse[RECALIBRATED],
+                "after": rmse[EXTENDED],
+                "reduction": by_channel(gain.reduction[at]),
+                "interval_95": _intervals(gain.interval[:, at]),
+                "reduction_from_recalibrated": by_channel(gain.reduction_from(RECALIBRATED)[at]),
+                "interval_95_from_recalibrated": _intervals(gain.interval_from(RECALIBRATED)[:, at]),
             },
-            "systematic": {"before": by_channel(self.before.share), "after": by_channel(self.after.share)},
+            "systematic": {
+                "before": by_channel(gain.systematic[GIVEN][at].share),
+                "recalibrated": by_channel(gain.systematic[RECALIBRATED][at].share),
+                "after": by_channel(gain.systematic[EXTENDED][at].share),
+                "gone": by_channel(gain.systematic_gone(GIVEN)[at]),
+            },
+            "noticeable": {effect: size if np.isfinite(size) else None for effect, size in self.noticeable.items()},
             "notes": list(self.notes),
             "vehicle": vehicle_path,
         }
 
 
-def by_channel(values: Vector) -> dict[str, float]:
-    """Values of the three channels by name."""
-    return {channel: float(value) for channel, value in zip(CHANNELS, values, strict=True)}
+def by_channel(values: Vector) -> dict[str, float | None]:
+    """Values of the three channels by name; ``None`` where there is none."""
+    return {c: float(value) if np.isfinite(value) else None for c, value in zip(CHANNELS, values, strict=True)}
+
+
+def _intervals(bounds: Vector) -> dict[str, list[float]]:
+    return {channel: [float(low), float(high)] for channel, low, high in zip(CHANNELS, *bounds, strict=True)}
 
 
 def diagnose(
@@ -170,26 +185,23 @@ def diagnose(
     found, impossible = candidates(at.study, at.car)
     search = Search(at.study, at.car, found, say)
     selection = search.run()
-    limits = [f"{name} cannot be judged: {why}" for name, why in impossible.items()]
-    blind = [name for name in {c.effect: None for c in found} if name not in selection.tried]
-    if blind:
-        limits.append(f"no excitation: {', '.join(blind)} would change nothing that was measured")
+    fit = selection.fit
     say("measuring the gain on held-out laps")
-    steps, fit = at.study.windows.steps, selection.fit
-    gain = measure(at.unseen, {_GIVEN: at.car, _RECALIBRATED: selection.base.car, _EXTENDED: fit.car}, steps)
-    std = np.sqrt(np.diag(at.study.covariance(fit)[0]))
-    causes = tuple(_cause(one, selection, search, at.unseen, steps, std) for one in selection.chosen)
-    before, after = (
-        systematic(at.study.windows, errors.reshape(-1, steps, 3), at.study.block)
-        for errors in (at.study.errors(at.car), fit.errors)
-    )
+    gain = measure(at.unseen, {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: fit.car}, at.steps)
+    sizes = noticeable(at.study, fit, found)
+    limits = [f"{name} cannot be judged: {why}" for name, why in impossible.items()]
+    limits += [*_hidden(sizes), *_not_live(selection.fit.car.extended(knowledge(vehicle)))]
+    std = np.sqrt(np.diag(at.study.covariance(fit)))
+    causes = tuple(_cause(one, selection, search, at, std) for one in selection.chosen)
+    windows = at.study.windows
+    left = systematic(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], at.study.block)
     return Diagnosis(
-        "effects" if causes else "unexplained" if after.is_there else "none",
+        "effects" if causes else "unexplained" if left.is_there else "none",
         causes,
         fit.car.extended(np.minimum(std[:17], 1.0) * knowledge(vehicle)),
         gain,
-        before,
-        after,
+        left,
+        sizes,
         selection,
         fit.car,
         std[:18],
@@ -203,6 +215,7 @@ class _Prepared(NamedTuple):
     """What a diagnosis works on."""
 
     study: Study
+    steps: int
     unseen: Windows
     car: Car
     notes: list[str]
@@ -228,6 +241,9 @@ def _prepare(
         raise ConfigurationError(
             f"horizon {horizon:g} s: expected at least two sampling times ({2 * recording.T_s:g} s)"
         )
+    asked = steps
+    every = -(-steps // _COMPARED)
+    steps = every * -(-steps // every)
     notes = _check_signals(recording)
     speed = default_min_speed(recording) if min_speed is None else min_speed
     cut, split = _cut(recording, holdout)
@@ -238,9 +254,10 @@ def _prepare(
     source = ", ".join(recording.info.source)
     require_context(vehicle.active_effects, context, f"recording {source}")
     track = Track(recording.matrix.T, context, recording.T_s, (recording.time - recording.time[0]) / 1e9)
-    fitted, unseen = _windows(recording, track, steps, speed, cut)
+    fitted, unseen = _windows(recording, track, steps, 2 * asked, speed, cut)
     car = Car.of(vehicle)
-    fitted = fitted.stepping(integrator or _integrator(fitted, car, say), vehicle)
+    fitted = replace(fitted, every=every)
+    fitted = _stepping(fitted, car, integrator, say)
     protocol = {
         "Recording": source,
         "Commands": recording.info.commands,
@@ -250,16 +267,18 @@ def _prepare(
         "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * recording.T_s:g} s",
     }
     unseen = replace(unseen, integrator=fitted.integrator, substeps=fitted.substeps)
-    return _Prepared(Study(fitted, car), unseen, car, notes, protocol)
+    return _Prepared(Study(fitted, car), asked, unseen, car, notes, protocol)
 
 
-def _cause(one: Refined, selection: Selection, search: Search, unseen: Windows, steps: int, std: Vector) -> Cause:
+def _cause(one: Refined, selection: Selection, search: Search, at: _Prepared, std: Vector) -> Cause:
     effect, fit = one.candidate.effect, selection.fit
     known = {
-        name: float(std[18 + k]) * unit(effect, name) for k, (owner, name) in enumerate(fit.free) if owner == effect
+        name: float(std[18 + k]) * per_unit(effect, name, fit.car.effects[effect][name])
+        for k, (owner, name) in enumerate(fit.free)
+        if owner == effect
     }
     other = search.leave_out(selection, one).car
-    errors = [unseen.errors(car)[:, steps - 1] for car in (other, fit.car)]
+    errors = [at.unseen.errors(car)[:, at.steps - 1] for car in (other, fit.car)]
     without, with_it = ((e**2).mean(axis=0) for e in errors)
     return Cause(
         effect,
@@ -270,6 +289,27 @@ def _cause(one: Refined, selection: Selection, search: Search, unseen: Windows, 
         float(1.0 - np.sqrt((with_it / np.maximum(without, 1e-300)).mean())),
         tuple(selection.alternatives[effect]),
     )
+
+
+def _hidden(sizes: Mapping[str, float]) -> Iterator[str]:
+    """What these laps cannot show at any size that is possible, and how to drive so that they do."""
+    hidden = [effect for effect, size in sizes.items() if size > room(effect)]
+    if hidden:
+        yield (
+            f"no excitation: {', '.join(hidden)} would not be noticed at any possible size, because these laps hardly show "
+            "it or the nominal values are known too badly; what would show it: "
+            + "; ".join(dict.fromkeys(EFFECTS[effect].MANOEUVRE for effect in hidden))
+        )
+
+
+def _not_live(vehicle: Vehicle) -> Iterator[str]:
+    """What of the extended car reads signals that a live window has not."""
+    for effect in vehicle.active_effects:
+        if effect.needs:
+            yield (
+                f"{effect.NAME} reads {', '.join(effect.needs)}: simulate and diagnose know it, train and the predictor node "
+                "do not and say so; take it out of the vehicle file for those"
+            )
 
 
 def _check_signals(recording: Recording) -> list[str]:
@@ -301,8 +341,19 @@ def _cut(recording: Recording, holdout: float) -> tuple[int, str]:
     return cut, f"the last {100 * holdout:.0f} % as one block (fewer than {_LEAST_LAPS} laps)"
 
 
-def _windows(recording: Recording, track: Track, steps: int, min_speed: float, cut: int) -> tuple[Windows, Windows]:
-    """Simulations for the fit, end to end before ``cut``, and for measuring, overlapping behind it."""
+def _windows(
+    recording: Recording, track: Track, steps: int, long: int, min_speed: float, cut: int
+) -> tuple[Windows, Windows]:
+    """Simulations for the fit, end to end before ``cut``, and for measuring, overlapping behind it.
+
+    Args:
+        recording: what was measured.
+        track: the same, as simulations read it.
+        steps: of each simulation for the fit.
+        long: of each one for measuring.
+        min_speed: of all rows (m/s).
+        cut: first held-out row.
+    """
     warm = round(WARM_UP / recording.T_s)
     ends = recording.window_ends(warm + 1, horizon=steps, min_speed=min_speed)
     usable = ends[ends + steps < cut]
@@ -315,8 +366,8 @@ def _windows(recording: Recording, track: Track, steps: int, min_speed: float, c
             f"recording {', '.join(recording.info.source)}: {len(starts)} stretches of {steps * recording.T_s:g} s at "
             f"{min_speed:g} m/s or more beside the held-out part; expected at least {_LEAST}"
         )
-    chosen = np.array(starts)[:: -(-len(starts) // _MOST)]
-    long = 2 * steps
+    spread = np.linspace(0, len(starts) - 1, min(len(starts), _MOST)).round().astype(int)
+    chosen = np.array(starts)[spread]
     ends = recording.window_ends(warm + 1, horizon=long, min_speed=min_speed)
     later = ends[ends - warm >= cut]
     if len(later) < _LEAST:
@@ -324,16 +375,27 @@ def _windows(recording: Recording, track: Track, steps: int, min_speed: float, c
             f"recording {', '.join(recording.info.source)}: {len(later)} rows in the held-out part from which "
             f"{long * recording.T_s:g} s can be simulated; expected at least {_LEAST}: record longer or hold out more"
         )
-    every = max(1, steps // 4, len(later) // (2 * _MOST))
+    every = max(1, steps // 4, len(later) // _MEASURED)
     return Windows(track, chosen, steps, warm), Windows(track, later[::every], long, warm)
 
 
-def _integrator(windows: Windows, car: Car, say: Say) -> Integrator:
-    """Runge-Kutta, unless the data were clearly made by Euler steps."""
-    say("choosing the integrator")
-    some = windows.select(np.arange(0, len(windows), -(-len(windows) // 300)))
-    fits: dict[Integrator, Fit] = {}
-    for name in ("rk4", "euler"):
-        study = Study(some.stepping(name, car.vehicle), car)
-        fits[name] = study.fit(car, (), rounds=2)
-    return "euler" if fits["euler"].objective < fits["rk4"].objective - _CLEARLY else "rk4"
+def _stepping(windows: Windows, car: Car, integrator: Integrator | None, say: Say) -> Windows:
+    """Runge-Kutta, unless the data were clearly made by Euler steps; short enough for the recalibrated car too.
+
+    That may be much stiffer than the one of the file, and a simulation whose steps are too long for it runs away.
+    """
+    if integrator == "euler":
+        return windows.stepping(integrator, car.vehicle)
+    say("choosing how the model steps")
+    some = windows.select(np.arange(0, len(windows), -(-len(windows) // _TRIED)))
+    tried: dict[Integrator, tuple[Windows, Fit]] = {}
+    for name in ("rk4", "euler") if integrator is None else (integrator,):
+        trial = some.stepping(name, car.vehicle)
+        fit = Study(trial, car).fit(car, ())
+        finer = trial.stepping(name, car.vehicle.with_nominal(np.array(fit.car.theta)))
+        if finer.substeps > trial.substeps:
+            trial, fit = finer, Study(finer, car).fit(fit.car, ())
+        tried[name] = trial, fit
+    euler = "euler" in tried and tried["euler"][1].objective < tried["rk4"][1].objective - _CLEARLY
+    trial = tried["euler" if euler else "rk4"][0]
+    return replace(windows, integrator=trial.integrator, substeps=trial.substeps)

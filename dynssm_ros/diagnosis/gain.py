@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.diagnosis.car import Car
 from dynssm_ros.diagnosis.study import BLOCK
+from dynssm_ros.diagnosis.systematic import Systematic, systematic
 from dynssm_ros.diagnosis.windows import Windows
 
 Vector = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
 
 _DRAWS = 400
+_NEXT_TO_NONE = 0.01  # of the squared error
 
 
 @dataclass(frozen=True)
@@ -22,29 +26,62 @@ class Gain:
     """Errors of several cars on the held-out rows.
 
     Attributes:
+        cars: by name; what was first and what is last.
         horizons: times ahead (s), shape ``(n,)``.
-        rmse: root mean square error at these times by car, each ``(n, 3)`` (m/s, m/s, rad/s).
-        interval: 95 % interval of the reduction of the error from the first car to the last, shape ``(2, n, 3)``.
-        time: of the starts (s), shape ``(W,)``.
-        errors: at the horizon that the diagnosis is about, by car, each ``(W, 3)``.
-        horizon: that horizon's number.
+        horizon: number of the one that the diagnosis is about.
+        errors: predicted minus measured at these times by car, each ``(W, n, 3)`` (m/s, m/s, rad/s).
+        systematic: what of them is no noise, by car, one for each horizon.
         windows: the simulations.
+        seed: of the bootstrap over blocks in time.
     """
 
+    cars: Mapping[str, Car]
     horizons: Vector
-    rmse: Mapping[str, Vector]
-    interval: Vector
-    time: Vector
-    errors: Mapping[str, Vector]
     horizon: int
+    errors: Mapping[str, Vector]
+    systematic: Mapping[str, tuple[Systematic, ...]]
     windows: Windows
+    seed: int = 0
+
+    @cached_property
+    def rmse(self) -> dict[str, Vector]:
+        """Root mean square error by car, each ``(n, 3)``."""
+        return {name: np.sqrt((e**2).mean(axis=0)) for name, e in self.errors.items()}
 
     @property
     def reduction(self) -> Vector:
         """Share of the first car's error that is gone with the last, shape ``(n, 3)``."""
-        cars = list(self.rmse.values())
-        reduced: Vector = 1.0 - cars[-1] / np.maximum(cars[0], 1e-300)
-        return reduced
+        return self.reduction_from(next(iter(self.errors)))
+
+    @property
+    def interval(self) -> Vector:
+        """Its 95 % interval, shape ``(2, n, 3)``."""
+        return self.interval_from(next(iter(self.errors)))
+
+    def reduction_from(self, name: str) -> Vector:
+        """Share of a car's error that is gone with the last, shape ``(n, 3)``."""
+        return np.asarray(1.0 - self.rmse[list(self.rmse)[-1]] / np.maximum(self.rmse[name], 1e-300))
+
+    def interval_from(self, name: str) -> Vector:
+        """95 % interval of :meth:`reduction_from` by a bootstrap over blocks in time, shape ``(2, n, 3)``."""
+        block = blocks(self.windows)
+        sums = [_sums(self.errors[car] ** 2, block) for car in (name, list(self.errors)[-1])]
+        rng = np.random.default_rng(self.seed)
+        drawn = rng.integers(0, len(sums[0]), (_DRAWS, len(sums[0])))
+        ratios = np.sqrt(sums[1][drawn].sum(axis=1) / np.maximum(sums[0][drawn].sum(axis=1), 1e-300))
+        return np.asarray(1.0 - np.quantile(ratios, [0.975, 0.025], axis=0))
+
+    def systematic_gone(self, name: str) -> Vector:
+        """Share of the systematic squared error of a car that is gone with the last, shape ``(n, 3)``.
+
+        NaN where there was next to none.
+        """
+        before, after = (
+            np.stack([s.share for s in self.systematic[car]]) * self.rmse[car] ** 2
+            for car in (name, list(self.errors)[-1])
+        )
+        there = np.stack([s.share for s in self.systematic[name]]) > _NEXT_TO_NONE
+        return np.where(there, 1.0 - after / np.maximum(before, 1e-300), np.nan)
 
 
 def measure(windows: Windows, cars: Mapping[str, Car], steps: int, seed: int = 0) -> Gain:
@@ -57,26 +94,21 @@ def measure(windows: Windows, cars: Mapping[str, Car], steps: int, seed: int = 0
         seed: of the bootstrap over blocks in time.
     """
     ahead = sorted({1, steps, windows.steps})
-    at = np.array(ahead) - 1
-    errors = {name: windows.errors(car)[:, at] for name, car in cars.items()}
-    first, last = next(iter(errors.values())), list(errors.values())[-1]
-    block = np.unique((windows.time // BLOCK).astype(int), return_inverse=True)[1]
-    sums = [_block_sums(e**2, block) for e in (first, last)]
-    rng = np.random.default_rng(seed)
-    drawn = rng.integers(0, len(sums[0]), (_DRAWS, len(sums[0])))
-    ratios = np.sqrt(sums[1][drawn].sum(axis=1) / np.maximum(sums[0][drawn].sum(axis=1), 1e-300))
-    return Gain(
-        np.array(ahead) * windows.data.T_s,
-        {name: np.sqrt((e**2).mean(axis=0)) for name, e in errors.items()},
-        1.0 - np.quantile(ratios, [0.975, 0.025], axis=0),
-        windows.time,
-        {name: e[:, ahead.index(steps)] for name, e in errors.items()},
-        ahead.index(steps),
-        windows,
-    )
+    errors = {name: windows.errors(car)[:, np.array(ahead) - 1] for name, car in cars.items()}
+    block = blocks(windows)
+    found = {
+        name: tuple(systematic(replace(windows, steps=k), e[:, i], block) for i, k in enumerate(ahead))
+        for name, e in errors.items()
+    }
+    return Gain(cars, np.array(ahead) * windows.data.T_s, ahead.index(steps), errors, found, windows, seed)
 
 
-def _block_sums(values: Vector, block: npt.NDArray[np.intp]) -> Vector:
+def blocks(windows: Windows) -> Indices:
+    """Number of the block in time of each window, shape ``(W,)``."""
+    return np.unique((windows.time // BLOCK).astype(np.intp), return_inverse=True)[1]
+
+
+def _sums(values: Vector, block: Indices) -> Vector:
     out = np.zeros((block.max() + 1, *values.shape[1:]))
     np.add.at(out, block, values)
     return out

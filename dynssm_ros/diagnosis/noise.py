@@ -14,7 +14,6 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
 
 Vector = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -22,6 +21,11 @@ Indices = npt.NDArray[np.intp]
 _GROUPS = 10
 _RANGE = 30.0  # of the logarithm of a variance above its floor
 _ROUNDING = 1e-10  # of each variance, that keeps covariances positive
+_ROUNDS = 40
+_HALVINGS = 8
+_STRIDE = 3.0  # of the logarithm of a variance in one round, at most
+_FLAT = 1e-3  # curvature added where a variance that vanishes has none
+_SETTLED = 1e-2  # of twice the logarithm of the likelihood, that another round promises
 _FAR = 4.0  # a window whose squared error exceeds the expected one by this factor counts only as much as that
 
 
@@ -112,37 +116,44 @@ def fit_noise(spread: Spread, errors: Vector, start: Vector, floor: Vector) -> N
 
 
 def _most_likely(spread: Spread, errors: Vector, start: Vector, floor: Vector) -> Vector:
+    """Fisher scoring in the logarithms of the variances, within their bounds."""
     count = np.bincount(spread.group, minlength=len(spread.G)).astype(float)
     moment = np.stack([errors[spread.group == m].T @ errors[spread.group == m] for m in range(len(spread.G))])
-    size = spread.G.shape[1]
-    bases = [_covariance(spread.G, np.eye(6)[i]) for i in range(6)]
-    total = count.sum() * size
+    bases = np.stack([_covariance(spread.G, one) for one in np.eye(6)])
+    low = np.log(floor)
+    high = low + _RANGE
 
-    def cost(log_v: Vector) -> tuple[float, Vector]:
-        v = np.exp(log_v)
-        C = sum(value * basis for value, basis in zip(v, bases, strict=True))
+    def likelihood(log_v: Vector) -> tuple[float, Vector]:
+        """Twice the negative logarithm of the likelihood, and the covariances' inverses."""
+        C = np.tensordot(np.exp(log_v), bases, 1)
         root = np.linalg.cholesky(C)
         inverse = np.linalg.inv(C)
-        fitted = inverse @ moment
-        value = (
-            2 * (count * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)).sum()
-            + np.trace(fitted, axis1=1, axis2=2).sum()
-        )
-        slope_of = count[:, None, None] * inverse - fitted @ inverse
-        slope = np.array([(slope_of * basis).sum() for basis in bases]) * v
-        return value / total, slope / total
+        log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        return float(count @ log_det + np.einsum("mij,mij->", inverse, moment)), inverse
 
-    bounds = [(np.log(low), np.log(low) + _RANGE) for low in floor]
-    # a likelihood per error is flat, its sum is not: hence the tolerances
-    found = minimize(
-        cost,
-        np.log(start),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=bounds,
-        options={"maxiter": 300, "ftol": 1e-13, "gtol": 1e-8},
-    )
-    return np.asarray(np.exp(found.x))
+    log_v = np.clip(np.log(start), low, high)
+    value, inverse = likelihood(log_v)
+    for _ in range(_ROUNDS):
+        shares = np.exp(log_v)[:, None, None, None] * (inverse @ bases)  # sum to one
+        fitted = inverse @ moment
+        slope = np.einsum("m,kmii->k", count, shares) - np.einsum("kmij,mji->k", shares, fitted)
+        curvature = np.einsum("m,kmij,lmji->kl", count, shares, shares)
+        free = ~((log_v <= low) & (slope > 0) | (log_v >= high) & (slope < 0))
+        step = np.zeros(6)
+        step[free] = -np.linalg.solve(curvature[np.ix_(free, free)] + _FLAT * np.eye(free.sum()), slope[free])
+        step = np.clip(step, -_STRIDE, _STRIDE)
+        if -slope @ step < _SETTLED:
+            break
+        for _ in range(_HALVINGS):
+            there = np.clip(log_v + step, low, high)
+            new, inverse_there = likelihood(there)
+            if new < value:
+                break
+            step = step / 2
+        else:
+            break
+        log_v, value, inverse = there, new, inverse_there
+    return np.asarray(np.exp(log_v))
 
 
 def _covariance(G: Vector, v: Vector) -> Vector:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
 
 import numpy as np
 
 from dynssm_ros.diagnosis import figures
-from dynssm_ros.diagnosis.diagnose import Cause, Diagnosis
+from dynssm_ros.diagnosis.diagnose import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
+from dynssm_ros.diagnosis.noticeable import room
+from dynssm_ros.diagnosis.selection import SURE
 from dynssm_ros.diagnosis.systematic import Systematic
 from dynssm_ros.evaluation.figures import UNITS
 from dynssm_ros.evaluation.metrics import CHANNELS
@@ -16,27 +19,19 @@ from dynssm_ros.evaluation.tables import Column, Table, Value, percent, text
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS
 from dynssm_ros.vehicle.effects import EFFECTS
 
+_LITTLE = 0.02  # of the squared error; less is not worth a word
+_WIDTH = 110
+
 
 def in_words(diagnosis: Diagnosis) -> str:
-    """The result for a terminal: cause, size, evidence, gain, what to do."""
+    """The result for a terminal: cause, size, evidence, gain, what to do, what is left."""
     lines = [headline(diagnosis)]
     for number, cause in enumerate(diagnosis.causes, 1):
-        effect = EFFECTS[cause.effect]
-        lines += [
-            "",
-            f"{number}. {cause.effect}: {size_in_words(cause)}",
-            f"   {effect.SUMMARY}",
-            f"   Evidence: information criterion better by {cause.delta_bic:.0f} (6 is strong); without it the held-out "
-            f"error is {percent(cause.heldout_gain)} of the present one larger"
-            if cause.heldout_gain < 0
-            else f"   Evidence: information criterion better by {cause.delta_bic:.0f} (6 is strong); it takes away "
-            f"{percent(cause.heldout_gain)} of the held-out error",
-            f"   What to do: {effect.ADVICE}",
-        ]
-        if cause.alternatives:
-            lines.append(f"   {alternatives_in_words(cause)}")
+        lines += ["", f"{number}. {cause.effect}: {size_in_words(cause)}"]
+        lines += [f"   {line}" for words in _about(cause) for line in textwrap.wrap(words, _WIDTH)]
     lines += ["", *gain_in_words(diagnosis)]
-    lines += [f"note: {note}" for note in diagnosis.notes]
+    for words in (left_in_words(diagnosis), *(f"Note: {note}." for note in diagnosis.notes)):
+        lines += textwrap.wrap(words, _WIDTH)
     return "\n".join(lines)
 
 
@@ -47,17 +42,28 @@ def headline(diagnosis: Diagnosis) -> str:
         return f"The simulation lacks: {listed}."
     if diagnosis.verdict == "none":
         return "The simulation is right within the noise of the measurement, once its nominal values are recalibrated."
-    return f"Something is wrong that no effect of the library explains. {pattern_in_words(diagnosis.after)}"
+    return "Something is wrong that no effect of the library explains."
 
 
 def pattern_in_words(left: Systematic) -> str:
-    """What systematic error goes with."""
+    """What systematic error goes with, and where on the lap it is farthest off."""
     parts = []
     for c, channel in enumerate(CHANNELS):
-        if left.share[c] > 0.02:
+        if left.share[c] > _LITTLE:
             goes = ", ".join(f"{name} ({value:+.2f})" for name, value in left.pattern[channel].items())
-            parts.append(f"{channel}: {percent(left.share[c])} of the squared error is systematic, it goes with {goes}")
-    return "; ".join(parts) + "." if parts else "The pattern is too weak to say with what it goes."
+            where = "; farthest off {:.0f} to {:.0f} m into the lap"
+            parts.append(
+                f"{channel}, {percent(left.share[c])} of the squared error: goes with {goes}"
+                + (where.format(*left.stretch[channel]) if left.stretch else "")
+            )
+    return ". ".join(parts) + "." if parts else "the pattern is too weak to say with what it goes."
+
+
+def left_in_words(diagnosis: Diagnosis) -> str:
+    """What the extended car gets wrong beyond noise; empty if there is nothing."""
+    if not diagnosis.left.is_there:
+        return ""
+    return f"Systematic error that is left, and what it goes with: {pattern_in_words(diagnosis.left)}"
 
 
 def size_in_words(cause: Cause) -> str:
@@ -71,6 +77,16 @@ def size_in_words(cause: Cause) -> str:
     return ", ".join(parts)
 
 
+def evidence_in_words(cause: Cause) -> str:
+    """How sure the cause is, and what it takes away."""
+    held_out = (
+        f"it takes away {percent(cause.heldout_gain)} of the error on held-out laps"
+        if cause.heldout_gain > 0
+        else f"on held-out laps it takes nothing away ({percent(cause.heldout_gain)})"
+    )
+    return f"the information criterion is better by {cause.delta_bic:.0f} (above {SURE:.0f} is strong); {held_out}"
+
+
 def alternatives_in_words(cause: Cause) -> str:
     """What the data cannot tell from a cause, and how to tell them apart."""
     ways = "; ".join(f"{name}: {EFFECTS[name].MANOEUVRE}" for name in (cause.effect, *cause.alternatives))
@@ -79,15 +95,16 @@ def alternatives_in_words(cause: Cause) -> str:
 
 def gain_in_words(diagnosis: Diagnosis) -> list[str]:
     """Errors before and after, by channel."""
-    gain, lines = diagnosis.gain, []
+    gain = diagnosis.gain
     at = gain.horizon
-    names = list(gain.rmse)
+    low, high = gain.interval_from(RECALIBRATED)[:, at]
+    lines = [f"Error on held-out laps {gain.horizons[at]:.4g} s ahead:"]
     for c, channel in enumerate(CHANNELS):
-        values = " -> ".join(f"{text(float(gain.rmse[name][at, c]))} {name}" for name in names)
-        low, high = gain.interval[:, at, c]
+        values = ", ".join(f"{text(float(values[at, c]))} {name}" for name, values in gain.rmse.items())
         lines.append(
-            f"held-out error of {channel} after {gain.horizons[at]:g} s ({UNITS[channel]}): {values}; "
-            f"{percent(float(gain.reduction[at, c]))} less (95 %: {percent(float(low))} to {percent(float(high))})"
+            f"   {channel} ({UNITS[channel]}): {values}: {percent(float(gain.reduction[at, c]))} less than as given, "
+            f"{percent(float(gain.reduction_from(RECALIBRATED)[at, c]))} less than recalibrated "
+            f"(95 %: {percent(float(low[c]))} to {percent(float(high[c]))})"
         )
     return lines
 
@@ -96,17 +113,26 @@ def diagnosis_report(diagnosis: Diagnosis) -> Report:
     """The report with figures."""
     return Report(
         f"Diagnosis of {diagnosis.vehicle.name}",
-        headline(diagnosis),
+        f"{headline(diagnosis)} {left_in_words(diagnosis)}".strip(),
         tuple(_sections(diagnosis)),
         diagnosis.protocol,
         _causes(diagnosis) if diagnosis.causes else None,
     )
 
 
+def _about(cause: Cause) -> Iterator[str]:
+    effect = EFFECTS[cause.effect]
+    yield effect.SUMMARY
+    yield f"Evidence: {evidence_in_words(cause)}."
+    yield f"What to do: {effect.ADVICE}"
+    if cause.alternatives:
+        yield alternatives_in_words(cause)
+
+
 def _causes(diagnosis: Diagnosis) -> Table:
     columns = (
         Column("cause"), Column("size"), Column("better by", group="information criterion"),
-        Column("less", "%", "held-out error"), Column("the data fit as well"), Column("what to do"),
+        Column("less", "%", "held-out error"), Column("the data fit as well"),
     )  # fmt: skip
     rows: list[list[Value]] = [
         [
@@ -114,8 +140,7 @@ def _causes(diagnosis: Diagnosis) -> Table:
             size_in_words(cause),
             cause.delta_bic,
             100 * cause.heldout_gain,
-            ", ".join(cause.alternatives) or None,
-            EFFECTS[cause.effect].ADVICE,
+            ", ".join(cause.alternatives) or "nothing else",
         ]
         for cause in diagnosis.causes
     ]
@@ -123,54 +148,84 @@ def _causes(diagnosis: Diagnosis) -> Table:
 
 
 def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
-    gain, windows = diagnosis.gain, diagnosis.gain.windows
     for cause in diagnosis.causes:
-        words = f"{EFFECTS[cause.effect].SUMMARY} {size_in_words(cause)}."
-        yield Section(cause.effect, words + (f" {alternatives_in_words(cause)}" if cause.alternatives else ""))
+        yield Section(cause.effect, " ".join((f"{size_in_words(cause)}.", *_about(cause))))
+    yield from _gained(diagnosis)
+    yield from _shown(diagnosis)
+    yield from _found(diagnosis)
+    if diagnosis.notes:
+        yield Section("Limits", " ".join(f"{note[0].upper()}{note[1:]}." for note in diagnosis.notes))
+
+
+def _gained(diagnosis: Diagnosis) -> Iterator[Section]:
+    gain = diagnosis.gain
+    yield Section(
+        "Simulated and measured",
+        f"A lively stretch of the held-out laps. Each simulation starts at a measured state and runs free for "
+        f"{gain.horizons[-1]:.4g} s, with the measured throttle and steering.",
+        figures.simulated_and_measured(gain),
+    )
     yield Section(
         "Gain on held-out laps",
         "Root mean square error of simulations that start at measured states of laps that neither the fit nor the "
-        "selection saw: the car as given, its nominal values recalibrated, and with the causes.",
+        f"selection saw: the car {GIVEN}, its nominal values {RECALIBRATED} without any cause, and {EXTENDED} by the "
+        "causes. Intervals are from a bootstrap over blocks in time. What is systematic the signals and the place on the "
+        "lap foretell, on parts of the data to which that was not fitted.",
         figures.gain_by_horizon(gain),
         _gain_table(diagnosis),
     )
     yield Section(
-        "Evidence by effect",
-        "How much each effect, alone, would improve the fit of the recalibrated car: decrease of twice the negative "
-        "log-likelihood, in linearised errors. Named causes are coloured. Effects that share a pattern share evidence.",
-        figures.evidence(diagnosis.selection.tried, [cause.effect for cause in diagnosis.causes]),
-    )
-    at = windows.starts + diagnosis.windows.steps // 2
-    rows = windows.data.rows
-    yield Section(
-        f"Errors over time ({gain.horizons[gain.horizon]:g} s ahead)",
-        "Held-out laps, before and after.",
-        figures.errors_over("time (s)", gain.time, gain.errors, line=True),
-    )
-    for title, values in (
-        ("speed (m/s)", rows[0, at]),
-        ("lateral acceleration (m/s²)", rows[0, at] * rows[2, at]),
-        ("steering (rad)", rows[4, at]),
-        ("throttle (negative: brake)", rows[3, at]),
-    ):
-        yield Section(
-            f"Errors against {title.split(' (')[0]}",
-            "Mean and spread of the error in bins: a mean off zero is systematic.",
-            figures.errors_over(title, values, gain.errors),
-        )
-    if "s" in windows.data.context:
-        lap = windows.data.context["s"][at]
-        yield Section(
-            "Errors over the position on the lap",
-            "A mean off zero stays at its place lap after lap.",
-            figures.errors_over("position (m)", lap, gain.errors),
-        )
-    yield Section(
-        "Systematic and noise",
-        "Share of the squared error that the signals and the place on the lap foretell on parts of the data to which "
-        f"that was not fitted. Left: {pattern_in_words(diagnosis.after)}",
+        "Systematic error and noise",
+        "The same errors in two parts: what the signals and the place on the lap foretell, and the rest, which is noise "
+        "or what the signals do not show. By place alone is what repeats lap after lap. Gone is the share of the "
+        f"systematic squared error of the car {GIVEN} that the extended one does not make. {left_in_words(diagnosis)}",
         None,
         _systematic_table(diagnosis),
+    )
+
+
+def _shown(diagnosis: Diagnosis) -> Iterator[Section]:
+    gain = diagnosis.gain
+    windows = gain.windows
+    rows = windows.data.rows
+    yield Section(
+        "Errors over time",
+        f"Predicted minus measured on the held-out laps, one step and {gain.horizons[gain.horizon]:.4g} s ahead.",
+        figures.errors_over_time(gain),
+    )
+    # what was going on half the way into the simulation
+    at = windows.starts + round(gain.horizons[gain.horizon] / windows.data.T_s / 2)
+    against = {
+        "speed (m/s)": rows[0, at],
+        "lateral acceleration (m/s²)": rows[0, at] * rows[2, at],
+        "steering (rad)": rows[4, at] + rows[6, at],
+        "throttle (negative: brake)": rows[3, at] + rows[5, at],
+    }
+    if "s" in windows.data.context:
+        against["position on the lap (m)"] = windows.data.context["s"][at]
+    for label, values in against.items():
+        yield Section(
+            f"Errors against {label.split(' (')[0]}",
+            "Mean and spread in bins: where the mean is off zero by more than the line's wiggling, the error is "
+            f"systematic. The car {GIVEN} may leave the panel.",
+            figures.errors_over(label, values, gain),
+        )
+
+
+def _found(diagnosis: Diagnosis) -> Iterator[Section]:
+    yield Section(
+        "Evidence by effect",
+        "How much each effect, alone, would improve the fit of the recalibrated car. Named causes are coloured. Effects "
+        "that leave like traces share the evidence; the causes named explain it best together.",
+        figures.evidence(diagnosis.selection.tried, [cause.effect for cause in diagnosis.causes]),
+    )
+    yield Section(
+        "What these laps would show",
+        "How far off neutral each effect that was not named would have to be to be named: the driving must excite it, and "
+        "the nominal values must be known well enough not to take it up. Where the bounds of the effect do not reach that "
+        "far, it cannot be judged.",
+        None,
+        _noticeable_table(diagnosis),
     )
     yield Section(
         "Nominal values",
@@ -178,37 +233,54 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
         None,
         _nominal_table(diagnosis),
     )
-    if diagnosis.notes:
-        yield Section("Limits", " ".join(f"{note[0].upper()}{note[1:]}." for note in diagnosis.notes))
 
 
 def _gain_table(diagnosis: Diagnosis) -> Table:
     gain = diagnosis.gain
     columns = (
         Column("channel"), Column("ahead", "s"), *(Column(name, group="error") for name in gain.rmse),
-        Column("less", "%"), Column("from", "%", "95 % interval"), Column("to", "%", "95 % interval"),
+        *(
+            Column(title, "%", f"less than {name}")
+            for name in (GIVEN, RECALIBRATED) for title in ("share", "from", "to")
+        ),
     )  # fmt: skip
+    less = [(gain.reduction_from(name), *gain.interval_from(name)) for name in (GIVEN, RECALIBRATED)]
     rows: list[list[Value]] = []
     for c, channel in enumerate(CHANNELS):
         for k, ahead in enumerate(gain.horizons):
             values = [float(values[k, c]) for values in gain.rmse.values()]
-            interval = [100 * float(v) for v in gain.interval[:, k, c]]
-            rows.append(
-                [f"{channel} ({UNITS[channel]})", float(ahead), *values, 100 * float(gain.reduction[k, c]), *interval]
-            )
+            shares = [round(100 * float(v[k, c])) for one in less for v in one]
+            rows.append([f"{channel} ({UNITS[channel]})", f"{ahead:.4g}", *values, *shares])
     return Table(columns, rows)
 
 
 def _systematic_table(diagnosis: Diagnosis) -> Table:
+    gain = diagnosis.gain
     columns = (
-        Column("channel"), Column("before", "%", "systematic"), Column("after", "%", "systematic"),
-        Column("by place, before", "%"), Column("by place, after", "%"),
+        Column("channel"), Column("ahead", "s"),
+        *(Column(title, "", name) for name in gain.rmse for title in ("systematic", "rest")),
+        Column("gone", "%", "systematic"),
+        *(Column(name, "%", "systematic by place alone") for name in (GIVEN, EXTENDED)),
     )  # fmt: skip
-    before, after = diagnosis.before, diagnosis.after
-    rows: list[list[Value]] = [
-        [channel, *(100 * float(v[c]) for v in (before.share, after.share, before.by_place, after.by_place))]
-        for c, channel in enumerate(CHANNELS)
-    ]
+    gone = gain.systematic_gone(GIVEN)
+    rows: list[list[Value]] = []
+    for c, channel in enumerate(CHANNELS):
+        for k, ahead in enumerate(gain.horizons):
+            parts: list[Value] = []
+            for name, values in gain.rmse.items():
+                share = float(gain.systematic[name][k].share[c])
+                parts += [float(values[k, c] * np.sqrt(part)) for part in (share, 1.0 - share)]
+            place = [100 * float(gain.systematic[name][k].by_place[c]) for name in (GIVEN, EXTENDED)]
+            rows.append([f"{channel} ({UNITS[channel]})", f"{ahead:.4g}", *parts, 100 * float(gone[k, c]), *place])
+    return Table(columns, rows)
+
+
+def _noticeable_table(diagnosis: Diagnosis) -> Table:
+    columns = (Column("effect"), Column("noticed from"), Column("unit"), Column("judged"))
+    rows: list[list[Value]] = []
+    for effect, size in sorted(diagnosis.noticeable.items(), key=lambda item: item[1] / room(item[0])):
+        unit = next(p.unit for p in EFFECTS[effect].PARAMETERS.values() if not p.shape)
+        rows.append([effect, size, "" if unit == "1" else unit, "yes" if size <= room(effect) else "no"])
     return Table(columns, rows)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,11 +19,15 @@ Vector = npt.NDArray[np.float64]
 Say = Callable[[str], None]
 
 SURE = 6.0  # difference in the information criterion that counts as strong (Kass and Raftery 1995: 6 to 10)
-_REFINED = 4  # candidates that are fitted in full in each round
+_HOPEFUL = 9  # candidates of which several sizes are tried in each round
+_FEW = 150  # windows on which they are tried
+_REFINED = 4  # of them are fitted in full
 _PROMISING = 0.15  # of the best prospect, that another one must reach to be fitted in full
+_CLOSE = 0.9  # of the best evidence, near which others are fitted to the end as well
 _MOST = 4  # effects
 _FOLDS = 5
-_SHARES = (1.0, 0.6, 0.3)  # of what linearised errors promise
+_EASED = 3  # times that nominal values make room for an effect before it is fitted
+_SHARES = (1.6, 1.0, 0.6, 0.3)  # of what linearised errors promise
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,14 @@ class Selection:
     alternatives: dict[str, list[str]] = field(default_factory=dict)
     tried: dict[str, float] = field(default_factory=dict)
     inflation: float = 1.0
+
+
+class _Start(NamedTuple):
+    """Where to fit a candidate from, and roughly what it is worth."""
+
+    candidate: Candidate
+    car: Car
+    worth: float
 
 
 class Search:
@@ -110,7 +123,7 @@ class Search:
             [result[c] for c in ordered],
             {c.effect: self._alternatives(tuple(chosen), c) for c in ordered},
             self.tried,
-            self._study.covariance(fit)[1],
+            self._study.inflation(fit),
         )
 
     def leave_out(self, selection: Selection, one: Refined) -> Fit:
@@ -124,7 +137,7 @@ class Search:
         if key not in self._fits:
             starts = [r.fit for c in chosen for r in self._ranked.get(key - {c}, []) if r.candidate == c]
             start = min(starts, key=lambda fit: fit.objective)
-            self._fits[key] = self._study.fit(start.car, start.free, start.noise)
+            self._fits[key] = self._study.fit(start.car, start.free, start)
         return self._fits[key]
 
     def ranked(self, before: tuple[Candidate, ...]) -> list[Refined]:
@@ -142,38 +155,60 @@ class Search:
             best.setdefault(prospect.candidate.effect, prospect)
         if not before:
             self.tried = {name: p.gain for name, p in best.items()}
-        least = max([-self._price, *(_PROMISING * self._worth(p) for p in list(best.values())[:1])])
-        promising = [p for p in best.values() if self._worth(p) >= least][:_REFINED]
-        refined = [self._refine(fit, prospect) for prospect in promising]
+        hopeful = [p for p in best.values() if self._worth(p) >= -self._price][:_HOPEFUL]
+        some, near = self._study.part(fit, max(1, len(self._study.windows) // _FEW))
+        starts = sorted((self._start(some, near, p) for p in hopeful), key=lambda start: start.worth, reverse=True)
+        least = max([-self._price, *(_PROMISING * start.worth for start in starts[:1])])
+        refined = [self._refine(fit, start) for start in starts[:_REFINED] if start.worth >= least]
+        close = max([-SURE, *(_CLOSE * r.delta_bic - 2 * SURE for r in refined)])
+        refined = [self._polish(key, fit, r) if r.delta_bic > close else r for r in refined]
         self._ranked[key] = sorted(refined, key=lambda r: -r.delta_bic)
         return self._ranked[key]
+
+    def _polish(self, before: frozenset[Candidate], without: Fit, rough: Refined) -> Refined:
+        """The same, fitted to the end."""
+        key = before | {rough.candidate}
+        if key not in self._fits:
+            self._fits[key] = self._study.fit(rough.fit.car, rough.fit.free, rough.fit)
+        return self._judge(without, self._fits[key], rough.candidate)
 
     def _worth(self, prospect: Prospect) -> float:
         return float(prospect.gain - self._price * len(prospect.candidate.parameters))
 
-    def _refine(self, fit: Fit, prospect: Prospect) -> Refined:
-        candidate = prospect.candidate
+    def _refine(self, fit: Fit, start: _Start) -> Refined:
+        candidate = start.candidate
         self._say(f"fitting {candidate.effect}")
-        car = self._start(fit, prospect)
         free = (*fit.free, *candidate.free)
-        return self._judge(fit, self._study.fit(car, free, fit.noise), candidate)
+        return self._judge(fit, self._study.fit(start.car, free, fit, rough=True), candidate)
 
-    def _start(self, fit: Fit, prospect: Prospect) -> Car:
-        """Where to fit from: what linearised errors promise is too much where an effect grows faster than its size."""
-        candidate, best = prospect.candidate, (np.inf, fit.car)
+    def _start(self, some: Study, near: Fit, prospect: Prospect) -> _Start:
+        """Where to fit from, and what is reached there.
+
+        What linearised errors promise is too much where an effect grows faster than its size, and too little where the
+        nominal values have hidden it: so several sizes are tried, as they are and with the nominal values moved along.
+        """
+        candidate, cars = prospect.candidate, []
         for share in _SHARES:
             values = dict(prospect.values)
             for name in candidate.amplitudes:
-                neutral = EFFECTS[candidate.effect].PARAMETERS[name].neutral
-                values[name] = neutral + share * (values[name] - neutral)
-            car = fit.car.with_effect(candidate.effect, values)
-            errors = self._study.errors(car)
-            value = self._study.objective(errors, position(car, (*fit.free, *candidate.free)), fit.noise)
-            best = min(best, (value, car), key=lambda pair: pair[0])
-        return best[1]
+                about = EFFECTS[candidate.effect].PARAMETERS[name]
+                wanted = about.neutral + share * (values[name] - about.neutral)
+                values[name] = float(np.clip(wanted, about.lower, about.upper))
+            cars.append(near.car.with_effect(candidate.effect, values))
+        eased = cars
+        for _ in range(_EASED):
+            eased = some.eased(eased, near)
+        cars, free = cars + eased, (*near.free, *candidate.free)
+        reached = [
+            some.objective(errors, position(car, free), near.noise)
+            for car, errors in zip(cars, some.errors_of(cars), strict=True)
+        ]
+        gain = (near.objective - min(reached)) * len(self._study.windows) / len(some.windows)
+        worth = gain - self._price * len(candidate.parameters)
+        return _Start(candidate, cars[int(np.argmin(reached))], worth)
 
     def _judge(self, without: Fit, fit: Fit, candidate: Candidate) -> Refined:
-        _, inflation = self._study.covariance(fit)
+        inflation = self._study.inflation(fit, len(fit.free) - len(without.free))
         gain = (without.objective - fit.objective) / inflation
         delta = gain - self._price * (len(fit.free) - len(without.free))
         return Refined(candidate, fit, gain, delta, self._crossed(without, fit))
@@ -188,7 +223,7 @@ class Search:
         if key not in self._fits:
             fit = self.fit(chosen)
             free = tuple(pair for pair in fit.free if pair[0] != one.effect)
-            self._fits[key] = self._study.fit(fit.car.without(one.effect), free, fit.noise)
+            self._fits[key] = self._study.fit(fit.car.without(one.effect), free, fit)
         return self._fits[key]
 
     def _exchange(self, chosen: list[Candidate]) -> None:
@@ -216,8 +251,12 @@ class Search:
         ]
 
     def _crossed(self, without: Fit, fit: Fit) -> float:
-        """How much less the squared error is where the parameters were not fitted: every n-th block in time in turn."""
-        parts = self._study.block % _FOLDS
+        """How much less the squared error is where the parameters were not fitted: every n-th part of the time in turn.
+
+        What is seen once, as one pass over a place, does not count: it has to repeat. What is known of the nominal
+        values counts as a measurement beside them: it is all that tells more drag from a badly known C_r2.
+        """
+        parts = self._study.block * _FOLDS // (self._study.block.max() + 1)
         return self._left_out(without, fit, parts) - self._left_out(fit, fit, parts)
 
     def _left_out(self, fit: Fit, noise_of: Fit, parts: npt.NDArray[np.intp]) -> float:
@@ -233,7 +272,7 @@ class Search:
         for f in range(_FOLDS):
             step = -np.linalg.solve(sum(H) - H[f] + np.diag(known), sum(g) - g[f] + known * p)
             total += float(((r[parts == f] + J[parts == f] @ step) ** 2).sum())
-        return total
+        return total + float(known @ p**2)
 
 
 def _pays(refined: Refined) -> bool:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import lsq_linear
 
 from dynssm_ros.diagnosis.car import Car
 from dynssm_ros.diagnosis.noise import Noise, Spread, fit_noise, weights
@@ -19,7 +22,8 @@ Free = tuple[tuple[str, str], ...]
 BLOCK = 3.0  # s; errors farther apart count as independent
 _UNIT = 0.1  # of the way from neutral to the upper bound: in this unit effects are fitted
 _FREE = 10.0  # of these units an effect's parameter may be, as one standard deviation
-_ROUNDS = 10
+_ROUNDS = 30
+_KEPT = 0.5  # of what a quadratic promises: derivatives that keep less are too old
 _DAMPING = (0.0, 0.03, 0.3, 3.0, 30.0)
 _CONVERGED = 0.3  # of the squared error
 
@@ -28,6 +32,30 @@ def unit(effect: str, parameter: str) -> float:
     """The unit in which a parameter is fitted."""
     about = EFFECTS[effect].PARAMETERS[parameter]
     return _UNIT * max(about.upper - about.neutral, about.neutral - about.lower)
+
+
+def _scales(effect: str, parameter: str) -> bool:
+    """Whether it multiplies, and so is fitted as a logarithm."""
+    about = EFFECTS[effect].PARAMETERS[parameter]
+    return about.neutral == 1.0 and about.lower > 0.0
+
+
+def _in_units(effect: str, parameter: str, value: float) -> float:
+    """A parameter's value as a fit has it: 0 where it is neutral."""
+    off = np.log(value) if _scales(effect, parameter) else value - EFFECTS[effect].PARAMETERS[parameter].neutral
+    return float(off / unit(effect, parameter))
+
+
+def _value(effect: str, parameter: str, in_units: float) -> float:
+    """The inverse of :func:`_in_units`, within the bounds."""
+    about, off = EFFECTS[effect].PARAMETERS[parameter], in_units * unit(effect, parameter)
+    value = np.exp(off) if _scales(effect, parameter) else about.neutral + off
+    return float(np.clip(value, about.lower, about.upper))
+
+
+def per_unit(effect: str, parameter: str, value: float) -> float:
+    """How much a parameter that has ``value`` changes per unit of a fit."""
+    return unit(effect, parameter) * (value if _scales(effect, parameter) else 1.0)
 
 
 @dataclass(frozen=True)
@@ -59,21 +87,24 @@ class Fit:
 
 def position(car: Car, free: Free) -> Vector:
     """The values of a car in the units of a fit."""
-    values = [
-        (car.effects[effect][name] - EFFECTS[effect].PARAMETERS[name].neutral) / unit(effect, name)
-        for effect, name in free
-    ]
-    return np.concatenate([car.moved, values])
+    return np.concatenate([car.moved, [_in_units(e, name, car.effects[e][name]) for e, name in free]])
+
+
+def limits(car: Car, free: Free) -> tuple[Vector, Vector]:
+    """The least and the largest values, in the units of a fit."""
+    bounds = [(EFFECTS[e].PARAMETERS[name].lower, EFFECTS[e].PARAMETERS[name].upper) for e, name in free]
+    inside = np.array([[_in_units(*pair, bound) for bound in b] for pair, b in zip(free, bounds, strict=True)])
+    lower, upper = car.limits
+    return np.concatenate([lower, inside.reshape(-1, 2)[:, 0]]), np.concatenate([upper, inside.reshape(-1, 2)[:, 1]])
 
 
 def placed(car: Car, free: Free, p: Vector) -> Car:
-    """The car at other values, within the bounds of the effects."""
+    """The car at other values, within their bounds."""
     n = len(car.moved)
+    p = np.clip(p, *limits(car, free))
     effects = {name: dict(values) for name, values in car.effects.items()}
     for (effect, name), value in zip(free, p[n:], strict=True):
-        about = EFFECTS[effect].PARAMETERS[name]
-        wanted = about.neutral + value * unit(effect, name)
-        effects[effect][name] = float(np.clip(wanted, about.lower, about.upper))
+        effects[effect][name] = _value(effect, name, value)
     return replace(car, moved=p[:n], effects=effects)
 
 
@@ -98,6 +129,10 @@ class Study:
         """Errors of a car, shape ``(W, 3 K)``."""
         return self.windows.errors(car, context).reshape(len(self.windows), -1)
 
+    def errors_of(self, cars: Sequence[Car], context: dict[str, float] | None = None) -> Vector:
+        """Errors of several cars that differ in values alone, shape ``(P, W, 3 K)``."""
+        return self.windows.errors_of(cars, context).reshape(len(cars), len(self.windows), -1)
+
     def first_noise(self, errors: Vector) -> Noise:
         """The noise under which ``errors`` are most likely."""
         rate = np.tile(self.windows.spread**2, 2)
@@ -110,21 +145,22 @@ class Study:
         """
         return fit_noise(self.spread, errors, np.maximum(noise.v, 1e6 * self.floor), self.floor)
 
-    def columns(self, car: Car, errors: Vector, free: Free) -> Vector:
-        """Derivatives of ``errors`` by the 18 nominal values and by ``free``; shape ``(W, 3 K, P)``."""
+    def columns(self, car: Car, errors: Vector, free: Free, first: int = 0) -> Vector:
+        """Derivatives of ``errors`` by the 18 nominal values and by ``free``, from the ``first`` on.
+
+        Shape ``(W, 3 K, P - first)``.
+        """
         at, n = position(car, free), len(car.moved)
-        out = np.empty((*errors.shape, len(at)))
-        for k in range(len(at)):
+        upper = limits(car, free)[1]
+        cars, done = [], np.empty(len(at) - first)
+        for k in range(first, len(at)):
             step = 0.05 if k < n else 0.02
             moved = at.copy()
-            moved[k] += step
-            other = placed(car, free, moved)
-            if k >= n and position(other, free)[k] - at[k] < 0.5 * step:  # on the upper bound
-                moved[k] -= 2 * step
-                other = placed(car, free, moved)
-            done = position(other, free)[k] - at[k]
-            out[..., k] = (self.errors(other) - errors) / done
-        return out
+            moved[k] += step if at[k] + step <= upper[k] else -step
+            done[k - first] = moved[k] - at[k]
+            cars.append(placed(car, free, moved))
+        change = self.errors_of(cars) - errors
+        return np.asarray(np.moveaxis(change, 0, -1) / done)
 
     def objective(self, errors: Vector, p: Vector, noise: Noise) -> float:
         """Twice the negative logarithm of likelihood and knowledge."""
@@ -142,36 +178,76 @@ class Study:
         known[:18] = 1.0
         return known
 
-    def fit(self, car: Car, free: Free, noise: Noise | None = None, rounds: int = _ROUNDS) -> Fit:
+    def fit(self, car: Car, free: Free, near: Fit | None = None, rounds: int = _ROUNDS, rough: bool = False) -> Fit:
         """Levenberg-Marquardt from ``car``; the noise is fitted along.
+
+        Derivatives by the nominal values hardly change, so they are those of a fit nearby while they keep what they promise
+        and until it has settled with them.
 
         Args:
             car: where to start; has the effects of ``free``.
             free: which of their parameters are fitted.
-            noise: to begin with.
+            near: a fit of a like car, whose noise and derivatives serve to begin with.
             rounds: of linearising anew, at most.
+            rough: whether it may end with the derivatives of ``near``.
         """
-        errors = self.errors(car)
-        noise = self.refit_noise(noise, errors) if noise is not None else self.first_noise(errors)
+        car = placed(car, free, position(car, free))
+        errors, n = self.errors(car), len(car.moved)
+        noise = self.refit_noise(near.noise, errors) if near is not None else self.first_noise(errors)
         p = position(car, free)
+        lower, upper = limits(car, free)
         best = self.objective(errors, p, noise)
+        nominal = None if near is None else near.jacobian[..., :n]
         jacobian = np.empty(0)
-        for _ in range(rounds):
-            jacobian = self.columns(car, errors, free)
+        for last in range(rounds, 0, -1):
+            stale = nominal is not None
+            if nominal is not None and last > 1:
+                jacobian = np.concatenate([nominal, self.columns(car, errors, free, n)], axis=2) if free else nominal
+            else:
+                jacobian, stale = self.columns(car, errors, free), False
             H, g = self._normal(errors, jacobian, p, noise)
-            before = best
+            before, promised, gained = best, 0.0, 0.0
             for damping in _DAMPING:
-                other = placed(car, free, p - np.linalg.solve(H + damping * np.diag(np.diag(H)), g))
+                step = _step(H + damping * np.diag(np.diag(H)), g, lower - p, upper - p)
+                other = placed(car, free, p + step)
                 there = self.errors(other)
                 value = self.objective(there, position(other, free), noise)
                 if value < best:
+                    promised = -float(2 * g @ step + step @ H @ step)
+                    gained = best - value
                     car, errors, p = other, there, position(other, free)
-                    noise = self.refit_noise(noise, errors)
+                    if gained > _CONVERGED:
+                        noise = self.refit_noise(noise, errors)
                     best = self.objective(errors, p, noise)
                     break
-            if before - best < _CONVERGED:
+            settled = before - best < _CONVERGED
+            if settled and (rough or not stale):
                 break
+            if stale and (settled or gained < _KEPT * promised):
+                nominal = None
+            elif not stale:
+                nominal = jacobian[..., :n]
         return Fit(car, free, errors, jacobian, noise, best)
+
+    def part(self, fit: Fit, every: int) -> tuple[Study, Fit]:
+        """One window of each ``every``, and what ``fit`` is there."""
+        other = copy(self)
+        other.windows = self.windows.select(np.arange(0, len(self.windows), every))
+        other.spread = Spread(self.spread.group[::every], self.spread.G)
+        other.block = self.block[::every]
+        noise, errors = Noise(other.spread, fit.noise.v), fit.errors[::every]
+        objective = other.objective(errors, fit.position, noise)
+        return other, replace(fit, errors=errors, jacobian=fit.jacobian[::every], noise=noise, objective=objective)
+
+    def eased(self, cars: Sequence[Car], near: Fit) -> list[Car]:
+        """The same cars with the values of ``near`` moved to where its derivatives say that they fit best."""
+        out = []
+        for car, errors in zip(cars, self.errors_of(cars), strict=True):
+            p = position(car, near.free)
+            H, g = self._normal(errors, near.jacobian, p, near.noise)
+            lower, upper = limits(car, near.free)
+            out.append(placed(car, near.free, p + _step(H, g, lower - p, upper - p)))
+        return out
 
     def _normal(self, errors: Vector, jacobian: Vector, p: Vector, noise: Noise) -> tuple[Vector, Vector]:
         """Second and first derivatives of half the objective, as Gauss and Newton approximate them."""
@@ -183,13 +259,39 @@ class Study:
         g = J.T @ (white * root).ravel() + known * p
         return H, g
 
-    def covariance(self, fit: Fit) -> tuple[Vector, float]:
-        """Covariance of the fitted values, robust against errors that hang together within blocks, and its inflation.
+    def covariance(self, fit: Fit) -> Vector:
+        """Covariance of the fitted values in the units of the fit, robust against errors that hang together in blocks.
 
-        Returns:
-            Covariance in the units of the fit, shape ``(P, P)``, and how many times larger the variance of the scores
-            is than independent errors would make it, at least 1.
+        Shape ``(P, P)``.
         """
+        information, _ = self._scores(fit)
+        known = np.diag(self.known_before(fit.position))
+        bread = np.linalg.inv(information + known)
+        return np.asarray(bread @ (self.inflation(fit) * information + known) @ bread)
+
+    def inflation(self, fit: Fit, last: int = 0) -> float:
+        """How many times larger the variance of the scores is than independent errors would make it, at least 1.
+
+        The larger one of the mean over all that the data tell of and, with ``last``, what is sure of that of the last
+        values, with what the others can take up projected out.
+        """
+        information, meat = self._scores(fit)
+        values, vectors = np.linalg.eigh(information)
+        told = values > 1.0
+        ratio = np.einsum("pi,pq,qi->i", vectors[:, told], meat, vectors[:, told]) / values[told]
+        inflation = float(ratio.mean()) if told.any() else 1.0
+        if last:
+            known = np.diag(self.known_before(fit.position))
+            n = len(information) - last
+            taken = np.linalg.solve((information + known)[:n, :n], information[:n, n:])
+            left = np.concatenate([-taken, np.eye(last)])
+            own = np.linalg.solve(left.T @ information @ left + 1e-9 * np.eye(last), left.T @ meat @ left)
+            chance = 1.0 + 2.0 * np.sqrt(2.0 / (self.block.max() + 1))
+            inflation = max(inflation, float(np.trace(own)) / last / chance)
+        return max(1.0, inflation)
+
+    def _scores(self, fit: Fit) -> tuple[Vector, Vector]:
+        """The information on the fitted values, and what blocks of errors make of it, both ``(P, P)``."""
         white = fit.noise.whiten(fit.errors)
         root = np.sqrt(weights(white))
         J = fit.noise.whiten(fit.jacobian) * root[:, None, None]
@@ -199,11 +301,10 @@ class Study:
         blocks = np.zeros((self.block.max() + 1, len(information)))
         np.add.at(blocks, self.block, scores)
         blocks -= blocks.mean(axis=0)
-        meat = blocks.T @ blocks * len(blocks) / max(1, len(blocks) - 1)
-        known = np.diag(self.known_before(fit.position))
-        bread = np.linalg.inv(information + known)
-        values, vectors = np.linalg.eigh(information)
-        told = values > 1.0
-        ratio = np.einsum("pi,pq,qi->i", vectors[:, told], meat, vectors[:, told]) / values[told]
-        inflation = max(1.0, float(ratio.mean())) if told.any() else 1.0
-        return bread @ (inflation * information + known) @ bread, inflation
+        return information, blocks.T @ blocks * len(blocks) / max(1, len(blocks) - 1)
+
+
+def _step(H: Vector, g: Vector, lower: Vector, upper: Vector) -> Vector:
+    """The step that a quadratic asks for within bounds: what would leave them stays on them, the others follow."""
+    root = np.linalg.cholesky(H)
+    return np.asarray(lsq_linear(root.T, -np.linalg.solve(root, g), (lower, upper), "bvls").x)

@@ -13,7 +13,7 @@ from dynssm_ros.evaluation.metrics import CHANNELS
 Vector = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
-_FOLDS = 5
+_FOLDS = 10
 _PLACES = 20
 _RIDGE = 3.0
 _SURE = 3.0  # standard errors by which the explanation must be better than none
@@ -29,12 +29,14 @@ class Systematic:
         by_place: the same from the place on the lap alone; NaN without laps.
         sure: by how many standard errors the whole is better than no explanation.
         pattern: the signals that the errors go with most, by channel, with their correlation.
+        stretch: where on the lap the mean error is farthest from zero, by channel, from and to (m); empty without laps.
     """
 
     share: Vector
     by_place: Vector
     sure: float
     pattern: dict[str, dict[str, float]]
+    stretch: dict[str, tuple[float, float]]
 
     @property
     def is_there(self) -> bool:
@@ -47,10 +49,10 @@ def systematic(windows: Windows, errors: Vector, block: Indices) -> Systematic:
 
     Args:
         windows: the simulations.
-        errors: theirs, shape ``(W, K, 3)``.
+        errors: at their ends, shape ``(W, 3)``.
         block: number of the block in time of each window, shape ``(W,)``; blocks are left out as a whole.
     """
-    y = errors[:, -1] / np.maximum(np.sqrt((errors[:, -1] ** 2).mean(axis=0)), 1e-12)
+    y = errors / np.maximum(np.sqrt((errors**2).mean(axis=0)), 1e-12)
     y = np.clip(y, -4.0, 4.0)
     signals = _signals(windows)
     X = _features(np.stack(list(signals.values()), axis=1))
@@ -69,6 +71,7 @@ def systematic(windows: Windows, errors: Vector, block: Indices) -> Systematic:
             channel: {name: round(value, 2) for name, value in _strongest(signals, y[:, c]).items()}
             for c, channel in enumerate(CHANNELS)
         },
+        {} if places is None else _stretches(windows, places, y),
     )
 
 
@@ -92,10 +95,10 @@ def _signals(windows: Windows) -> dict[str, Vector]:
 
 
 def _features(signals: Vector) -> Vector:
+    """The signals and their squares; products of all of them would foretell wildly where nothing alike was driven."""
     spread = signals.std(axis=0)
     z = (signals - signals.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-    pairs = [z[:, i] * z[:, j] for i in range(z.shape[1]) for j in range(i, z.shape[1])]
-    return np.concatenate([np.ones((len(z), 1)), z, np.stack(pairs, axis=1)], axis=1)
+    return np.concatenate([np.ones((len(z), 1)), z, z**2], axis=1)
 
 
 def _places(windows: Windows) -> Vector | None:
@@ -104,6 +107,16 @@ def _places(windows: Windows) -> Vector | None:
     here = windows.context(windows.steps // 2)
     bin_ = np.minimum((here["s"] / here["lap_length"] * _PLACES).astype(int), _PLACES - 1)
     return np.asarray(np.eye(_PLACES)[bin_])
+
+
+def _stretches(windows: Windows, places: Vector, y: Vector) -> dict[str, tuple[float, float]]:
+    """The part of the lap, by channel, at which the mean error is farthest from zero in its standard errors."""
+    count = np.maximum(places.sum(axis=0), 1.0)[:, None]
+    mean = places.T @ y / count
+    spread = np.sqrt(np.maximum(places.T @ y**2 / count - mean**2, 1e-12) / count)
+    length = float(windows.context(0)["lap_length"][0]) / _PLACES
+    worst = np.abs(mean / (spread + 1.0 / np.sqrt(len(y)))).argmax(axis=0)
+    return {c: (float(k * length), float((k + 1) * length)) for c, k in zip(CHANNELS, worst, strict=True)}
 
 
 def _foretold(X: Vector, y: Vector, fold: Indices) -> Vector:

@@ -12,10 +12,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from dynssm_ros.diagnosis.car import Car
+from dynssm_ros.diagnosis.car import Car, Fleet
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
-from dynssm_ros.vehicle.effects import Effect
 from dynssm_ros.vehicle.single_track import Integrator, settled_memory, step_with_memory
 
 Vector = npt.NDArray[np.float64]
@@ -45,15 +44,16 @@ class Track:
 
 @dataclass(frozen=True)
 class Windows:
-    """``W`` simulations of ``K`` steps.
+    """``W`` simulations, compared with the measurement at ``K`` rows each.
 
     Attributes:
         data: what is simulated.
         starts: rows from which the simulations start, shape ``(W,)``; ``warm`` rows before each belong to its stretch.
-        steps: ``K``.
+        steps: sampling times simulated, a multiple of ``every``.
         warm: rows of warm-up.
         integrator: how the model steps.
         substeps: integration steps per sampling time.
+        every: compared is every so many rows, so that ``K = steps / every``.
     """
 
     data: Track = field(repr=False)
@@ -62,6 +62,7 @@ class Windows:
     warm: int
     integrator: Integrator = "rk4"
     substeps: int = 1
+    every: int = 1
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -88,7 +89,7 @@ class Windows:
     @cached_property
     def target(self) -> Vector:
         """Measured states of the predicted rows, shape ``(W, K, 3)``."""
-        at = self.starts[:, None] + np.arange(1, self.steps + 1)
+        at = self.starts[:, None] + np.arange(self.every, self.steps + 1, self.every)
         return np.moveaxis(self.data.rows[:3, at], 0, -1)
 
     @cached_property
@@ -101,47 +102,58 @@ class Windows:
         return {name: values[self.starts + shift] for name, values in self.data.context.items()}
 
     def errors(self, car: Car, context: dict[str, float] | None = None) -> Vector:
-        """Predicted minus measured states (m/s, m/s, rad/s), shape ``(W, K, 3)``.
+        """Predicted minus measured states (m/s, m/s, rad/s), shape ``(W, K, 3)``; see :meth:`errors_of`."""
+        return np.asarray(self.errors_of([car], context)[0])
+
+    def errors_of(self, cars: Sequence[Car], context: dict[str, float] | None = None) -> Vector:
+        """Predicted minus measured states of ``P`` cars at once, shape ``(P, W, K, 3)``.
 
         Args:
-            car: what is simulated.
+            cars: what is simulated; they differ in values alone.
             context: values that replace signals of the recording, the same in all rows.
         """
-        effects = car.active
-        carries = any(effect.carries for effect in effects)
+        fleet = Fleet.of(cars)
+        carries = any(effect.carries for effect in fleet.effects)
         shift = -self.warm if carries else 0
         first = self.data.rows[:, self.starts + shift]
         here = self.context(shift) | (context or {})
         state = State(*first[:3])
-        theta, constants = car.theta, car.constants
-        memory = settled_memory(np, state, Applied(*first[3:5]), theta, constants, effects, context=here)
-        out = np.empty((len(self), self.steps, 3))
+        memory = settled_memory(
+            np, state, Applied(*first[3:5]), fleet.theta, fleet.constants, fleet.effects, context=here
+        )
+        out = np.empty((len(cars), len(self), self.steps // self.every, 3))
         with np.errstate(all="ignore"):
             for k in range(shift, self.steps):
                 rows = self.data.rows[:, self.starts + k]
                 if k <= 0:
                     state = State(*rows[:3])
-                state, memory = self._step(car, state, memory, rows, k, context, effects)
-                if k >= 0:
-                    out[:, k] = np.stack(np.broadcast_arrays(*state), axis=-1)
+                state, memory = self._step(fleet, state, memory, rows, k, context)
+                if k >= 0 and (k + 1) % self.every == 0:
+                    for channel, value in enumerate(state):
+                        out[:, :, k // self.every, channel] = value
         limit = _WILD * self.spread
-        return np.clip(np.nan_to_num(out - self.target, nan=1e9, posinf=1e9, neginf=-1e9), -limit, limit)
+        out -= self.target
+        return np.asarray(np.clip(np.nan_to_num(out, copy=False, nan=1e9, posinf=1e9, neginf=-1e9), -limit, limit))
 
     def transitions(self, car: Car) -> Vector:
-        """Derivatives of each step's end by its start, along the measured rows, shape ``(W, K, 3, 3)``."""
-        effects = tuple(effect for effect in car.active if not effect.carries)
+        """Derivatives of each compared row by the one before, along the measured rows, shape ``(W, K, 3, 3)``."""
+        fleet = Fleet.of([car])
+        fleet = fleet._replace(effects=tuple(effect for effect in fleet.effects if not effect.carries))
         out = np.empty((len(self), self.steps, 3, 3))
         for k in range(self.steps):
             rows = self.data.rows[:, self.starts + k]
             state = State(*rows[:3])
-            base, _ = self._step(car, state, {}, rows, k, None, effects)
+            base, _ = self._step(fleet, state, {}, rows, k, None)
             for j in range(3):
                 h = 1e-4 * self.spread[j]
-                moved, _ = self._step(
-                    car, State(*(v + h * (i == j) for i, v in enumerate(state))), {}, rows, k, None, effects
-                )
+                there = State(*(v + h * (i == j) for i, v in enumerate(state)))
+                moved, _ = self._step(fleet, there, {}, rows, k, None)
                 out[:, k, :, j] = np.stack([(a - b) / h for a, b in zip(moved, base, strict=True)], axis=-1)
-        return np.asarray(np.clip(np.nan_to_num(out), -10.0, 10.0))
+        steps = np.clip(np.nan_to_num(out), -10.0, 10.0).reshape(len(self), -1, self.every, 3, 3)
+        through = steps[:, :, 0]
+        for k in range(1, self.every):
+            through = steps[:, :, k] @ through
+        return np.asarray(through)
 
     @cached_property
     def spread(self) -> Vector:
@@ -150,13 +162,12 @@ class Windows:
 
     def _step(
         self,
-        car: Car,
+        fleet: Fleet,
         state: State,
         memory: Mapping[str, Vector],
         rows: Vector,
         k: int,
         context: Mapping[str, float] | None,
-        effects: Sequence[Effect],
     ) -> tuple[State, dict[str, Vector]]:
         """One step from the rows ``k`` after the starts."""
         return step_with_memory(
@@ -164,10 +175,10 @@ class Windows:
             state,
             memory,
             applied_inputs(rows),
-            car.theta,
-            car.constants,
+            fleet.theta,
+            fleet.constants,
             self.data.T_s,
-            effects,
+            fleet.effects,
             self.integrator,
             self.substeps,
             self.context(k) | dict(context or {}),

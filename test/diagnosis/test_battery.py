@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from pathlib import Path
 
@@ -9,8 +10,28 @@ import numpy as np
 import pytest
 
 from dynssm_ros.diagnosis import battery
-from dynssm_ros.diagnosis.battery import SIZES, Case, Outcome, cases, judge, matrix, rates, size
+from dynssm_ros.diagnosis.battery import (
+    NOISE,
+    SIZES,
+    TRACKS,
+    Case,
+    Outcome,
+    cases,
+    judge,
+    matrix,
+    page,
+    rates,
+    run_case,
+    size,
+    sized,
+)
+from dynssm_ros.diagnosis.car import Car
 from dynssm_ros.diagnosis.diagnose import Cause
+from dynssm_ros.diagnosis.study import Study
+from dynssm_ros.diagnosis.windows import Track, Windows
+from dynssm_ros.simulation.driver import Style
+from dynssm_ros.simulation.laps import simulate
+from dynssm_ros.simulation.tracks import load_track
 from dynssm_ros.vehicle import load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 
@@ -35,9 +56,14 @@ def test_the_cases_hold_every_effect_none_two_and_four_wheels() -> None:
     single = Counter(name for case in listed if len(case.hidden) == 1 for name in case.hidden)
     assert set(single) == set(EFFECTS)
     assert min(single.values()) >= 3
-    assert Counter(len(case.hidden) for case in listed)[0] == 13
-    assert Counter(len(case.hidden) for case in listed)[2] == 13
+    assert Counter(len(case.hidden) for case in listed)[0] == 20
+    assert Counter(len(case.hidden) for case in listed)[2] == 20
+    assert Counter(len(case.hidden) for case in listed)[1] == 90
     assert {case.plant for case in listed} == {"rk4", "double_track"}
+    assert {case.track for case in listed} == set(TRACKS)
+    assert {case.sampling_time for case in listed} == {0.04, 0.02}
+    four_wheels = {len(case.hidden) for case in listed if case.plant == "double_track"}
+    assert four_wheels == {0, 1, 2}
 
 
 def test_the_nominal_car_is_off_by_what_it_says() -> None:
@@ -72,27 +98,85 @@ def test_none_and_two_are_judged_by_all_that_is_named() -> None:
     assert judge(two, [cause("mass", {"factor": 1.2}), cause("drag", {"coefficient": 0.4})]).all
 
 
-def test_rates_and_confusion_count_what_happened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    outcomes = [
-        Outcome("a", ("drag",), ("drag",), True, True, True),
-        Outcome("b", ("drag",), ("mass",), False, False, None),
-        Outcome("c", (), ("mass",), False, False, None),
-        Outcome("d", ("drag", "mass"), ("drag", "mass"), True, True, False),
-    ]
-    assert rates(outcomes) == {
-        "cases": 4,
-        "named_first": {"of": 2, "share": 0.5},
-        "both_found": {"of": 1, "share": 1.0},
-        "false_alarms": {"of": 1, "share": 1.0},
-        "right_size": {"of": 2, "share": 0.5},
+OUTCOMES = [
+    Outcome("a", ("drag",), ("drag",), True, True, True),
+    Outcome("b", ("drag",), ("mass",), False, False, None, {"drag": {"coefficient": 0.3}}, {"mass": {"factor": 1.2}}),
+    Outcome("c", (), ("mass",), False, False, None),
+    Outcome("d", ("drag", "mass"), ("drag", "mass"), True, True, False),
+]
+
+
+def test_rates_and_confusion_count_what_happened() -> None:
+    found = rates(OUTCOMES)
+    assert {name: (rate["of"], rate["share"]) for name, rate in found.items() if name != "cases"} == {
+        "named_first": (2, 0.5),
+        "both_found": (1, 1.0),
+        "false_alarms": (1, 1.0),
+        "right_size": (2, 0.5),
+        "more_named": (2, 0.0),
     }
-    labels, _, count = matrix(outcomes)
+    # Wilson 1927: (p + z^2 / 2n +- z sqrt(p q / n + z^2 / 4n^2)) / (1 + z^2 / n)
+    n, z = 2, 1.959964
+    half = z * np.sqrt(0.25 / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
+    assert found["named_first"]["interval_95"] == pytest.approx([0.5 - half, 0.5 + half], abs=1e-5)
+    labels, _, count = matrix(OUTCOMES)
     drag, mass, none = (labels.index(name) for name in ("drag", "mass", "none"))
     assert count.sum() == 3
     assert (count[drag, drag], count[drag, mass], count[none, mass]) == (1, 1, 1)
 
-    ran = iter(outcomes)
-    monkeypatch.setattr(battery, "run_case", lambda case: next(ran))
-    battery.main(["--out", str(tmp_path), "--count", "4"])
-    assert "<svg" in (tmp_path / "confusion.svg").read_text()
-    assert '"share": 0.5' in (tmp_path / "battery.json").read_text()
+
+def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
+    text = page(OUTCOMES, 7, 1)
+    assert "4 simulated drives with hidden effects, seeds 7 to 11, without 1 whose car could not be driven" in text
+    assert (
+        "| the hidden effect, or an alternative reported with it, is named first | 2 | 50 % | 9 to 91 % | >= 95 % |"
+        in text
+    )
+    assert "| `b` | drag coefficient 0.3 | mass factor 1.2 |" in text
+    assert "| `a` |" not in text
+
+
+def test_the_command_writes_rates_figure_and_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran = iter([*OUTCOMES, None])
+    monkeypatch.setattr(battery, "run_case", lambda case, folder: next(ran))
+    battery.main(["--out", str(tmp_path), "--page", str(tmp_path / "docs"), "--count", "5", "--seed", "7"])
+    assert (tmp_path / "docs" / "diagnose_battery_confusion.png").read_bytes()[1:4] == b"PNG"
+    assert (tmp_path / "docs" / "diagnose_battery.md").read_text() == page(OUTCOMES, 7, 1)
+    written = json.loads((tmp_path / "battery.json").read_text())
+    assert written["named_first"]["share"] == 0.5
+    assert (written["seed"], written["undriven"], len(written["outcomes"])) == (7, 1, 4)
+
+
+def test_what_is_done_is_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case({"steering_offset": {"offset": 0.02}}, 3, "euler", 40.0)
+    first = run_case(case, tmp_path)
+    assert first is not None
+    assert first.values == case.hidden
+
+    def no_more(*arguments: object, **options: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(battery, "diagnose", no_more)
+    monkeypatch.setattr(battery, "record", no_more)
+    assert run_case(case, tmp_path) == first
+
+
+def test_the_least_sizes_are_just_noticeable() -> None:
+    # about seven standard deviations on the reference drive, so that twice the log-likelihood changes by 49 or some more
+    car = load_vehicle("av21")
+    known = [c.std for c in battery.off(car, np.random.default_rng(0)).coefficients.values()]
+    car = car.with_nominal(car.nominal, np.array(known, dtype=float))
+    run = simulate(car, load_track("road_course"), duration=90.0, noise=NOISE, seed=1, style=Style(0.72, 0.65))
+    rows = np.concatenate([run.measured.T, run.feedback.T, (run.command - run.feedback).T])
+    time = (run.time - run.time[0]) / 1e9
+    lap = {"s": run.s % run.track.length, "lap_length": np.full(len(time), run.track.length)}
+    track = Track(rows, {"t": time, "theta": run.pose[:, 2]} | lap, car.sampling_time, time)
+    study = Study(Windows(track, np.arange(8, rows.shape[1] - 14, 13), 13, 8, "euler"), Car.of(car))
+    fit = study.fit(Car.of(car), ())
+    J = fit.noise.whiten(fit.jacobian).reshape(-1, 18)
+    for name, ((least, _),) in ((name, tuple(sizes.values())) for name, sizes in SIZES.items()):
+        values = sized(name, least, np.random.default_rng(0))
+        change = fit.noise.whiten(study.errors(fit.car.with_effect(name, values)) - fit.errors).ravel()
+        seen = J.T @ change
+        evidence = change @ change - seen @ np.linalg.solve(J.T @ J + np.eye(18), seen)
+        assert 40 < evidence < 5 * 49, name

@@ -23,13 +23,7 @@ LINE = load_track("road_course").centre
 SEED = 1
 
 
-# in 70 s a little less front grip is not yet told from the uncertainty of the nominal tyre: the verdict is "none"
-UNDECIDED = pytest.mark.xfail(reason="front_grip of this size is not found in so short a stretch", strict=False)
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=UNDECIDED if name == "front_grip" else ()) for name in sorted(EFFECTS)]
-)
+@pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_a_hidden_cause_is_named(name: str, laps: Laps) -> None:
     # a stretch of the lap has to be driven before it can be judged
     duration = 120.0 if name == "grip_patch" else 70.0
@@ -117,7 +111,7 @@ def test_words_and_report_name_cause_size_gain_and_advice(lagging: tuple[Recordi
         "±",
         " s\n",
         EFFECTS["steering_lag"].ADVICE,
-        "held-out error of v_y",
+        "Error on held-out laps",
     ):
         assert part in words
     page = diagnosis_report(found).html()

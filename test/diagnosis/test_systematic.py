@@ -24,8 +24,8 @@ def driven(place: bool = True) -> Windows:
 
 
 def errors(windows: Windows, planted: np.ndarray) -> np.ndarray:
-    noise = np.random.default_rng(1).standard_normal((len(windows), K, 3))
-    return noise + planted[:, None, None]
+    noise = np.random.default_rng(1).standard_normal((len(windows), 3))
+    return noise + planted[:, None]
 
 
 def test_noise_is_no_pattern() -> None:
@@ -51,3 +51,5 @@ def test_an_error_that_repeats_at_a_place_is_seen_as_such() -> None:
     found = systematic(windows, errors(windows, np.where(np.abs(lap - 0.4) < 0.1, 3.0, 0.0)), windows.starts // 75)
     assert found.is_there
     assert found.by_place == pytest.approx(np.full(3, 0.55), abs=0.12)
+    low, high = found.stretch["v_y"]
+    assert 300.0 <= low < high <= 500.0
