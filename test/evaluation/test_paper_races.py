@@ -72,7 +72,7 @@ def test_models_without_training_drive_and_those_that_are_not_there_are_left_out
 def test_the_document_sets_the_papers_rows_beside(plan, root, tmp_path):
     text = document(plan, root, {race_key("lap"): Outcome("done")}, tmp_path / "results_race.md")
     rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| ")]
-    assert ["| DynSSM, the paper's", "4.88"] in [row[:2] for row in rows]
+    assert ["| DynSSM, the paper's", "4.880"] in [row[:2] for row in rows]
     assert any(row[0] == "| the plant's own model" for row in rows)
     assert "Lap time against the plant's own model: `single_track`" in text
     assert (tmp_path / "results_race_lap_coefficients.png").is_file()

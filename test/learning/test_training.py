@@ -20,9 +20,9 @@ import torch
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.learning import training as training_module
 from dynssm_ros.learning.configuration import ModelConfig
-from dynssm_ros.learning.dataset import all_windows, split_windows
+from dynssm_ros.learning.dataset import split_windows
 from dynssm_ros.learning.dynssm import DynSSM
-from dynssm_ros.learning.training import Trained, check_device, checkpoints, train
+from dynssm_ros.learning.training import Trained, check_device, train
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
@@ -58,14 +58,6 @@ def same(a: Trained, b: Trained) -> bool:
     """Whether weights and history agree bit by bit."""
     ours, theirs = a.model.state_dict(), b.model.state_dict()
     return a.history == b.history and all(torch.equal(ours[name], theirs[name]) for name in ours)
-
-
-WITH_PARTS = {
-    "H": 6,
-    "memory": {"taps": 2},
-    "hindcast": {"steps": 2, "folds": 2},
-    "training": {"epochs": 4, "batch_size": 16},
-}
 
 
 # --- repeatable ---------------------------------------------------------------------------------
@@ -173,49 +165,6 @@ def test_an_interruption_in_the_middle_of_an_epoch_costs_that_epoch_alone(
     resumed = train(short, config, orca, tmp_path / "cut.pt")
     assert resumed.resumed_from == 2
     assert same(whole, resumed)
-
-
-def test_the_variance_is_fitted_to_the_errors_on_parts_that_the_model_did_not_know(
-    drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicle, tmp_path: Path
-) -> None:
-    recording = drive(orca, 800)
-    with_parts = make_config(**WITH_PARTS)
-    trained = train(recording, with_parts, orca, tmp_path / "a.pt")
-    second = np.arange(len(recording)) >= len(recording) // 2
-    errors = []
-    for part in (~second, second):
-        other = with_parts.with_training(epochs=1).model_copy(
-            update={"hindcast": with_parts.hindcast.model_copy(update={"folds": 1})}
-        )
-        without = train(recording.select(~part), other, orca, tmp_path / f"{part[0]}.pt")
-        left_out = all_windows(recording.select(part), with_parts.H, with_parts.training.min_speed)
-        errors.append(without.model.errors(*left_out.batch(slice(None))))
-    fitted = trained.model.hindcast.variance.clone()
-    trained.model.fit_variance(*(torch.cat(each) for each in zip(*errors, strict=True)))
-    assert torch.equal(trained.model.hindcast.variance, fitted)
-    # the prediction itself knows nothing of it
-    plain = train(recording, make_config(**WITH_PARTS | {"hindcast": {"steps": 2}}), orca, tmp_path / "b.pt")
-    different = {
-        name
-        for name, value in plain.model.state_dict().items()
-        if not torch.equal(value, trained.model.state_dict()[name])
-    }
-    assert different == {"hindcast.variance"}
-
-
-@pytest.mark.parametrize("epoch", [3, 5, 6])
-def test_an_interrupted_stage_is_gone_on_with(
-    drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicle, tmp_path: Path, epoch: int
-) -> None:
-    recording, config = drive(orca, 800), make_config(**WITH_PARTS)
-    whole = train(recording, config, orca, tmp_path / "whole.pt")
-    with pytest.raises(KeyboardInterrupt):
-        train(recording, config, orca, tmp_path / "cut.pt", progress=interrupt_at(epoch))
-    told: list[int] = []
-    resumed = train(recording, config, orca, tmp_path / "cut.pt", progress=lambda done, *_: told.append(done))
-    assert same(whole, resumed)
-    assert told == list(range(epoch + 1, 7))
-    assert all(path.is_file() for path in checkpoints(config, tmp_path / "cut.pt"))
 
 
 def test_a_finished_training_is_not_trained_on(

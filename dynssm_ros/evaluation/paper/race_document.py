@@ -112,7 +112,7 @@ def race_table(race: Race, driven: Entry, published: Mapping[str, ClosedLoop]) -
     """
     columns = (
         Column("model"),
-        Column("lap", "s", best="min"),
+        Column("lap", "s"),
         Column("violation"),
         Column("v_x", "m/s", "mean"),
         Column("|v_y|", "m/s", "mean"),
@@ -123,8 +123,8 @@ def race_table(race: Race, driven: Entry, published: Mapping[str, ClosedLoop]) -
         Column("missing plans"),
     )
     rows: list[list[Value]] = [
-        [f"{name}, the paper's", None if row.violation else row.lap_time, "yes" if row.violation else "no", row.mean_v_x,
-         row.mean_abs_v_y, row.mean_abs_omega, row.steering_total_variation, None, None, None]
+        [f"{name}, the paper's", _lap(None if row.violation else row.lap_time), "yes" if row.violation else "no",
+         row.mean_v_x, row.mean_abs_v_y, row.mean_abs_omega, row.steering_total_variation, None, None, None]
         for name, row in published.items()
     ]  # fmt: skip
     for model in race.models:
@@ -132,7 +132,7 @@ def race_table(race: Race, driven: Entry, published: Mapping[str, ClosedLoop]) -
             continue
         row = driven["models"][model]
         rows.append(
-            [_NAMES.get(model, f"`{model}`"), row["lap_time_s"], "yes" if row["violation"] else "no", row["mean_v_x"],
+            [_NAMES.get(model, f"`{model}`"), _lap(row["lap_time_s"]), "yes" if row["violation"] else "no", row["mean_v_x"],
              row["mean_abs_v_y"], row["mean_abs_omega"], row["steering_total_variation"], row["solve_ms"]["p50"],
              row["solve_ms"]["p99"], row["infeasible"] + row["late"]]
         )  # fmt: skip
@@ -157,6 +157,11 @@ def _said(models: Mapping[str, Entry]) -> str:
         listed = ", ".join(f"{_name(model)} {100 * (lap / mark - 1):+.2f} %" for model, lap in others.items())
         said.append(f"Lap time against the plant's own model: {listed}.")
     return " ".join(said)
+
+
+def _lap(seconds: float | None) -> str:
+    """A lap time to the millisecond: models differ by little."""
+    return "–" if seconds is None else f"{seconds:.3f}"
 
 
 def _name(model: str) -> str:
