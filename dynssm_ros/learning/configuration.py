@@ -110,7 +110,8 @@ class HindcastConfig(StrictModel):
         default=1,
         ge=1,
         description="stretches of the recording; the variance is fitted to the errors on each by a model trained on the rest "
-        "for a quarter of the epochs. 1: to those on the validation blocks, whose laps the model knows",
+        "for a quarter of the epochs. 1, or too little data for it: to those on the validation blocks, whose laps the model "
+        "knows",
     )
 
     @property

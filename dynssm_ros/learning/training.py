@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from dynssm_ros import __version__
-from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.files import replacing
 from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.calibration import calibrate
@@ -93,22 +93,31 @@ def train(
         ddm = _train(recording, start, vehicle, files[0], device, _stage(progress, start.name, 0, stages))
         return _train(recording, config, vehicle, files[1], device, _stage(progress, config.name, 1, stages), ddm)
     parts = config.hindcast.parts if config.hindcast else 0
-    if not parts:
+    unknown = [np.arange(len(recording)) * parts // len(recording) == k for k in range(parts)]
+    if not parts or not all(_can_be_trained_on(recording.select(~part), config) for part in unknown):
         return _train(recording, config, vehicle, checkpoint, device, progress)
     shorter = config.with_training(epochs=max(1, config.training.epochs // _SHORTER))
     stages = (config.training.epochs, *[shorter.training.epochs] * parts)
     trained = _train(recording, config, vehicle, checkpoint, device, _stage(progress, config.name, 0, stages))
     errors = []
     for k, file in enumerate(files[1:]):
-        unknown = np.arange(len(recording)) * parts // len(recording) == k
         report = _stage(progress, f"{config.name} without part {k + 1} of {parts}", k + 1, stages)
-        without = _train(recording.select(~unknown), shorter, vehicle, file, device, report)
+        without = _train(recording.select(~unknown[k]), shorter, vehicle, file, device, report)
         assert isinstance(without.model, DynSSM)
-        part = recording.select(unknown)
+        part = recording.select(unknown[k])
         errors.append(without.model.errors(*all_windows(part, config.H, config.training.min_speed).batch(slice(None))))
     assert isinstance(trained.model, DynSSM)
     trained.model.fit_variance(*(torch.cat(each) for each in zip(*errors, strict=True)))
     return trained
+
+
+def _can_be_trained_on(recording: Recording, config: ModelConfig) -> bool:
+    """Whether ``recording`` has windows enough for training and validation."""
+    try:
+        split_windows(recording, config.H, config.training)
+    except RecordingError:
+        return False
+    return True
 
 
 def checkpoints(config: ModelConfig, checkpoint: Path) -> list[Path]:

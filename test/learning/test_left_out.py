@@ -71,3 +71,16 @@ def test_an_interrupted_stage_is_gone_on_with(
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     assert told == list(range(epoch + 1, 7))
     assert all(path.is_file() for path in checkpoints(config, tmp_path / "cut.pt"))
+
+
+def test_too_little_to_leave_any_out_is_trained_on_all_the_same(
+    drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicle, tmp_path: Path
+) -> None:
+    recording = drive(orca, 400)  # half of it has no validation block
+    blocks = {"validation_block": 2.0, "validation_every": 4}
+    config = make_config(**WITH_PARTS | {"training": WITH_PARTS["training"] | blocks})
+    trained = train(recording, config, orca, tmp_path / "a.pt")
+    plain = make_config(**WITH_PARTS | {"training": config.training.model_dump(), "hindcast": {"steps": 2}})
+    alone = train(recording, plain, orca, tmp_path / "b.pt")
+    assert torch.equal(trained.model.hindcast.variance, alone.model.hindcast.variance)
+    assert [path.name for path in checkpoints(config, tmp_path / "a.pt") if path.is_file()] == ["a.pt"]
