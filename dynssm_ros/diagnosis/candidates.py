@@ -247,9 +247,8 @@ class Scan:
                 signs = np.where(amounts < 0, -1.0, 1.0)
             if not seen:
                 continue
-            if (
-                sizes and size > sizes[0]
-            ):  # the slope serves for all: with nominal values that make up for it, it goes on
+            # the slope serves for all: with nominal values that make up for it, it goes on
+            if sizes and size > sizes[0]:
                 limited = np.sign(amounts) * np.clip(np.abs(amounts), size * _REACH[0], size * _REACH[1])
                 amounts = np.where(bent, limited, amounts)
             gain = float(2 * along @ amounts - amounts @ gram @ amounts)

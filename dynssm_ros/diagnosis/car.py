@@ -90,9 +90,7 @@ class Car:
         """
         vehicle = self.vehicle.with_nominal(np.array(self.theta), std)
         vehicle = vehicle.model_copy(update={"constants": self.constants})
-        for name, values in self.effects.items():
-            vehicle = vehicle.with_effect(name, values)
-        return vehicle
+        return vehicle.with_effects(self.effects.items())
 
 
 class Fleet(NamedTuple):

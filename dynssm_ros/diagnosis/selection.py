@@ -129,7 +129,7 @@ class Search:
     def leave_out(self, selection: Selection, one: Refined) -> Fit:
         """The fit of everything chosen but ``one``."""
         chosen = tuple(r.candidate for r in selection.chosen)
-        return self._without(chosen, one.candidate, tuple(c for c in chosen if c != one.candidate))
+        return self._without(chosen, one.candidate)
 
     def fit(self, chosen: tuple[Candidate, ...]) -> Fit:
         """All of ``chosen`` together, linearised anew."""
@@ -215,11 +215,11 @@ class Search:
 
     def _against(self, chosen: tuple[Candidate, ...], one: Candidate) -> Refined:
         """What ``one`` is worth among ``chosen``."""
-        rest = tuple(c for c in chosen if c != one)
-        return self._judge(self._without(chosen, one, rest), self.fit(chosen), one)
+        return self._judge(self._without(chosen, one), self.fit(chosen), one)
 
-    def _without(self, chosen: tuple[Candidate, ...], one: Candidate, rest: tuple[Candidate, ...]) -> Fit:
-        key = frozenset(rest)
+    def _without(self, chosen: tuple[Candidate, ...], one: Candidate) -> Fit:
+        """The fit of ``chosen`` but ``one``, from that of all."""
+        key = frozenset(chosen) - {one}
         if key not in self._fits:
             fit = self.fit(chosen)
             free = tuple(pair for pair in fit.free if pair[0] != one.effect)
@@ -232,7 +232,7 @@ class Search:
             return
         for one in chosen[:-1]:
             rest = tuple(c for c in chosen if c != one)
-            self._without(tuple(chosen), one, rest)
+            self._without(tuple(chosen), one)
             ranked = self.ranked(rest)
             if ranked and ranked[0].candidate.effect != one.effect:
                 here = next((r for r in ranked if r.candidate == one), None)
@@ -242,7 +242,7 @@ class Search:
 
     def _alternatives(self, chosen: tuple[Candidate, ...], one: Candidate) -> list[str]:
         rest = tuple(c for c in chosen if c != one)
-        self._without(chosen, one, rest)
+        self._without(chosen, one)
         own = self._against(chosen, one).delta_bic
         return [
             r.candidate.effect

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from dynssm_ros.diagnosis.battery import Case, record, size
+from dynssm_ros.diagnosis.battery.cases import Case, record, size
 from dynssm_ros.diagnosis.diagnose import Diagnosis, diagnose
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.tracks import load_track

@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dynssm_ros.diagnosis import battery
-from dynssm_ros.diagnosis.battery import (
-    NOISE,
-    SIZES,
-    TRACKS,
-    Case,
-    Outcome,
-    cases,
-    judge,
-    matrix,
-    page,
-    rates,
-    run_case,
-    size,
-    sized,
-)
+from dynssm_ros.diagnosis.battery import __main__ as command
+from dynssm_ros.diagnosis.battery import run
+from dynssm_ros.diagnosis.battery.cases import NOISE, SIZES, TRACKS, Case, cases, off, size, sized
+from dynssm_ros.diagnosis.battery.outcomes import Outcome, judge, matrix, rates
+from dynssm_ros.diagnosis.battery.page import page
+from dynssm_ros.diagnosis.battery.run import kept, run_case
 from dynssm_ros.diagnosis.car import Car
 from dynssm_ros.diagnosis.diagnose import Cause
 from dynssm_ros.diagnosis.study import Study
 from dynssm_ros.diagnosis.windows import Track, Windows
+from dynssm_ros.files import write_json
 from dynssm_ros.simulation.driver import Style
 from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.simulation.tracks import load_track
@@ -68,7 +62,7 @@ def test_the_cases_hold_every_effect_none_two_and_four_wheels() -> None:
 
 def test_the_nominal_car_is_off_by_what_it_says() -> None:
     car = load_vehicle("av21")
-    drawn = [battery.off(car, np.random.default_rng(seed)) for seed in range(200)]
+    drawn = [off(car, np.random.default_rng(seed)) for seed in range(200)]
     moved = np.array([(other.nominal - car.nominal) for other in drawn]).std(axis=0)
     stated = np.array([c.std for c in drawn[0].coefficients.values()])
     np.testing.assert_allclose(moved, stated, rtol=0.25)
@@ -138,8 +132,8 @@ def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
 
 def test_the_command_writes_rates_figure_and_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ran = iter([*OUTCOMES, None])
-    monkeypatch.setattr(battery, "run_case", lambda case, folder: next(ran))
-    battery.main(["--out", str(tmp_path), "--page", str(tmp_path / "docs"), "--count", "5", "--seed", "7"])
+    monkeypatch.setattr(command, "run_case", lambda case, folder: next(ran))
+    command.main(["--out", str(tmp_path), "--page", str(tmp_path / "docs"), "--count", "5", "--seed", "7"])
     assert (tmp_path / "docs" / "diagnose_battery_confusion.png").read_bytes()[1:4] == b"PNG"
     assert (tmp_path / "docs" / "diagnose_battery.md").read_text() == page(OUTCOMES, 7, 1)
     written = json.loads((tmp_path / "battery.json").read_text())
@@ -156,21 +150,32 @@ def test_what_is_done_is_not_done_again(tmp_path: Path, monkeypatch: pytest.Monk
     def no_more(*arguments: object, **options: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(battery, "diagnose", no_more)
-    monkeypatch.setattr(battery, "record", no_more)
+    monkeypatch.setattr(run, "diagnose", no_more)
+    monkeypatch.setattr(run, "record", no_more)
     assert run_case(case, tmp_path) == first
+
+
+def test_the_command_continues_with_what_is_done_in_several_processes(tmp_path: Path) -> None:
+    for case, named in zip(cases(0, 2), (("steering_offset",), ()), strict=True):
+        outcome = Outcome(case.name, tuple(case.hidden), named, bool(named), bool(named), True if named else None)
+        write_json(kept(case, tmp_path), {"outcome": asdict(outcome)})
+    module = "dynssm_ros.diagnosis.battery"
+    subprocess.run(
+        [sys.executable, "-m", module, "--out", str(tmp_path), "--count", "2", "--jobs", "2"], check=True, timeout=60
+    )
+    assert json.loads((tmp_path / "battery.json").read_text())["named_first"]["share"] == 0.5
 
 
 def test_the_least_sizes_are_just_noticeable() -> None:
     # about seven standard deviations on the reference drive, so that twice the log-likelihood changes by 49 or some more
     car = load_vehicle("av21")
-    known = [c.std for c in battery.off(car, np.random.default_rng(0)).coefficients.values()]
+    known = [c.std for c in off(car, np.random.default_rng(0)).coefficients.values()]
     car = car.with_nominal(car.nominal, np.array(known, dtype=float))
-    run = simulate(car, load_track("road_course"), duration=90.0, noise=NOISE, seed=1, style=Style(0.72, 0.65))
-    rows = np.concatenate([run.measured.T, run.feedback.T, (run.command - run.feedback).T])
-    time = (run.time - run.time[0]) / 1e9
-    lap = {"s": run.s % run.track.length, "lap_length": np.full(len(time), run.track.length)}
-    track = Track(rows, {"t": time, "theta": run.pose[:, 2]} | lap, car.sampling_time, time)
+    drive = simulate(car, load_track("road_course"), duration=90.0, noise=NOISE, seed=1, style=Style(0.72, 0.65))
+    rows = np.concatenate([drive.measured.T, drive.feedback.T, (drive.command - drive.feedback).T])
+    time = (drive.time - drive.time[0]) / 1e9
+    lap = {"s": drive.s % drive.track.length, "lap_length": np.full(len(time), drive.track.length)}
+    track = Track(rows, {"t": time, "theta": drive.pose[:, 2]} | lap, car.sampling_time, time)
     study = Study(Windows(track, np.arange(8, rows.shape[1] - 14, 13), 13, 8, "euler"), Car.of(car))
     fit = study.fit(Car.of(car), ())
     J = fit.noise.whiten(fit.jacobian).reshape(-1, 18)

@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.diagnosis.battery import Case, judge, record, size
+from dynssm_ros.diagnosis.battery.cases import Case, record, size
+from dynssm_ros.diagnosis.battery.outcomes import judge
 from dynssm_ros.diagnosis.diagnose import Diagnosis, diagnose
 from dynssm_ros.diagnosis.report import diagnosis_report, in_words
 from dynssm_ros.errors import ConfigurationError, RecordingError

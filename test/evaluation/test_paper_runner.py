@@ -10,8 +10,9 @@ import pytest
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.paper.plan import Drive
 from dynssm_ros.evaluation.paper.racing import DriveLaps
-from dynssm_ros.evaluation.paper.runner import _reached, code_digest, run
+from dynssm_ros.evaluation.paper.runner import COMPUTING, code_digest, run
 from dynssm_ros.evaluation.paper.steps import Simulate, Step, UnavailableError
+from dynssm_ros.evaluation.provenance import reached
 from dynssm_ros.signals.recording import Recording
 
 
@@ -149,9 +150,9 @@ def test_two_processes_make_what_one_makes(tmp_path):
 
 
 def test_the_code_of_a_step_is_what_it_imports_from_the_rooms_that_compute():
-    modules = set(_reached(Simulate.__module__, {}))
+    modules = set(reached(Simulate.__module__, COMPUTING))
     assert {"dynssm_ros.simulation.laps", "dynssm_ros.learning.dynssm", "dynssm_ros.vehicle.single_track"} <= modules
     assert "dynssm_ros.simulation.external" not in modules  # drives live
     assert not any(".nodes." in name or ".diagnosis." in name for name in modules)
-    assert "dynssm_ros.control.nmpc" in _reached(DriveLaps.__module__, {})
+    assert "dynssm_ros.control.nmpc" in reached(DriveLaps.__module__, COMPUTING)
     assert code_digest(Simulate) != code_digest(DriveLaps)

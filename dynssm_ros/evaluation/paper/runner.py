@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import json
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Literal, Protocol
@@ -17,10 +15,11 @@ from typing import Literal, Protocol
 from dynssm_ros import __version__
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.paper.steps import Step, UnavailableError
+from dynssm_ros.evaluation.provenance import code_digest as digest_of
 from dynssm_ros.files import replacing, write_json
 
-_PACKAGE = Path(__file__).parents[2]
-_COMPUTING = ("vehicle", "signals", "learning", "runtime", "simulation", "control")  # rooms
+COMPUTING = ("vehicle", "signals", "learning", "runtime", "simulation", "control")
+"""Rooms on which results depend."""
 
 
 @dataclass(frozen=True)
@@ -53,46 +52,13 @@ class Told(Protocol):
         """``done`` of ``total`` steps have ended."""
 
 
-@cache
 def code_digest(kind: type[Step]) -> str:
-    """Names the code that the outputs of a kind of step depend on, less comments, layout and docstrings.
+    """Names the code that the outputs of a kind of step depend on.
 
-    That is its own module and all that this imports from the rooms that compute, directly or by others. Outputs are not
-    remade because of it, or a corrected word would cost an hour; but what is shown of them can say that they are of other
-    code than the present.
+    Outputs are not remade because of it, or a corrected line would cost an hour; but what is shown of them can say that
+    they are of other code than the present.
     """
-    total = hashlib.sha256()
-    for _, source in sorted(_reached(kind.__module__, {}).items()):
-        total.update(ast.dump(_Bare().visit(ast.parse(source))).encode())
-    return total.hexdigest()
-
-
-def _reached(module: str, found: dict[str, str]) -> dict[str, str]:
-    """Texts of ``module`` and of what it imports, by their names; imports count wherever they stand."""
-    file = _file(module)
-    if module in found or file is None:
-        return found
-    found[module] = file.read_text(encoding="utf-8")
-    for node in ast.walk(ast.parse(found[module])):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            for name in (node.module, *(f"{node.module}.{alias.name}" for alias in node.names)):
-                parts = name.split(".")
-                if parts[0] == _PACKAGE.name and len(parts) > 1 and parts[1] in _COMPUTING:
-                    _reached(name, found)
-    return found
-
-
-def _file(module: str) -> Path | None:
-    """Where the text of a module of the package is; ``None`` if it is not one."""
-    path = _PACKAGE.parent.joinpath(*module.split("."))
-    return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
-
-
-class _Bare(ast.NodeTransformer):
-    """Drops what is only said: docstrings, and other texts that stand alone."""
-
-    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
-        return None if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str) else node
+    return digest_of(kind.__module__, COMPUTING)
 
 
 def run(steps: Sequence[Step], root: Path, jobs: int, told: Told) -> dict[str, Outcome]:

@@ -1,0 +1,71 @@
+"""The results of the battery as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from dynssm_ros.diagnosis.battery.cases import Hidden
+from dynssm_ros.diagnosis.battery.outcomes import Outcome, rates
+
+PAGE, FIGURE = "diagnose_battery.md", "diagnose_battery_confusion.png"
+GOALS = {"named_first": 0.95, "right_size": 0.95, "both_found": 0.85, "false_alarms": 0.05}
+_IN_WORDS = {
+    "named_first": "the hidden effect, or an alternative reported with it, is named first",
+    "right_size": "parameters of what was found are within 15 % or two standard deviations",
+    "both_found": "both effects of a pair are found",
+    "false_alarms": "something is named where nothing is hidden",
+    "more_named": "more is named than the one effect that is hidden",
+}
+
+
+def page(outcomes: Sequence[Outcome], seed: int, undriven: int) -> str:
+    """The results as Markdown.
+
+    Args:
+        outcomes: of the cases.
+        seed: of the first case; the others' count on from it.
+        undriven: cases whose car could not be driven.
+    """
+    return "\n".join(_lines(outcomes, seed, undriven)) + "\n"
+
+
+def _lines(outcomes: Sequence[Outcome], seed: int, undriven: int) -> Iterator[str]:
+    yield "# Hidden causes"
+    yield ""
+    yield (
+        f"Made by `python -m dynssm_ros.diagnosis.battery`: {len(outcomes)} simulated drives with hidden effects, seeds "
+        f"{seed} to {seed + len(outcomes) + undriven - 1}"
+        + (f", without {undriven} whose car could not be driven" if undriven else "")
+        + ". How they are drawn and what counts as just noticeable: the command's `--help`."
+    )
+    yield ""
+    yield "| rate | cases | share | 95 % interval | goal |"
+    yield "| --- | --- | --- | --- | --- |"
+    for name, words in _IN_WORDS.items():
+        rate = rates(outcomes)[name]
+        if rate["of"]:
+            low, high = rate["interval_95"]
+            goal = "" if name not in GOALS else f"{'<=' if name == 'false_alarms' else '>='} {100 * GOALS[name]:.0f} %"
+            yield (
+                f"| {words} | {rate['of']} | {100 * rate['share']:.0f} % | {100 * low:.0f} to {100 * high:.0f} % | {goal} |"
+            )
+    yield ""
+    yield f"![What was hidden and what was named first]({FIGURE})"
+    yield ""
+    yield "Cases of one effect or none; an alternative that is reported counts as named."
+    wrong = [o for o in outcomes if not o.right or o.sized is False]
+    if wrong:
+        yield ""
+        yield "## What came out wrong"
+        yield ""
+        yield "| case | hidden | named |"
+        yield "| --- | --- | --- |"
+        for o in wrong:
+            yield f"| `{o.case}` | {_with_values(o.values)} | {_with_values(o.found)} |"
+
+
+def _with_values(effects: Hidden) -> str:
+    return "; ".join(
+        f"{name} " + ", ".join(f"{key} {value:.3g}" for key, value in values.items())
+        for name, values in effects.items()
+    )
