@@ -33,7 +33,7 @@ demo: $(STAMP) ## from simulated laps to a live prediction and its report
 	@$(BIN)/dynssm demo --out "$(OUT)"
 
 paper: OUT = out/paper
-paper: $(STAMP) ## docs/results.md measured anew, about an hour on two cores; continues after a kill
+paper: $(STAMP) ## docs/results.md and results_race.md measured anew, about two hours on two cores; continues after a kill
 	@$(BIN)/dynssm paper --out "$(OUT)" --results docs/results.md --data "$(DYNSSM_DATA)" --jobs $(JOBS) $(ARGS)
 
 test: $(STAMP) ## style, types and all tests

@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from dynssm_ros.cli.console import JsonOption, console, progress_bar
+from dynssm_ros.cli.console import JsonOption, console, progress_bar, told_apart
 from dynssm_ros.evaluation.tables import Column, Table
 from dynssm_ros.files import write_json
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
@@ -69,12 +70,7 @@ def bench(
 
 def open_artifacts(folders: list[Path]) -> dict[str, Artifact]:
     """The models by name; where two folders hold models of the same name, the folders tell them apart."""
-    opened = {str(folder): open_artifact(folder) for folder in folders}
-    called = [artifact.card.name for artifact in opened.values()]
-    return {
-        given if called.count(artifact.card.name) > 1 else artifact.card.name: artifact
-        for given, artifact in opened.items()
-    }
+    return told_apart({str(folder): open_artifact(folder) for folder in folders}, attrgetter("card.name"))
 
 
 def comparison(results: dict[str, dict[str, Any]]) -> Table:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated, Any, Protocol, TypeVar
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from dynssm_ros.files import write_json
 from dynssm_ros.signals.signal_map import Commands
 
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
+
+Opened = TypeVar("Opened")
 
 VehicleOption = Annotated[
     str, typer.Option("--vehicle", help="Vehicle: name of a shipped one (orca, av21, ...) or a file.")
@@ -24,7 +27,33 @@ CommandsOption = Annotated[
     Commands | None,
     typer.Option("--commands", help="Source of the command inputs; the signal map's or recording's own if not given."),
 ]
+MinSpeedOption = Annotated[
+    float | None,
+    typer.Option(
+        "--min-speed",
+        help="Leave out stretches below this speed (m/s).",
+        show_default="5 if the recording exceeds 10 m/s as full-size cars do, else 0",
+    ),
+]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the result as JSON.", dir_okay=False)]
+
+
+def told_apart(opened: Mapping[str, Opened], name: Callable[[Opened], str]) -> dict[str, Opened]:
+    """What was opened, by name; where several have the same one, what was given tells them apart.
+
+    Args:
+        opened: by what was given on the command line.
+        name: of one of them.
+    """
+    called = [name(each) for each in opened.values()]
+    return {given if called.count(name(each)) > 1 else name(each): each for given, each in opened.items()}
+
+
+def write_results(content: dict[str, Any], out: Path, also: Path | None) -> None:
+    """Writes the result for programs: ``results.json`` in the folder ``out``, and the file of ``--json`` if given."""
+    for path in (out / "results.json", also):
+        if path is not None:
+            write_json(path, content)
 
 
 class Update(Protocol):

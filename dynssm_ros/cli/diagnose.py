@@ -7,10 +7,17 @@ from typing import Annotated
 
 import typer
 
-from dynssm_ros.cli.console import CommandsOption, JsonOption, VehicleOption, console, progress_bar
+from dynssm_ros.cli.console import (
+    CommandsOption,
+    JsonOption,
+    MinSpeedOption,
+    VehicleOption,
+    console,
+    progress_bar,
+    write_results,
+)
 from dynssm_ros.diagnosis.diagnose import diagnose as find_causes
 from dynssm_ros.diagnosis.report import diagnosis_report, in_words
-from dynssm_ros.files import write_json
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.simulation.tracks import load_track
 from dynssm_ros.vehicle import load_vehicle, save_vehicle
@@ -26,13 +33,7 @@ def diagnose(
         float,
         typer.Option(help="Share at the end that only measures the gain; whole laps if there are three.", max=0.8),
     ] = 0.25,
-    min_speed: Annotated[
-        float | None,
-        typer.Option(
-            help="Leave out stretches below this speed (m/s).",
-            show_default="5 if the recording exceeds 10 m/s as full-size cars do, else 0",
-        ),
-    ] = None,
+    min_speed: MinSpeedOption = None,
     integrator: Annotated[
         Integrator | None,
         typer.Option(help="How the model steps.", show_default="rk4, unless euler is clearly closer to the data"),
@@ -65,9 +66,6 @@ def diagnose(
         result.vehicle, path, f"{car.name}, extended by a diagnosis of {', '.join(data.info.source)}: {result.verdict}."
     )
     diagnosis_report(result).save(out / "report.html")
-    content = result.to_json(str(path))
-    for target in (out / "results.json", json):
-        if target is not None:
-            write_json(target, content)
+    write_results(result.to_json(str(path)), out, json)
     console.print(in_words(result), markup=False, soft_wrap=True)
     console.print(f"{path} written; {out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)

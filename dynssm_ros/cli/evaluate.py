@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
-from dynssm_ros.cli.console import CommandsOption, JsonOption, console, progress_bar
+from dynssm_ros.cli.console import (
+    CommandsOption,
+    JsonOption,
+    MinSpeedOption,
+    console,
+    progress_bar,
+    told_apart,
+    write_results,
+)
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.evaluation.lap import first_lap
 from dynssm_ros.evaluation.open_loop import Evaluation, shared_commands
 from dynssm_ros.evaluation.open_loop import evaluate as evaluate_models
 from dynssm_ros.evaluation.open_loop_report import markdown, open_loop_report, summary_table, verdict
 from dynssm_ros.evaluation.tables import percent
-from dynssm_ros.files import replacing, write_json
+from dynssm_ros.files import replacing
 from dynssm_ros.runtime.models import WindowModel, load_model
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands
@@ -49,13 +58,7 @@ def evaluate(
         float | None, typer.Option(help="Score only this last fraction of the recording, as one block.", max=1.0)
     ] = None,
     commands: CommandsOption = None,
-    min_speed: Annotated[
-        float | None,
-        typer.Option(
-            help="Leave out stretches below this speed (m/s).",
-            show_default="5 if the recording exceeds 10 m/s as full-size cars do, else 0",
-        ),
-    ] = None,
+    min_speed: MinSpeedOption = None,
     horizon: Annotated[
         float | None,
         typer.Option(help="Length of the rollouts (s).", show_default="0.3 up to T_s = 0.02 s, else 0.6", min=0.0),
@@ -96,17 +99,12 @@ def _write(evaluation: Evaluation, out: Path, json: Path | None) -> None:
     open_loop_report(evaluation).save(out / "report.html")
     with replacing(out / "results.md") as aside:
         aside.write_text(markdown(evaluation), encoding="utf-8")
-    results = evaluation.to_json()
-    for path in (out / "results.json", json):
-        if path is not None:
-            write_json(path, results)
+    write_results(evaluation.to_json(), out, json)
 
 
 def _load_models(names: list[str], vehicle: Vehicle | None) -> dict[str, WindowModel]:
     """Opens the models; where two folders hold models of the same name, the folders tell them apart."""
-    opened = {name: load_model(name, vehicle) for name in names}
-    called = [model.name for model in opened.values()]
-    return {given if called.count(model.name) > 1 else model.name: model for given, model in opened.items()}
+    return told_apart({name: load_model(name, vehicle) for name in names}, attrgetter("name"))
 
 
 def _with_commands(log: Recording, commands: Commands | None, models: dict[str, WindowModel]) -> Recording:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from dynssm_ros.cli.console import JsonOption, VehicleOption, console, progress_bar
+from dynssm_ros.cli.console import JsonOption, VehicleOption, console, progress_bar, told_apart, write_results
 from dynssm_ros.control.animation import animate
 from dynssm_ros.control.learned import Knowledge, load_knowledge
 from dynssm_ros.control.nmpc import Objective, Settings
@@ -16,10 +17,9 @@ from dynssm_ros.control.race import race as drive
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.report import race_json, race_report, race_table, summary
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.files import write_json
 from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.simulation.tracks import Track, load_track
-from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle import Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import parse_effect
 
 
@@ -86,23 +86,21 @@ def race(
 ) -> None:
     """Drive laps in closed loop: a predictive controller with each model in turn, on a simulated car."""
     car = load_vehicle(vehicle)
-    driven = car
-    for text in effect or []:
-        driven = driven.with_effect(*parse_effect(text))
+    driven = car.with_effects(map(parse_effect, effect or []))
     course_track = _sized(load_track(track), scale, lap_length)
-    knowledge = [load_knowledge(name, car, driven, plant, along_horizon) for name in model]
-    _told_apart(knowledge, model)
+    knowledge = _load(model, car, driven, plant, along_horizon)
     reference = load_reference(line, car, course_track, pace)
     settings = Settings.of(car, objective, horizon)
     course = Course(driven, course_track, plant, reference, settings, laps, Start(start, start_offset, start_speed))
-    races = _driven(course, knowledge)
+    _written(_driven(course, knowledge), out, animation, json)
+
+
+def _written(races: list[Race], out: Path, animation: bool, json: Path | None) -> None:
+    """The outcome as files, and in short on the terminal."""
     race_report(races).save(out / "report.html")
     if animation:
         animate(races, out / "race.gif")
-    result = race_json(races)
-    for path in (out / "results.json", json):
-        if path is not None:
-            write_json(path, result)
+    write_results(race_json(races), out, json)
     console.print(race_table(races).brief.rich())
     console.print(summary(races), markup=False, soft_wrap=True)
     console.print(f"{out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)
@@ -130,15 +128,16 @@ def _sized(track: Track, scale: float | None, lap_length: float | None) -> Track
     return track if scale is None else track.scaled(scale)
 
 
-def _told_apart(knowledge: list[Knowledge], given: list[str]) -> None:
-    """Where two models have the same name, what was given tells them apart.
+def _load(given: list[str], known: Vehicle, driven: Vehicle, plant: PlantKind, along_horizon: bool) -> list[Knowledge]:
+    """Opens the models; where two have the same name, what was given tells them apart.
 
     Raises:
         ConfigurationError: the same was given twice.
     """
-    names = [each.name for each in knowledge]
-    for each, text in zip(knowledge, given, strict=True):
+    opened = {text: load_knowledge(text, known, driven, plant, along_horizon) for text in given}
+    for text in opened:
         if given.count(text) > 1:
             raise ConfigurationError(f"--model {text}: given twice; expected different models")
-        if names.count(each.name) > 1:
-            each.name = text
+    for name, each in told_apart(opened, attrgetter("name")).items():
+        each.name = name
+    return list(opened.values())

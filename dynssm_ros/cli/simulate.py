@@ -51,9 +51,7 @@ def simulate(
     json: JsonOption = None,
 ) -> None:
     """Drive laps on a track and write them as a rosbag2 with the default topics."""
-    car = load_vehicle(vehicle)
-    for text in effect or []:
-        car = car.with_effect(*parse_effect(text))
+    car = load_vehicle(vehicle).with_effects(map(parse_effect, effect or []))
     course = load_track(track).scaled(scale)
     if duration is None and laps is None:
         duration = 60.0

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from dynssm_ros.control.horizon_model import STATES
 from dynssm_ros.control.nmpc import Settings, Status
-from dynssm_ros.control.pilot import Pilot
+from dynssm_ros.control.pilot import LOST, Pilot
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.remote import Remote
 from dynssm_ros.runtime.health import Level
@@ -34,7 +34,6 @@ from dynssm_ros.vehicle import COEFFICIENTS, Applied, State, Vehicle
 
 Vector = npt.NDArray[np.float64]
 
-LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
 LAUNCH = 0.3, 0.7  # shares of the line's speed: below the first pursuit takes over, above the second it ends
 _LAUNCH_STYLE = Style(aggressiveness=0.7, variation=0.0)
 _REMEMBERED = 1000  # control steps that the percentiles are of
@@ -83,8 +82,7 @@ class Laps:
             self.s = self._start = at
             self._mark, self._before = t, (t, at)
         self.s += math.remainder(at - self.s, self._track.length)
-        right, left = (float(width) for width in self._track.widths(self.s))
-        self.outside = max(0.0, self.lateral - left, -right - self.lateral)
+        self.outside = max(0.0, -float(self._track.room(self.s, self.lateral)))
         self.worst = max(self.worst, self.outside)
         goal = self._start + self._track.length
         if self.s >= goal:

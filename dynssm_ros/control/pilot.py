@@ -26,6 +26,7 @@ from dynssm_ros.vehicle.single_track import settled_memory
 
 Vector = npt.NDArray[np.float64]
 
+LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
 _MEASURED = slice(3, len(STATES))  # what a window's row begins with
 _KNOWN = (*STATES[:3], *CONTEXT)  # what effects may read
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from dynssm_ros.control.learned import Knowledge
 from dynssm_ros.control.nmpc import Settings
-from dynssm_ros.control.pilot import Pilot
+from dynssm_ros.control.pilot import LOST, Pilot
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.simulation.external import Creeping
 from dynssm_ros.simulation.laps import SimulationError
@@ -32,7 +32,6 @@ Vector = npt.NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
 PATIENCE = 3.0  # laps at the line's own speed that a lap may take
-LOST = 1.0  # widths of the road that the car may be outside of it
 
 
 @dataclass(frozen=True)
@@ -158,8 +157,7 @@ class Race:
     @property
     def outside(self) -> float:
         """How far the car's centre came outside the borders (m); 0 if it stayed between them."""
-        right, left = self.course.track.widths(self.s)
-        return float(np.max(np.maximum(self.lateral - left, -right - self.lateral), initial=0.0))
+        return float(np.max(-self.course.track.room(self.s, self.lateral), initial=0.0))
 
     def to_json(self) -> dict[str, Any]:
         """The figures of the race, for programs; ``lap_time_s`` is the mean over the laps, null without one."""
@@ -233,8 +231,7 @@ class _Drive:
     def _failure(self, t: float) -> str:
         """Why the drive ends before its time; empty if it does not."""
         track, state, s = self._course.track, self._car.state, self.s
-        right, left = (float(width) for width in track.widths(s))
-        if max(self._lateral - left, -right - self._lateral) > LOST * (left + right):
+        if -track.room(s, self._lateral) > LOST * np.sum(track.widths(s)):
             return f"leaves the track after {t:.2f} s at s = {s % track.length:.4g} m"
         if state.v_x < abs(state.v_y):
             return f"spins after {t:.2f} s at s = {s % track.length:.4g} m"

@@ -114,11 +114,6 @@ class HindcastConfig(StrictModel):
         "knows",
     )
 
-    @property
-    def parts(self) -> int:
-        """How many further models are trained for it."""
-        return self.folds if self.uncertainty and self.folds > 1 else 0
-
 
 class PhysicsConfig(StrictModel):
     """Analytical dynamics layer."""
@@ -269,6 +264,12 @@ class ModelConfig(StrictModel):
                 f"fine_tuning.frozen: {fine_tuning.frozen} leaves nothing to train of GRU, {self.dense.layers} dense "
                 "layers and the output layer"
             )
+
+    @property
+    def parts(self) -> int:
+        """Stretches that further models are trained without, to fit the variance to."""
+        wanted = self.hindcast.folds if self.hindcast and self.hindcast.uncertainty else 1
+        return wanted if wanted > 1 else 0
 
     def with_training(self, **changes: Any) -> ModelConfig:
         """The same model with other training settings, which hold for the model that it starts from too."""

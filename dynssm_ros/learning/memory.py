@@ -25,9 +25,9 @@ _PREMIUM = 0.01  # what trust may cost at home
 _COVERED, _QUANTILE = 0.9, 1.6448536  # the share of errors within this many standard deviations
 
 
-def limited(value: Tensor) -> Tensor:
-    """``value`` squeezed smoothly into a range that the training laps have seen."""
-    return _LIMIT * torch.tanh(value / _LIMIT)
+def limited(value: Tensor, limit: Tensor | float = _LIMIT) -> Tensor:
+    """``value`` squeezed smoothly to less than ``limit``, by default the range that the training laps have seen."""
+    return limit * torch.tanh(value / limit)
 
 
 def centred(rows: Tensor) -> Tensor:
@@ -150,8 +150,7 @@ class Hindcast(nn.Module):
         if self.config.limit is None:
             return residual
         errors = torch.sqrt(_mean_square(predicted - happened) + torch.finfo(residual.dtype).tiny)
-        largest: Tensor = self.config.limit * errors
-        return largest * torch.tanh(residual / largest)
+        return limited(residual, self.config.limit * errors)
 
     def trust_fully(self) -> None:
         """Lets no evidence speak against the predictions."""

@@ -92,20 +92,20 @@ def train(
         stages: tuple[int, ...] = (start.training.epochs, config.training.epochs)
         ddm = _train(recording, start, vehicle, files[0], device, _stage(progress, start.name, 0, stages))
         return _train(recording, config, vehicle, files[1], device, _stage(progress, config.name, 1, stages), ddm)
-    parts = config.hindcast.parts if config.hindcast else 0
-    unknown = [np.arange(len(recording)) * parts // len(recording) == k for k in range(parts)]
-    if not parts or not all(_can_be_trained_on(recording.select(~part), config) for part in unknown):
+    parts = [np.arange(len(recording)) * config.parts // len(recording) == k for k in range(config.parts)]
+    rests = [recording.select(~part) for part in parts]
+    if not rests or not all(_can_be_trained_on(rest, config) for rest in rests):
         return _train(recording, config, vehicle, checkpoint, device, progress)
     shorter = config.with_training(epochs=max(1, config.training.epochs // _SHORTER))
-    stages = (config.training.epochs, *[shorter.training.epochs] * parts)
+    stages = (config.training.epochs, *[shorter.training.epochs] * len(parts))
     trained = _train(recording, config, vehicle, checkpoint, device, _stage(progress, config.name, 0, stages))
     errors = []
-    for k, file in enumerate(files[1:]):
-        report = _stage(progress, f"{config.name} without part {k + 1} of {parts}", k + 1, stages)
-        without = _train(recording.select(~unknown[k]), shorter, vehicle, file, device, report)
-        assert isinstance(without.model, DynSSM)
-        part = recording.select(unknown[k])
-        errors.append(without.model.errors(*all_windows(part, config.H, config.training.min_speed).batch(slice(None))))
+    for k, (part, rest, file) in enumerate(zip(parts, rests, files[1:], strict=True), 1):
+        report = _stage(progress, f"{config.name} without part {k} of {len(parts)}", k, stages)
+        without = _train(rest, shorter, vehicle, file, device, report).model
+        assert isinstance(without, DynSSM)
+        unknown = all_windows(recording.select(part), config.H, config.training.min_speed)
+        errors.append(without.errors(*unknown.batch(slice(None))))
     assert isinstance(trained.model, DynSSM)
     trained.model.fit_variance(*(torch.cat(each) for each in zip(*errors, strict=True)))
     return trained
@@ -124,8 +124,7 @@ def checkpoints(config: ModelConfig, checkpoint: Path) -> list[Path]:
     """The files that a training with ``checkpoint`` keeps, in the order of its stages."""
     if config.fine_tuning is not None:
         return [checkpoint.with_suffix(".start.pt"), checkpoint]
-    parts = config.hindcast.parts if config.hindcast else 0
-    return [checkpoint, *[checkpoint.with_suffix(f".part{k + 1}.pt") for k in range(parts)]]
+    return [checkpoint, *[checkpoint.with_suffix(f".part{k + 1}.pt") for k in range(config.parts)]]
 
 
 def _stage(progress: Progress | None, name: str, stage: int, epochs: tuple[int, ...]) -> Progress | None:

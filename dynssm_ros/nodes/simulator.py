@@ -69,9 +69,7 @@ class SimulatorNode(Node):
             raise ConfigurationError(f"parameter noise: {list(noise)}; expected three finite numbers of at least 0")
         if self._seed < 0:
             raise ConfigurationError(f"parameter seed: {self._seed}; expected at least 0")
-        self._vehicle = load_vehicle(vehicle)
-        for text in effects.split():
-            self._vehicle = self._vehicle.with_effect(*parse_effect(text))
+        self._vehicle = load_vehicle(vehicle).with_effects(map(parse_effect, effects.split()))
         self._track = load_track(track).scaled(scale)
         self._style = Style(aggressiveness, variation)
         self._noise = np.array(noise)
@@ -138,8 +136,7 @@ class SimulatorNode(Node):
         obeyed = self._commands.fresh
         if obeyed != self._obeyed:
             self.get_logger().info(f"obeys {COMMAND_TOPIC}" if obeyed else f"{COMMAND_TOPIC} is silent: brakes")
-        right, left = self._track.widths(sample.s)
-        on_road = bool(-right <= sample.lateral <= left)
+        on_road = bool(self._track.room(sample.s, sample.lateral) >= 0)
         if on_road != self._on_road:
             words = "is back on" if on_road else "leaves"
             self.get_logger().warning(f"{self._vehicle.name} {words} the road at s = {sample.s:.4g} m")

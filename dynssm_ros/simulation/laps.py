@@ -215,8 +215,7 @@ def _check_motion(vehicle: Vehicle, track: Track, time: float, pose: Pose, state
 
 def _check_place(vehicle: Vehicle, track: Track, time: float, state: State, s: float, lateral: float) -> None:
     """The centre of gravity must stay between the borders."""
-    right, left = track.widths(s)
-    if not -right <= lateral <= left:
+    if not track.room(s, lateral) >= 0:
         raise SimulationError(
             f"{vehicle.name} leaves track {track.name} after {time:.2f} s at s = {s % track.length:.4g} m "
             f"({lateral:+.3g} m beside the centre line, {state.v_x:.3g} m/s); "

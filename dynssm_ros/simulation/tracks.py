@@ -79,7 +79,10 @@ class Track:
 
     def clearance(self, points: npt.ArrayLike) -> Vector:
         """Distance from ``points`` (m, shape ``(..., 2)``) to the nearer border (m), negative outside; ``(...)``."""
-        s, lateral = self.project(points)
+        return self.room(*self.project(points))
+
+    def room(self, s: Floats, lateral: Floats) -> Vector:
+        """The same for places that are known as ``s`` and ``lateral`` (m, positive left)."""
         right, left = self.widths(s)
         return np.minimum(left - lateral, right + lateral)
 

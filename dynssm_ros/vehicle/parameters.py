@@ -6,6 +6,7 @@ Names and units are the paper's (Table I); a file is checked completely when it 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -168,6 +169,13 @@ class Vehicle(StrictModel):
         content = self.model_dump()
         content["effects"] = [*content["effects"], entry]
         return configuration.validate(Vehicle, content, f"vehicle {self.name} with {name}")
+
+    def with_effects(self, effects: Iterable[tuple[str, dict[str, float]]]) -> Vehicle:
+        """The same car with more effects, each a name and its parameters; see :meth:`with_effect`."""
+        vehicle = self
+        for name, parameters in effects:
+            vehicle = vehicle.with_effect(name, parameters)
+        return vehicle
 
 
 def load_vehicle(name_or_path: str | Path) -> Vehicle:

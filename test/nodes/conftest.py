@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -127,3 +128,23 @@ def start_car(small_model: Path) -> Iterator[StartCar]:
             return car
 
         yield start
+
+
+RefusedStart = Callable[..., str]
+
+
+@pytest.fixture(scope="session")
+def refused_start() -> RefusedStart:
+    """Starts a node with parameters that it refuses; returns the one line that it ends with."""
+
+    def start(node: str, *parameters: str, timeout: float = 60) -> str:
+        given = ["--ros-args", *(part for text in parameters for part in ("-p", text))] if parameters else []
+        command = [sys.executable, "-m", f"dynssm_ros.nodes.{node}", *given]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+        assert result.returncode == 1
+        lines = result.stderr.strip().splitlines()
+        assert len(lines) == 1
+        assert lines[0].startswith("error: ")
+        return lines[0]
+
+    return start

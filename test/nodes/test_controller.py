@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -218,11 +217,5 @@ def test_the_process_holds_no_torch_and_is_warm_before_it_listens(stand: Stand) 
         ("vehicle:=av21", "track club is 0.4 m wide"),
     ],
 )
-def test_a_wrong_start_is_one_clear_line(parameter: str, expected: str) -> None:
-    command = [sys.executable, "-m", "dynssm_ros.nodes.controller", "--ros-args", "-p", parameter]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert result.returncode == 1
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("error: ")
-    assert expected in lines[0]
+def test_a_wrong_start_is_one_clear_line(refused_start: Callable[..., str], parameter: str, expected: str) -> None:
+    assert expected in refused_start("controller", parameter, timeout=120)

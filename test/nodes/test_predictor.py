@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +34,9 @@ def test_every_odometry_message_after_the_first_window_gets_a_prediction_as_repl
     run = run_live(small_model, bag, 0.02, rate=speed, duration=4.0 * speed)
     assert len(run.sent) >= 4.0 * speed * rate
     assert run.missing() == []
-    assert min(run.predicted) - run.T_s == sorted(run.sent)[round((H - 1) * 0.02 * rate)]
+    # the first window begins with the first odometry that its actuators have not been overtaken by
+    late = min(run.predicted) - run.T_s - sorted(run.sent)[round((H - 1) * 0.02 * rate)]
+    assert 0 <= late <= 0.2e9
 
     predictor = Predictor(OnnxModel(open_artifact(small_model)), load_signal_map("default"))
     with open_bag(bag) as opened:
@@ -153,13 +154,7 @@ def test_simulated_time_without_a_clock_does_not_hinder_predictions(start_car) -
         (["model:={model}", "signals:=av21"], "signals: missing throttle_command, steering_command"),
     ],
 )
-def test_a_wrong_start_is_one_clear_line(small_model: Path, parameters: list[str], expected: str) -> None:
-    command = [sys.executable, "-m", "dynssm_ros.nodes.predictor"]
-    if parameters:
-        command += ["--ros-args", *(p for text in parameters for p in ("-p", text.format(model=small_model)))]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert result.returncode == 1
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("error: ")
-    assert expected in lines[0]
+def test_a_wrong_start_is_one_clear_line(
+    refused_start: Callable[..., str], small_model: Path, parameters: list[str], expected: str
+) -> None:
+    assert expected in refused_start("predictor", *(text.format(model=small_model) for text in parameters))

@@ -195,13 +195,8 @@ def test_a_car_that_cannot_hold_the_road_ends_in_one_line() -> None:
         ("effects:=drag:size=2", "effect drag has no parameter 'size'"),
     ],
 )
-def test_a_wrong_start_is_one_clear_line(parameter: str, expected: str) -> None:
-    result = subprocess.run(_simulator(parameter), capture_output=True, text=True, timeout=60, check=False)
-    assert result.returncode == 1
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("error: ")
-    assert expected in lines[0]
+def test_a_wrong_start_is_one_clear_line(refused_start: Callable[..., str], parameter: str, expected: str) -> None:
+    assert expected in refused_start("simulator", parameter)
 
 
 def test_the_process_holds_no_torch(start_pit: StartPit) -> None:

@@ -14,6 +14,7 @@ from dynssm_ros.evaluation.paper.results import Comparison, Results
 from dynssm_ros.evaluation.tables import Table
 from dynssm_ros.files import replacing
 
+MADE_BY = "Made by `make paper`; no number here is typed by hand. The paper's own numbers are those of its tables."
 _CARS = {"real": "Full-size car", "sim": "Small car"}
 _DPI = 130
 
@@ -77,7 +78,7 @@ def _parts(results: Results, pictures: dict[str, str]) -> Iterator[str]:
 
 def _introduction(results: Results) -> Iterator[str]:
     made = results.made
-    yield "Made by `make paper`; no number here is typed by hand. The paper's own numbers are those of its tables."
+    yield MADE_BY
     if made.quick:
         yield (
             f"> **Not results:** a quick run to try everything out, with {results.plan.epochs} epochs in each stage, "

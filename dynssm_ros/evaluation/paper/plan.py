@@ -10,6 +10,8 @@ from pydantic import Field, model_validator
 
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel, config_root
+from dynssm_ros.control.learned import TRUE
+from dynssm_ros.control.nmpc import Objective
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma
 from dynssm_ros.signals.signal_map import Commands
@@ -19,7 +21,7 @@ from dynssm_ros.vehicle.parameters import EffectEntry
 
 Quantity = Literal["time", "speed", "yaw_rate", "lateral_acceleration"]
 UNTRAINED = (Persistence.name, SingleTrack.name, SingleTrackEwma.name)
-TRUE, MID_RANGE = "true", "mid_range"
+MID_RANGE = "mid_range"
 FIXED = (TRUE, MID_RANGE, *UNTRAINED)
 """Models of a race that need no training: the plant's own, the middle of the bounds, and those on the calibrated car."""
 
@@ -134,7 +136,7 @@ class Race(StrictModel):
     track: str = Field(description="built-in name, or file relative to the data folder")
     lap_length: float | None = Field(default=None, gt=0, description="that it is scaled to (m)")
     plant: PlantKind = "euler"
-    objective: Literal["tracking", "progress"] = "tracking"
+    objective: Objective = "tracking"
     line: str = Field(default="racing", description="centre, racing, or file relative to the data folder")
     pace: float = Field(default=1.0, gt=0)
     horizon: int = Field(default=15, ge=2)

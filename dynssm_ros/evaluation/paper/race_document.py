@@ -6,7 +6,9 @@ import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from dynssm_ros.evaluation.paper.plan import MID_RANGE, TRUE, Race
+from dynssm_ros.control.learned import TRUE
+from dynssm_ros.evaluation.paper.document import MADE_BY
+from dynssm_ros.evaluation.paper.plan import MID_RANGE, Race
 from dynssm_ros.evaluation.paper.reference import ClosedLoop
 from dynssm_ros.evaluation.paper.results import Entry, Results
 from dynssm_ros.evaluation.paper.schedule import race_key
@@ -54,7 +56,7 @@ def races_markdown(results: Results, pictures: Mapping[str, Mapping[str, str]]) 
 
 def _parts(results: Results, pictures: Mapping[str, Mapping[str, str]]) -> Iterator[str]:
     yield "# Results in closed loop"
-    yield "Made by `make paper`; no number here is typed by hand. The paper's own numbers are those of its tables."
+    yield MADE_BY
     if results.made.quick:
         yield "> **Not results:** a quick run to try everything out."
     lines = [

@@ -6,20 +6,22 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, get_args
 
+from dynssm_ros.control import report
+from dynssm_ros.control.learned import Knowledge, load_knowledge
+from dynssm_ros.control.nmpc import Settings
+from dynssm_ros.control.race import Course, Start
+from dynssm_ros.control.race import race as drive
+from dynssm_ros.control.reference import load_reference
 from dynssm_ros.evaluation.paper.plan import MID_RANGE, Race
-from dynssm_ros.evaluation.paper.steps import Step, digest, in_data
+from dynssm_ros.evaluation.paper.steps import Step, digest, in_data, named_track
 from dynssm_ros.files import replacing, write_json
-from dynssm_ros.simulation.layouts import LAYOUTS
-from dynssm_ros.simulation.tracks import Track, load_track
+from dynssm_ros.simulation.racing_line import LineKind
+from dynssm_ros.simulation.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 
-if TYPE_CHECKING:
-    from dynssm_ros.control.learned import Knowledge
-
 NUMBERS = "results.json"
-_LINES = ("centre", "racing")
 _DPI = 130
 
 
@@ -41,28 +43,21 @@ class DriveLaps(Step):
 
     def recipe(self) -> dict[str, Any]:
         """The race, the car, and what is in the files of track and line."""
-        files = [name for name in (self.race.track, self.race.line) if name not in (*LAYOUTS, *_LINES)]
+        named = {self.race.track: named_track(self.data, self.race.track), self.race.line: self._line()}
         return {
             "race": self.race.model_dump(mode="json", exclude={"title", "text", "paper", "ablation"}),
             "vehicle": load_vehicle(self.race.vehicle).model_dump(mode="json"),
-            "files": {name: digest(in_data(self.data, name)) for name in files},
+            "files": {name: digest(file) for name, file in named.items() if isinstance(file, Path)},
         }
 
     def make(self, root: Path, there: frozenset[str]) -> None:
         """Drives."""
-        from dynssm_ros.control import report
-        from dynssm_ros.control.nmpc import Settings
-        from dynssm_ros.control.race import Course, Start
-        from dynssm_ros.control.race import race as drive
-        from dynssm_ros.control.reference import load_reference
-
         race, vehicle = self.race, load_vehicle(self.race.vehicle)
-        driven = vehicle
-        for effect in race.effects:
-            driven = driven.with_effect(effect.name, effect.parameters)
-        track = self._track()
-        line = race.line if race.line in _LINES else str(in_data(self.data, race.line))
-        reference = load_reference(line, vehicle, track, race.pace)
+        driven = vehicle.with_effects((each.name, each.parameters) for each in race.effects)
+        track = load_track(named_track(self.data, race.track))
+        if race.lap_length is not None:
+            track = track.scaled(race.lap_length / track.length)
+        reference = load_reference(str(self._line()), vehicle, track, race.pace)
         settings = Settings.of(vehicle, race.objective, race.horizon)
         course = Course(driven, track, race.plant, reference, settings, race.laps, Start(speed=race.speed))
         models = [name for name in race.models if self.trained.get(name) in there or name not in self.trained]
@@ -73,15 +68,11 @@ class DriveLaps(Step):
             for figure in race.figures:
                 getattr(report, figure)(races).savefig(folder / f"{figure}.png", dpi=_DPI, metadata={"Software": None})
 
-    def _track(self) -> Track:
-        name = self.race.track
-        track = load_track(name if name in LAYOUTS else in_data(self.data, name))
-        return track if self.race.lap_length is None else track.scaled(self.race.lap_length / track.length)
+    def _line(self) -> str | Path:
+        return self.race.line if self.race.line in get_args(LineKind) else in_data(self.data, self.race.line)
 
     def _knowledge(self, name: str, driven: Vehicle, root: Path) -> Knowledge:
         """What the controller is to know, under its name in the plan."""
-        from dynssm_ros.control.learned import load_knowledge
-
         known = load_vehicle(root / self.calibrated)
         with tempfile.TemporaryDirectory(prefix="dynssm-") as folder:
             given = str(root / self.trained[name]) if name in self.trained else name

@@ -110,7 +110,7 @@ class Simulate(Step):
 
     def recipe(self) -> dict[str, Any]:
         """Car, track and driver."""
-        track = self._track()
+        track = named_track(self.data, self.drive.track)
         return {
             "drive": self.drive.model_dump(mode="json"),
             "vehicle": load_vehicle(self.drive.vehicle).model_dump(mode="json"),
@@ -119,10 +119,9 @@ class Simulate(Step):
 
     def make(self, root: Path, there: frozenset[str]) -> None:
         """Drives, through a bag like a real log."""
-        drive, vehicle = self.drive, load_vehicle(self.drive.vehicle)
-        for effect in drive.effects:
-            vehicle = vehicle.with_effect(effect.name, effect.parameters)
-        track = load_track(self._track())
+        drive = self.drive
+        vehicle = load_vehicle(drive.vehicle).with_effects((each.name, each.parameters) for each in drive.effects)
+        track = load_track(named_track(self.data, drive.track))
         run = simulate(
             vehicle, track, drive.duration, plant=drive.plant, seed=drive.seed, noise=drive.noise,
             style=Style(drive.aggressiveness, drive.variation), line=line_of(drive.line, vehicle, track),
@@ -131,9 +130,6 @@ class Simulate(Step):
             bag = Path(folder) / Path(self.key).stem
             write_run(run, bag)
             extract([bag], load_signal_map("default"), 1 / vehicle.sampling_time).save(root / self.key)
-
-    def _track(self) -> str | Path:
-        return self.drive.track if self.drive.track in LAYOUTS else in_data(self.data, self.drive.track)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,6 +321,15 @@ def in_data(data: Path | None, path: str) -> Path:
     if data is None or not (data / path).exists():
         raise UnavailableError(f"{path} is not in the data folder (--data or DYNSSM_DATA)")
     return data / path
+
+
+def named_track(data: Path | None, name: str) -> str | Path:
+    """What :func:`load_track` takes: the name of a built-in track, or a file among the measured data.
+
+    Raises:
+        UnavailableError: there is none.
+    """
+    return name if name in LAYOUTS else in_data(data, name)
 
 
 def digest(path: Path) -> str:
