@@ -9,14 +9,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dynssm_ros.diagnosis.candidates import candidates
 from dynssm_ros.diagnosis.car import Car, knowledge
 from dynssm_ros.diagnosis.gain import Gain, measure
+from dynssm_ros.diagnosis.noise import weights
 from dynssm_ros.diagnosis.noticeable import noticeable, room
 from dynssm_ros.diagnosis.place import driven_line, lap_context, lap_number
-from dynssm_ros.diagnosis.selection import Refined, Search, Selection
-from dynssm_ros.diagnosis.study import Fit, Study, per_unit
-from dynssm_ros.diagnosis.systematic import Systematic, systematic
+from dynssm_ros.diagnosis.selection import Refined, Selection
+from dynssm_ros.diagnosis.stepping import Searched, searched
+from dynssm_ros.diagnosis.study import per_unit
+from dynssm_ros.diagnosis.systematic import Bunched, Systematic, bunched, systematic
 from dynssm_ros.diagnosis.windows import WARM_UP, Track, Windows
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.evaluation.metrics import CHANNELS
@@ -39,8 +40,6 @@ _MOST = 500  # windows in the fit, evenly spread: more would cost time and tell 
 _MEASURED = 3000  # in the held-out rows
 _LEAST = 24  # windows with which a fit can begin
 _LEAST_LAPS = 3  # with which whole laps are held out
-_TRIED = 300  # windows with which the integrator is chosen
-_CLEARLY = 20.0  # difference of twice the log-likelihood for which another integrator is taken than Runge-Kutta
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
 
@@ -78,6 +77,7 @@ class Diagnosis:
         vehicle: the vehicle with effects and refitted nominal values.
         gain: on the held-out rows.
         left: what is systematic in the errors of the extended car, on the rows of the fit.
+        bunched: how those errors are spread over time.
         noticeable: how far off neutral each effect that is not named would have to be to be named (the unit of its
             first parameter).
         selection: how it was found.
@@ -93,6 +93,7 @@ class Diagnosis:
     vehicle: Vehicle
     gain: Gain
     left: Systematic
+    bunched: Bunched
     noticeable: Mapping[str, float]
     selection: Selection
     car: Car
@@ -181,40 +182,43 @@ def diagnose(
         RecordingError: another sampling time than the vehicle's, a constant or missing channel, too few rows.
         ConfigurationError: an effect of the vehicle needs a signal that the recording has not; options out of range.
     """
-    at = _prepare(recording, vehicle, horizon, holdout, min_speed, integrator, line, say)
-    found, impossible = candidates(at.study, at.car)
-    search = Search(at.study, at.car, found, say)
-    selection = search.run()
-    fit = selection.fit
+    at = _prepare(recording, vehicle, horizon, holdout, min_speed, line)
+    found = searched(at.fitted, at.car, integrator, say)
+    study, selection, fit = found.study, found.selection, found.selection.fit
+    windows = study.windows
+    at = at._replace(unseen=replace(at.unseen, integrator=windows.integrator, substeps=windows.substeps))
     say("measuring the gain on held-out laps")
     gain = measure(at.unseen, {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: fit.car}, at.steps)
-    sizes = noticeable(at.study, fit, found)
-    limits = [f"{name} cannot be judged: {why}" for name, why in impossible.items()]
-    limits += [*_hidden(sizes), *_not_live(selection.fit.car.extended(knowledge(vehicle)))]
-    std = np.sqrt(np.diag(at.study.covariance(fit)))
-    causes = tuple(_cause(one, selection, search, at, std) for one in selection.chosen)
-    windows = at.study.windows
-    left = systematic(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], at.study.block)
+    sizes = noticeable(study, fit, found.search.found)
+    limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
+    limits += [*_hidden(sizes), *_not_live(fit.car.extended(knowledge(vehicle)))]
+    std = np.sqrt(np.diag(study.covariance(fit)))
+    causes = tuple(_cause(one, found, at, std) for one in selection.chosen)
+    left = systematic(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], study.block)
+    white = fit.noise.whiten(fit.errors)
+    far = (weights(white)[:, None] * white**2).mean(axis=1)
+    spread = bunched(far, windows.time, study.block, selection.inflation)
     return Diagnosis(
-        "effects" if causes else "unexplained" if left.is_there else "none",
+        "effects" if causes else "unexplained" if left.is_there or spread.is_there else "none",
         causes,
         fit.car.extended(np.minimum(std[:17], 1.0) * knowledge(vehicle)),
         gain,
         left,
+        spread,
         sizes,
         selection,
         fit.car,
         std[:18],
         (*at.notes, *limits),
-        at.protocol,
-        at.study.windows,
+        at.protocol | {"Integrator": windows.integrator},
+        windows,
     )
 
 
 class _Prepared(NamedTuple):
     """What a diagnosis works on."""
 
-    study: Study
+    fitted: Windows
     steps: int
     unseen: Windows
     car: Car
@@ -228,9 +232,7 @@ def _prepare(
     horizon: float,
     holdout: float,
     min_speed: float | None,
-    integrator: Integrator | None,
     line: ClosedLine | None,
-    say: Say,
 ) -> _Prepared:
     """Checks what was given, holds laps out and lays the simulations along the rest; see :func:`diagnose`."""
     if not 0.05 <= holdout <= 0.8:
@@ -255,29 +257,25 @@ def _prepare(
     require_context(vehicle.active_effects, context, f"recording {source}")
     track = Track(recording.matrix.T, context, recording.T_s, (recording.time - recording.time[0]) / 1e9)
     fitted, unseen = _windows(recording, track, steps, 2 * asked, speed, cut)
-    car = Car.of(vehicle)
-    fitted = replace(fitted, every=every)
-    fitted = _stepping(fitted, car, integrator, say)
     protocol = {
         "Recording": source,
         "Commands": recording.info.commands,
         "Vehicle": vehicle.name,
         "Held out": split,
-        "Fit": f"{len(fitted)} simulations of {steps * recording.T_s:g} s, from {speed:g} m/s, {fitted.integrator}",
+        "Fit": f"{len(fitted)} simulations of {steps * recording.T_s:g} s, from {speed:g} m/s",
         "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * recording.T_s:g} s",
     }
-    unseen = replace(unseen, integrator=fitted.integrator, substeps=fitted.substeps)
-    return _Prepared(Study(fitted, car), asked, unseen, car, notes, protocol)
+    return _Prepared(replace(fitted, every=every), asked, unseen, Car.of(vehicle), notes, protocol)
 
 
-def _cause(one: Refined, selection: Selection, search: Search, at: _Prepared, std: Vector) -> Cause:
-    effect, fit = one.candidate.effect, selection.fit
+def _cause(one: Refined, found: Searched, at: _Prepared, std: Vector) -> Cause:
+    effect, fit = one.candidate.effect, found.selection.fit
     known = {
         name: float(std[18 + k]) * per_unit(effect, name, fit.car.effects[effect][name])
         for k, (owner, name) in enumerate(fit.free)
         if owner == effect
     }
-    other = search.leave_out(selection, one).car
+    other = found.search.leave_out(found.selection, one).car
     errors = [at.unseen.errors(car)[:, at.steps - 1] for car in (other, fit.car)]
     without, with_it = ((e**2).mean(axis=0) for e in errors)
     return Cause(
@@ -287,7 +285,7 @@ def _cause(one: Refined, selection: Selection, search: Search, at: _Prepared, st
         one.gain,
         float(one.delta_bic),
         float(1.0 - np.sqrt((with_it / np.maximum(without, 1e-300)).mean())),
-        tuple(selection.alternatives[effect]),
+        tuple(found.selection.alternatives[effect]),
     )
 
 
@@ -376,26 +374,4 @@ def _windows(
             f"{long * recording.T_s:g} s can be simulated; expected at least {_LEAST}: record longer or hold out more"
         )
     every = max(1, steps // 4, len(later) // _MEASURED)
-    return Windows(track, chosen, steps, warm), Windows(track, later[::every], long, warm)
-
-
-def _stepping(windows: Windows, car: Car, integrator: Integrator | None, say: Say) -> Windows:
-    """Runge-Kutta, unless the data were clearly made by Euler steps; short enough for the recalibrated car too.
-
-    That may be much stiffer than the one of the file, and a simulation whose steps are too long for it runs away.
-    """
-    if integrator == "euler":
-        return windows.stepping(integrator, car.vehicle)
-    say("choosing how the model steps")
-    some = windows.select(np.arange(0, len(windows), -(-len(windows) // _TRIED)))
-    tried: dict[Integrator, tuple[Windows, Fit]] = {}
-    for name in ("rk4", "euler") if integrator is None else (integrator,):
-        trial = some.stepping(name, car.vehicle)
-        fit = Study(trial, car).fit(car, ())
-        finer = trial.stepping(name, car.vehicle.with_nominal(np.array(fit.car.theta)))
-        if finer.substeps > trial.substeps:
-            trial, fit = finer, Study(finer, car).fit(fit.car, ())
-        tried[name] = trial, fit
-    euler = "euler" in tried and tried["euler"][1].objective < tried["rk4"][1].objective - _CLEARLY
-    trial = tried["euler" if euler else "rk4"][0]
-    return replace(windows, integrator=trial.integrator, substeps=trial.substeps)
+    return Windows(track, chosen, steps, warm, filtered=True), Windows(track, later[::every], long, warm)

@@ -1,8 +1,8 @@
 """How far off a right model may be: noise at the start, noise at each predicted row, disturbances on the way.
 
-An error after ``k`` steps is what the noise of the starting row has become by then, minus the noise of the predicted
-row, plus the disturbances in between. With variances ``R`` of the measurement and ``Q`` of a disturbance per step, the
-``3 K`` errors of a window have the covariance ``G diag(R, Q, ..., Q) G' + I R``, where ``G`` follows from the
+An error after ``k`` steps is what the error of the start has become by then, minus the noise of the predicted row, plus
+the disturbances in between. With variances ``P`` of the start, ``R`` of the measurement and ``Q`` of a disturbance per
+step, the ``3 K`` errors of a window have the covariance ``G diag(P, Q, ..., Q) G' + I R``, where ``G`` follows from the
 derivatives of the steps. Errors that are divided by its root are independent of unit variance, so that sums of squares
 are likelihoods. Windows of like speed share their ``G``.
 """
@@ -18,6 +18,7 @@ import numpy.typing as npt
 Vector = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
+_VARIANCES = 9
 _GROUPS = 10
 _RANGE = 30.0  # of the logarithm of a variance above its floor
 _ROUNDING = 1e-10  # of each variance, that keeps covariances positive
@@ -26,6 +27,7 @@ _HALVINGS = 8
 _STRIDE = 3.0  # of the logarithm of a variance in one round, at most
 _FLAT = 1e-3  # curvature added where a variance that vanishes has none
 _SETTLED = 1e-2  # of twice the logarithm of the likelihood, that another round promises
+_REWEIGHTED = 8  # times at most, that far errors are weighed anew
 _FAR = 4.0  # a window whose squared error exceeds the expected one by this factor counts only as much as that
 
 
@@ -63,7 +65,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Noise:
-    """Variances of measurement and disturbance, ``v = (R, Q)``, shape ``(6,)``, and what they make of errors."""
+    """Variances of measurement, disturbance and start, ``v = (R, Q, P)``, shape ``(9,)``, and what they make of errors."""
 
     spread: Spread
     v: Vector
@@ -105,13 +107,16 @@ def fit_noise(spread: Spread, errors: Vector, start: Vector, floor: Vector) -> N
     Args:
         spread: how noise spreads.
         errors: of a model, m/s and rad/s.
-        start: variances to begin with, shape ``(6,)``.
-        floor: the least that they may be, shape ``(6,)``.
+        start: variances to begin with, shape ``(9,)``. Where one is far too small the others may settle as if there were
+            none of it: let them be too large.
+        floor: the least that they may be, shape ``(9,)``.
     """
     noise = Noise(spread, np.maximum(start, floor))
-    for _ in range(2):
+    for _ in range(_REWEIGHTED):
         weight = weights(noise.whiten(errors))
-        noise = Noise(spread, _most_likely(spread, errors * np.sqrt(weight)[:, None], noise.v, floor))
+        before, noise = noise, Noise(spread, _most_likely(spread, errors * np.sqrt(weight)[:, None], noise.v, floor))
+        if abs(noise.log_det - before.log_det) < _SETTLED:
+            break
     return noise
 
 
@@ -119,7 +124,7 @@ def _most_likely(spread: Spread, errors: Vector, start: Vector, floor: Vector) -
     """Fisher scoring in the logarithms of the variances, within their bounds."""
     count = np.bincount(spread.group, minlength=len(spread.G)).astype(float)
     moment = np.stack([errors[spread.group == m].T @ errors[spread.group == m] for m in range(len(spread.G))])
-    bases = np.stack([_covariance(spread.G, one) for one in np.eye(6)])
+    bases = np.stack([_covariance(spread.G, one) for one in np.eye(_VARIANCES)])
     low = np.log(floor)
     high = low + _RANGE
 
@@ -139,7 +144,7 @@ def _most_likely(spread: Spread, errors: Vector, start: Vector, floor: Vector) -
         slope = np.einsum("m,kmii->k", count, shares) - np.einsum("kmij,mji->k", shares, fitted)
         curvature = np.einsum("m,kmij,lmji->kl", count, shares, shares)
         free = ~((log_v <= low) & (slope > 0) | (log_v >= high) & (slope < 0))
-        step = np.zeros(6)
+        step = np.zeros(_VARIANCES)
         step[free] = -np.linalg.solve(curvature[np.ix_(free, free)] + _FLAT * np.eye(free.sum()), slope[free])
         step = np.clip(step, -_STRIDE, _STRIDE)
         if -slope @ step < _SETTLED:
@@ -158,6 +163,7 @@ def _most_likely(spread: Spread, errors: Vector, start: Vector, floor: Vector) -
 
 def _covariance(G: Vector, v: Vector) -> Vector:
     size = G.shape[1]
-    inside = np.concatenate([v[:3], np.tile(v[3:], size // 3)])
-    C = (G * inside) @ np.swapaxes(G, 1, 2) + np.diag(np.tile(v[:3], size // 3))
+    R, Q, P = v.reshape(3, 3)
+    inside = np.concatenate([P, np.tile(Q, size // 3)])
+    C = (G * inside) @ np.swapaxes(G, 1, 2) + np.diag(np.tile(R, size // 3))
     return np.asarray(C * (1.0 + _ROUNDING * np.eye(size)))

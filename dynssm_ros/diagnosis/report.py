@@ -61,9 +61,16 @@ def pattern_in_words(left: Systematic) -> str:
 
 def left_in_words(diagnosis: Diagnosis) -> str:
     """What the extended car gets wrong beyond noise; empty if there is nothing."""
-    if not diagnosis.left.is_there:
-        return ""
-    return f"Systematic error that is left, and what it goes with: {pattern_in_words(diagnosis.left)}"
+    parts = []
+    if diagnosis.left.is_there:
+        parts.append(f"Systematic error that is left, and what it goes with: {pattern_in_words(diagnosis.left)}")
+    if diagnosis.bunched.is_there:
+        low, high = diagnosis.bunched.when
+        parts.append(
+            "Errors come together over seconds as noise does not, so that something is missing that comes and goes; they are "
+            f"largest {low:.0f} to {high:.0f} s into the recording."
+        )
+    return " ".join(parts)
 
 
 def size_in_words(cause: Cause) -> str:
@@ -84,7 +91,7 @@ def evidence_in_words(cause: Cause) -> str:
         if cause.heldout_gain > 0
         else f"on held-out laps it takes nothing away ({percent(cause.heldout_gain)})"
     )
-    return f"the information criterion is better by {cause.delta_bic:.0f} (above {SURE:.0f} is strong); {held_out}"
+    return f"the information criterion is better by {cause.delta_bic:.0f} (above {SURE:.0f} is very strong); {held_out}"
 
 
 def alternatives_in_words(cause: Cause) -> str:

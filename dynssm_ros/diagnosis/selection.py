@@ -18,7 +18,8 @@ from dynssm_ros.vehicle.effects import EFFECTS
 Vector = npt.NDArray[np.float64]
 Say = Callable[[str], None]
 
-SURE = 6.0  # difference in the information criterion that counts as strong (Kass and Raftery 1995: 6 to 10)
+SURE = 10.0  # difference in the information criterion that counts as very strong (Kass and Raftery 1995)
+_ALIKE = 6.0  # the same that is hardly strong: explanations that are not farther apart are not told apart
 _HOPEFUL = 9  # candidates of which several sizes are tried in each round
 _FEW = 150  # windows on which they are tried
 _REFINED = 4  # of them are fitted in full
@@ -89,7 +90,7 @@ class Search:
     """
 
     def __init__(self, study: Study, car: Car, found: Sequence[Candidate], say: Say = lambda words: None) -> None:
-        self._study, self._found, self._say = study, list(found), say
+        self._study, self.found, self._say = study, list(found), say
         self._price = np.log(3.0 * study.windows.steps * len(study.windows))
         say("recalibrating the nominal car")
         self.base = study.fit(car, ())
@@ -102,10 +103,10 @@ class Search:
         """Forward while it pays; then each effect is exchanged against all others, or dropped."""
         chosen: list[Candidate] = []
         while len(chosen) < _MOST:
-            ranked = self.ranked(tuple(chosen))
-            if not ranked or not _pays(ranked[0]):
+            best = next((r for r in self.ranked(tuple(chosen)) if _pays(r)), None)
+            if best is None:
                 break
-            chosen.append(ranked[0].candidate)
+            chosen.append(best.candidate)
             self._exchange(chosen)
         result: dict[Candidate, Refined] = {}
         dropped = True
@@ -149,7 +150,7 @@ class Search:
         taken = {c.effect for c in before}
         self._say("trying all effects" + (f" beside {', '.join(taken)}" if taken else ""))
         scan = Scan(self._study, fit, self._responses)
-        prospects = list(scan.try_all([c for c in self._found if c.effect not in taken]))
+        prospects = list(scan.try_all([c for c in self.found if c.effect not in taken]))
         best: dict[str, Prospect] = {}
         for prospect in sorted(prospects, key=self._worth, reverse=True):
             best.setdefault(prospect.candidate.effect, prospect)
@@ -160,7 +161,7 @@ class Search:
         starts = sorted((self._start(some, near, p) for p in hopeful), key=lambda start: start.worth, reverse=True)
         least = max([-self._price, *(_PROMISING * start.worth for start in starts[:1])])
         refined = [self._refine(fit, start) for start in starts[:_REFINED] if start.worth >= least]
-        close = max([-SURE, *(_CLOSE * r.delta_bic - 2 * SURE for r in refined)])
+        close = max([-_ALIKE, *(_CLOSE * r.delta_bic - 2 * _ALIKE for r in refined)])
         refined = [self._polish(key, fit, r) if r.delta_bic > close else r for r in refined]
         self._ranked[key] = sorted(refined, key=lambda r: -r.delta_bic)
         return self._ranked[key]
@@ -236,7 +237,7 @@ class Search:
             ranked = self.ranked(rest)
             if ranked and ranked[0].candidate.effect != one.effect:
                 here = next((r for r in ranked if r.candidate == one), None)
-                if here is None or ranked[0].delta_bic > here.delta_bic + SURE:
+                if here is None or ranked[0].delta_bic > here.delta_bic + _ALIKE:
                     chosen[:] = [*rest, ranked[0].candidate]
                     return
 
@@ -247,14 +248,15 @@ class Search:
         return [
             r.candidate.effect
             for r in self.ranked(rest)
-            if r.candidate.effect != one.effect and r.delta_bic > own - SURE and _pays(r)
+            if r.candidate.effect != one.effect and r.delta_bic > own - _ALIKE and _pays(r)
         ]
 
     def _crossed(self, without: Fit, fit: Fit) -> float:
         """How much less the squared error is where the parameters were not fitted: every n-th part of the time in turn.
 
-        What is seen once, as one pass over a place, does not count: it has to repeat. What is known of the nominal
-        values counts as a measurement beside them: it is all that tells more drag from a badly known C_r2.
+        What is seen once, as one pass over a place, does not count: it has to repeat. The place itself stays where it was
+        found: parts without it would move it anywhere. What is known of the nominal values counts as a measurement beside
+        them: it is all that tells more drag from a badly known C_r2.
         """
         parts = self._study.block * _FOLDS // (self._study.block.max() + 1)
         return self._left_out(without, fit, parts) - self._left_out(fit, fit, parts)
@@ -262,9 +264,11 @@ class Search:
     def _left_out(self, fit: Fit, noise_of: Fit, parts: npt.NDArray[np.intp]) -> float:
         white = noise_of.noise.whiten(fit.errors)
         root = np.sqrt(weights(noise_of.noise.whiten(noise_of.errors)))
-        J = noise_of.noise.whiten(fit.jacobian) * root[:, None, None]
+        shapes = [EFFECTS[effect].PARAMETERS[name].shape for effect, name in fit.free]
+        moving = np.flatnonzero(~np.array([False] * len(fit.car.moved) + shapes))
+        J = noise_of.noise.whiten(fit.jacobian[..., moving]) * root[:, None, None]
         r = white * root[:, None]
-        p = fit.position
+        p = fit.position[moving]
         known = self._study.known_before(p)
         H = [np.tensordot(J[parts == f], J[parts == f], ([0, 1], [0, 1])) for f in range(_FOLDS)]
         g = [np.einsum("wnp,wn->p", J[parts == f], r[parts == f]) for f in range(_FOLDS)]

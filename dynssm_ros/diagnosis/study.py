@@ -24,6 +24,7 @@ _UNIT = 0.1  # of the way from neutral to the upper bound: in this unit effects 
 _FREE = 10.0  # of these units an effect's parameter may be, as one standard deviation
 _ROUNDS = 30
 _KEPT = 0.5  # of what a quadratic promises: derivatives that keep less are too old
+_LOUD, _LEAST = 1e-2, 1e-12  # of the variance of a channel: more than any noise, and less
 _DAMPING = (0.0, 0.03, 0.3, 3.0, 30.0)
 _CONVERGED = 0.3  # of the squared error
 
@@ -122,8 +123,7 @@ class Study:
         self.spread = Spread.of(windows.transitions(car), speed)
         block = (windows.time // BLOCK).astype(np.intp)
         self.block: npt.NDArray[np.intp] = np.unique(block, return_inverse=True)[1]
-        rate = np.tile(windows.spread**2, 2)
-        self.floor = 1e-12 * rate
+        self._channels = np.tile(windows.spread**2, 3)
 
     def errors(self, car: Car, context: dict[str, float] | None = None) -> Vector:
         """Errors of a car, shape ``(W, 3 K)``."""
@@ -133,17 +133,9 @@ class Study:
         """Errors of several cars that differ in values alone, shape ``(P, W, 3 K)``."""
         return self.windows.errors_of(cars, context).reshape(len(cars), len(self.windows), -1)
 
-    def first_noise(self, errors: Vector) -> Noise:
-        """The noise under which ``errors`` are most likely."""
-        rate = np.tile(self.windows.spread**2, 2)
-        return fit_noise(self.spread, errors, 1e-4 * rate, self.floor)
-
-    def refit_noise(self, noise: Noise, errors: Vector) -> Noise:
-        """The same from what is known already.
-
-        Variances that had vanished begin a little above: their logarithm is what is fitted, and that has no slope there.
-        """
-        return fit_noise(self.spread, errors, np.maximum(noise.v, 1e6 * self.floor), self.floor)
+    def noise(self, errors: Vector) -> Noise:
+        """The noise under which ``errors`` are most likely, whatever it was taken for before."""
+        return fit_noise(self.spread, errors, _LOUD * self._channels, _LEAST * self._channels)
 
     def columns(self, car: Car, errors: Vector, free: Free, first: int = 0) -> Vector:
         """Derivatives of ``errors`` by the 18 nominal values and by ``free``, from the ``first`` on.
@@ -193,7 +185,7 @@ class Study:
         """
         car = placed(car, free, position(car, free))
         errors, n = self.errors(car), len(car.moved)
-        noise = self.refit_noise(near.noise, errors) if near is not None else self.first_noise(errors)
+        noise = self.noise(errors)
         p = position(car, free)
         lower, upper = limits(car, free)
         best = self.objective(errors, p, noise)
@@ -217,7 +209,7 @@ class Study:
                     gained = best - value
                     car, errors, p = other, there, position(other, free)
                     if gained > _CONVERGED:
-                        noise = self.refit_noise(noise, errors)
+                        noise = self.noise(errors)
                     best = self.objective(errors, p, noise)
                     break
             settled = before - best < _CONVERGED

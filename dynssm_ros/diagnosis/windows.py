@@ -1,6 +1,6 @@
 """Short simulations along a recording: each starts at a measured row and runs free from there.
 
-The effects' own states are carried along the measured rows before the start, so that a lag is where it was.
+The effects' own states are led along the measured rows before the start, so that a lag is where it was.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ Vector = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 _FINEST = 16  # integration steps per sampling time, at most
-WARM_UP = 0.32  # s of measured rows along which the effects' own states are led
+WARM_UP = 0.64  # s of measured rows along which a simulation is led before it runs free
+_FOLLOWING = 0.16  # s, within which a simulation that is led settles to what is measured: a quarter of the way in noise
 _WILD = 1e3  # a prediction farther off than this many spreads of its channel counts as that far
 
 
@@ -54,6 +55,9 @@ class Windows:
         integrator: how the model steps.
         substeps: integration steps per sampling time.
         every: compared is every so many rows, so that ``K = steps / every``.
+        filtered: whether a simulation is led up to its start by the rows before as an observer is, and not put on the
+            measured row. The noise of a row would otherwise be seen in what the car does next, and effects that answer
+            to it, such as a relaxing tyre, be taken for smaller than they are.
     """
 
     data: Track = field(repr=False)
@@ -63,6 +67,7 @@ class Windows:
     integrator: Integrator = "rk4"
     substeps: int = 1
     every: int = 1
+    filtered: bool = False
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -114,7 +119,8 @@ class Windows:
         """
         fleet = Fleet.of(cars)
         carries = any(effect.carries for effect in fleet.effects)
-        shift = -self.warm if carries else 0
+        shift = -self.warm if carries or self.filtered else 0
+        taken = 1.0 - np.exp(-self.data.T_s / _FOLLOWING) if self.filtered else 1.0
         first = self.data.rows[:, self.starts + shift]
         here = self.context(shift) | (context or {})
         state = State(*first[:3])
@@ -126,7 +132,7 @@ class Windows:
             for k in range(shift, self.steps):
                 rows = self.data.rows[:, self.starts + k]
                 if k <= 0:
-                    state = State(*rows[:3])
+                    state = State(*(led + taken * (row - led) for led, row in zip(state, rows[:3], strict=True)))
                 state, memory = self._step(fleet, state, memory, rows, k, context)
                 if k >= 0 and (k + 1) % self.every == 0:
                     for channel, value in enumerate(state):

@@ -55,7 +55,7 @@ def test_a_finely_integrated_plant_is_told_from_euler_steps() -> None:
     recording, vehicle = record(Case({"yaw_rate_bias": {"bias": 0.02}}, 2, "rk4", 45.0))
     found = diagnose(recording, vehicle, line=LINE)
     assert [cause.effect for cause in found.causes] == ["yaw_rate_bias"]
-    assert "rk4" in found.protocol["Fit"]
+    assert found.protocol["Integrator"] == "rk4"
 
 
 def test_the_extended_car_errs_less_on_held_out_rows(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
@@ -63,7 +63,7 @@ def test_the_extended_car_errs_less_on_held_out_rows(lagging: tuple[Recording, V
     (cause,) = found.causes
     hidden = size("steering_lag", np.random.default_rng(1))["time_constant"]
     assert cause.values["time_constant"] == pytest.approx(hidden, abs=4 * cause.std["time_constant"])
-    assert cause.heldout_gain > 0.05
+    assert cause.heldout_gain > 0.02
     assert found.gain.reduction[found.gain.horizon, 2] > 0.1
     low, high = found.gain.interval[:, found.gain.horizon]
     assert (

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dynssm_ros.control.learned import load_knowledge
-from dynssm_ros.control.nmpc import Settings
 from dynssm_ros.control.race import Course, race
 from dynssm_ros.control.reference import load_reference
+from dynssm_ros.control.settings import Settings
 from dynssm_ros.diagnosis.car import Car
 from dynssm_ros.diagnosis.windows import Track, Windows
 from dynssm_ros.learning.configuration import ModelConfig
@@ -84,7 +84,7 @@ def test_it_trains_a_model_and_the_node_predicts_with_it(
 def test_it_races(extended: Vehicle, path: Path) -> None:
     club = load_track("club")
     line = load_reference("centre", extended, club, pace=0.6)
-    course = Course(extended, club, "euler", line, Settings("tracking", 15, 0.02, 0.02))
+    course = Course(extended, club, "euler", line, Settings.of(extended))
     lap = race(course, load_knowledge(str(path), load_vehicle("orca"), extended, "euler"))
     assert lap.completed
     assert lap.outside == 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.diagnosis.systematic import systematic
+from dynssm_ros.diagnosis.systematic import bunched, systematic
 from dynssm_ros.diagnosis.windows import Track, Windows
 
 N, K = 6000, 10
@@ -53,3 +53,16 @@ def test_an_error_that_repeats_at_a_place_is_seen_as_such() -> None:
     assert found.by_place == pytest.approx(np.full(3, 0.55), abs=0.12)
     low, high = found.stretch["v_y"]
     assert 300.0 <= low < high <= 500.0
+
+
+def test_errors_that_come_together_are_told_from_the_same_errors_anywhere() -> None:
+    rng, W = np.random.default_rng(2), 180
+    time, sizes = np.arange(W) * 0.5, rng.chisquare(20, W) / 20
+    block = (time // 3).astype(int)
+    assert not bunched(sizes, time, block, 1.0).is_there
+    oil = np.where((time >= 30) & (time < 36), 2.0, 0.0)
+    found = bunched(sizes + oil, time, block, 1.0)
+    assert found.is_there
+    assert 30 <= found.when[0] < found.when[1] < 36
+    assert not bunched(rng.permutation(sizes + oil), time, block, 1.0).is_there
+    assert bunched(sizes, time, block, 4.0).is_there

@@ -76,9 +76,9 @@ def test_noise_is_recovered_and_whitened() -> None:
     some = windows(AV21, stds)
     study = Study(some, Car.of(AV21))
     errors = study.errors(Car.of(AV21))
-    noise = study.first_noise(errors)
+    noise = study.noise(errors)
     np.testing.assert_allclose(np.sqrt(noise.v[:3]), stds, rtol=0.1)
-    assert (np.sqrt(noise.v[3:]) < np.array(stds) / 4).all()
+    assert (np.sqrt(noise.v[3:6]) < np.array(stds) / 4).all()
     white = noise.whiten(errors)
     assert (white**2).mean() == pytest.approx(1.0, abs=0.02)
     assert np.abs(np.corrcoef(white.T) - np.eye(white.shape[1])).max() < 0.5
@@ -93,8 +93,25 @@ def test_disturbances_on_the_way_are_told_from_noise_of_the_measurement() -> Non
     for _ in range(K):
         state = 0.8 * state + Q * rng.standard_normal((W, 3))
         errors.append(state - R * rng.standard_normal((W, 3)))
-    found = fit_noise(spread, np.stack(errors, axis=1).reshape(W, -1), np.full(6, 0.01), np.full(6, 1e-12))
-    np.testing.assert_allclose(np.sqrt(found.v), [*R, *Q], rtol=0.12)
+    found = fit_noise(spread, np.stack(errors, axis=1).reshape(W, -1), np.full(9, 0.01), np.full(9, 1e-12))
+    np.testing.assert_allclose(np.sqrt(found.v), [*R, *Q, *R], rtol=0.12)
+
+
+def test_a_filtered_start_is_closer_to_the_car_than_a_measured_row() -> None:
+    some = windows(AV21, (0.02, 0.03, 0.004))
+    noise = Study(replace(some, starts=some.starts[2:], warm=16, filtered=True), Car.of(AV21))
+    R, _, P = noise.noise(noise.errors(Car.of(AV21))).v.reshape(3, 3)
+    assert (P < 0.4 * R).all()
+
+
+@pytest.mark.parametrize("filtered", [True, False])
+def test_a_relaxing_tyre_is_not_taken_for_a_shorter_one_where_starts_are_filtered(filtered: bool) -> None:
+    effect, free = "tire_relaxation", (("tire_relaxation", "length"),)
+    some = windows(AV21.with_effect(effect, {"length": 0.8}), (0.02, 0.02, 0.003), duration=100.0)
+    study = Study(replace(some, starts=some.starts[2:], warm=16, filtered=filtered), Car.of(AV21))
+    fit = study.fit(Car.of(AV21).with_effect(effect, {"length": 0.4}), free)
+    off = (fit.car.effects[effect]["length"] - 0.8) / (0.3 * np.sqrt(study.covariance(fit)[-1, -1]))
+    assert abs(off) < 2.5 if filtered else off < -2.5
 
 
 def test_a_window_that_is_far_out_counts_less() -> None:
@@ -106,7 +123,7 @@ def test_a_window_that_is_far_out_counts_less() -> None:
 
 def test_whitening_undoes_what_the_covariance_says() -> None:
     spread = Spread.of(np.broadcast_to(0.9 * np.eye(3), (5, 4, 3, 3)), np.arange(5.0))
-    noise = Noise(spread, np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+    noise = Noise(spread, np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.5, 0.6, 0.7]))
     np.testing.assert_allclose(noise.whiten(np.stack([noise.roots[0]] * 5))[0], np.eye(12), atol=1e-12)
     assert noise.log_det == pytest.approx(5 * np.linalg.slogdet(noise.roots[0] @ noise.roots[0].T)[1])
 

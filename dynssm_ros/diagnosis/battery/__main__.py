@@ -13,7 +13,7 @@ from pathlib import Path
 import joblib
 
 from dynssm_ros.diagnosis.battery import cases as drawn
-from dynssm_ros.diagnosis.battery.cases import cases
+from dynssm_ros.diagnosis.battery.cases import Case, cases
 from dynssm_ros.diagnosis.battery.outcomes import Outcome, matrix, rates
 from dynssm_ros.diagnosis.battery.page import FIGURE, PAGE, page
 from dynssm_ros.diagnosis.battery.run import run_case
@@ -41,24 +41,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
     running = joblib.Parallel(n_jobs=options.jobs, return_as="generator")(
         joblib.delayed(run_case)(case, options.out) for case in listed
     )
-    outcomes: list[Outcome] = []
+    of: list[tuple[Case, Outcome | None]] = []
     for k, (case, outcome) in enumerate(zip(listed, running, strict=True), start=1):
-        if outcome is None:
-            words = "cannot be driven"
-        else:
-            outcomes.append(outcome)
+        of.append((case, outcome))
+        words = "cannot be driven"
+        if outcome is not None:
             words = f"{', '.join(outcome.named) or 'none'}: {'right' if outcome.right else 'WRONG'}"
         print(f"[{k}/{len(listed)}] {case.name} -> {words}", flush=True)
+    outcomes = [outcome for _, outcome in of if outcome is not None]
     if not outcomes:
         raise UserError(f"--count {options.count}: no case could be driven")
-    undriven = len(listed) - len(outcomes)
-    about = {"seed": options.seed, "undriven": undriven, **rates(outcomes)}
+    about = {"seed": options.seed, "undriven": len(of) - len(outcomes), **rates(outcomes)}
     write_json(options.out / "battery.json", about | {"outcomes": [asdict(outcome) for outcome in outcomes]})
     folder = options.page or options.out
     with replacing(folder / FIGURE) as aside:
         confusion(*matrix(outcomes)).savefig(aside, format="png", dpi=_DPI, metadata={"Software": None})
     with replacing(folder / PAGE) as aside:
-        aside.write_text(page(outcomes, options.seed, undriven), encoding="utf-8")
+        aside.write_text(page(of, options.seed), encoding="utf-8")
     for name, value in about.items():
         print(f"{name}: {value}")
 

@@ -30,6 +30,7 @@ class Outcome:
         values: what was hidden, with its parameters.
         found: what was named, with its parameters.
         alternatives: what is reported as explaining the data as well, by what was named.
+        evidence: difference in the information criterion, by what was named.
     """
 
     case: str
@@ -41,6 +42,7 @@ class Outcome:
     values: Hidden = field(default_factory=dict)
     found: Hidden = field(default_factory=dict)
     alternatives: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    evidence: dict[str, float] = field(default_factory=dict)
 
     @property
     def right(self) -> bool:
@@ -65,6 +67,7 @@ def judge(case: Case, causes: Sequence[Cause]) -> Outcome:
         case.hidden,
         {cause.effect: dict(cause.values) for cause in causes},
         {cause.effect: tuple(cause.alternatives) for cause in causes},
+        {cause.effect: cause.delta_bic for cause in causes},
     )
 
 
@@ -98,9 +101,9 @@ def rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 def _share(right: Sequence[bool]) -> dict[str, Any]:
     count, of = sum(right), len(right)
     if not of:
-        return {"of": 0, "share": None, "interval_95": None}
+        return {"of": 0, "count": 0, "share": None, "interval_95": None}
     interval = binomtest(count, of).proportion_ci(method="wilson")
-    return {"of": of, "share": count / of, "interval_95": [float(interval.low), float(interval.high)]}
+    return {"of": of, "count": count, "share": count / of, "interval_95": [float(interval.low), float(interval.high)]}
 
 
 def matrix(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], npt.NDArray[np.intp]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from dynssm_ros.diagnosis.battery.cases import Hidden
+from dynssm_ros.diagnosis.battery.cases import Case, Hidden
 from dynssm_ros.diagnosis.battery.outcomes import Outcome, rates
 
 PAGE, FIGURE = "diagnose_battery.md", "diagnose_battery_confusion.png"
@@ -16,39 +16,49 @@ _IN_WORDS = {
     "false_alarms": "something is named where nothing is hidden",
     "more_named": "more is named than the one effect that is hidden",
 }
+_PLANTS = {"rk4": "one track, steps of 1 ms", "double_track": "four wheels"}
 
 
-def page(outcomes: Sequence[Outcome], seed: int, undriven: int) -> str:
+def page(outcomes: Sequence[tuple[Case, Outcome | None]], seed: int) -> str:
     """The results as Markdown.
 
     Args:
-        outcomes: of the cases.
+        outcomes: of the cases; ``None``: the car could not be driven.
         seed: of the first case; the others' count on from it.
-        undriven: cases whose car could not be driven.
     """
-    return "\n".join(_lines(outcomes, seed, undriven)) + "\n"
+    return "\n".join(_lines(outcomes, seed)) + "\n"
 
 
-def _lines(outcomes: Sequence[Outcome], seed: int, undriven: int) -> Iterator[str]:
+def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str]:
+    outcomes = [outcome for _, outcome in of if outcome is not None]
+    undriven = len(of) - len(outcomes)
     yield "# Hidden causes"
     yield ""
     yield (
         f"Made by `python -m dynssm_ros.diagnosis.battery`: {len(outcomes)} simulated drives with hidden effects, seeds "
-        f"{seed} to {seed + len(outcomes) + undriven - 1}"
+        f"{seed} to {seed + len(of) - 1}"
         + (f", without {undriven} whose car could not be driven" if undriven else "")
         + ". How they are drawn and what counts as just noticeable: the command's `--help`."
     )
     yield ""
-    yield "| rate | cases | share | 95 % interval | goal |"
-    yield "| --- | --- | --- | --- | --- |"
+    yield f"| rate | cases | share | 95 % interval | goal | {' | '.join(_PLANTS.values())} |"
+    yield f"| --- | --- | --- | --- | --- |{' --- |' * len(_PLANTS)}"
+    by_plant = [rates([o for case, o in of if o is not None and case.plant == plant]) for plant in _PLANTS]
     for name, words in _IN_WORDS.items():
         rate = rates(outcomes)[name]
         if rate["of"]:
             low, high = rate["interval_95"]
             goal = "" if name not in GOALS else f"{'<=' if name == 'false_alarms' else '>='} {100 * GOALS[name]:.0f} %"
+            each = " | ".join(f"{one[name]['count']} of {one[name]['of']}" for one in by_plant)
             yield (
-                f"| {words} | {rate['of']} | {100 * rate['share']:.0f} % | {100 * low:.0f} to {100 * high:.0f} % | {goal} |"
+                f"| {words} | {rate['of']} | {100 * rate['share']:.0f} % | {100 * low:.0f} to {100 * high:.0f} % | {goal} "
+                f"| {each} |"
             )
+    yield ""
+    yield (
+        "Four wheels are a car that the equations do not have: an axle loses grip as load moves from one wheel to the other, "
+        "and unequal forces at the steered wheels turn the car. Small effects that are named there stand for this."
+    )
     yield ""
     yield f"![What was hidden and what was named first]({FIGURE})"
     yield ""
