@@ -11,11 +11,11 @@ import typer
 from dynssm_ros.cli.console import JsonOption, VehicleOption, console, progress_bar, told_apart, write_results
 from dynssm_ros.control.animation import animate
 from dynssm_ros.control.learned import Knowledge, load_knowledge
-from dynssm_ros.control.nmpc import Objective, Settings
 from dynssm_ros.control.race import Course, Race, Start
 from dynssm_ros.control.race import race as drive
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.report import race_json, race_report, race_table, summary
+from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.simulation.tracks import Track, load_track
@@ -58,7 +58,15 @@ def race(
         float,
         typer.Option(help="Share of the car's limits in the line's speed; of a file, factor on it.", min=0.1, max=2.0),
     ] = 1.0,
-    horizon: Annotated[int, typer.Option(help="Steps of T_s that are planned ahead.", min=2, max=100)] = 15,
+    horizon: Annotated[
+        int | None,
+        typer.Option(
+            help="Steps of T_s that are planned ahead.",
+            min=2,
+            max=100,
+            show_default="as the car needs: orca 15, av21 40",
+        ),
+    ] = None,
     along_horizon: Annotated[
         bool, typer.Option("--along-horizon", help="Read the models anew at every step of the horizon.")
     ] = False,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,9 @@ Vector = npt.NDArray[np.float64]
 STATES = ("x", "y", "theta", "v_x", "v_y", "omega", "r", "delta")
 """Pose (m, m, rad), velocities (m/s, m/s, rad/s), what the actuators do (fraction, rad). The effects' own follow."""
 INPUTS = ("increment of r", "increment of delta")
+Travel = Literal["start", "middle"]
+"""Which velocity and heading carry a car over a step: those at its start, as forward Euler does in the published data, or
+those at its middle, as on a road."""
 CONTEXT = ("t", "s", "lap_length")
 """What effects may read beside the pose: time (s), track position and length of the lap (m)."""
 PARAMETERS = len(COEFFICIENTS) + 3 + len(CONTEXT)
@@ -68,17 +71,19 @@ class Car:
 class HorizonModel:
     """One step of ``car`` and its Jacobians, for all steps of a horizon at once.
 
-    The velocities move by the single-track step plus the correction; the pose moves by the mean velocity of the step at
-    its middle heading, as the live predictor's does.
+    The velocities move by the single-track step plus the correction, the pose by the velocities. In the middle of a step
+    these are the mean of its ends.
 
     Args:
         car: what is stepped.
         N: steps of the horizon.
+        travel: what carries the pose; a matter of the world, and not of what a model knows of the car.
     """
 
-    def __init__(self, car: Car, N: int) -> None:
+    def __init__(self, car: Car, N: int, travel: Travel = "middle") -> None:
         self.car = car
         self.N = N
+        self._travel = travel
         self.size = len(STATES) + len(car.memory)
         import casadi as ca  # takes a while, and most of the command line does without
 
@@ -139,7 +144,8 @@ class HorizonModel:
             {"x": x_pos, "y": y_pos, "theta": heading, **dict(zip(CONTEXT, context, strict=True))},
         )
         state = State(*(value + by for value, by in zip(state, correction, strict=True)))
-        v_x, v_y, turn = ((a + b) / 2 * car.T_s for a, b in zip(now, state, strict=True))
-        c, s = ca.cos(heading + turn / 2), ca.sin(heading + turn / 2)
+        share = 0.5 if self._travel == "middle" else 0.0
+        v_x, v_y, turn = (((1 - share) * a + share * b) * car.T_s for a, b in zip(now, state, strict=True))
+        c, s = ca.cos(heading + share * turn), ca.sin(heading + share * turn)
         pose = (x_pos + v_x * c - v_y * s, y_pos + v_x * s + v_y * c, heading + turn)
         return ca.vertcat(*pose, *state, *applied, *(memory[name] for name in car.memory))

@@ -4,17 +4,16 @@ The plan of the step before, moved on by one step, is where dynamics, borders an
 shooting: its gaps are closed by the program). The states are then eliminated, so that what is left to optimise are the
 ``2 N`` increments of throttle and steering and a slack per soft constraint: a dense program for an active-set solver.
 
-Actuator limits are hard; the borders, and speed and slip at the end of the horizon where the objective asks for it, are soft
-with a linear penalty, so that a program is feasible wherever the car is.
+Actuator limits are hard; the borders, the rear slip, and the speed at the end of the horizon where the objective asks for it
+are soft with a linear penalty, so that a program is feasible wherever the car is.
 
 Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control", 2005.
 """
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -23,89 +22,17 @@ import numpy.typing as npt
 
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, PARAMETERS, STATES, HorizonModel
 from dynssm_ros.control.reference import Reference
-from dynssm_ros.simulation.racing_line import CAR_WIDTH
+from dynssm_ros.control.settings import Settings
 from dynssm_ros.simulation.tracks import Track
-from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, Vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, Applied
 from dynssm_ros.vehicle.effects.base import SLOWEST
 from dynssm_ros.vehicle.parameters import InputLimits
-from dynssm_ros.vehicle.single_track import shape
 
 Vector = npt.NDArray[np.float64]
-Objective = Literal["tracking", "progress"]
 Status = Literal["solved", "infeasible", "late"]
 
 V_X, R, DELTA = (STATES.index(name) for name in ("v_x", "r", "delta"))
 _FIRST_ROUNDS = 10  # programs that the first plan takes to settle
-_GRIP_USED = 0.95  # share of the rear tyres' force in a car that is not sliding: there is hardly more, and no way back
-
-
-@dataclass(frozen=True)
-class Weights:
-    """What the controller minimises, summed over the steps of the horizon.
-
-    Attributes:
-        along: of the squared distance from the reference point along the line (1/m^2).
-        across: likewise across it (1/m^2).
-        progress: gain per metre that the horizon's last point lies further along the line (1/m).
-        throttle: of the squared increment of the throttle (1).
-        steering: of the squared increment of the steering (1/rad^2).
-        border: price of the distance beyond a border (1/m), and of its square (1/m^2).
-        ending: price of speed above the line's own at the end of the horizon (s/m), of rear slip there beyond its bound
-            (1/rad), and of the larger of their squares (s^2/m^2, 1/rad^2); 0: neither is bounded.
-    """
-
-    along: float
-    across: float
-    progress: float
-    throttle: float = 0.005
-    steering: float = 1.0
-    border: float = 10.0
-    ending: float = 0.0
-
-
-WEIGHTS: Mapping[Objective, Weights] = {
-    # Q and R of the literature: bayesrace and Deep Dynamics
-    "tracking": Weights(along=1.0, across=1.0, progress=0.0),
-    # a point of the last plan draws as the reference does, so that no plan strays from where it was linearised
-    "progress": Weights(along=1.0, across=1.0, progress=0.15, ending=10.0),
-}
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How the controller works.
-
-    Attributes:
-        objective: ``tracking`` follows the reference at its own speed; ``progress`` goes as far as it can between the
-            borders, to where it can go on from: no faster than the reference is there, and not sliding.
-        N: steps of the horizon.
-        deadline: time (s) after which a plan comes too late and is not used.
-        margin: distance to keep between the car's centre and the borders (m).
-        slip: slip angle of the rear axle from which on the car slides (rad).
-    """
-
-    objective: Objective = "tracking"
-    N: int = 15
-    deadline: float = math.inf
-    margin: float = 0.0
-    slip: float = math.inf
-
-    @classmethod
-    def of(cls, vehicle: Vehicle, objective: Objective = "tracking", N: int = 15) -> Settings:
-        """For a car: a plan has a control period of time, half the car stays within the borders.
-
-        Args:
-            vehicle: the car as its file describes it.
-            objective: see above.
-            N: steps of the horizon.
-        """
-        half_width = CAR_WIDTH * (vehicle.constants.l_f + vehicle.constants.l_r) / 2
-        return cls(objective, N, vehicle.sampling_time, half_width, _sliding(Coefficients(*vehicle.nominal)))
-
-    @property
-    def weights(self) -> Weights:
-        """Those of the objective."""
-        return WEIGHTS[self.objective]
 
 
 class Adapted(NamedTuple):
@@ -182,8 +109,8 @@ class Nmpc:
         self._plan: Plan | None = None
         self._on_track = self._on_line = 0.0
         N = settings.N
-        self._variables = 2 * N + N + 1  # increments, slacks of the borders, slack of the end
-        self._rows = 2 * N + 2 * N + 3  # actuators, both borders, slip to both sides and speed at the end
+        self._variables = 2 * N + N + 1  # increments, slacks of the steps, slack of the end
+        self._rows = 2 * N + 2 * N + 2 * N + 1  # actuators, both borders, slip to both sides, speed at the end
         shape = {"h": ca.Sparsity.dense(self._variables, self._variables)}
         shape["a"] = ca.Sparsity.dense(self._rows, self._variables)
         self._solver = ca.conic("program", "daqp", shape, {"error_on_fail": False})
@@ -290,15 +217,18 @@ class Nmpc:
         point, heading = self._reference.line.position(at), self._reference.line.heading(at)
         tangent, normal = _directions(heading)
         H, g = np.zeros((self._variables,) * 2), np.zeros(self._variables)
+        length, h = self.settings.scale.length, self.model.car.T_s / self.settings.scale.time
         for direction, weight in ((tangent, w.along), (normal, w.across)):
-            errors = np.einsum("ki,ki->k", direction, positions - point)
-            by_u = np.einsum("ki,kij->kj", direction, moves)
-            H[: 2 * N, : 2 * N] += 2 * weight * by_u.T @ by_u
-            g[: 2 * N] += 2 * weight * by_u.T @ errors
-        g[: 2 * N] -= w.progress * tangent[-1] @ moves[-1]
-        diagonal = np.concatenate([np.tile([w.throttle, w.steering], N), np.full(N, w.border), [max(w.ending, 1.0)]])
-        H[np.diag_indices(self._variables)] += 2 * diagonal
-        g[2 * N : 3 * N] = w.border
+            errors = np.einsum("ki,ki->k", direction, positions - point) / length
+            by_u = np.einsum("ki,kij->kj", direction, moves) / length
+            H[: 2 * N, : 2 * N] += 2 * h * weight * by_u.T @ by_u
+            g[: 2 * N] += 2 * h * weight * by_u.T @ errors
+        g[: 2 * N] -= w.progress * tangent[-1] @ moves[-1] / length
+        rates = np.tile([w.throttle, w.steering], N) / h
+        H[np.diag_indices(self._variables)] += 2 * np.concatenate(
+            [rates, np.full(N, h * w.border), [max(w.ending, 1.0)]]
+        )
+        g[2 * N : 3 * N] = h * w.border
         g[3 * N] = w.ending
 
         A = np.zeros((self._rows, self._variables))
@@ -308,12 +238,10 @@ class Nmpc:
             A[rows, k : 2 * N : 2] = np.tri(N)
             low[rows], high[rows] = bounds[0] - held, bounds[1] - held
         self._add_borders(A[2 * N : 4 * N], low[2 * N : 4 * N], high[2 * N : 4 * N], guess, positions, moves)
+        self._add_slip(A[4 * N : 6 * N], high[4 * N : 6 * N], offset[1:], slope[1:])
         if w.ending > 0:
-            slip, by_u = self._rear_slip(offset[-1], slope[-1])
-            A[-3:, : 2 * N] = np.stack([by_u, -by_u, slope[-1, V_X]])
-            A[-3:, -1] = -1.0
-            bound, top_speed = self.settings.slip, float(self._reference.speed_at(at[-1]))
-            high[-3:] = bound - slip, bound + slip, top_speed - offset[-1, V_X]
+            A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -length / self.settings.scale.time
+            high[-1] = float(self._reference.speed_at(at[-1])) - offset[-1, V_X]
 
         reach = self._limits.steering_rate * self.model.car.T_s
         span = self._limits.throttle[1] - self._limits.throttle[0]
@@ -321,14 +249,21 @@ class Nmpc:
         z_high = np.concatenate([np.tile([span, reach], N), np.full(N + 1, np.inf)])
         return _Program(H, g, A, low, high, z_low, z_high)
 
-    def _rear_slip(self, x: Vector, slope: Vector) -> tuple[float, Vector]:
-        """Slip angle of the rear axle (rad) at the state ``x``, shape ``(size,)``, and how it varies with that state."""
-        v_x, v_y, omega = x[V_X : V_X + 3]
+    def _add_slip(self, A: Vector, high: Vector, x: Vector, slope: Vector) -> None:
+        """The slip angle of the rear axle (rad) at the states ``x``, shape ``(N, size)``, within its bound on both sides."""
+        N = self.settings.N
+        v_x, v_y, omega = x[:, V_X : V_X + 3].T
         l_r = self.model.car.constants.l_r
-        across, along = l_r * omega - v_y, max(v_x, SLOWEST)
-        by_across, by_along = along / (along**2 + across**2), -across / (along**2 + across**2)
-        moves = slope[V_X : V_X + 3]
-        return math.atan2(across, along), by_across * (l_r * moves[2] - moves[1]) + by_along * moves[0]
+        across, along = l_r * omega - v_y, np.maximum(v_x, SLOWEST)
+        squared = along**2 + across**2
+        by_along, by_v_y, by_omega = (
+            part[:, None] for part in (-across / squared, -along / squared, l_r * along / squared)
+        )
+        slip = np.arctan2(across, along)
+        by_u = by_along * slope[:, V_X] + by_v_y * slope[:, V_X + 1] + by_omega * slope[:, V_X + 2]
+        A[:, : 2 * N] = np.concatenate([by_u, -by_u])
+        A[:N, 2 * N : 3 * N] = A[N:, 2 * N : 3 * N] = -np.eye(N)
+        high[:N], high[N:] = self.settings.slip - slip, self.settings.slip + slip
 
     def _reference_points(self, guess: Vector) -> Vector:
         """Where on the line the steps of the horizon are compared with it (m), shape ``(N,)``."""
@@ -348,7 +283,8 @@ class Nmpc:
         lateral = np.einsum("ki,ki->k", normal, positions - foot)
         by_u = np.einsum("ki,kij->kj", normal, moves)
         A[:, : 2 * N] = np.concatenate([by_u, by_u])
-        A[:N, 2 * N : 3 * N], A[N:, 2 * N : 3 * N] = -np.eye(N), np.eye(N)
+        into_slack = self.settings.scale.length * np.eye(N)
+        A[:N, 2 * N : 3 * N], A[N:, 2 * N : 3 * N] = -into_slack, into_slack
         high[:N], low[N:] = left - lateral, -right - lateral
 
     def _held(self, now: Vector, guess: Plan, adapted: Adapted, t: float, status: Status) -> Plan:
@@ -365,13 +301,6 @@ class Nmpc:
             float(min(max(r, self._limits.throttle[0]), self._limits.throttle[1])),
             float(min(max(delta, self._limits.steering[0]), self._limits.steering[1])),
         )
-
-
-def _sliding(theta: Coefficients) -> float:
-    """Slip angle (rad) at which the rear tyres give ``_GRIP_USED`` of what they can."""
-    slip = np.linspace(0.0, 1.0, 1001)
-    force = np.sin(theta.C_r * shape(np, theta.B_r, theta.E_r, slip))
-    return float(slip[np.argmax(force >= _GRIP_USED * np.max(force))])
 
 
 def _condensed(x: Vector, u: Vector, following: Vector, by_x: Vector, by_u: Vector) -> tuple[Vector, Vector]:

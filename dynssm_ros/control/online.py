@@ -20,10 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.control.horizon_model import STATES
-from dynssm_ros.control.nmpc import Settings, Status
+from dynssm_ros.control.nmpc import Status
 from dynssm_ros.control.pilot import LOST, Pilot
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.remote import Remote
+from dynssm_ros.control.settings import Settings
 from dynssm_ros.runtime.health import Level
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.simulation.driver import Driver, Style

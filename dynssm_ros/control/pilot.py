@@ -15,8 +15,9 @@ import numpy.typing as npt
 
 from dynssm_ros.control.horizon_model import CONTEXT, STATES, HorizonModel
 from dynssm_ros.control.learned import Knowledge
-from dynssm_ros.control.nmpc import Adapted, Nmpc, Plan, Settings, Status
+from dynssm_ros.control.nmpc import Adapted, Nmpc, Plan, Status
 from dynssm_ros.control.reference import Reference
+from dynssm_ros.control.settings import Settings
 from dynssm_ros.simulation.plant import SCALAR, Pose
 from dynssm_ros.simulation.tracks import Track
 from dynssm_ros.vehicle import Applied, Coefficients, State
@@ -90,7 +91,8 @@ class Pilot:
         self._knowledge = knowledge
         self._track = track
         self._clock = clock
-        self._controller = Nmpc(HorizonModel(knowledge.car, settings.N), limits, reference, track, settings, clock)
+        model = HorizonModel(knowledge.car, settings.N, settings.travel)
+        self._controller = Nmpc(model, limits, reference, track, settings, clock)
         self._history: deque[Vector] = deque(maxlen=max(knowledge.H, 1))
 
     def forget(self) -> None:

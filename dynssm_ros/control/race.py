@@ -12,16 +12,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.control.learned import Knowledge
-from dynssm_ros.control.nmpc import Settings
 from dynssm_ros.control.pilot import LOST, Pilot
 from dynssm_ros.control.reference import Reference
+from dynssm_ros.control.settings import Settings
 from dynssm_ros.simulation.external import Creeping
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.simulation.plant import PlantKind, Pose, make_plant
@@ -189,7 +189,8 @@ class _Drive:
         pose, state = course.starting()
         vehicle, track = course.vehicle, course.track
         # the processor's time, so that what else runs on the machine changes no simulated lap
-        self.pilot = Pilot(knowledge, vehicle.inputs, course.reference, track, course.settings, time.thread_time)
+        settings = replace(course.settings, travel="start" if course.plant == "euler" else "middle")
+        self.pilot = Pilot(knowledge, vehicle.inputs, course.reference, track, settings, time.thread_time)
         self._car = make_plant(vehicle, course.plant, pose, state, (Creeping(vehicle, course.plant),), track.length)
         self._course = course
         self._feedback = Applied(0.0, 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -118,7 +119,7 @@ def summary(races: Sequence[Race]) -> str:
     text = f"No model completed {_laps(races[0].course)}."
     if done:
         best = min(done, key=lambda race: float(np.mean(race.lap_times)))
-        text = f"{best.name} is the fastest with {np.mean(best.lap_times):.2f} s a lap."
+        text = f"{best.name} is the fastest with {np.mean(best.lap_times):.3f} s a lap."
     if outside:
         text += f" Outside the borders: {', '.join(outside)}."
     return text + (f" Not completed: {'; '.join(lost)}." if lost else "")
@@ -130,6 +131,7 @@ def _laps(course: Course) -> str:
 
 def _protocol(course: Course) -> dict[str, str]:
     settings, effects = course.settings, course.vehicle.effects
+    weights = ", ".join(f"{name} {value:g}" for name, value in asdict(settings.weights).items())
     return {
         "Track": f"{course.track.name}, {course.track.length:.4g} m, {_laps(course)}",
         "Plant": f"{course.vehicle.name}, {course.plant}"
@@ -139,7 +141,7 @@ def _protocol(course: Course) -> dict[str, str]:
         "Line": f"{course.reference.name}, {course.reference.line.length:.4g} m, {course.reference.lap_time:.3f} s at its "
         f"own speed, {course.reference.full_throttle_time:.3f} s with no more than full throttle",
         "Controller": f"{settings.objective}, {settings.N} steps of {course.vehicle.sampling_time:g} s, late after "
-        f"{1e3 * settings.deadline:g} ms; {settings.weights}",
+        f"{1e3 * settings.deadline:g} ms; weights {weights}, in wheelbases and units of {settings.scale.time:.3g} s",
         "Time": "of a control step: model and plan together, the processor's time on one core",
         "Violation": VIOLATION,
     }

@@ -18,9 +18,9 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
-from dynssm_ros.control.nmpc import Objective, Settings
 from dynssm_ros.control.online import Online
 from dynssm_ros.control.reference import load_reference
+from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, diagnostics, run
 from dynssm_ros.runtime.health import Health, Level
@@ -32,7 +32,7 @@ from dynssm_ros.simulation.plant import Pose
 from dynssm_ros.simulation.tracks import load_track
 from dynssm_ros.vehicle import State, load_vehicle
 
-HORIZON = (2, 100)
+_STEPS = (2, 100)  # of a horizon
 # a controller that was held up goes on from the newest odometry
 _NEWEST = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
 
@@ -76,20 +76,20 @@ class ControllerNode(Node):
         objective: Objective = choose(
             self, "objective", "tracking", get_args(Objective), "To follow the line's speed, or to go as far as can be."
         )
-        horizon = describe(self, "horizon", 15, "Steps of T_s that are planned ahead.", read_only=True)
+        horizon = describe(self, "horizon", 0, "Steps of T_s planned ahead; 0: as the car needs.", read_only=True)
         max_age = describe(
             self, "max_age", 0.5, "Age to which the predictor's coefficients are held (s).", (0.01, 10.0), read_only=True
         )  # fmt: skip
-        if not HORIZON[0] <= horizon <= HORIZON[1]:
-            raise ConfigurationError(f"parameter horizon: {horizon}; expected {HORIZON[0]} to {HORIZON[1]}")
+        if horizon and not _STEPS[0] <= horizon <= _STEPS[1]:
+            raise ConfigurationError(f"parameter horizon: {horizon}; expected {_STEPS[0]} to {_STEPS[1]}, or 0")
         car = load_vehicle(vehicle)
         road = load_track(track).scaled(scale)
         reference = load_reference(line, car, road, pace)
-        settings = replace(Settings.of(car, objective, horizon), deadline=car.sampling_time / self._rate)
+        settings = replace(Settings.of(car, objective, horizon or None), deadline=car.sampling_time / self._rate)
         driver = Online(car, reference, road, settings, max_age, self._watchdog)
         self.get_logger().info(
             f"{car.name} on {road.name} ({road.length:.4g} m), {objective} of the {reference.name} line "
-            f"({reference.lap_time:.4g} s a lap at its own speed), {horizon} steps of {car.sampling_time:g} s"
+            f"({reference.lap_time:.4g} s a lap at its own speed), {settings.N} steps of {car.sampling_time:g} s"
         )
         return driver
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dynssm_ros.control.horizon_model import Car, HorizonModel
-from dynssm_ros.control.nmpc import Nmpc, Settings
+from dynssm_ros.control.nmpc import Nmpc
 from dynssm_ros.control.reference import Reference, load_reference
+from dynssm_ros.control.settings import Settings
 from dynssm_ros.simulation.lines import ClosedLine
 from dynssm_ros.simulation.tracks import Track, load_track
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
@@ -65,7 +67,9 @@ def horizon_model(orca):
 def controller(horizon_model, orca):
     """Builds a controller of the 1:43 car on ``(track, reference)``."""
 
-    def build(track, reference, objective="tracking", deadline=math.inf, **options):
-        return Nmpc(horizon_model, orca.inputs, reference, track, Settings(objective, N, deadline, 0.02), **options)
+    def build(track, reference, objective="tracking", deadline=math.inf, slip=None, **options):
+        settings = replace(Settings.of(orca, objective, N), deadline=deadline)
+        settings = settings if slip is None else replace(settings, slip=slip)
+        return Nmpc(horizon_model, orca.inputs, reference, track, settings, **options)
 
     return build

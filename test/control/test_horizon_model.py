@@ -6,6 +6,7 @@ import pytest
 from dynssm_ros.control.horizon_model import Car, HorizonModel
 from dynssm_ros.runtime.predictor import propagate_pose
 from dynssm_ros.simulation.double_track import DoubleTrack
+from dynssm_ros.simulation.plant import Pose, make_plant
 from dynssm_ros.vehicle import Applied, Coefficients, State, step
 from dynssm_ros.vehicle.effects import EFFECTS
 
@@ -33,8 +34,25 @@ def test_a_step_is_the_single_track_step_plus_the_correction(orca, integrator, s
     np.testing.assert_allclose(x[:3], pose, rtol=1e-12)
 
 
-def test_the_jacobians_are_those_of_the_step(orca):
-    model = HorizonModel(Car(orca.constants, 0.02, (), "rk4", 1), N)
+@pytest.mark.parametrize(("plant", "car", "travel", "off"), [
+    ("euler", ("euler", 1), "start", 1e-12),
+    ("rk4", ("rk4", 2), "middle", 2e-4),
+])  # fmt: skip
+def test_the_true_model_moves_as_its_plant(orca, plant, car, travel, off):
+    """State and pose, in a quick turn; with the other travel the published car would be a millimetre beside where it is."""
+    driven = make_plant(orca, plant, Pose(*NOW[:3]), State(*NOW[3:6]))
+    driven.advance(Applied(*(NOW[6:] + U)))
+    p = np.concatenate([orca.nominal, np.zeros(3), [0.0, 0.0, 12.0]])
+    following = {
+        each: HorizonModel(Car(orca.constants, 0.02, (), *car), N, each).step(NOW, U, p) for each in ("start", "middle")
+    }
+    np.testing.assert_allclose(following[travel][:6], [*driven.pose, *driven.state], rtol=0, atol=off)
+    assert np.hypot(*(following["start"] - following["middle"])[:2]) > 9e-4
+
+
+@pytest.mark.parametrize("travel", ["start", "middle"])
+def test_the_jacobians_are_those_of_the_step(orca, travel):
+    model = HorizonModel(Car(orca.constants, 0.02, (), "rk4", 1), N, travel)
     x, u = np.tile(NOW, (N, 1)) * np.array([[1.0], [1.1], [0.9]]), np.tile(U, (N, 1))
     p = np.tile(parameters(orca), (N, 1))
     following, by_x, by_u = model.linearised(x, u, p)

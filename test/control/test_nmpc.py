@@ -106,6 +106,20 @@ def test_borders_bend_the_plan(orca, circle, controller):
     assert np.max(np.hypot(*plan.x[:, :2].T)) == pytest.approx(1.18, abs=0.012)  # 2 cm short of the border
 
 
+@pytest.mark.parametrize("objective", ["tracking", "progress"])
+def test_no_step_of_a_plan_slides(orca, circle, controller, objective):
+    """On a circle for which the rear axle needs 0.13 rad of slip, a bound of 0.08 is kept and the line is left for it."""
+    track, reference = circle(radius=0.6, speed=2.0)
+    now, most = state_vector((0.6, 0.0, np.pi / 2), (1.9, 0.0, 2.0), (0.4, 0.1)), {}
+    for bound in (0.08, np.inf):
+        nmpc = controller(track, reference, objective, slip=bound)
+        for _ in range(5):
+            plan = nmpc.plan(now, nominal(orca))
+        v_x, v_y, omega = plan.x[1:, 3:6].T
+        most[bound] = np.max(np.abs(np.arctan2(orca.constants.l_r * omega - v_y, v_x)))
+    assert most[0.08] < 0.085 < 0.1 < most[np.inf]
+
+
 def test_progress_is_faster_than_the_line_and_ends_as_slow(orca, circle, controller):
     track, reference = circle(speed=1.5)
     nmpc = controller(track, reference, "progress")

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dynssm_ros.control.nmpc import Settings
 from dynssm_ros.control.online import Laps, Online
 from dynssm_ros.control.pilot import Pilot
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.remote import Remote
+from dynssm_ros.control.settings import Settings
 from dynssm_ros.runtime.health import Level
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
@@ -28,7 +29,7 @@ def online(orca, club):
 
     def build(line="centre", pace=0.7, N=10, **options):
         reference = load_reference(line, orca, club, pace)
-        return Online(orca, reference, club, Settings("tracking", N, margin=0.02), **options)
+        return Online(orca, reference, club, replace(Settings.of(orca, N=N), deadline=math.inf), **options)
 
     return build
 
@@ -226,7 +227,7 @@ def test_brakes_hold_the_steering(online, orca, club):
 
 def test_late_plans_are_counted_and_told(orca, club):
     reference = load_reference("centre", orca, club, 0.7)
-    controller = Online(orca, reference, club, Settings("tracking", 10, deadline=0.0, margin=0.02))
+    controller = Online(orca, reference, club, replace(Settings.of(orca, N=10), deadline=0.0))
     car = Car(orca, club)
     for _ in range(5):
         assert isinstance(car.answered(controller), Applied)

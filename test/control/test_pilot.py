@@ -2,26 +2,26 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dynssm_ros.control.learned import Adaptive, true_model
-from dynssm_ros.control.nmpc import Settings
 from dynssm_ros.control.pilot import Pilot
+from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.runtime.models import Persistence, SingleTrack
 from dynssm_ros.simulation.plant import Pose, make_plant
 from dynssm_ros.vehicle import Applied, State
-
-SETTINGS = Settings("tracking", 10, math.inf, 0.02)
 
 
 @pytest.fixture
 def pilot(orca, club, club_line):
     """Builds a pilot on the small track."""
 
-    def build(knowledge=None, settings=SETTINGS, **options):
+    def build(knowledge=None, deadline=math.inf, **options):
+        settings = replace(Settings.of(orca, N=10), deadline=deadline)
         return Pilot(knowledge or true_model(orca, "rk4"), orca.inputs, club_line, club, settings, **options)
 
     return build
@@ -117,8 +117,7 @@ def test_the_deadline_counts_the_model_too(orca, pilot, on_line):
                 next(now)
             return super().predict(windows)
 
-    settings = Settings("tracking", 10, 0.5, 0.02)
-    driver = pilot(Adaptive(Slow(orca), orca), settings, clock=lambda: next(now) / 100)
+    driver = pilot(Adaptive(Slow(orca), orca), 0.5, clock=lambda: next(now) / 100)
     pose, state = on_line
     first = driver.step(0.0, pose, state, Applied(0.0, 0.0))
     second = driver.step(0.02, pose, state, first.command)

@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 
 from dynssm_ros.control.learned import load_knowledge, true_model
-from dynssm_ros.control.nmpc import Settings
-from dynssm_ros.control.race import Course, Start, race
-from dynssm_ros.control.reference import Reference
+from dynssm_ros.control.race import Course, Start, _Drive, race
+from dynssm_ros.control.reference import Reference, load_reference
 from dynssm_ros.control.report import driven_coefficients, race_json, race_report, race_table, summary
+from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.laps import SimulationError
+from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.vehicle import load_vehicle
 
 
 @pytest.fixture(scope="module")
 def course(orca, club, club_line):
-    return Course(orca, club, "euler", club_line, Settings("tracking", 15, 0.02, 0.02))
+    return Course(orca, club, "euler", club_line, Settings.of(orca))
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +33,22 @@ def test_the_true_model_completes_a_lap_close_to_what_the_line_allows(lap, cours
     assert (lap.infeasible, lap.late) == (0, 0)
     assert lap.lap_times[0] == pytest.approx(course.reference.lap_time, rel=0.03)
     assert len(lap.time) == int(lap.lap_times[0] / 0.02) + 2
+
+
+@pytest.mark.parametrize("objective", ["tracking", "progress"])
+def test_the_full_size_car_takes_a_bend_at_its_limit(objective):
+    """The AV-21 by its own defaults: braking from 41 m/s for a bend that it can take with 35."""
+    car, track = load_vehicle("av21"), load_track("road_course")
+    reference = load_reference("racing", car, track)
+    course = Course(car, track, "rk4", reference, Settings.of(car, objective), start=Start(s=600.0))
+    drive = _Drive(course, true_model(car, "rk4"))
+    assert all(drive.step() is None for _ in range(60))
+    driven = drive.result("true", "")
+    beside = reference.line.project(driven.pose[:, :2])[1]
+    assert driven.outside == 0.0
+    assert np.max(np.abs(beside)) < 2.0
+    assert driven.s[-1] > 680.0
+    assert (driven.infeasible, driven.late) == (0, 0)
 
 
 def test_commands_respect_the_actuators(lap, orca):
@@ -61,7 +79,7 @@ def test_the_report_shows_every_model(lap, course, orca, tmp_path):
     other = replace(lap, name="other", theta=lap.theta * np.linspace(1, 1.1, len(lap.time))[:, None], failure="spins")
     race_report([lap, other]).save(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
-    for words in ("Trajectories", "Coefficients", "other", "Forces", "rolling"):
+    for words in ("Trajectories", "Coefficients", "other", "Forces", "rolling", "weights along 1, across 1"):
         assert words in text
     assert "Not completed: other spins" in summary([lap, other])
     assert len(race_table([lap, other]).cells) == 2
@@ -123,5 +141,5 @@ def test_what_effects_amount_to_is_told_as_coefficients(lap, course, orca):
 
 def test_a_road_narrower_than_the_car_is_refused(course, orca, club):
     path = replace(club, width_left=club.width_left / 12, width_right=club.width_right / 12)
-    with pytest.raises(SimulationError, match=r"track club is 0.0333 m wide .* more than 0.04 m, the width of orca"):
+    with pytest.raises(SimulationError, match=r"track club is 0.0333 m wide .* more than 0.0403 m, the width of orca"):
         race(replace(course, track=path), true_model(orca, "euler"))

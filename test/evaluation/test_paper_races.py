@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import shutil
 
+import numpy as np
 import pytest
 import yaml
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.evaluation.paper.plan import load_plan
 from dynssm_ros.evaluation.paper.race_document import write_races
+from dynssm_ros.evaluation.paper.race_figures import lap_over_pace
 from dynssm_ros.evaluation.paper.racing import NUMBERS
 from dynssm_ros.evaluation.paper.reference import load_reference
 from dynssm_ros.evaluation.paper.results import Made, read_results
@@ -77,6 +80,43 @@ def test_the_document_sets_the_papers_rows_beside(plan, root, tmp_path):
     assert "Lap time against the plant's own model: `single_track`" in text
     assert (tmp_path / "results_race_lap_coefficients.png").is_file()
     assert "](results_race_lap_coefficients.png)" in text
+
+
+def test_races_that_differ_in_their_pace_make_a_figure_together(plan, root, tmp_path):
+    """Three of them do, two do not; the published times are those of the race that has them beside."""
+    lap = plan.races["lap"]
+    laps = {f"lap_{k}": lap.model_copy(update={"pace": 0.8 + k / 10, "paper": None}) for k in range(3)}
+    laps["lap_0"] = laps["lap_0"].model_copy(update={"paper": "ETHZMobil", "title": "The first"})
+    driven = json.loads((root / race_key("lap") / NUMBERS).read_text())
+    for k, name in enumerate(laps):
+        (tmp_path / race_key(name)).mkdir(parents=True)
+        driven["models"]["single_track"]["lap_time_s"] = None if k == 2 else 9.0
+        (tmp_path / race_key(name) / NUMBERS).write_text(json.dumps(driven))
+        shutil.copy(root / race_key("lap") / "coefficients.png", tmp_path / race_key(name))
+    for count, shown in ((3, True), (2, False)):
+        some = plan.model_copy(update={"races": dict(list(laps.items())[:count])})
+        done = {race_key(name): Outcome("done") for name in some.races}
+        text = document(some, tmp_path, done, tmp_path / f"{count}.md")
+        assert ("](3_lap_0_pace.png)" in text) == shown
+        assert (tmp_path / f"{count}_lap_0_pace.png").is_file() == shown
+
+
+def test_lap_times_over_the_pace(tmp_path):
+    """What was completed is a line, what was not a mark at the top, and the paper's times are level."""
+    figure = lap_over_pace(
+        {"a": {0.8: 6.0, 0.9: 5.5, 1.0: None}, "b": {0.8: 6.5, 0.9: 6.4, 1.0: 6.3}},
+        {"the line": {0.8: 5.9, 0.9: 5.2, 1.0: 4.7}},
+        {"theirs": 4.88},
+    )
+    (axes,) = figure.axes
+    lines = {line.get_label(): line for line in axes.lines if not line.get_label().startswith("_")}
+    np.testing.assert_array_equal(lines["a"].get_ydata(), [6.0, 5.5, np.nan])
+    np.testing.assert_array_equal(lines["the line"].get_xdata(), [0.8, 0.9, 1.0])
+    top = axes.get_ylim()[1]
+    lost = [line for line in axes.lines if line.get_linestyle() == "None" and len(line.get_ydata())]
+    assert [list(line.get_ydata()) for line in lost] == [[top]]
+    assert [text.get_text() for text in axes.texts] == ["theirs: 4.88 s"]
+    figure.savefig(tmp_path / "pace.png")
 
 
 def test_a_race_that_could_not_be_driven_says_why(plan, root, tmp_path):

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel, config_root
 from dynssm_ros.control.learned import TRUE
-from dynssm_ros.control.nmpc import Objective
+from dynssm_ros.control.settings import Objective
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma
 from dynssm_ros.signals.signal_map import Commands
@@ -139,7 +139,7 @@ class Race(StrictModel):
     objective: Objective = "tracking"
     line: str = Field(default="racing", description="centre, racing, or file relative to the data folder")
     pace: float = Field(default=1.0, gt=0)
-    horizon: int = Field(default=15, ge=2)
+    horizon: int | None = Field(default=None, ge=2, description="null: as the car needs")
     laps: int = Field(default=1, ge=1)
     speed: float | None = Field(default=None, ge=0, description="at the start (m/s); null: the line's own")
     split: str = Field(description="on whose training part the models were trained, with seed 0")

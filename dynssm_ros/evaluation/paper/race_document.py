@@ -6,9 +6,12 @@ import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 from dynssm_ros.control.learned import TRUE
 from dynssm_ros.evaluation.paper.document import MADE_BY
 from dynssm_ros.evaluation.paper.plan import MID_RANGE, Race
+from dynssm_ros.evaluation.paper.race_figures import lap_over_pace
 from dynssm_ros.evaluation.paper.reference import ClosedLoop
 from dynssm_ros.evaluation.paper.results import Entry, Results
 from dynssm_ros.evaluation.paper.schedule import race_key
@@ -28,7 +31,10 @@ _CAPTIONS = {
     "profiles": "State and commands over the lap",
     "forces": "Forces over the lap",
     "coefficients": "What each model told the controller over the lap",
+    "pace": "Lap time over the factor on the line's speed; hollow at the top: not completed",
 }
+_SWEEP = 3  # races that differ in nothing but their pace and make a figure together
+_DPI = 130
 
 
 def write_races(results: Results, root: Path, path: Path) -> None:
@@ -40,8 +46,42 @@ def write_races(results: Results, root: Path, path: Path) -> None:
             pictures[name][figure] = f"{path.stem}_{name}_{figure}.png"
             with replacing(path.with_name(pictures[name][figure])) as aside:
                 shutil.copyfile(root / race_key(name) / f"{figure}.png", aside)
+    for names in _sweeps(results):
+        pictures[names[-1]]["pace"] = f"{path.stem}_{names[0]}_pace.png"
+        with replacing(path.with_name(pictures[names[-1]]["pace"])) as aside:
+            _over_pace(results, names).savefig(aside, format="png", dpi=_DPI, metadata={"Software": None})
     with replacing(path) as aside:
         aside.write_text(races_markdown(results, pictures), encoding="utf-8")
+
+
+def _sweeps(results: Results) -> list[list[str]]:
+    """Names of measured races that differ in nothing but their pace, in the plan's order."""
+    alike: dict[str, list[str]] = {}
+    for name in results.races:
+        told_apart = {"title", "text", "paper", "pace", "figures"}
+        alike.setdefault(results.plan.races[name].model_dump_json(exclude=told_apart), []).append(name)
+    return [names for names in alike.values() if len(names) >= _SWEEP]
+
+
+def _over_pace(results: Results, names: list[str]) -> Figure:
+    """Their lap times, what the line allows, and the paper's."""
+    races, driven = [results.plan.races[name] for name in names], [results.races[name] for name in names]
+    models = [model for model in races[0].models if model in driven[0]["models"]]
+    over = list(zip((race.pace for race in races), driven, strict=True))
+    laps = {
+        _NAMES.get(model, model): {pace: entry["models"][model]["lap_time_s"] for pace, entry in over}
+        for model in models
+    }
+    bounds = {
+        "the line at its own speed": {pace: entry["line_lap_time_s"] for pace, entry in over},
+        "the same with no more than full throttle": {pace: entry["line_full_throttle_s"] for pace, entry in over},
+    }
+    published = {
+        f"{name}, the paper's": row.lap_time for race in races for name, row in _published(results, race).items()
+    }
+    return lap_over_pace(
+        laps, bounds, {f"{name}, the paper's": lap for name, lap in published.items() if lap is not None}
+    )
 
 
 def races_markdown(results: Results, pictures: Mapping[str, Mapping[str, str]]) -> str:

@@ -10,10 +10,10 @@ from typing import Any, get_args
 
 from dynssm_ros.control import report
 from dynssm_ros.control.learned import Knowledge, load_knowledge
-from dynssm_ros.control.nmpc import Settings
 from dynssm_ros.control.race import Course, Start
 from dynssm_ros.control.race import race as drive
 from dynssm_ros.control.reference import load_reference
+from dynssm_ros.control.settings import Settings
 from dynssm_ros.evaluation.paper.plan import MID_RANGE, Race
 from dynssm_ros.evaluation.paper.steps import Step, digest, in_data, named_track
 from dynssm_ros.files import replacing, write_json

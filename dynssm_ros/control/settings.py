@@ -1,0 +1,134 @@
+"""How the controller works, the same for cars of any size: its weights and its horizon are in units of the car.
+
+A car that is 48 times as long drives the same lap in its own lengths and times, if it grips as well. So lengths are
+measured in wheelbases, and times in that in which the car's grip moves it sideways by half of one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from dynssm_ros.control.horizon_model import Travel
+from dynssm_ros.simulation.racing_line import CAR_WIDTH
+from dynssm_ros.simulation.speed_profile import vehicle_limits
+from dynssm_ros.vehicle import Coefficients, Vehicle
+from dynssm_ros.vehicle.single_track import shape
+
+Objective = Literal["tracking", "progress"]
+
+HORIZON = 3.5  # in units of the car's time: 15 steps of 20 ms for the 1:43 car, 40 of 40 ms for an Indy car
+_GRIP_USED = 0.95  # share of the rear tyres' force in a car that is not sliding: there is hardly more, and no way back
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What a car's motion is measured in.
+
+    Attributes:
+        length: wheelbase (m).
+        time: square root of wheelbase over lateral grip (s).
+    """
+
+    length: float
+    time: float
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> Scale:
+        """That of a car, with the grip that it has at any speed.
+
+        Raises:
+            UserError: the car cannot drive, brake or corner.
+        """
+        wheelbase = vehicle.constants.l_f + vehicle.constants.l_r
+        return cls(wheelbase, math.sqrt(wheelbase / float(np.min(vehicle_limits(vehicle).lateral))))
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What the controller minimises, in units of the car's :class:`Scale`, integrated over the horizon.
+
+    Attributes:
+        along: of the squared distance from the reference point along the line.
+        across: likewise across it.
+        progress: gain per length that the horizon's last point lies further along the line.
+        throttle: of the squared rate of the throttle (fraction per time).
+        steering: of the squared rate of the steering (rad per time).
+        border: price of the distance beyond a border or the rear slip beyond its bound (rad), whichever is larger, and of
+            its square.
+        ending: price of speed above the line's own at the end of the horizon, and of its square; 0: it is not bounded.
+    """
+
+    along: float
+    across: float
+    progress: float
+    throttle: float = 0.07
+    steering: float = 15.0
+    border: float = 160.0
+    ending: float = 0.0
+
+
+WEIGHTS: Mapping[Objective, Weights] = {
+    # for the 1:43 car Q and R of the literature: bayesrace and Deep Dynamics
+    "tracking": Weights(along=1.0, across=1.0, progress=0.0),
+    # a point of the last plan draws as the reference does, so that no plan strays from where it was linearised
+    "progress": Weights(along=1.0, across=1.0, progress=0.6, ending=500.0),
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the controller works.
+
+    Attributes:
+        scale: of the car.
+        objective: ``tracking`` follows the reference at its own speed; ``progress`` goes as far as it can between the
+            borders, to where it can go on from: no faster than the reference is there.
+        N: steps of the horizon.
+        deadline: time (s) after which a plan comes too late and is not used.
+        margin: distance to keep between the car's centre and the borders (m).
+        slip: slip angle of the rear axle from which on the car slides (rad), which no step is to reach.
+        travel: what carries the pose over a step.
+    """
+
+    scale: Scale
+    objective: Objective = "tracking"
+    N: int = 15
+    deadline: float = math.inf
+    margin: float = 0.0
+    slip: float = math.inf
+    travel: Travel = "middle"
+
+    @classmethod
+    def of(cls, vehicle: Vehicle, objective: Objective = "tracking", N: int | None = None) -> Settings:
+        """For a car: a plan has a control period of time, half the car stays within the borders.
+
+        Args:
+            vehicle: the car as its file describes it.
+            objective: see above.
+            N: steps of the horizon; ``None``: ``HORIZON``.
+
+        Raises:
+            UserError: the car cannot drive, brake or corner.
+        """
+        scale = Scale.of(vehicle)
+        steps = round(HORIZON * scale.time / vehicle.sampling_time) if N is None else N
+        half_width = CAR_WIDTH * scale.length / 2
+        slip = _sliding(Coefficients(*vehicle.nominal))
+        return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip)
+
+    @property
+    def weights(self) -> Weights:
+        """Those of the objective."""
+        return WEIGHTS[self.objective]
+
+
+def _sliding(theta: Coefficients) -> float:
+    """Slip angle (rad) at which the rear tyres give ``_GRIP_USED`` of what they can."""
+    slip = np.linspace(0.0, 1.0, 1001)
+    force = np.sin(theta.C_r * shape(np, theta.B_r, theta.E_r, slip))
+    return float(slip[np.argmax(force >= _GRIP_USED * np.max(force))])
