@@ -174,9 +174,11 @@ def confusion(hidden: Sequence[str], named: Sequence[str], count: npt.NDArray[np
     """
     figure = Figure(figsize=(WIDTH, 0.72 * WIDTH + 1.2), layout="constrained")
     panel = figure.subplots()
-    panel.imshow(count / np.maximum(count.sum(axis=1, keepdims=True), 1), cmap="Blues", vmin=0, vmax=1.2)
+    share = count / np.maximum(count.sum(axis=1, keepdims=True), 1)
+    panel.imshow(share, cmap="Blues", vmin=0, vmax=1.2)
     for i, j in np.argwhere(count > 0):
-        panel.text(j, i, str(count[i, j]), ha="center", va="center", fontsize=8)
+        ink = "white" if share[i, j] > 0.5 else "black"
+        panel.text(j, i, str(count[i, j]), ha="center", va="center", fontsize=8, color=ink)
     panel.set_xticks(range(len(named)), named, rotation=90, fontsize=8)
     panel.set_yticks(range(len(hidden)), hidden, fontsize=8)
     panel.set(xlabel="named first", ylabel="hidden")

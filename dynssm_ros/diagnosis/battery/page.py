@@ -35,8 +35,8 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
     yield "# Hidden causes"
     yield ""
     yield (
-        f"Made by `python -m dynssm_ros.diagnosis.battery`: {len(outcomes)} simulated drives with hidden effects, seeds "
-        f"{seed} to {seed + len(of) - 1}"
+        f"Made by `python -m dynssm_ros.diagnosis.battery --seed {seed}`: {len(outcomes)} simulated drives with hidden "
+        f"effects, seeds {seed} to {seed + len(of) - 1}"
         + (f", without {undriven} whose car could not be driven" if undriven else "")
         + ". How they are drawn and what counts as just noticeable: the command's `--help`."
     )

@@ -79,9 +79,7 @@ def _over_pace(results: Results, names: list[str]) -> Figure:
     published = {
         f"{name}, the paper's": row.lap_time for race in races for name, row in _published(results, race).items()
     }
-    return lap_over_pace(
-        laps, bounds, {f"{name}, the paper's": lap for name, lap in published.items() if lap is not None}
-    )
+    return lap_over_pace(laps, bounds, {name: lap for name, lap in published.items() if lap is not None})
 
 
 def races_markdown(results: Results, pictures: Mapping[str, Mapping[str, str]]) -> str:

@@ -48,13 +48,13 @@ def lap_over_pace(
         axes.plot(lost, [top] * len(lost), linestyle="", markerfacecolor="none", clip_on=False, **look)
     for style, (words, by_pace) in zip(_STYLES, bounds.items(), strict=False):
         axes.plot(*zip(*sorted(by_pace.items()), strict=True), color=MEASURED, linestyle=style, label=words)
-    right = max(pace for by_pace in laps.values() for pace in by_pace)
+    left = min(pace for by_pace in laps.values() for pace in by_pace)  # where all are slower than what is published
     for words, lap in published.items():
         axes.axhline(lap, color=NO_MODEL, linewidth=0.9, zorder=1)
         above = not any(0 < other - lap < _CLOSE for other in published.values())
         axes.annotate(
-            f"{words}: {lap:.2f} s", (right, lap), textcoords="offset points", xytext=(0, 2 if above else -2),
-            va="bottom" if above else "top", fontsize=8, ha="right",
+            f"{words}: {lap:.2f} s", (left, lap), textcoords="offset points", xytext=(0, 2 if above else -2),
+            va="bottom" if above else "top", fontsize=8, ha="left",
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
         )  # fmt: skip
     axes.set(xlabel="factor on the line's speed", ylabel="lap (s)", ylim=(None, top))
