@@ -196,15 +196,15 @@ def diagnose(
     causes = tuple(_cause(one, found, at, std) for one in selection.chosen)
     left = systematic(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], study.block)
     white = fit.noise.whiten(fit.errors)
-    far = (weights(white)[:, None] * white**2).mean(axis=1)
-    spread = bunched(far, windows.time, study.block, selection.inflation)
+    in_noise = weights(white) * (white**2).mean(axis=1)
+    together = bunched(in_noise, windows.time, study.block, selection.inflation)
     return Diagnosis(
-        "effects" if causes else "unexplained" if left.is_there or spread.is_there else "none",
+        "effects" if causes else "unexplained" if left.is_there or together.is_there else "none",
         causes,
         fit.car.extended(np.minimum(std[:17], 1.0) * knowledge(vehicle)),
         gain,
         left,
-        spread,
+        together,
         sizes,
         selection,
         fit.car,

@@ -179,7 +179,7 @@ class Study:
         Args:
             car: where to start; has the effects of ``free``.
             free: which of their parameters are fitted.
-            near: a fit of a like car, whose noise and derivatives serve to begin with.
+            near: a fit of a like car, whose derivatives serve to begin with.
             rounds: of linearising anew, at most.
             rough: whether it may end with the derivatives of ``near``.
         """

@@ -22,7 +22,7 @@ Indices = npt.NDArray[np.intp]
 
 _FINEST = 16  # integration steps per sampling time, at most
 WARM_UP = 0.64  # s of measured rows along which a simulation is led before it runs free
-_FOLLOWING = 0.16  # s, within which a simulation that is led settles to what is measured: a quarter of the way in noise
+_FOLLOWING = 0.16  # s, time constant with which a simulation that is led follows the measured rows
 _WILD = 1e3  # a prediction farther off than this many spreads of its channel counts as that far
 
 

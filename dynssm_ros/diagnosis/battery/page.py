@@ -44,8 +44,9 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
     yield f"| rate | cases | share | 95 % interval | goal | {' | '.join(_PLANTS.values())} |"
     yield f"| --- | --- | --- | --- | --- |{' --- |' * len(_PLANTS)}"
     by_plant = [rates([o for case, o in of if o is not None and case.plant == plant]) for plant in _PLANTS]
+    overall = rates(outcomes)
     for name, words in _IN_WORDS.items():
-        rate = rates(outcomes)[name]
+        rate = overall[name]
         if rate["of"]:
             low, high = rate["interval_95"]
             goal = "" if name not in GOALS else f"{'<=' if name == 'false_alarms' else '>='} {100 * GOALS[name]:.0f} %"
