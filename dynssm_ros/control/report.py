@@ -20,7 +20,7 @@ from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDe
 from dynssm_ros.vehicle.single_track import Motion, shape
 
 _STAMPS = 0.5  # s between the time stamps on the map
-_MOVED = 1e-3  # share of its value by which a coefficient moves for that to be shown
+_MOVED = 1e-3  # share of its value that a coefficient must move, and of a state's range that must be added, to be shown
 VIOLATION = "A violation is the car's centre of gravity outside the borders at any sample."
 
 
@@ -242,7 +242,7 @@ def driven_coefficients(race: Race) -> dict[str, Any]:
 
 @styled
 def coefficients(races: Sequence[Race]) -> Figure:
-    """The coefficients that a model or the driven car's effects move, and the corrections, over the position on the track."""
+    """The coefficients that a model or the driven car's effects move, and what models add, over the position on the track."""
     longest = max(races, key=lambda race: race.s[-1] - race.s[0])
     driven = driven_coefficients(longest)
     moved = np.any([np.ptp(race.theta, axis=0) > _MOVED * np.max(np.abs(race.theta), axis=0) for race in races], axis=0)
@@ -250,7 +250,10 @@ def coefficients(races: Sequence[Race]) -> Figure:
     labels = {name: f"{name} ({unit})" if (unit := coefficient_unit(name)) else name for name in COEFFICIENTS}
     rows = [(labels[COEFFICIENTS[k]], [race.theta[:, k] for race in races]) for k in moving]
     rows += [
-        (f"{SYMBOLS[c]} added ({UNITS[c]})", [race.correction[:, k] for race in races]) for k, c in enumerate(CHANNELS)
+        (f"{SYMBOLS[c]} added ({UNITS[c]})", [race.correction[:, k] for race in races])
+        for k, c in enumerate(CHANNELS)
+        if not moving
+        or any(np.max(np.abs(race.correction[:, k])) > _MOVED * np.ptp(race.state[:, k]) for race in races)
     ]
     return _panels(races, rows, {labels[name]: values for name, values in driven.items()}, longest)
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat, field_validator, model_validator
 
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.runtime.artifact import ModelKind
+from dynssm_ros.vehicle import COEFFICIENTS
 from dynssm_ros.vehicle.single_track import Integrator
 
 
@@ -48,6 +49,31 @@ class AdaptationConfig(StrictModel):
 
     hidden: int = Field(ge=1, description="size of the physics-conditioned feature c_t")
     alpha: float = Field(gt=0, le=1, description="alpha_theta, largest deviation as a fraction of the admissible range")
+
+
+class IdentificationConfig(StrictModel):
+    """Beyond the paper: changes of a few coefficients are estimated from the physics' past errors in the window."""
+
+    spread: dict[str, PositiveFloat] = Field(
+        min_length=1,
+        description="standard deviation of each coefficient's change, in its unit, before anything is seen",
+    )
+    noise: float = Field(
+        default=0.03,
+        gt=0,
+        description="standard deviation of one-step errors that are not the coefficients', in units of s_delta",
+    )
+    steps: int = Field(ge=1, description="steps of the window that the estimate is of")
+    rounds: int = Field(
+        default=2, ge=1, description="of linearisation; one will do where changes are small and come one at a time"
+    )
+
+    @field_validator("spread")
+    @classmethod
+    def _known(cls, value: dict[str, float]) -> dict[str, float]:
+        if unknown := [name for name in value if name not in COEFFICIENTS]:
+            raise ValueError(f"unknown {', '.join(unknown)}; expected some of {' '.join(COEFFICIENTS)}")
+        return value
 
 
 class ResidualConfig(StrictModel):
@@ -201,6 +227,7 @@ class ModelConfig(StrictModel):
     dense: DenseConfig | None = None
     fusion: FusionConfig | None = None
     physics: PhysicsConfig | None = None
+    identification: IdentificationConfig | None = None
     adaptation: AdaptationConfig | None = None
     residual: ResidualConfig | None = None
     memory: MemoryConfig | None = None
@@ -240,6 +267,12 @@ class ModelConfig(StrictModel):
         rows = self.H - 1 if changes else self.H  # the first row's change is not in the window
         if (self.inputs.physics_errors or self.memory is not None) and self.physics is None:
             raise ValueError("inputs.physics_errors and memory need physics, whose errors they are")
+        if self.identification is not None and self.adaptation is None:
+            raise ValueError("identification needs adaptation, which starts from it")
+        if self.identification is not None and self.identification.steps > self.H - 1:
+            raise ValueError(
+                f"identification.steps: {self.identification.steps}; a window of {self.H} rows has {self.H - 1}"
+            )
         if rows < 1 or (self.inputs.rows or 1) > rows:
             raise ValueError(f"inputs.rows: {self.inputs.rows}; a window of {self.H} rows has {rows} of them")
         if changes and self.residual is not None and self.residual.inputs == "raw":
@@ -280,7 +313,7 @@ class ModelConfig(StrictModel):
         return self.model_copy(update=updated)
 
 
-_OF_DYNSSM = ("ssm", "fusion", "adaptation", "residual", "memory", "hindcast")
+_OF_DYNSSM = ("ssm", "fusion", "identification", "adaptation", "residual", "memory", "hindcast")
 # the blocks that a kind needs, and those that it does not have
 _BLOCKS: dict[ModelKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "dynssm": (("fusion", "loss"), ("dense", "fine_tuning")),

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from dynssm_ros.learning.configuration import ModelConfig, PhysicsConfig
 from dynssm_ros.learning.encoders import Fusion
+from dynssm_ros.learning.identification import Identification
 from dynssm_ros.learning.memory import ErrorMemory, Hindcast, Increments, centred, limited
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
@@ -157,6 +158,7 @@ class DynSSM(nn.Module):
         self.fusion = Fusion(width, config.ssm, config.gru, config.fusion)
         self.physics = PhysicsLayer(vehicle, config.physics) if config.physics else None
         self.head = ParameterHead(config, vehicle, latent + width) if config.adaptation else None
+        self.identification = Identification(config.identification, vehicle) if config.identification else None
         self.memory = ErrorMemory(config.memory) if config.memory else None
         self.hindcast = Hindcast(config.hindcast) if config.hindcast else None
         conditioned = config.adaptation.hidden if config.adaptation else latent
@@ -177,7 +179,7 @@ class DynSSM(nn.Module):
         conditioned = self.fusion(seen)
         theta = deviation = None
         if self.head is not None:
-            theta, deviation, conditioned = self.head(conditioned, latest, self.nominal)
+            theta, deviation, conditioned = self.head(conditioned, latest, self._nominal(window, increments))
         elif self.physics is not None:
             theta = self.nominal.expand(window.shape[0], -1)  # not len(), which an export would freeze
         step = self._step(window, increments, theta)
@@ -199,6 +201,19 @@ class DynSSM(nn.Module):
             if self.hindcast.config.uncertainty:
                 variance = self.hindcast.spread(*hindsight) * self.increment_scale.square()
         return Output(moved, step.physics, theta, deviation, correction, variance)
+
+    def _nominal(self, window: Tensor, increments: Tensor) -> Tensor:
+        """theta_0, which adaptation starts from: ``(17,)``, or as the window tells it ``(B, 17)``."""
+        if self.identification is None:
+            return self.nominal
+        physics = self.physics
+        assert physics is not None
+        steps = self.identification.config.steps
+        rows = window[:, -steps - 1 : -1, None]
+        theta: Tensor = self.identification(
+            increments[:, -steps:], lambda cars: physics(rows, cars[:, None]) / self.increment_scale, self.nominal
+        )
+        return theta
 
     def _seen(self, window: Tensor, increments: Tensor) -> Tensor:
         """What the encoders read, ``(B, rows, features)``."""

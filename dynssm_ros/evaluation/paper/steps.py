@@ -199,7 +199,9 @@ class Train(Step):
     def recipe(self) -> dict[str, Any]:
         """Model file, rows and, unless calibrated, the car."""
         car = None if self.vehicle in self.needs else load_vehicle(self.vehicle).model_dump(mode="json")
-        return _data(self.part, self.commands) | {"model": self._config().model_dump(mode="json"), "vehicle": car}
+        # a part that the model does not have is no part of the recipe, also if an earlier version did not know it
+        model = self._config().model_dump(mode="json", exclude_none=True)
+        return _data(self.part, self.commands) | {"model": model, "vehicle": car}
 
     def make(self, root: Path, there: frozenset[str]) -> None:
         """Trains it; after a kill from where it was. The checkpoint stays, for what starts from this model."""
