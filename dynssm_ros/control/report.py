@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from dynssm_ros.control.race import Course, Race
@@ -242,10 +243,14 @@ def driven_coefficients(race: Race) -> dict[str, Any]:
 
 @styled
 def coefficients(races: Sequence[Race]) -> Figure:
-    """The coefficients that a model or the driven car's effects move, and what models add, over the position on the track."""
+    """The coefficients that a model or the driven car's effects move, and what models add, over the position on the track.
+
+    Where effects are hidden in the car, what a model says once and for all is not shown: it does not answer to them.
+    """
     longest = max(races, key=lambda race: race.s[-1] - race.s[0])
     driven = driven_coefficients(longest)
-    moved = np.any([np.ptp(race.theta, axis=0) > _MOVED * np.max(np.abs(race.theta), axis=0) for race in races], axis=0)
+    told = [race.theta[_first_change(race.theta) if driven else 0 :] for race in races]
+    moved = np.any([np.ptp(theta, axis=0) > _MOVED * np.max(np.abs(theta), axis=0) for theta in told], axis=0)
     moving = [k for k, name in enumerate(COEFFICIENTS) if moved[k] or name in driven]
     labels = {name: f"{name} ({unit})" if (unit := coefficient_unit(name)) else name for name in COEFFICIENTS}
     rows = [(labels[COEFFICIENTS[k]], [race.theta[:, k] for race in races]) for k in moving]
@@ -256,6 +261,11 @@ def coefficients(races: Sequence[Race]) -> Figure:
         or any(np.max(np.abs(race.correction[:, k])) > _MOVED * np.ptp(race.state[:, k]) for race in races)
     ]
     return _panels(races, rows, {labels[name]: values for name, values in driven.items()}, longest)
+
+
+def _first_change(theta: npt.NDArray[np.float64]) -> int:
+    """The first row that is not the first one repeated: where a model begins to speak; 0 if it never does."""
+    return int(np.argmax(np.any(theta != theta[0], axis=1)))
 
 
 def _panels(

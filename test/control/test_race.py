@@ -8,12 +8,12 @@ import pytest
 from dynssm_ros.control.learned import load_knowledge, true_model
 from dynssm_ros.control.race import Course, Start, _Drive, race
 from dynssm_ros.control.reference import Reference, load_reference
-from dynssm_ros.control.report import driven_coefficients, race_json, race_report, race_table, summary
+from dynssm_ros.control.report import coefficients, driven_coefficients, race_json, race_report, race_table, summary
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.simulation.tracks import load_track
-from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, State, load_vehicle
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +137,22 @@ def test_what_effects_amount_to_is_told_as_coefficients(lap, course, orca):
     assert np.mean(np.isfinite(told["D_f"])) > 0.5
     np.testing.assert_allclose(told["S_hf"], -0.0013 + 0.01, rtol=1e-9)
     assert driven_coefficients(lap) == {}
+
+
+def test_the_figure_of_a_hidden_effect_shows_what_answers_to_it(lap, course, orca):
+    """Not what a model says once and for all, which without an effect is what tells models apart."""
+    steady, following = lap.theta.copy(), lap.theta.copy()
+    steady[15:, COEFFICIENTS.index("B_r")] = 6.0
+    following[:, COEFFICIENTS.index("D_f")] *= np.linspace(1.0, 0.8, len(following))
+    races = [replace(lap, name="steady", theta=steady), replace(lap, name="following", theta=following)]
+
+    def shown(races):
+        return [panel.get_ylabel() for panel in coefficients(races).axes if panel.get_visible()]
+
+    assert shown(races) == ["D_f (N)", "B_r (1/rad)"]
+    slick = replace(course, vehicle=orca.with_effect("front_grip", {"factor": 0.8}))
+    assert shown([replace(race, course=slick) for race in races]) == ["D_f (N)"]
+    assert len(shown([lap])) == len(State._fields), "nothing moves and nothing is added"
 
 
 def test_a_road_narrower_than_the_car_is_refused(course, orca, club):
