@@ -4,8 +4,11 @@ The plan of the step before, moved on by one step, is where dynamics, borders an
 shooting: its gaps are closed by the program). The states are then eliminated, so that what is left to optimise are the
 ``2 N`` increments of throttle and steering and a slack per soft constraint: a dense program for an active-set solver.
 
-Actuator limits are hard; the borders, the rear slip, and the speed at the end of the horizon where the objective asks for it
-are soft with a linear penalty, so that a program is feasible wherever the car is.
+Actuator limits are hard; the borders, the slip of both axles, and the speed at the end of the horizon where the objective
+asks for it are soft with a linear penalty, so that a program is feasible wherever the car is.
+
+Tracking follows a schedule: the place where a car that keeps the line's own time would be now. One that is behind or ahead is
+asked to catch up, or to wait; but the schedule is never further away than a leash, so what cannot be made up for is forgiven.
 
 Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control", 2005.
 """
@@ -25,7 +28,6 @@ from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.simulation.tracks import Track
 from dynssm_ros.vehicle import COEFFICIENTS, Applied
-from dynssm_ros.vehicle.effects.base import SLOWEST
 from dynssm_ros.vehicle.parameters import InputLimits
 
 Vector = npt.NDArray[np.float64]
@@ -107,10 +109,10 @@ class Nmpc:
         self._track = track
         self._clock = clock
         self._plan: Plan | None = None
-        self._on_track = self._on_line = 0.0
+        self._on_track = self._on_line = self._scheduled = 0.0
         N = settings.N
         self._variables = 2 * N + N + 1  # increments, slacks of the steps, slack of the end
-        self._rows = 2 * N + 2 * N + 2 * N + 1  # actuators, both borders, slip to both sides, speed at the end
+        self._rows = 2 * N + 2 * N + 4 * N + 1  # actuators, both borders, slip of both axles to both sides, the end's speed
         shape = {"h": ca.Sparsity.dense(self._variables, self._variables)}
         shape["a"] = ca.Sparsity.dense(self._rows, self._variables)
         self._solver = ca.conic("program", "daqp", shape, {"error_on_fail": False})
@@ -153,6 +155,10 @@ class Nmpc:
             return self._held(now, guess, adapted, t, "late")
         return plan
 
+    def following(self, x: Vector, u: Vector, adapted: Adapted, t: float = 0.0) -> Vector:
+        """The state one T_s after ``x`` with the increments ``u``, by the model and not linearised; see :meth:`plan`."""
+        return self.model.step(x, u, self._parameters(adapted, t)[0])
+
     def command(self, plan: Plan) -> Applied:
         """Absolute throttle and steering of the plan's first step, within the limits."""
         reach = self._limits.steering_rate * self.model.car.T_s
@@ -163,6 +169,8 @@ class Nmpc:
         near = self._plan is not None
         self._on_track = float(self._track.project(now[:2], self._on_track if near else None)[0])
         self._on_line = float(self._reference.project(now[:2], self._on_line if near else None))
+        due = float(self._reference.ahead(self._scheduled, self._times(0)[1:2])[0]) if near else self._on_line
+        self._scheduled = self._on_line + float(np.clip(due - self._on_line, -self.settings.leash, self.settings.leash))
 
     def _first_guess(self, now: Vector) -> Plan:
         """Along the reference at its own speed."""
@@ -238,7 +246,7 @@ class Nmpc:
             A[rows, k : 2 * N : 2] = np.tri(N)
             low[rows], high[rows] = bounds[0] - held, bounds[1] - held
         self._add_borders(A[2 * N : 4 * N], low[2 * N : 4 * N], high[2 * N : 4 * N], guess, positions, moves)
-        self._add_slip(A[4 * N : 6 * N], high[4 * N : 6 * N], offset[1:], slope[1:])
+        self._add_slip(A[4 * N : 8 * N], high[4 * N : 8 * N], offset[1:], slope[1:])
         if w.ending > 0:
             A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -length / self.settings.scale.time
             high[-1] = float(self._reference.speed_at(at[-1])) - offset[-1, V_X]
@@ -250,25 +258,25 @@ class Nmpc:
         return _Program(H, g, A, low, high, z_low, z_high)
 
     def _add_slip(self, A: Vector, high: Vector, x: Vector, slope: Vector) -> None:
-        """The slip angle of the rear axle (rad) at the states ``x``, shape ``(N, size)``, within its bound on both sides."""
-        N = self.settings.N
+        """The slip angles (rad) of both axles at the states ``x``, shape ``(N, size)``, within their bounds on both sides."""
+        N, car, scale = self.settings.N, self.model.car.constants, self.settings.scale
         v_x, v_y, omega = x[:, V_X : V_X + 3].T
-        l_r = self.model.car.constants.l_r
-        across, along = l_r * omega - v_y, np.maximum(v_x, SLOWEST)
-        squared = along**2 + across**2
-        by_along, by_v_y, by_omega = (
-            part[:, None] for part in (-across / squared, -along / squared, l_r * along / squared)
-        )
-        slip = np.arctan2(across, along)
-        by_u = by_along * slope[:, V_X] + by_v_y * slope[:, V_X + 1] + by_omega * slope[:, V_X + 2]
-        A[:, : 2 * N] = np.concatenate([by_u, -by_u])
-        A[:N, 2 * N : 3 * N] = A[N:, 2 * N : 3 * N] = -np.eye(N)
-        high[:N], high[N:] = self.settings.slip - slip, self.settings.slip + slip
+        along = np.maximum(v_x, scale.length / scale.time)  # slower wheels roll, and no line is close to their angle
+        for k, (place, steered) in enumerate(((car.l_f, 1.0), (-car.l_r, 0.0))):
+            across = v_y + place * omega
+            slip = steered * x[:, DELTA] - np.arctan2(across, along)
+            by_along, by_across = (part[:, None] / (along**2 + across**2)[:, None] for part in (across, -along))
+            by_u = by_along * slope[:, V_X] + by_across * (slope[:, V_X + 1] + place * slope[:, V_X + 2])
+            by_u += steered * slope[:, DELTA]
+            rows, bound = slice(2 * k * N, 2 * (k + 1) * N), self.settings.slip[k]
+            A[rows, : 2 * N] = np.concatenate([by_u, -by_u])
+            A[rows, 2 * N : 3 * N] = -np.tile(np.eye(N), (2, 1))
+            high[rows] = np.concatenate([bound - slip, bound + slip])
 
     def _reference_points(self, guess: Vector) -> Vector:
         """Where on the line the steps of the horizon are compared with it (m), shape ``(N,)``."""
         if self.settings.objective == "tracking":
-            return self._reference.within_reach(self._on_line, self._times(1), float(guess[0, V_X]))
+            return self._reference.within_reach(self._on_line, self._times(1), float(guess[0, V_X]), self._scheduled)
         return self._reference.project(guess[1:, :2], _along(guess[:, :2], self._on_line))
 
     def _add_borders(

@@ -13,6 +13,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 
+from dynssm_ros.control.disturbance import Disturbance
 from dynssm_ros.control.horizon_model import CONTEXT, STATES, HorizonModel
 from dynssm_ros.control.learned import Knowledge
 from dynssm_ros.control.nmpc import Adapted, Nmpc, Plan, Status
@@ -28,6 +29,7 @@ from dynssm_ros.vehicle.single_track import settled_memory
 Vector = npt.NDArray[np.float64]
 
 LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
+_VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
 _MEASURED = slice(3, len(STATES))  # what a window's row begins with
 _KNOWN = (*STATES[:3], *CONTEXT)  # what effects may read
 
@@ -38,7 +40,7 @@ class Decision(NamedTuple):
     Attributes:
         command: absolute throttle and steering to apply from now on: finite, within the limits and the steering rate.
         plan: whose first step that is.
-        adapted: what the model said.
+        adapted: what was planned with: what the model said, and what was found to be missing from that.
         seconds: that it took, model and plan together, by the pilot's clock.
     """
 
@@ -93,11 +95,13 @@ class Pilot:
         self._clock = clock
         model = HorizonModel(knowledge.car, settings.N, settings.travel)
         self._controller = Nmpc(model, limits, reference, track, settings, clock)
+        self._disturbance = Disturbance.of(settings, knowledge.car.T_s)
         self._history: deque[Vector] = deque(maxlen=max(knowledge.H, 1))
 
     def forget(self) -> None:
-        """Begins anew, as after a gap in what was measured: without a window and without a plan."""
+        """Begins anew, as after a gap in what was measured: without a window, a plan, or an error of the model."""
         self._history.clear()
+        self._disturbance.forget()
         self._controller.forget()
 
     def step(self, t: float, pose: Pose, seen: State, feedback: Applied) -> Decision:
@@ -116,12 +120,16 @@ class Pilot:
         outlook = self._controller.outlook
         increments = np.zeros(2) if outlook is None else outlook.u[0]
         self._history.append(np.array([*seen, *feedback, *increments]))
-        adapted = self._knowledge.read(np.array(self._history), outlook)
+        self._disturbance.measured(np.array(seen))
+        adapted = self._disturbance.added(self._knowledge.read(np.array(self._history), outlook))
         memory = self._settled(t, pose, seen, feedback, adapted) if outlook is None else outlook.x[0, len(STATES) :]
         plan = self._controller.plan(np.array([*pose, *seen, *feedback, *memory]), adapted, t, began)
         command = self._controller.command(plan)
         measured = plan.x[0, _MEASURED]
-        self._history[-1] = np.array([*measured, *np.subtract(command, measured[-2:])])
+        increments = np.subtract(command, measured[-2:])
+        self._history[-1] = np.array([*measured, *increments])
+        if np.all(np.isfinite([*pose, *seen, *feedback])):
+            self._disturbance.expects(self._controller.following(plan.x[0], increments, adapted, t)[_VELOCITIES])
         self.counts[plan.status] += 1
         return Decision(command, plan, adapted, self._clock() - began)
 

@@ -84,13 +84,19 @@ class Reference:
         """Speed (m/s) at ``s`` (m)."""
         return np.asarray(np.interp(s if self.standing else s % self.line.length, self._grid, self._grid_speed))
 
-    def within_reach(self, s: float, times: Vector, v: float) -> Vector:
+    def within_reach(self, s: float, times: Vector, v: float, scheduled: float | None = None) -> Vector:
         """Places (m) that a car with speed ``v`` (m/s) at ``s`` (m) is to reach after ``times`` (s).
 
         They are those of :meth:`ahead`, but none beyond what full throttle reaches. A car that is asked for what is far
         out of its reach, as at a standing start, would take every short cut to get closer.
+
+        Args:
+            s: where the car is.
+            times: from now on.
+            v: its speed.
+            scheduled: where it should be now (m); ``None``: where it is.
         """
-        places = self.ahead(s, times)
+        places = self.ahead(s if scheduled is None else scheduled, times)
         if self.limits is None:
             return places
         gain = float(np.interp(v, self.limits.speed, self.limits.drive))

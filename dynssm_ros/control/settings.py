@@ -22,7 +22,8 @@ from dynssm_ros.vehicle.single_track import shape
 Objective = Literal["tracking", "progress"]
 
 HORIZON = 3.5  # in units of the car's time: 15 steps of 20 ms for the 1:43 car, 40 of 40 ms for an Indy car
-_GRIP_USED = 0.95  # share of the rear tyres' force in a car that is not sliding: there is hardly more, and no way back
+_GRIP_USED = 0.95  # share of a tyre's force up to which its axle does not slide: beyond there is hardly more, or less
+_LEASH = 0.3  # wheelbases that a car may be behind the line's own time and still be asked to make up for it
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Weights:
         progress: gain per length that the horizon's last point lies further along the line.
         throttle: of the squared rate of the throttle (fraction per time).
         steering: of the squared rate of the steering (rad per time).
-        border: price of the distance beyond a border or the rear slip beyond its bound (rad), whichever is larger, and of
+        border: price of the distance beyond a border or a slip angle beyond its bound (rad), whichever is larger, and of
             its square.
         ending: price of speed above the line's own at the end of the horizon, and of its square; 0: it is not bounded.
     """
@@ -91,7 +92,9 @@ class Settings:
         N: steps of the horizon.
         deadline: time (s) after which a plan comes too late and is not used.
         margin: distance to keep between the car's centre and the borders (m).
-        slip: slip angle of the rear axle from which on the car slides (rad), which no step is to reach.
+        slip: slip angles of front and rear axle from which on they slide (rad), which no step is to reach.
+        leash: how far the place where a car that keeps the line's time would be is from this one (m) at most.
+        offset_free: whether what the model mispredicts is added to it; see :mod:`dynssm_ros.control.disturbance`.
         travel: what carries the pose over a step.
     """
 
@@ -100,17 +103,22 @@ class Settings:
     N: int = 15
     deadline: float = math.inf
     margin: float = 0.0
-    slip: float = math.inf
+    slip: tuple[float, float] = (math.inf, math.inf)
+    leash: float = 0.0
+    offset_free: bool = False
     travel: Travel = "middle"
 
     @classmethod
-    def of(cls, vehicle: Vehicle, objective: Objective = "tracking", N: int | None = None) -> Settings:
+    def of(
+        cls, vehicle: Vehicle, objective: Objective = "tracking", N: int | None = None, offset_free: bool = False
+    ) -> Settings:
         """For a car: a plan has a control period of time, half the car stays within the borders.
 
         Args:
             vehicle: the car as its file describes it.
             objective: see above.
             N: steps of the horizon; ``None``: ``HORIZON``.
+            offset_free: see above.
 
         Raises:
             UserError: the car cannot drive, brake or corner.
@@ -118,8 +126,10 @@ class Settings:
         scale = Scale.of(vehicle)
         steps = round(HORIZON * scale.time / vehicle.sampling_time) if N is None else N
         half_width = CAR_WIDTH * scale.length / 2
-        slip = _sliding(Coefficients(*vehicle.nominal))
-        return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip)
+        th = Coefficients(*vehicle.nominal)
+        slip = _sliding(th.B_f, th.C_f, th.E_f), _sliding(th.B_r, th.C_r, th.E_r)
+        leash = _LEASH * scale.length
+        return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip, leash, offset_free)
 
     @property
     def weights(self) -> Weights:
@@ -127,8 +137,8 @@ class Settings:
         return WEIGHTS[self.objective]
 
 
-def _sliding(theta: Coefficients) -> float:
-    """Slip angle (rad) at which the rear tyres give ``_GRIP_USED`` of what they can."""
+def _sliding(B: float, C: float, E: float) -> float:
+    """Slip angle (rad) at which tyres give ``_GRIP_USED`` of what they can."""
     slip = np.linspace(0.0, 1.0, 1001)
-    force = np.sin(theta.C_r * shape(np, theta.B_r, theta.E_r, slip))
+    force = np.sin(C * shape(np, B, E, slip))
     return float(slip[np.argmax(force >= _GRIP_USED * np.max(force))])

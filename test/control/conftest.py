@@ -69,7 +69,7 @@ def controller(horizon_model, orca):
 
     def build(track, reference, objective="tracking", deadline=math.inf, slip=None, **options):
         settings = replace(Settings.of(orca, objective, N), deadline=deadline)
-        settings = settings if slip is None else replace(settings, slip=slip)
+        settings = settings if slip is None else replace(settings, slip=(slip, slip))
         return Nmpc(horizon_model, orca.inputs, reference, track, settings, **options)
 
     return build
