@@ -70,6 +70,10 @@ def race(
     along_horizon: Annotated[
         bool, typer.Option("--along-horizon", help="Read the models anew at every step of the horizon.")
     ] = False,
+    offset_free: Annotated[
+        bool,
+        typer.Option("--offset-free", help="Follow what each model mispredicts, and add it to what the model says."),
+    ] = False,
     effect: Annotated[
         list[str] | None,
         typer.Option(
@@ -98,7 +102,7 @@ def race(
     course_track = _sized(load_track(track), scale, lap_length)
     knowledge = _load(model, car, driven, plant, along_horizon)
     reference = load_reference(line, car, course_track, pace)
-    settings = Settings.of(car, objective, horizon)
+    settings = Settings.of(car, objective, horizon, offset_free)
     course = Course(driven, course_track, plant, reference, settings, laps, Start(start, start_offset, start_speed))
     _written(_driven(course, knowledge), out, animation, json)
 

@@ -112,7 +112,7 @@ class Nmpc:
         self._on_track = self._on_line = self._scheduled = 0.0
         N = settings.N
         self._variables = 2 * N + N + 1  # increments, slacks of the steps, slack of the end
-        self._rows = 2 * N + 2 * N + 4 * N + 1  # actuators, both borders, slip of both axles to both sides, the end's speed
+        self._rows = 2 * N + 2 * N + 4 * N + 1  # actuators, both borders, both axles to both sides, the end
         shape = {"h": ca.Sparsity.dense(self._variables, self._variables)}
         shape["a"] = ca.Sparsity.dense(self._rows, self._variables)
         self._solver = ca.conic("program", "daqp", shape, {"error_on_fail": False})

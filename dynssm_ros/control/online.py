@@ -14,11 +14,13 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
 import numpy.typing as npt
 
+from dynssm_ros.control.disturbance import Disturbance
 from dynssm_ros.control.horizon_model import STATES
 from dynssm_ros.control.nmpc import Status
 from dynssm_ros.control.pilot import LOST, Pilot
@@ -126,8 +128,9 @@ class Online:
         self.vehicle = vehicle
         self.period = round(vehicle.sampling_time * 1e9)
         """T_s (ns): a command acts that long after the stamp of the odometry that it answers."""
-        self.remote = Remote(vehicle, max_age)
-        """What the predictor says."""
+        self.remote = Remote(vehicle, max_age, Disturbance.of(settings, vehicle.sampling_time))
+        """What the predictor says; what that mispredicts is told where it is measured, and not from where it is planned."""
+        settings = replace(settings, offset_free=False)
         self._pilot = Pilot(self.remote, vehicle.inputs, reference, track, settings, clock)
         self._pursuit = Driver(vehicle, reference.line, vehicle_limits(vehicle), _LAUNCH_STYLE)
         self._reference = reference
@@ -243,7 +246,7 @@ class Online:
         """All figures by name, for the key-value list of a diagnostic status."""
         p50, p99 = np.percentile([seconds for seconds, _ in self._recent] or [math.nan], [50, 99])
         laps, said = self.laps, self.remote.said
-        theta, correction = (np.atleast_2d(part)[0] for part in said.adapted)
+        theta, correction = (np.atleast_2d(part)[0] for part in self.remote.planned_with)
         return {
             "coefficients": said.source,
             "age of the coefficients (s)": f"{said.age:.3f}",

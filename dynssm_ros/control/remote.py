@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dynssm_ros.control.disturbance import Disturbance
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, STATES, Car, HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Plan
 from dynssm_ros.simulation.plant import SCALAR, Pose
@@ -19,6 +20,7 @@ Context = tuple[float, float, float]
 """Time (s), place on the track (m) and length of the lap (m): what effects may read beside the pose."""
 
 _VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
+_PUNCTUAL = 0.02  # of T_s by which odometry may be off for its difference to the one before to be that of a step
 _ROUNDING = 1e-5  # of a coefficient's range: predictors compute in single precision
 
 
@@ -46,6 +48,7 @@ class Remote:
     Args:
         vehicle: the car.
         max_age: how old the odometry behind the coefficients may be (s).
+        disturbance: follows what the next odometry differs by from what was expected, and is added; ``None``: nothing is.
     """
 
     name = "predictor"
@@ -54,11 +57,13 @@ class Remote:
     ADAPTED = "adapted coefficients"
     CORRECTED = "nominal car, corrected"
 
-    def __init__(self, vehicle: Vehicle, max_age: float) -> None:
+    def __init__(self, vehicle: Vehicle, max_age: float, disturbance: Disturbance | None = None) -> None:
         self.car = Car.of(vehicle)
         self._model = HorizonModel(self.car, 1)
         self._period = round(vehicle.sampling_time * 1e9)
         self._max_age = max_age * 1e9
+        self._disturbance = disturbance or Disturbance.none()
+        self._stamp = 0  # of the last odometry (ns)
         self._lower, self._upper = vehicle.lower, vehicle.upper
         self._nothing = Said(Adapted(vehicle.nominal, np.zeros(3)), self.NOMINAL, np.inf)
         # all by the predicted instant (ns)
@@ -123,6 +128,10 @@ class Remote:
             context: then.
         """
         self._start[stamp + self._period] = x, context
+        if abs(stamp - self._stamp - self._period) > _PUNCTUAL * self._period:
+            self._disturbance.interrupted()
+        self._disturbance.measured(x[_VELOCITIES])
+        self._stamp = stamp
 
     def update(self, stamp: int) -> None:
         """Chooses what holds for the odometry at ``stamp`` (ns); what is too old for it, or not of its time, is dropped.
@@ -146,18 +155,26 @@ class Remote:
         self.said = Said(Adapted(theta, correction), source, (following - best) / 1e9)
 
     def read(self, rows: Vector, outlook: Plan | None) -> Adapted:
-        """What was chosen; see :class:`~dynssm_ros.control.learned.Knowledge`."""
-        return self.said.adapted
+        """What is planned with; see :class:`~dynssm_ros.control.learned.Knowledge`."""
+        return self.planned_with
+
+    @property
+    def planned_with(self) -> Adapted:
+        """What was chosen, and what was found to be missing from it."""
+        return self._disturbance.added(self.said.adapted)
 
     def ahead(self, x: Vector, context: Context) -> Vector:
         """The state one T_s after ``x`` with its actuators held, by what holds now; see :meth:`measured`."""
-        return self._step(x, context, *self.said.adapted)
+        following = self._step(x, context, *self.planned_with)
+        self._disturbance.expects(following[_VELOCITIES])
+        return following
 
     def forget(self) -> None:
         """Drops everything that was heard and measured, as after a jump of time."""
         self._theta.clear()
         self._state.clear()
         self._start.clear()
+        self._disturbance.forget()
         self.said = self._nothing
 
     def _correction(self, stamp: int, theta: Vector) -> Vector:

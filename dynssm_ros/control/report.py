@@ -39,6 +39,7 @@ def race_json(races: Sequence[Race]) -> dict[str, Any]:
         "line_lap_time_s": course.reference.lap_time,
         "line_full_throttle_s": course.reference.full_throttle_time,
         "horizon": course.settings.N,
+        "offset_free": course.settings.offset_free,
         "laps": course.laps,
         "models": {race.name: race.to_json() for race in races},
     }
@@ -103,9 +104,9 @@ def race_report(races: Sequence[Race]) -> Report:
         ),
         Section(
             "Coefficients",
-            "What each model told the controller, step by step: the coefficients that it moves and what it adds to the "
-            "stepped velocities. Where the driven car has effects that amount to a change of a coefficient, the dashed line "
-            "is what it comes to with them.",
+            "What the controller planned with, step by step: the coefficients that a model moves, and what is added to the "
+            "stepped velocities, by the model and, if offset-free, for what it mispredicts. Where the driven car has effects "
+            "that amount to a change of a coefficient, the dashed line is what it comes to with them.",
             coefficients(races),
         ),
     ]  # fmt: skip
@@ -142,7 +143,8 @@ def _protocol(course: Course) -> dict[str, str]:
         "Line": f"{course.reference.name}, {course.reference.line.length:.4g} m, {course.reference.lap_time:.3f} s at its "
         f"own speed, {course.reference.full_throttle_time:.3f} s with no more than full throttle",
         "Controller": f"{settings.objective}, {settings.N} steps of {course.vehicle.sampling_time:g} s, late after "
-        f"{1e3 * settings.deadline:g} ms; weights {weights}, in wheelbases and units of {settings.scale.time:.3g} s",
+        f"{1e3 * settings.deadline:g} ms; weights {weights}, in wheelbases and units of {settings.scale.time:.3g} s; what a "
+        f"model mispredicts is {'added to it (offset-free)' if settings.offset_free else 'left as it is'}",
         "Time": "of a control step: model and plan together, the processor's time on one core",
         "Violation": VIOLATION,
     }

@@ -22,7 +22,9 @@ from dynssm_ros.vehicle.single_track import shape
 Objective = Literal["tracking", "progress"]
 
 HORIZON = 3.5  # in units of the car's time: 15 steps of 20 ms for the 1:43 car, 40 of 40 ms for an Indy car
-_GRIP_USED = 0.95  # share of a tyre's force up to which its axle does not slide: beyond there is hardly more, or less
+# shares of what the tyres can give up to which an axle is used: beyond its peak the front gives less for more steering, and
+# from a slide of the rear there is no way back
+_FRONT_USED, _REAR_USED = 1.0, 0.95
 _LEASH = 0.3  # wheelbases that a car may be behind the line's own time and still be asked to make up for it
 
 
@@ -77,7 +79,7 @@ WEIGHTS: Mapping[Objective, Weights] = {
     # for the 1:43 car Q and R of the literature: bayesrace and Deep Dynamics
     "tracking": Weights(along=1.0, across=1.0, progress=0.0),
     # a point of the last plan draws as the reference does, so that no plan strays from where it was linearised
-    "progress": Weights(along=1.0, across=1.0, progress=0.6, ending=500.0),
+    "progress": Weights(along=1.0, across=10.0, progress=0.6, steering=3.0, ending=500.0),
 }
 
 
@@ -92,7 +94,7 @@ class Settings:
         N: steps of the horizon.
         deadline: time (s) after which a plan comes too late and is not used.
         margin: distance to keep between the car's centre and the borders (m).
-        slip: slip angles of front and rear axle from which on they slide (rad), which no step is to reach.
+        slip: slip angles of front and rear axle that no step is to exceed (rad).
         leash: how far the place where a car that keeps the line's time would be is from this one (m) at most.
         offset_free: whether what the model mispredicts is added to it; see :mod:`dynssm_ros.control.disturbance`.
         travel: what carries the pose over a step.
@@ -127,7 +129,7 @@ class Settings:
         steps = round(HORIZON * scale.time / vehicle.sampling_time) if N is None else N
         half_width = CAR_WIDTH * scale.length / 2
         th = Coefficients(*vehicle.nominal)
-        slip = _sliding(th.B_f, th.C_f, th.E_f), _sliding(th.B_r, th.C_r, th.E_r)
+        slip = _slip(_FRONT_USED, th.B_f, th.C_f, th.E_f), _slip(_REAR_USED, th.B_r, th.C_r, th.E_r)
         leash = _LEASH * scale.length
         return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip, leash, offset_free)
 
@@ -137,8 +139,8 @@ class Settings:
         return WEIGHTS[self.objective]
 
 
-def _sliding(B: float, C: float, E: float) -> float:
-    """Slip angle (rad) at which tyres give ``_GRIP_USED`` of what they can."""
+def _slip(share: float, B: float, C: float, E: float) -> float:
+    """Slip angle (rad) at which tyres give ``share`` of what they can."""
     slip = np.linspace(0.0, 1.0, 1001)
     force = np.sin(C * shape(np, B, E, slip))
-    return float(slip[np.argmax(force >= _GRIP_USED * np.max(force))])
+    return float(slip[np.argmax(force >= share * np.max(force))])

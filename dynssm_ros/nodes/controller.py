@@ -77,6 +77,9 @@ class ControllerNode(Node):
             self, "objective", "tracking", get_args(Objective), "To follow the line's speed, or to go as far as can be."
         )
         horizon = describe(self, "horizon", 0, "Steps of T_s planned ahead; 0: as the car needs.", read_only=True)
+        offset_free = describe(
+            self, "offset_free", False, "Whether what the model mispredicts is added to it.", read_only=True
+        )
         max_age = describe(
             self, "max_age", 0.5, "Age to which the predictor's coefficients are held (s).", (0.01, 10.0), read_only=True
         )  # fmt: skip
@@ -85,7 +88,8 @@ class ControllerNode(Node):
         car = load_vehicle(vehicle)
         road = load_track(track).scaled(scale)
         reference = load_reference(line, car, road, pace)
-        settings = replace(Settings.of(car, objective, horizon or None), deadline=car.sampling_time / self._rate)
+        settings = Settings.of(car, objective, horizon or None, offset_free)
+        settings = replace(settings, deadline=car.sampling_time / self._rate)
         driver = Online(car, reference, road, settings, max_age, self._watchdog)
         self.get_logger().info(
             f"{car.name} on {road.name} ({road.length:.4g} m), {objective} of the {reference.name} line "

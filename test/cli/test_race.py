@@ -13,12 +13,14 @@ SHORT = ("--vehicle", "orca", "--track", "club", "--plant", "euler", "--line", "
 def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
     out, result = tmp_path / "race", tmp_path / "race.json"
     models = ("--model", "true", "--model", "persistence")
-    status, text, _ = dynssm("race", *SHORT, *models, "--out", out, "--json", result, "--animation")
+    more = ("--animation", "--offset-free")
+    status, text, _ = dynssm("race", *SHORT, *models, "--out", out, "--json", result, *more)
     assert status == 0
     assert "true" in text
     content = json.loads(result.read_text())
     assert content == json.loads((out / "results.json").read_text())
     assert (content["track"], content["plant"], content["objective"]) == ("club", "euler", "tracking")
+    assert content["offset_free"]
     assert list(content["models"]) == ["true", "persistence"]
     assert content["models"]["true"]["completed"]
     assert (out / "report.html").stat().st_size > 50_000

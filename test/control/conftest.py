@@ -67,9 +67,10 @@ def horizon_model(orca):
 def controller(horizon_model, orca):
     """Builds a controller of the 1:43 car on ``(track, reference)``."""
 
-    def build(track, reference, objective="tracking", deadline=math.inf, slip=None, **options):
+    def build(track, reference, objective="tracking", deadline=math.inf, slip=None, leash=None, **options):
         settings = replace(Settings.of(orca, objective, N), deadline=deadline)
-        settings = settings if slip is None else replace(settings, slip=(slip, slip))
+        settings = settings if slip is None else replace(settings, slip=slip)
+        settings = settings if leash is None else replace(settings, leash=leash)
         return Nmpc(horizon_model, orca.inputs, reference, track, settings, **options)
 
     return build

@@ -36,17 +36,17 @@ def test_a_circle_is_held_with_the_inputs_of_the_steady_turn(symmetric_orca, cir
     track, reference = circle(side)
     nmpc, feedback = controller(track, reference), Applied(0.0, 0.0)
     plant = make_plant(symmetric_orca, "rk4", Pose(1.0, 0.0, side * np.pi / 2), State(1.5, 0.0, side * 1.5))
-    for k in range(60):
+    for k in range(150):
         now = state_vector(plant.pose, plant.state, feedback)
         feedback = nmpc.command(nmpc.plan(now, nominal(symmetric_orca), 0.02 * k))
         plant.advance(feedback)
     speed = np.hypot(plant.state.v_x, plant.state.v_y)
-    assert speed == pytest.approx(1.5, rel=2e-3)
-    assert np.hypot(*plant.pose[:2]) == pytest.approx(1.0, abs=2e-3)
+    assert speed == pytest.approx(1.5, rel=1e-4)
+    assert np.hypot(*plant.pose[:2]) == pytest.approx(1.0, abs=1e-4)
     v_y, r, delta = steady_turn(symmetric_orca, plant.state.v_x, plant.state.omega)
-    assert plant.state.v_y == pytest.approx(v_y, rel=0.02)
-    assert feedback.r == pytest.approx(r, rel=0.02)
-    assert feedback.delta == pytest.approx(delta, rel=0.02)
+    assert plant.state.v_y == pytest.approx(v_y, rel=5e-3)
+    assert feedback.r == pytest.approx(r, rel=5e-3)
+    assert feedback.delta == pytest.approx(delta, rel=5e-3)
 
 
 @pytest.mark.parametrize("objective", ["tracking", "progress"])
@@ -112,12 +112,45 @@ def test_no_step_of_a_plan_slides(orca, circle, controller, objective):
     track, reference = circle(radius=0.6, speed=2.0)
     now, most = state_vector((0.6, 0.0, np.pi / 2), (1.9, 0.0, 2.0), (0.4, 0.1)), {}
     for bound in (0.08, np.inf):
-        nmpc = controller(track, reference, objective, slip=bound)
+        nmpc = controller(track, reference, objective, slip=(np.inf, bound))
         for _ in range(5):
             plan = nmpc.plan(now, nominal(orca))
         v_x, v_y, omega = plan.x[1:, 3:6].T
         most[bound] = np.max(np.abs(np.arctan2(orca.constants.l_r * omega - v_y, v_x)))
-    assert most[0.08] < 0.085 < 0.1 < most[np.inf]
+    assert most[0.08] < 0.09 < 0.1 < most[np.inf]
+
+
+def test_no_more_steering_is_planned_than_the_front_makes_use_of(orca, circle, controller):
+    """In a bend that is too fast, with a bound of 0.15 rad; without it the plan steers to 0.4 rad of slip."""
+    track, reference = circle(radius=0.6, speed=2.2)
+    now, most = state_vector((0.62, 0.0, np.pi / 2), (2.2, 0.0, 2.5), (0.4, 0.2)), {}
+    for bound in (0.15, np.inf):
+        nmpc = controller(track, reference, slip=(bound, np.inf))
+        for _ in range(5):
+            plan = nmpc.plan(now, nominal(orca))
+        v_x, v_y, omega, _, delta = plan.x[1:, 3:8].T
+        most[bound] = np.max(np.abs(delta - np.arctan2(v_y + orca.constants.l_f * omega, v_x)))
+    assert most[0.15] < 0.17 < 0.4 < most[np.inf]
+
+
+@pytest.mark.parametrize("leash", [0.0, 0.02])
+def test_time_lost_is_made_up_for_within_the_leash(symmetric_orca, circle, controller, leash):
+    """A start at 1.2 m/s where the line is driven with 1.5 m/s: what is lost until then is won back, or it is not."""
+    track, reference = circle()
+    nmpc, feedback, lost = controller(track, reference, leash=leash), Applied(0.0, 0.0), []
+    plant = make_plant(symmetric_orca, "rk4", Pose(1.0, 0.0, np.pi / 2), State(1.2, 0.0, 1.2))
+    place = 0.0
+    for k in range(60):
+        place = float(reference.project(plant.pose[:2], place))
+        lost.append(1.5 * 0.02 * k - place)
+        now = state_vector(plant.pose, plant.state, feedback)
+        feedback = nmpc.command(nmpc.plan(now, nominal(symmetric_orca), 0.02 * k))
+        plant.advance(feedback)
+    assert max(lost) > 0.005
+    if leash:
+        assert abs(lost[-1]) < 1e-3
+    else:
+        assert lost[-1] > 0.005
 
 
 def test_progress_is_faster_than_the_line_and_ends_as_slow(orca, circle, controller):

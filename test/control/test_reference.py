@@ -90,6 +90,15 @@ def test_a_car_is_not_asked_for_more_than_full_throttle_reaches(orca, club_line)
     np.testing.assert_array_equal(club_line.within_reach(s, times, fast), club_line.ahead(s, times))
 
 
+def test_a_car_behind_its_time_is_asked_to_catch_up(club_line):
+    s, times = float(club_line.line.s[np.argmax(club_line.speed)]), np.array([0.1, 0.2])
+    v, late = 1.2 * float(np.max(club_line.speed)), 0.05
+    asked = club_line.within_reach(s, times, v, scheduled=s + late)
+    np.testing.assert_array_equal(asked, club_line.ahead(s + late, times))
+    slow = club_line.within_reach(s, times, 0.0, scheduled=s + late)
+    np.testing.assert_array_equal(slow, club_line.within_reach(s, times, 0.0))
+
+
 def test_full_throttle_bounds_the_time_of_a_line(standing):
     """From standstill around 6 pi m at 2 m/s^2, as the line asks, or at 1 m/s^2, as the car can: t^2 = 2 s / a."""
     ones, length = np.ones(2), standing.line.length
