@@ -15,6 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
 from dynssm_ros.control.race import Race
+from dynssm_ros.control.report import widths
 from dynssm_ros.evaluation.figures import MEASURED, STYLE, model_colours
 from dynssm_ros.files import replacing
 from dynssm_ros.simulation.racing_line import CAR_WIDTH
@@ -78,9 +79,9 @@ def _scene(races: Sequence[Race]) -> tuple[Figure, list[_Car]]:
     wheelbase = course.vehicle.constants.l_f + course.vehicle.constants.l_r
     size = max(_LENGTH * wheelbase, _SMALLEST * float(np.max(extent)))
     cars = []
-    for race in races:
+    for race, width in zip(races, widths(len(races)), strict=True):
         colour = colours[race.name]
-        (trail,) = axes.plot([], [], color=colour, lw=1.5, label=race.name)
+        (trail,) = axes.plot([], [], color=colour, lw=1.5 * width, label=race.name)
         body = Polygon(np.zeros((4, 2)), closed=True, facecolor=colour, edgecolor="white", lw=0.5, zorder=3)
         axes.add_patch(body)
         cars.append(_Car(race, body, trail, size))

@@ -21,7 +21,10 @@ from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDe
 from dynssm_ros.vehicle.single_track import Motion, shape
 
 _STAMPS = 0.5  # s between the time stamps on the map
-_MOVED = 1e-3  # share of its value that a coefficient must move, and of a state's range that must be added, to be shown
+_MOVED = (
+    1e-3  # share of its bounds that a coefficient must move, and of a state's range that must be added, to be shown
+)
+_ANSWERS = 6  # coefficients at most in a figure of hidden effects
 VIOLATION = "A violation is the car's centre of gravity outside the borders at any sample."
 
 
@@ -120,8 +123,10 @@ def summary(races: Sequence[Race]) -> str:
     outside = [race.name for race in done if race.outside > 0]
     text = f"No model completed {_laps(races[0].course)}."
     if done:
-        best = min(done, key=lambda race: float(np.mean(race.lap_times)))
-        text = f"{best.name} is the fastest with {np.mean(best.lap_times):.3f} s a lap."
+        laps = {race.name: f"{np.mean(race.lap_times):.3f}" for race in done}
+        best = min(laps.values(), key=float)
+        fastest = [name for name, lap in laps.items() if lap == best]
+        text = f"{', '.join(fastest)} {'is' if len(fastest) == 1 else 'are'} the fastest with {best} s a lap."
     if outside:
         text += f" Outside the borders: {', '.join(outside)}."
     return text + (f" Not completed: {'; '.join(lost)}." if lost else "")
@@ -173,16 +178,21 @@ def trajectories(races: Sequence[Race]) -> Figure:
     )
     T_s = course.vehicle.sampling_time
     every = max(1, round(_stamp_period(races) / T_s))
-    for race in races:
-        axes.plot(*race.pose[:, :2].T, color=colours[race.name], label=race.name)
+    for race, width in zip(races, widths(len(races)), strict=True):
+        axes.plot(*race.pose[:, :2].T, color=colours[race.name], lw=width, label=race.name)
         marks = race.pose[::every]
-        axes.plot(*marks[:, :2].T, ".", color=colours[race.name], ms=4)
+        axes.plot(*marks[:, :2].T, "o", color=colours[race.name], mec="white", mew=0.5, ms=4, zorder=3)
     for k in range(0, len(races[0].time), 2 * every):
         x, y = (float(value) for value in races[0].pose[k, :2])
         axes.annotate(f"{races[0].time[k]:.3g} s", (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7)
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
+
+
+def widths(count: int) -> list[float]:
+    """Of the lines of ``count`` models: those drawn first are wider, so that cars that drive alike are all seen."""
+    return [float(width) for width in np.linspace(min(count, 3), 1.0, count)]
 
 
 def _stamp_period(races: Sequence[Race]) -> float:
@@ -247,13 +257,16 @@ def driven_coefficients(race: Race) -> dict[str, Any]:
 def coefficients(races: Sequence[Race]) -> Figure:
     """The coefficients that a model or the driven car's effects move, and what models add, over the position on the track.
 
-    Where effects are hidden in the car, what a model says once and for all is not shown: it does not answer to them.
+    Where effects are hidden in the car, those that they amount to come first, then those that answer most. What a model says
+    once and for all does not answer.
     """
     longest = max(races, key=lambda race: race.s[-1] - race.s[0])
-    driven = driven_coefficients(longest)
+    vehicle, driven = longest.course.vehicle, driven_coefficients(longest)
     told = [race.theta[_first_change(race.theta) if driven else 0 :] for race in races]
-    moved = np.any([np.ptp(theta, axis=0) > _MOVED * np.max(np.abs(theta), axis=0) for theta in told], axis=0)
-    moving = [k for k, name in enumerate(COEFFICIENTS) if moved[k] or name in driven]
+    moves = np.max([np.ptp(theta, axis=0) for theta in told], axis=0) / (vehicle.upper - vehicle.lower)
+    moving = [k for k, name in enumerate(COEFFICIENTS) if moves[k] > _MOVED or name in driven]
+    if driven:
+        moving = sorted(moving, key=lambda k: (COEFFICIENTS[k] not in driven, -moves[k]))[:_ANSWERS]
     labels = {name: f"{name} ({unit})" if (unit := coefficient_unit(name)) else name for name in COEFFICIENTS}
     rows = [(labels[COEFFICIENTS[k]], [race.theta[:, k] for race in races]) for k in moving]
     rows += [
@@ -283,8 +296,8 @@ def _panels(
     figure = Figure(figsize=(WIDTH, 0.6 + 1.35 * lines), layout="constrained")
     axes = figure.subplots(lines, columns, sharex=True, squeeze=False)
     for panel, (label, values) in zip(axes.T.flat, rows, strict=False):
-        for race, series in zip(races, values, strict=True):
-            panel.plot(race.s - race.s[0], series, color=colours[race.name], lw=1.0, label=race.name)
+        for race, series, width in zip(races, values, widths(len(races)), strict=True):
+            panel.plot(race.s - race.s[0], series, color=colours[race.name], lw=width, label=race.name)
         if along is not None and label in (dashed or {}):
             panel.plot(along.s - along.s[0], (dashed or {})[label], color=MEASURED, lw=1.0, ls="--", zorder=1)
         panel.set_ylabel(label)

@@ -82,6 +82,7 @@ def test_the_report_shows_every_model(lap, course, orca, tmp_path):
     for words in ("Trajectories", "Coefficients", "other", "Forces", "rolling", "weights along 1, across 1"):
         assert words in text
     assert "Not completed: other spins" in summary([lap, other])
+    assert "true, twin are the fastest" in summary([lap, replace(lap, name="twin")])
     assert len(race_table([lap, other]).cells) == 2
 
 
@@ -152,6 +153,10 @@ def test_the_figure_of_a_hidden_effect_shows_what_answers_to_it(lap, course, orc
     assert shown(races) == ["D_f (N)", "B_r (1/rad)"]
     slick = replace(course, vehicle=orca.with_effect("front_grip", {"factor": 0.8}))
     assert shown([replace(race, course=slick) for race in races]) == ["D_f (N)"]
+    wandering = replace(lap, theta=lap.theta * (1 + np.linspace(0, 0.5, len(lap.time))[:, None]))
+    assert len(shown([wandering])) == len(COEFFICIENTS)
+    assert shown([replace(wandering, course=slick)])[0] == "D_f (N)"
+    assert len(shown([replace(wandering, course=slick)])) == 6
     assert len(shown([lap])) == len(State._fields), "nothing moves and nothing is added"
 
 
