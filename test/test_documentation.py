@@ -60,7 +60,11 @@ def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_fi
 def test_the_parameters_of_the_controller_are_those_of_its_page() -> None:
     page = (ROOT / "docs" / "controller.md").read_text(encoding="utf-8")
     described = {name: cells[0].strip("`") for name, cells in table("parameter", page).items()}
-    assert described == {name: str(value) for name, value in declared_parameters("controller").items()}
+    declared = declared_parameters("controller")
+    as_ros_writes = {
+        name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in declared.items()
+    }
+    assert described == as_ros_writes
 
 
 def test_the_topics_are_those_of_the_default_signal_map_and_of_the_node() -> None:
