@@ -112,12 +112,12 @@ def test_no_step_of_a_plan_slides(orca, circle, controller, objective):
     track, reference = circle(radius=0.6, speed=2.0)
     now, most = state_vector((0.6, 0.0, np.pi / 2), (1.9, 0.0, 2.0), (0.4, 0.1)), {}
     for bound in (0.08, np.inf):
-        nmpc = controller(track, reference, objective, slip=(np.inf, bound))
+        nmpc = controller(track, reference, objective, slip=(np.inf, bound), leash=0.0)  # 5 looks at one instant
         for _ in range(5):
             plan = nmpc.plan(now, nominal(orca))
         v_x, v_y, omega = plan.x[1:, 3:6].T
         most[bound] = np.max(np.abs(np.arctan2(orca.constants.l_r * omega - v_y, v_x)))
-    assert most[0.08] < 0.09 < 0.1 < most[np.inf]
+    assert most[0.08] < 0.085 < 0.1 < most[np.inf]
 
 
 def test_no_more_steering_is_planned_than_the_front_makes_use_of(orca, circle, controller):
