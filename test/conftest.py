@@ -56,7 +56,7 @@ def acting() -> Callable[..., dict[str, float]]:
 def laps_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """20 s of the simulated ORCA car on a club track, as a rosbag2 folder with the standard topics."""
     from dynssm_ros.simulation.laps import simulate, write_run
-    from dynssm_ros.simulation.tracks import load_track
+    from dynssm_ros.track.tracks import load_track
     from dynssm_ros.vehicle import load_vehicle
 
     bag = tmp_path_factory.mktemp("laps") / "club"

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 import typer
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.cli.console import JsonOption, console, progress_bar, told_apart
-from dynssm_ros.evaluation.tables import Column, Table
 from dynssm_ros.files import write_json
+from dynssm_ros.reporting.tables import Column, Table
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.runtime.predictor import Predictor
@@ -25,7 +25,6 @@ from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, load_signal_map
 from dynssm_ros.signals.standard import recording_to_bag
 
-Vector = npt.NDArray[np.float64]
 _WARM_UP, _BLOCK = 50, 200  # calls
 
 

@@ -18,18 +18,18 @@ import typer
 
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.errors import UserError
-from dynssm_ros.evaluation import figures
 from dynssm_ros.evaluation.open_loop import Evaluation
 from dynssm_ros.evaluation.open_loop import evaluate as evaluate_models
-from dynssm_ros.evaluation.open_loop_report import open_loop_report, summary_table, verdict
-from dynssm_ros.evaluation.report import Report, Section
+from dynssm_ros.reporting import evaluation_figures as figures
+from dynssm_ros.reporting.evaluation_report import open_loop_report, summary_table, verdict
+from dynssm_ros.reporting.page import Report, Section
 from dynssm_ros.runtime.models import Persistence, SingleTrack, load_model
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, load_signal_map
-from dynssm_ros.simulation.driver import Style
 from dynssm_ros.simulation.laps import simulate, write_run
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.driver import Style
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 
 VEHICLE, MODEL, SIGNALS = "av21", "dynssm_av21", "default"

@@ -16,10 +16,10 @@ from dynssm_ros.cli.console import (
     progress_bar,
     write_results,
 )
-from dynssm_ros.diagnosis.diagnose import diagnose as find_causes
-from dynssm_ros.diagnosis.report import diagnosis_report, in_words
+from dynssm_ros.identification.diagnose import diagnose as find_causes
+from dynssm_ros.reporting.diagnosis_report import diagnosis_report, in_words
 from dynssm_ros.signals.recording import Recording, concatenate
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import load_vehicle, save_vehicle
 from dynssm_ros.vehicle.single_track import Integrator
 

@@ -19,17 +19,17 @@ from dynssm_ros.cli.console import (
     write_results,
 )
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.evaluation.lap import first_lap
 from dynssm_ros.evaluation.open_loop import Evaluation, shared_commands
 from dynssm_ros.evaluation.open_loop import evaluate as evaluate_models
-from dynssm_ros.evaluation.open_loop_report import markdown, open_loop_report, summary_table, verdict
-from dynssm_ros.evaluation.tables import percent
 from dynssm_ros.files import replacing
+from dynssm_ros.reporting.evaluation_report import markdown, open_loop_report, summary_table, verdict
+from dynssm_ros.reporting.tables import percent
 from dynssm_ros.runtime.models import WindowModel, load_model
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands
-from dynssm_ros.simulation.lines import ClosedLine
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.lap_position import first_lap
+from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 
 TrackOption = Annotated[

@@ -16,7 +16,6 @@ from dynssm_ros.cli.demo import demo
 from dynssm_ros.cli.diagnose import diagnose
 from dynssm_ros.cli.evaluate import evaluate
 from dynssm_ros.cli.extract import extract
-from dynssm_ros.cli.paper import paper
 from dynssm_ros.cli.race import race
 from dynssm_ros.cli.replay import replay
 from dynssm_ros.cli.simulate import simulate
@@ -33,7 +32,7 @@ app = typer.Typer(
 # click's base of all usage errors, wherever typer keeps its click
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
-for command in (demo, simulate, extract, calibrate, train, evaluate, replay, diagnose, race, bench, paper):
+for command in (demo, simulate, extract, calibrate, train, evaluate, replay, diagnose, race, bench):
     app.command()(command)
 
 

@@ -9,16 +9,17 @@ from typing import Annotated
 import typer
 
 from dynssm_ros.cli.console import JsonOption, VehicleOption, console, progress_bar, told_apart, write_results
-from dynssm_ros.control.animation import animate
-from dynssm_ros.control.learned import Knowledge, load_knowledge
+from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.race import Course, Race, Start
 from dynssm_ros.control.race import race as drive
+from dynssm_ros.control.race_models import load_prediction_model
 from dynssm_ros.control.reference import load_reference
-from dynssm_ros.control.report import race_json, race_report, race_table, summary
 from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.reporting.animation import animate
+from dynssm_ros.reporting.race_report import race_json, race_report, race_table, summary
 from dynssm_ros.simulation.plant import PlantKind
-from dynssm_ros.simulation.tracks import Track, load_track
+from dynssm_ros.track.tracks import Track, load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import parse_effect
 
@@ -100,11 +101,11 @@ def race(
     car = load_vehicle(vehicle)
     driven = car.with_effects(map(parse_effect, effect or []))
     course_track = _sized(load_track(track), scale, lap_length)
-    knowledge = _load(model, car, driven, plant, along_horizon)
+    models = _load(model, car, driven, plant, along_horizon)
     reference = load_reference(line, car, course_track, pace)
     settings = Settings.of(car, objective, horizon, offset_free)
     course = Course(driven, course_track, plant, reference, settings, laps, Start(start, start_offset, start_speed))
-    _written(_driven(course, knowledge), out, animation, json)
+    _written(_driven(course, models), out, animation, json)
 
 
 def _written(races: list[Race], out: Path, animation: bool, json: Path | None) -> None:
@@ -118,14 +119,14 @@ def _written(races: list[Race], out: Path, animation: bool, json: Path | None) -
     console.print(f"{out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)
 
 
-def _driven(course: Course, knowledge: list[Knowledge]) -> list[Race]:
+def _driven(course: Course, model: list[PredictionModel]) -> list[Race]:
     """A race of each."""
     races = []
     with progress_bar("racing") as progress:
-        for k, each in enumerate(knowledge):
+        for k, each in enumerate(model):
 
             def update(done: int, total: int, words: str, k: int = k) -> None:
-                progress(k * total + done, len(knowledge) * total, words)
+                progress(k * total + done, len(model) * total, words)
 
             races.append(drive(course, each, update))
     return races
@@ -140,13 +141,15 @@ def _sized(track: Track, scale: float | None, lap_length: float | None) -> Track
     return track if scale is None else track.scaled(scale)
 
 
-def _load(given: list[str], known: Vehicle, driven: Vehicle, plant: PlantKind, along_horizon: bool) -> list[Knowledge]:
+def _load(
+    given: list[str], known: Vehicle, driven: Vehicle, plant: PlantKind, along_horizon: bool
+) -> list[PredictionModel]:
     """Opens the models; where two have the same name, what was given tells them apart.
 
     Raises:
         ConfigurationError: the same was given twice.
     """
-    opened = {text: load_knowledge(text, known, driven, plant, along_horizon) for text in given}
+    opened = {text: load_prediction_model(text, known, driven, plant, along_horizon) for text in given}
     for text in opened:
         if given.count(text) > 1:
             raise ConfigurationError(f"--model {text}: given twice; expected different models")

@@ -10,12 +10,12 @@ import typer
 from dynssm_ros.cli.console import JsonOption, VehicleOption, console, progress_bar
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
-from dynssm_ros.simulation.driver import Style
 from dynssm_ros.simulation.laps import Run, write_run
 from dynssm_ros.simulation.laps import simulate as simulate_run
 from dynssm_ros.simulation.plant import PlantKind
-from dynssm_ros.simulation.racing_line import LineKind, line_of
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.driver import Style
+from dynssm_ros.track.racing_line import LineKind, line_of
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import load_vehicle
 from dynssm_ros.vehicle.effects import parse_effect
 

@@ -28,11 +28,11 @@ def train(
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
 ) -> None:
     """Train a model on recordings and write its folder: card, weights, ONNX, metrics, loss picture."""
-    from dynssm_ros.evaluation.figures import loss_components
     from dynssm_ros.learning.configuration import load_model_config
     from dynssm_ros.learning.export import check_replaceable, save_artifact
     from dynssm_ros.learning.training import check_device, checkpoints
     from dynssm_ros.learning.training import train as fit
+    from dynssm_ros.reporting.evaluation_figures import loss_components
 
     check_device(device)
     out = out if out.name else out.absolute()  # "." has no name to put the checkpoint beside

@@ -11,12 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.control.settings import Settings
-
-Vector = npt.NDArray[np.float64]
 
 SETTLING = 1.0  # in units of the car's time: that after which 63 % of a constant disturbance are found
 

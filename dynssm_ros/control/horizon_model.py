@@ -8,14 +8,13 @@ from itertools import islice
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from dynssm_ros.simulation.external import Creeping
+from dynssm_ros.arrays import Vector
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects.base import SLOWEST
+from dynssm_ros.vehicle.kinematics import Pose, advance_pose
+from dynssm_ros.vehicle.low_speed import LowSpeedRolling
 from dynssm_ros.vehicle.single_track import Constants, Integrator, StageEffect, at_least, step_with_memory
-
-Vector = npt.NDArray[np.float64]
 
 STATES = ("x", "y", "theta", "v_x", "v_y", "omega", "r", "delta")
 """Pose (m, m, rad), velocities (m/s, m/s, rad/s), what the actuators do (fraction, rad). The effects' own follow."""
@@ -59,13 +58,13 @@ class Car:
             substeps: of the integrator.
             first: acts before the vehicle's own effects.
         """
-        effects = (*first, *vehicle.active_effects, Creeping(vehicle, "euler"))
+        effects = (*first, *vehicle.active_effects, LowSpeedRolling(vehicle, vehicle.sampling_time))
         return cls(vehicle.constants, vehicle.sampling_time, effects, integrator, substeps)
 
     @property
     def memory(self) -> tuple[str, ...]:
         """Names of the effects' own states."""
-        return tuple(name for effect in self.effects for name in getattr(effect, "carries", ()))
+        return tuple(name for effect in self.effects for name in effect.carries)
 
 
 class HorizonModel:
@@ -145,7 +144,5 @@ class HorizonModel:
         )
         state = State(*(value + by for value, by in zip(state, correction, strict=True)))
         share = 0.5 if self._travel == "middle" else 0.0
-        v_x, v_y, turn = (((1 - share) * a + share * b) * car.T_s for a, b in zip(now, state, strict=True))
-        c, s = ca.cos(heading + share * turn), ca.sin(heading + share * turn)
-        pose = (x_pos + v_x * c - v_y * s, y_pos + v_x * s + v_y * c, heading + turn)
+        pose = advance_pose(ca, Pose(x_pos, y_pos, heading), now, state, car.T_s, share)
         return ca.vertcat(*pose, *state, *applied, *(memory[name] for name in car.memory))

@@ -21,16 +21,15 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, PARAMETERS, STATES, HorizonModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
-from dynssm_ros.simulation.tracks import Track
+from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import COEFFICIENTS, Applied
 from dynssm_ros.vehicle.parameters import InputLimits
 
-Vector = npt.NDArray[np.float64]
 Status = Literal["solved", "infeasible", "late"]
 
 V_X, R, DELTA = (STATES.index(name) for name in ("v_x", "r", "delta"))
@@ -118,7 +117,7 @@ class Nmpc:
         self._solver = ca.conic("program", "daqp", shape, {"error_on_fail": False})
 
     @property
-    def outlook(self) -> Plan | None:
+    def previous(self) -> Plan | None:
         """The plan as it stands before the next step: the last one, moved on."""
         return None if self._plan is None else self._plan.shifted()
 
@@ -161,9 +160,9 @@ class Nmpc:
 
     def command(self, plan: Plan) -> Applied:
         """Absolute throttle and steering of the plan's first step, within the limits."""
-        reach = self._limits.steering_rate * self.model.car.T_s
-        turn = min(max(plan.u[0, 1], -reach), reach)  # the solver's tolerance is 1e-6
-        return Applied(*self._within(plan.x[0, R] + plan.u[0, 0], plan.x[0, DELTA] + turn))
+        now = Applied(plan.x[0, R], plan.x[0, DELTA])
+        wanted = Applied(now.r + plan.u[0, 0], now.delta + plan.u[0, 1])  # within the solver's tolerance of 1e-6
+        return self._limits.reached(wanted, now, self.model.car.T_s)
 
     def _locate(self, now: Vector) -> None:
         near = self._plan is not None
@@ -299,16 +298,10 @@ class Nmpc:
         """The inputs of ``guess`` from ``now`` on, within the limits, and where they lead."""
         x, u = np.tile(now, (self.settings.N + 1, 1)), np.zeros_like(guess.u)
         for k, p in enumerate(self._parameters(adapted, t)):
-            u[k] = np.subtract(self._within(*(x[k, [R, DELTA]] + guess.u[k])), x[k, [R, DELTA]])
+            u[k] = np.subtract(self._limits.clamped(Applied(*(x[k, [R, DELTA]] + guess.u[k]))), x[k, [R, DELTA]])
             following = self.model.step(x[k], u[k], p)
             x[k + 1] = following if np.all(np.isfinite(following)) else guess.x[k + 1]
         return Plan(x, u, status)
-
-    def _within(self, r: float, delta: float) -> tuple[float, float]:
-        return (
-            float(min(max(r, self._limits.throttle[0]), self._limits.throttle[1])),
-            float(min(max(delta, self._limits.steering[0]), self._limits.steering[1])),
-        )
 
 
 def _condensed(x: Vector, u: Vector, following: Vector, by_x: Vector, by_u: Vector) -> tuple[Vector, Vector]:

@@ -16,19 +16,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from dynssm_ros.control.learned import Knowledge
-from dynssm_ros.control.pilot import LOST, Pilot
+from dynssm_ros.arrays import Vector
+from dynssm_ros.control.controller import LOST, Controller
+from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
-from dynssm_ros.simulation.external import Creeping
 from dynssm_ros.simulation.laps import SimulationError
-from dynssm_ros.simulation.plant import PlantKind, Pose, make_plant
-from dynssm_ros.simulation.tracks import Track
+from dynssm_ros.simulation.plant import PlantKind, make_plant, plant_step
+from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Applied, State, Vehicle
+from dynssm_ros.vehicle.kinematics import Pose
+from dynssm_ros.vehicle.low_speed import LowSpeedRolling
 
-Vector = npt.NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
 PATIENCE = 3.0  # laps at the line's own speed that a lap may take
@@ -185,13 +185,14 @@ class Race:
 class _Drive:
     """The car of a race on its way."""
 
-    def __init__(self, course: Course, knowledge: Knowledge) -> None:
+    def __init__(self, course: Course, model: PredictionModel) -> None:
         pose, state = course.starting()
         vehicle, track = course.vehicle, course.track
         # the processor's time, so that what else runs on the machine changes no simulated lap
         settings = replace(course.settings, travel="start" if course.plant == "euler" else "middle")
-        self.pilot = Pilot(knowledge, vehicle.inputs, course.reference, track, settings, time.thread_time)
-        self._car = make_plant(vehicle, course.plant, pose, state, (Creeping(vehicle, course.plant),), track.length)
+        self.pilot = Controller(model, vehicle.inputs, course.reference, track, settings, time.thread_time)
+        rolling = LowSpeedRolling(vehicle, plant_step(vehicle, course.plant))
+        self._car = make_plant(vehicle, course.plant, pose, state, (rolling,), track.length)
         self._course = course
         self._feedback = Applied(0.0, 0.0)
         self._limit = PATIENCE * course.laps * course.reference.lap_time
@@ -215,7 +216,7 @@ class _Drive:
         if not all(map(math.isfinite, (*car.pose, *car.state))):
             return f"its motion is not finite after {t:.2f} s"
         at, self._lateral = (float(value) for value in self._course.track.project(car.pose[:2], near=self.s))
-        self.s += math.remainder(at - self.s, self._course.track.length)
+        self.s = self._course.track.centre.counted_on(at, self.s)
         return None
 
     def result(self, name: str, failure: str) -> Race:
@@ -241,21 +242,21 @@ class _Drive:
         return ""
 
 
-def race(course: Course, knowledge: Knowledge, progress: Progress | None = None) -> Race:
-    """Drives the laps of ``course`` with ``knowledge`` in the controller.
+def race(course: Course, model: PredictionModel, progress: Progress | None = None) -> Race:
+    """Drives the laps of ``course`` with ``model`` in the controller.
 
     Args:
         course: what to drive.
-        knowledge: what the controller knows of the car.
+        model: what the controller knows of the car.
         progress: told of the millimetres driven, of how many, and of a few words.
 
     Raises:
         SimulationError: the road is too narrow for the car, or the start is not on it.
         ConfigurationError: the model's physics needs a signal that there is not.
     """
-    drive = _Drive(course, knowledge)
+    drive = _Drive(course, model)
     while (failure := drive.step()) is None:
         if progress is not None:
             done = min(max(drive.s, drive.start), drive.goal) - drive.start
-            progress(round(1e3 * done), round(1e3 * (drive.goal - drive.start)), knowledge.name)
-    return drive.result(knowledge.name, failure)
+            progress(round(1e3 * done), round(1e3 * (drive.goal - drive.start)), model.name)
+    return drive.result(model.name, failure)

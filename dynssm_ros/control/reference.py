@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from dynssm_ros.simulation.lines import ClosedLine, Floats
-from dynssm_ros.simulation.racing_line import line_of
-from dynssm_ros.simulation.speed_profile import Limits, speed_profile, vehicle_limits
-from dynssm_ros.simulation.tracks import Track, TrackError
+from dynssm_ros.arrays import Vector
+from dynssm_ros.track.lines import ClosedLine, Floats
+from dynssm_ros.track.racing_line import line_of
+from dynssm_ros.track.speed_profile import Limits, speed_profile, vehicle_limits
+from dynssm_ros.track.tracks import Track, TrackError
 from dynssm_ros.vehicle import Vehicle
-
-Vector = npt.NDArray[np.float64]
 
 COLUMNS = ("s_m", "x_m", "y_m", "v_mps")
 MIN_POINTS = 10

@@ -6,16 +6,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.control.disturbance import Disturbance
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, STATES, Car, HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Plan
-from dynssm_ros.simulation.plant import SCALAR, Pose
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.kinematics import SCALAR, Pose
 from dynssm_ros.vehicle.single_track import settled_memory
 
-Vector = npt.NDArray[np.float64]
 Context = tuple[float, float, float]
 """Time (s), place on the track (m) and length of the lap (m): what effects may read beside the pose."""
 
@@ -24,7 +23,7 @@ _PUNCTUAL = 0.02  # of T_s by which odometry may be off for its difference to th
 _ROUNDING = 1e-5  # of a coefficient's range: predictors compute in single precision
 
 
-class Said(NamedTuple):
+class ModelOutput(NamedTuple):
     """What holds now.
 
     Attributes:
@@ -38,7 +37,7 @@ class Said(NamedTuple):
     age: float
 
 
-class Remote:
+class RemoteModel:
     """The nominal car with the last coefficients of a predictor, and what the predictor adds to a step with them.
 
     A prediction carries the stamp of the instant that it is for, one T_s after the odometry that it rests on, and the
@@ -65,12 +64,12 @@ class Remote:
         self._disturbance = disturbance or Disturbance.none()
         self._stamp = 0  # of the last odometry (ns)
         self._lower, self._upper = vehicle.lower, vehicle.upper
-        self._nothing = Said(Adapted(vehicle.nominal, np.zeros(3)), self.NOMINAL, np.inf)
+        self._nothing = ModelOutput(Adapted(vehicle.nominal, np.zeros(3)), self.NOMINAL, np.inf)
         # all by the predicted instant (ns)
         self._theta: dict[int, Vector] = {}
         self._state: dict[int, Vector] = {}
         self._start: dict[int, tuple[Vector, Context]] = {}
-        self.said = self._nothing
+        self.output = self._nothing
         """What :meth:`read` hands on."""
 
     def predicted(self, stamp: int, state: Sequence[float]) -> str:
@@ -113,7 +112,7 @@ class Remote:
             memory: states of the car's effects; settled if not given.
         """
         if memory is None:
-            car, theta = self.car, Coefficients(*self.said.adapted.theta.tolist())
+            car, theta = self.car, Coefficients(*self.output.adapted.theta.tolist())
             around = dict(zip(CONTEXT, context, strict=True)) | pose._asdict()
             settled = settled_memory(SCALAR, seen, applied, theta, car.constants, car.effects, None, around)
             memory = np.array([settled[name] for name in car.memory])
@@ -146,22 +145,22 @@ class Remote:
         correctable = self._state.keys() & self._start.keys()
         candidates = self._theta.keys() | correctable
         if not candidates:
-            self.said = self._nothing
+            self.output = self._nothing
             return
         best = max(candidates, key=lambda k: (k in self._theta, k in correctable, k))
         theta = self._theta.get(best, self._nothing.adapted.theta)
         correction = self._correction(best, theta) if best in correctable else np.zeros(3)
         source = self.ADAPTED if best in self._theta else self.CORRECTED
-        self.said = Said(Adapted(theta, correction), source, (following - best) / 1e9)
+        self.output = ModelOutput(Adapted(theta, correction), source, (following - best) / 1e9)
 
-    def read(self, rows: Vector, outlook: Plan | None) -> Adapted:
-        """What is planned with; see :class:`~dynssm_ros.control.learned.Knowledge`."""
+    def read(self, rows: Vector, previous: Plan | None) -> Adapted:
+        """What is planned with; see :class:`~dynssm_ros.control.prediction_model.Knowledge`."""
         return self.planned_with
 
     @property
     def planned_with(self) -> Adapted:
         """What was chosen, and what was found to be missing from it."""
-        return self._disturbance.added(self.said.adapted)
+        return self._disturbance.added(self.output.adapted)
 
     def ahead(self, x: Vector, context: Context) -> Vector:
         """The state one T_s after ``x`` with its actuators held, by what holds now; see :meth:`measured`."""
@@ -175,7 +174,7 @@ class Remote:
         self._state.clear()
         self._start.clear()
         self._disturbance.forget()
-        self.said = self._nothing
+        self.output = self._nothing
 
     def _correction(self, stamp: int, theta: Vector) -> Vector:
         """What the prediction for ``stamp`` adds to the car's own step with ``theta``; none if that is not finite."""

@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 
 from dynssm_ros.control.horizon_model import Travel
-from dynssm_ros.simulation.racing_line import CAR_WIDTH
-from dynssm_ros.simulation.speed_profile import vehicle_limits
+from dynssm_ros.track.racing_line import CAR_WIDTH
+from dynssm_ros.track.speed_profile import vehicle_limits
 from dynssm_ros.vehicle import Coefficients, Vehicle
-from dynssm_ros.vehicle.single_track import shape
+from dynssm_ros.vehicle.single_track import lateral_force
 
 Objective = Literal["tracking", "progress"]
 
@@ -142,5 +142,5 @@ class Settings:
 def _slip(share: float, B: float, C: float, E: float) -> float:
     """Slip angle (rad) at which tyres give ``share`` of what they can."""
     slip = np.linspace(0.0, 1.0, 1001)
-    force = np.sin(C * shape(np, B, E, slip))
+    force = lateral_force(np, B, C, 1.0, E, 0.0, slip)
     return float(slip[np.argmax(force >= share * np.max(force))])

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from dynssm_ros.evaluation.metrics import Vector, finite
+from dynssm_ros.arrays import Vector
+from dynssm_ros.evaluation.metrics import finite
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, Vehicle
 
 AT_BOUND = 0.01  # of the admissible range: nearer to a bound than this counts as resting on it

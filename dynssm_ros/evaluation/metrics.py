@@ -8,17 +8,14 @@ from statistics import NormalDist
 from time import perf_counter_ns
 
 import numpy as np
-import numpy.typing as npt
 
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.runtime.models import WindowModel, WindowPrediction
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
-Vector = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 Tick = Callable[[int], None]
 """Told how many predictions were just made."""
 
-CHANNELS = STATE_SIGNALS
 BATCH = 4096
 
 
@@ -129,7 +126,7 @@ def finite(value: float) -> float | None:
 
 def by_channel(values: Vector) -> dict[str, float | None]:
     """Names the entries of a ``(3,)`` array."""
-    return {name: finite(value) for name, value in zip(CHANNELS, values, strict=True)}
+    return {name: finite(value) for name, value in zip(STATE_SIGNALS, values, strict=True)}
 
 
 def _join(parts: list[Vector | None]) -> Vector | None:

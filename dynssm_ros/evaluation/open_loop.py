@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.errors import ArtifactError, RecordingError
 from dynssm_ros.evaluation.coefficients import coefficient_statistics
-from dynssm_ros.evaluation.lap import first_lap
 from dynssm_ros.evaluation.metrics import (
     BATCH,
-    Indices,
     Tick,
-    Vector,
     by_channel,
     coverage,
     explained,
@@ -31,12 +29,10 @@ from dynssm_ros.evaluation.regimes import Regime, driving_regimes, regime_rmse
 from dynssm_ros.evaluation.rollout import default_horizon, score_rollouts
 from dynssm_ros.evaluation.score import Group, Score, grouped
 from dynssm_ros.runtime.models import WindowModel
-from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.recording import Recording, default_min_speed
 from dynssm_ros.signals.signal_map import Commands
-from dynssm_ros.simulation.lines import ClosedLine
-
-FULL_SIZE_SPEED = 10.0  # a recording that exceeds this speed (m/s) is of a full-size car
-FULL_SIZE_MIN_SPEED = 5.0  # m/s; the published evaluations of full-size cars leave out slower rows
+from dynssm_ros.track.lap_position import first_lap
+from dynssm_ros.track.lines import ClosedLine
 
 
 @dataclass(frozen=True)
@@ -218,11 +214,6 @@ def _score(
             rollout=score_rollouts(model, matrix, starts, steps, recording.T_s, batch, tick),
             latency_us=latency_us(model, gather(matrix, rows[:50], model.H - 1), calls),
         )
-
-
-def default_min_speed(recording: Recording) -> float:
-    """Speed (m/s) below which rows are not scored: 5 for full-size cars as in the literature, none for small ones."""
-    return FULL_SIZE_MIN_SPEED if recording["v_x"].max(initial=0.0) > FULL_SIZE_SPEED else 0.0
 
 
 def horizon_steps(horizon_s: float, T_s: float) -> int:

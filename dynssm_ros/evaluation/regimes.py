@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.ticker import MaxNLocator
 
-from dynssm_ros.evaluation.metrics import Vector, rmse
+from dynssm_ros.arrays import Vector
+from dynssm_ros.evaluation.metrics import rmse
 from dynssm_ros.signals.inputs import applied_inputs
 
 COASTING = 0.02  # applied throttle (fraction) that neither drives nor brakes to speak of
@@ -86,9 +86,20 @@ def regime_rmse(regimes: tuple[Regime, ...], errors: Vector) -> Vector:
 
 
 def _bins(quantity: str, values: Vector, unit: str) -> Iterator[Regime]:
-    edges = MaxNLocator(nbins=4, steps=[1, 2, 2.5, 5, 10]).tick_values(float(values.min()), float(values.max()))
+    edges = round_edges(float(values.min()), float(values.max()), 4)
     labels = tuple(f"{low:g} to {high:g}" for low, high in pairwise(edges))
     yield from _members(quantity, labels, unit, np.digitize(values, edges[1:-1]))
+
+
+def round_edges(low: float, high: float, most: int) -> Vector:
+    """Edges of at most ``most`` bins that cover ``low`` to ``high``; their width is 1, 2, 2.5 or 5 times a power of ten."""
+    span = max(high - low, 1e-12 * max(abs(low), abs(high), 1e-300))
+    power = 10.0 ** np.floor(np.log10(span / most))
+    for width in (factor * power for factor in (1.0, 2.0, 2.5, 5.0, 10.0, 20.0)):
+        first, last = np.floor(low / width + 1e-9), np.ceil(high / width - 1e-9)
+        if last - first <= most:
+            return np.asarray(width * np.arange(first, max(last, first + 1) + 1))
+    raise AssertionError("one of the widths is wide enough")
 
 
 def _members(quantity: str, labels: tuple[str, ...], unit: str, index: npt.NDArray[np.intp]) -> Iterator[Regime]:

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dynssm_ros.evaluation.metrics import BATCH, Indices, Tick, Vector, gather, silent
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.evaluation.metrics import BATCH, Tick, gather, silent
 from dynssm_ros.runtime.models import WindowModel
+from dynssm_ros.vehicle.kinematics import world_velocity
 
 
 @dataclass(frozen=True)
@@ -89,9 +91,8 @@ def path(velocities: Vector, T_s: float) -> Vector:
     mean = (velocities[..., 1:, :] + velocities[..., :-1, :]) / 2
     turn = T_s * mean[..., 2]
     heading = np.cumsum(turn, axis=-1) - turn / 2
-    c, s = np.cos(heading), np.sin(heading)
-    v_x, v_y = mean[..., 0], mean[..., 1]
-    return T_s * np.cumsum(np.stack([v_x * c - v_y * s, v_x * s + v_y * c], axis=-1), axis=-2)
+    velocity = world_velocity(np, heading, mean[..., 0], mean[..., 1])
+    return T_s * np.cumsum(np.stack(velocity, axis=-1), axis=-2)
 
 
 def branches(model: WindowModel, matrix: Vector, starts: Indices, steps: int, T_s: float) -> Vector:

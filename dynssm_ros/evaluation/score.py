@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.coefficients import CoefficientStatistics
-from dynssm_ros.evaluation.metrics import CHANNELS, Vector, by_channel, finite
+from dynssm_ros.evaluation.metrics import by_channel, finite
 from dynssm_ros.evaluation.regimes import Regime
 from dynssm_ros.evaluation.rollout import Rollout
 from dynssm_ros.evaluation.spread import Spread, mean_and_std, spreads
 from dynssm_ros.runtime.models import OnnxModel, WindowModel
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _WITH_STD = ("rmse", "max_error", "ade", "fde", "coverage_90", "explained")  # what is stated with its spread over seeds
 
@@ -88,7 +90,7 @@ class Score:
             "coefficients": None if self.coefficients is None else self.coefficients.to_json(),
             "rollout": {
                 "time_s": [finite(t) for t in self.rollout.time],
-                "rmse": {name: [finite(v) for v in self.rollout.rmse[:, k]] for k, name in enumerate(CHANNELS)},
+                "rmse": {name: [finite(v) for v in self.rollout.rmse[:, k]] for k, name in enumerate(STATE_SIGNALS)},
                 "displacement": [finite(v) for v in self.rollout.displacement],
             },
         }

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.learning.least_squares import Influence, Loss, influence, least_squares
 from dynssm_ros.signals.context import recording_context
@@ -23,7 +24,6 @@ from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehic
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.single_track import Integrator, settled_memory, step_with_memory
 
-Vector = npt.NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 _UNIFORM_PRECISION = 12.0  # inverse variance of a uniform distribution on [0, 1]

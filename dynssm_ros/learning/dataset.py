@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -14,7 +13,6 @@ from dynssm_ros.learning.configuration import TrainingConfig
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.recording import Recording
 
-Indices = npt.NDArray[np.intp]
 _CONSTANT = 1e-9  # a column that varies less than this is not scaled
 
 

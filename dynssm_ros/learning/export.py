@@ -25,8 +25,8 @@ from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import replacing
 from dynssm_ros.learning.configuration import ModelConfig
 from dynssm_ros.learning.dataset import Windows
-from dynssm_ros.learning.dynssm import DynSSM, Output
-from dynssm_ros.learning.models import build_model
+from dynssm_ros.learning.models.dynssm.network import DynSSM, Output
+from dynssm_ros.learning.models.registry import build_model
 from dynssm_ros.learning.training import Trained
 from dynssm_ros.runtime.artifact import (
     CARD,

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import optimize
 
-Vector = npt.NDArray[np.float64]
+from dynssm_ros.arrays import Vector
+
 Residuals = Callable[[Vector], Vector]
 Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dynssm_ros.learning.configuration import LossConfig
-from dynssm_ros.learning.dynssm import Output
+from dynssm_ros.learning.models.dynssm.network import Output
 from dynssm_ros.runtime.artifact import Normalisation
 
 COMPONENTS = ("prediction", "parameters", "correction", "physics")

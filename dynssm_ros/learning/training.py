@@ -21,12 +21,12 @@ from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.calibration import calibrate
 from dynssm_ros.learning.configuration import LossConfig, ModelConfig, TrainingConfig
 from dynssm_ros.learning.dataset import Windows, all_windows, normalisation, split_windows
-from dynssm_ros.learning.ddm import DDM
-from dynssm_ros.learning.dynssm import DynSSM
-from dynssm_ros.learning.fthd import freeze, physics_loss
 from dynssm_ros.learning.losses import COMPONENTS, Scales, objective, scales
-from dynssm_ros.learning.models import build_model, modelled_vehicle
-from dynssm_ros.learning.ridge import Ridge
+from dynssm_ros.learning.models.ddm import DDM
+from dynssm_ros.learning.models.dynssm.network import DynSSM
+from dynssm_ros.learning.models.fthd import freeze, physics_loss
+from dynssm_ros.learning.models.registry import build_model, modelled_vehicle
+from dynssm_ros.learning.models.ridge import Ridge
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
-from dynssm_ros.control.online import Online
+from dynssm_ros.control.live import LiveController
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
@@ -28,9 +28,9 @@ from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.messages import COMMAND_TOPIC, ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
-from dynssm_ros.simulation.plant import Pose
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import State, load_vehicle
+from dynssm_ros.vehicle.kinematics import Pose
 
 _STEPS = (2, 100)  # of a horizon
 # a controller that was held up goes on from the newest odometry
@@ -66,7 +66,7 @@ class ControllerNode(Node):
         self.create_timer(self._driver.period / 1e9 / self._rate, self._watch, clock=steady)
         self.create_timer(period, self._diagnose, clock=steady)
 
-    def _make_driver(self) -> Online:
+    def _make_driver(self) -> LiveController:
         """What the parameters ask for; it has its first step behind it."""
         vehicle = describe(self, "vehicle", "orca", "Vehicle: shipped name or file.", read_only=True)
         track = describe(self, "track", "club", "Track: built-in name or CSV file.", read_only=True)
@@ -90,7 +90,7 @@ class ControllerNode(Node):
         reference = load_reference(line, car, road, pace)
         settings = Settings.of(car, objective, horizon or None, offset_free)
         settings = replace(settings, deadline=car.sampling_time / self._rate)
-        driver = Online(car, reference, road, settings, max_age, self._watchdog)
+        driver = LiveController(car, reference, road, settings, max_age, self._watchdog)
         self.get_logger().info(
             f"{car.name} on {road.name} ({road.length:.4g} m), {objective} of the {reference.name} line "
             f"({reference.lap_time:.4g} s a lap at its own speed), {settings.N} steps of {car.sampling_time:g} s"

@@ -23,12 +23,12 @@ from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, ru
 from dynssm_ros.signals.decoding import decoders
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
-from dynssm_ros.simulation.driver import Style
 from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
 from dynssm_ros.simulation.laps import Sample, drive
 from dynssm_ros.simulation.plant import PlantKind
-from dynssm_ros.simulation.racing_line import LineKind, line_of
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.driver import Style
+from dynssm_ros.track.racing_line import LineKind, line_of
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, State, load_vehicle
 from dynssm_ros.vehicle.effects import parse_effect
 

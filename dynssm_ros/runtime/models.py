@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 import onnxruntime as ort
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
@@ -17,8 +17,6 @@ from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle import Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_memory
 from dynssm_ros.vehicle.single_track import Integrator, step_with_memory
-
-Vector = npt.NDArray[np.float64]
 
 
 class WindowPrediction(NamedTuple):

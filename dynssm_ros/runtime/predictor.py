@@ -11,15 +11,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.signal_map import SignalMap
-
-Vector = npt.NDArray[np.float64]
-Pose = tuple[float, float, float]
+from dynssm_ros.vehicle import State
+from dynssm_ros.vehicle.kinematics import SCALAR, Pose, advance_pose
 
 
 @dataclass(frozen=True)
@@ -126,9 +125,8 @@ class Predictor:
             row[:3], row[3:5], row[5:7] = state, row[3:5] + row[5:7], 0.0
             window = np.concatenate([window[1:], row[None]])
             following = self.model.predict(window[None]).state[0]
-            x, y, theta = poses[-1]
-            pose = propagate_pose({"x": x, "y": y, "theta": theta}, state, following, self.model.T_s)
-            if pose is None or not _finite(pose):
+            pose = advance_pose(SCALAR, poses[-1], State(*state.tolist()), State(*following.tolist()), self.model.T_s)
+            if not _finite(pose):
                 break
             poses.append(pose)
             state = following
@@ -166,12 +164,9 @@ def _finite_row(part: Vector | None) -> bool:
 def propagate_pose(
     values: Mapping[str, float], now: Iterable[float], following: Iterable[float], T_s: float
 ) -> Pose | None:
-    """The pose one step on, by the mean velocity of the step at its middle heading; ``None`` without a pose."""
+    """The pose one step on; ``None`` without a pose."""
     try:
-        x, y, theta = values["x"], values["y"], values["theta"]
+        pose = Pose(values["x"], values["y"], values["theta"])
     except KeyError:
         return None
-    v_x, v_y, omega = (float(a + b) / 2 for a, b in zip(now, following, strict=True))
-    heading = theta + omega * T_s / 2
-    c, s = math.cos(heading), math.sin(heading)
-    return x + T_s * (v_x * c - v_y * s), y + T_s * (v_x * s + v_y * c), theta + omega * T_s
+    return advance_pose(SCALAR, pose, State(*now), State(*following), T_s)

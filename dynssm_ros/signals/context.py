@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
-
+from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle.effects import CONTEXT_UNITS
-
-Vector = npt.NDArray[np.float64]
 
 
 def recording_context(recording: Recording) -> dict[str, Vector]:

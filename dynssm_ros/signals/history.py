@@ -11,12 +11,11 @@ from enum import Enum
 from math import isfinite
 
 import numpy as np
-import numpy.typing as npt
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.inputs import model_inputs
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, SignalMap
 
-Vector = npt.NDArray[np.float64]
 _BRIDGE = 1e-6  # fraction of T_s by which float rounding may miss the first sample of a window
 
 

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.vehicle.single_track import Applied
-
-Vector = npt.NDArray[np.float64]
 
 WINDOW_COLUMNS = ("v_x", "v_y", "omega", "r_fb", "delta_fb", "r_cmd", "delta_cmd")
 """One row of the model's input: ``x_t = [v_x, v_y, omega, r_fb, delta_fb]`` and ``u_t = [r_cmd, delta_cmd]``."""

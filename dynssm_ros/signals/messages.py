@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from rosbags.typesys import Stores, get_typestore
+
+from dynssm_ros.arrays import Vector
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -20,7 +21,6 @@ PARAMETERS_TOPIC = "/dynssm/parameters"
 HORIZON_TOPIC = "/dynssm/horizon"
 
 _TYPES = get_typestore(Stores.ROS2_JAZZY).types
-Vector = npt.NDArray[np.float64]
 
 
 def odometry(

@@ -14,14 +14,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import Field, ValidationError
 
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.configuration import StrictModel, describe
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.files import replacing
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, Commands
 
-Vector = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 METADATA_KEY = b"dynssm"
 COLUMN_UNITS = {
     "v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "r_fb": "1", "delta_fb": "rad", "r_cmd": "1", "delta_cmd": "rad",
@@ -38,6 +37,10 @@ class RecordingInfo(StrictModel):
     source: tuple[str, ...] = Field(default=(), description="names of the bags or simulations")
     signal_map: str = ""
     notes: tuple[str, ...] = Field(default=(), description="what was recovered, dropped or bridged")
+
+
+FULL_SIZE_SPEED = 10.0  # a recording that exceeds this speed (m/s) is of a full-size car
+FULL_SIZE_MIN_SPEED = 5.0  # m/s; the published evaluations of full-size cars leave out slower rows
 
 
 @dataclass(frozen=True)
@@ -237,3 +240,8 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
         np.concatenate([r.segment + offset for r, offset in zip(recordings, offsets, strict=True)]).astype(np.int32),
         {name: np.concatenate([r.columns[name] for r in recordings]) for name in names},
     )
+
+
+def default_min_speed(recording: Recording) -> float:
+    """Speed (m/s) below which rows are not scored: 5 for full-size cars as in the literature, none for small ones."""
+    return FULL_SIZE_MIN_SPEED if recording["v_x"].max(initial=0.0) > FULL_SIZE_SPEED else 0.0

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.signals.inputs import lookahead_commands, model_inputs
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, Commands
 
-Vector = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 _ROUNDING = 1e-6  # periods by which a float may miss the last instant of a stretch
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.bags import write_bag
 from dynssm_ros.signals.messages import (
     COMMAND_TOPIC,
@@ -20,7 +21,6 @@ from dynssm_ros.signals.messages import (
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS
 
-Vector = npt.NDArray[np.float64]
 _ORDER = 1000  # ns between the log times of the messages of one instant: actuators first, odometry last
 
 

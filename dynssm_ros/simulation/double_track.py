@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from dynssm_ros.vehicle.effects.drivetrain import TRACK_WIDTH
-from dynssm_ros.vehicle.single_track import Array, Constants, Motion, shape
+from dynssm_ros.vehicle.single_track import Array, Constants, Motion, StageEffect, front_force, rear_force
 
 LOAD_SENSITIVITY = 0.15  # of a racing slick: grip per load that 100 % more load costs
 _ROUNDS = 2  # of lateral force and load transfer, which hang on each other weakly
@@ -29,7 +29,7 @@ class Wheels(NamedTuple):
 
 
 @dataclass(frozen=True)
-class DoubleTrack:
+class DoubleTrack(StageEffect):
     """Left and right wheels with their own slip angle, load and Pacejka force.
 
     Without load transfer and with both wheels at one slip angle the forces are those of the single-track car. Beyond
@@ -52,14 +52,7 @@ class DoubleTrack:
         wheelbase = car.l_f + car.l_r
         return cls(width=TRACK_WIDTH * wheelbase, roll_front=car.l_r / wheelbase)
 
-    def apply(self, stage: str, xp: Any, q: Motion) -> None:
-        """Acts at the stages ``tyres`` and ``forces``."""
-        if stage == "tyres":
-            self._tyres(xp, q)
-        elif stage == "forces":
-            q.M_z = q.M_z + q.context[_MOMENT]
-
-    def loads(self, q: Motion, F_y: Array) -> Wheels:
+    def wheel_loads(self, q: Motion, F_y: Array) -> Wheels:
         """Wheel loads (N) under the lateral force ``F_y`` (N) on the body; left wheels are lighter if that is positive.
 
         A wheel that lifts carries nothing; the other one has the whole axle then.
@@ -69,7 +62,7 @@ class DoubleTrack:
         rear = _within((1 - self.roll_front) * roll, q.F_zr / 2)
         return Wheels(q.F_zf / 2 - front, q.F_zf / 2 + front, q.F_zr / 2 - rear, q.F_zr / 2 + rear)
 
-    def slips(self, xp: Any, q: Motion) -> Wheels:
+    def wheel_slips(self, xp: Any, q: Motion) -> Wheels:
         """Slip angles (rad): those of the axles, which effects may have changed, and the yawing of the wheels."""
         shift = q.omega * self.width / 2
         left, right, centre = abs(q.v_x - shift), abs(q.v_x + shift), abs(q.v_x)
@@ -82,14 +75,18 @@ class DoubleTrack:
             rear_axle + xp.arctan2(rear, right),
         )
 
-    def _tyres(self, xp: Any, q: Motion) -> None:
-        th, alpha = q.theta, self.slips(xp, q)
+    def forces(self, xp: Any, q: Motion) -> None:
+        """Adds the yaw moment of the steered wheels."""
+        q.M_z = q.M_z + q.context[_MOMENT]
+
+    def tyres(self, xp: Any, q: Motion) -> None:
+        """Puts the sum of left and right wheels in the place of each axle's lateral force."""
+        alpha = self.wheel_slips(xp, q)
         full = Wheels(
-            *(th.S_vf + th.D_f * xp.sin(th.C_f * shape(xp, th.B_f, th.E_f, a)) for a in alpha[:2]),
-            *(th.S_vr + th.D_r * xp.sin(th.C_r * shape(xp, th.B_r, th.E_r, a)) for a in alpha[2:]),
+            *(front_force(xp, q.theta, a) for a in alpha[:2]), *(rear_force(xp, q.theta, a) for a in alpha[2:])
         )
         for _ in range(_ROUNDS):
-            F_z = self.loads(q, q.F_fy * xp.cos(q.delta) + q.F_ry)
+            F_z = self.wheel_loads(q, q.F_fy * xp.cos(q.delta) + q.F_ry)
             axles = (q.F_zf, q.F_zf, q.F_zr, q.F_zr)
             force = Wheels(*map(self._force, full, F_z, axles, (q.F_z0,) * 4))
             q.F_fy, q.F_ry = force.front_left + force.front_right, force.rear_left + force.rear_right

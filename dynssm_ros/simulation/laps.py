@@ -12,14 +12,16 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
 from dynssm_ros.signals.standard import write_standard_bag
-from dynssm_ros.simulation.driver import Driver, Style
-from dynssm_ros.simulation.lines import ClosedLine, Vector
-from dynssm_ros.simulation.plant import PlantKind, Pose, make_plant
-from dynssm_ros.simulation.speed_profile import vehicle_limits
-from dynssm_ros.simulation.tracks import Track
+from dynssm_ros.simulation.plant import PlantKind, make_plant
+from dynssm_ros.track.driver import Driver, Style
+from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.speed_profile import vehicle_limits
+from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Applied, State, Vehicle
+from dynssm_ros.vehicle.kinematics import Pose
 
 START_TIME = 1_000_000_000_000_000_000  # ns: the stamp of the first sample; a fixed one, so that runs repeat
 DEFAULT_STYLE = Style()
@@ -125,7 +127,7 @@ def drive(
         _check_motion(vehicle, track, time, pose, state)
         on_line = float(line.project(pose[:2], near=on_line)[0])
         on_track, lateral = (float(value) for value in track.project(pose[:2], near=s))
-        s += math.remainder(on_track - s, track.length)
+        s = track.centre.counted_on(on_track, s)
         _check_place(vehicle, track, time, state, s, lateral)
         command = driver.command(time, pose, state, on_line, feedback)
         yield Sample(time, state, pose, feedback, command, s, lateral, car.measured)

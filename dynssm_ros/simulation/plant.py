@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from types import SimpleNamespace
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, Protocol
 
 from dynssm_ros.simulation.double_track import DoubleTrack
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step_with_memory
 from dynssm_ros.vehicle.effects import require_context
-from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDelay
+from dynssm_ros.vehicle.kinematics import SCALAR, Pose, world_velocity
 from dynssm_ros.vehicle.single_track import Integrator, Motion, StageEffect, measured_state, settled_memory
 
 PlantKind = Literal["euler", "rk4", "double_track"]
@@ -19,20 +18,6 @@ PlantKind = Literal["euler", "rk4", "double_track"]
 ``double_track``: four wheels with load transfer, in steps of 1 ms."""
 
 RK4_STEP = 1e-3  # s, at most
-
-# floats through `math` are ten times faster than through numpy; the names are those of numpy
-SCALAR = SimpleNamespace(
-    sin=math.sin, cos=math.cos, tan=math.tan, arctan=math.atan, arctan2=math.atan2, tanh=math.tanh, exp=math.exp,
-    sqrt=math.sqrt, fabs=math.fabs, hypot=math.hypot, pi=math.pi,
-)  # fmt: skip
-
-
-class Pose(NamedTuple):
-    """Position (m) and heading (rad, counter-clockwise, not wrapped) of the centre of gravity."""
-
-    x: float
-    y: float
-    theta: float
 
 
 class Plant(Protocol):
@@ -53,21 +38,20 @@ class Plant(Protocol):
         """Moves it on by T_s under constant inputs; ``s`` is its track position (m), for effects that live there."""
 
 
-class _Odometer:
+class _Odometer(StageEffect):
     """Carries the pose as states of the equations of motion, so that it is integrated exactly like them."""
 
-    MEMORY = ("pose.x", "pose.y", "pose.theta")
+    POSE = ("pose.x", "pose.y", "pose.theta")
 
-    def apply(self, stage: str, xp: Any, q: Motion) -> None:
-        """Shows the pose to the effects that follow, and sets its rates."""
-        x, y, theta = self.MEMORY
-        if stage == "inputs":
-            q.context = {**q.context, "x": q.memory[x], "y": q.memory[y], "theta": q.memory[theta]}
-        elif stage == "accelerations":
-            sin, cos = xp.sin(q.memory[theta]), xp.cos(q.memory[theta])
-            q.memory_rate[x] = q.v_x * cos - q.v_y * sin
-            q.memory_rate[y] = q.v_x * sin + q.v_y * cos
-            q.memory_rate[theta] = q.omega
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Shows the pose to the effects that follow."""
+        q.context = {**q.context, **{name: q.memory[f"pose.{name}"] for name in Pose._fields}}
+
+    def accelerations(self, xp: Any, q: Motion) -> None:
+        """Sets the rates of the pose."""
+        x, y, theta = self.POSE
+        q.memory_rate[x], q.memory_rate[y] = world_velocity(xp, q.memory[theta], q.v_x, q.v_y)
+        q.memory_rate[theta] = q.omega
 
 
 class SingleTrackPlant:
@@ -104,24 +88,24 @@ class SingleTrackPlant:
         self._integrator: Integrator = integrator
         self._theta = Coefficients(*(float(value) for value in vehicle.nominal))
         effects = vehicle.active_effects
-        sensors = [effect for effect in effects if isinstance(effect, MeasurementEffect)]
-        physics = [effect for effect in effects if not isinstance(effect, (MeasurementEffect, OdometryDelay))]
+        sensors = [effect for effect in effects if effect.SENSOR and not effect.reading_delay]
+        physics = [effect for effect in effects if not effect.SENSOR]
         self._effects: tuple[StageEffect, ...] = (_Odometer(), *first, *physics, *last, *sensors)
         self._steps = 0
         self._track = {} if lap_length is None else {"lap_length": lap_length}
         require_context(effects, {*self._context(0.0), *Pose._fields}, "simulation")
         self._memory = settled_memory(
             SCALAR, state, Applied(0.0, 0.0), self._theta, vehicle.constants, self._effects,
-            dict(zip(_Odometer.MEMORY, pose, strict=True)), self._context(0.0), measured=False,
+            dict(zip(_Odometer.POSE, pose, strict=True)), self._context(0.0), measured=False,
         )  # fmt: skip
         self._substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
-        delay = sum(effect.delay for effect in effects if isinstance(effect, OdometryDelay))
+        delay = sum(effect.reading_delay for effect in effects)
         self._late = _Late(delay, self._seen()) if delay > 0 else None
 
     @property
     def pose(self) -> Pose:
         """Where the car is."""
-        return Pose(*(self._memory[name] for name in _Odometer.MEMORY))
+        return Pose(*(self._memory[name] for name in _Odometer.POSE))
 
     @property
     def measured(self) -> State:
@@ -178,6 +162,11 @@ class _Late:
         (before, old), (after, new) = self._past[0], self._past[1]
         share = (self._past[-1][0] - self._delay - before) / (after - before)
         return State(*(a + share * (b - a) for a, b in zip(old, new, strict=True)))
+
+
+def plant_step(vehicle: Vehicle, kind: PlantKind) -> float:
+    """Longest integration step (s) of a plant."""
+    return vehicle.sampling_time if kind == "euler" else RK4_STEP
 
 
 def make_plant(

@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import yaml
 from pydantic import Field, field_validator, model_validator
 
 from dynssm_ros import configuration
+from dynssm_ros.arrays import Vector
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.files import replacing
 from dynssm_ros.vehicle.effects import EFFECTS, Effect, build_effect
-from dynssm_ros.vehicle.single_track import Coefficients
+from dynssm_ros.vehicle.single_track import Applied, Coefficients
 
 COEFFICIENT_UNITS: dict[str, str] = {
     "B_f": "1/rad", "C_f": "1", "D_f": "N", "E_f": "1",
@@ -29,8 +29,6 @@ COEFFICIENT_UNITS: dict[str, str] = {
 }  # fmt: skip
 COEFFICIENTS: tuple[str, ...] = Coefficients._fields
 assert tuple(COEFFICIENT_UNITS) == COEFFICIENTS
-
-Vector = npt.NDArray[np.float64]
 
 
 class Coefficient(StrictModel):
@@ -69,6 +67,19 @@ class InputLimits(StrictModel):
     throttle: tuple[float, float] = Field(description="range of the signed throttle (fraction, negative brakes)")
     steering: tuple[float, float] = Field(description="range of the road-wheel angle (rad)")
     steering_rate: float = Field(gt=0, description="largest steering speed (rad/s)")
+
+    def reached(self, wanted: Applied, previous: Applied, T_s: float) -> Applied:
+        """What the actuators make of ``wanted`` within ``T_s`` (s) after ``previous``: in range, no faster than they can."""
+        reach = self.steering_rate * T_s
+        delta = min(max(wanted.delta, previous.delta - reach), previous.delta + reach)
+        return self.clamped(Applied(wanted.r, delta))
+
+    def clamped(self, wanted: Applied) -> Applied:
+        """``wanted`` in the range of the actuators."""
+        return Applied(
+            float(min(max(wanted.r, self.throttle[0]), self.throttle[1])),
+            float(min(max(wanted.delta, self.steering[0]), self.steering[1])),
+        )
 
     @field_validator("throttle", "steering")
     @classmethod

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 GRAVITY = 9.81  # m/s^2
 _INSTANT = 1e-3  # s; the time that a single evaluation stands for
@@ -139,15 +139,68 @@ class Motion:
     h: float = _INSTANT
 
 
-class StageEffect(Protocol):
-    """What :func:`motion` asks of an effect: a method per stage, called after the stage's own equations.
+class StageEffect:
+    """Physics beyond the nominal equations. A subclass overrides the stages at which it acts.
 
-    It may have more, all of it optional: ``carries``, the names of its own states; and, if ``measures`` is true, the
-    methods ``measured`` and ``true`` (see :class:`dynssm_ros.vehicle.effects.measurement.MeasurementEffect`).
+    Each method is called after the stage of its name and may change what that stage computed. An effect of the sensors
+    overrides ``measured`` and its inverse ``true`` instead.
+
+    Attributes:
+        NAME: for messages.
+        HOOKS: the methods of which it overrides at least one.
     """
 
-    def apply(self, stage: str, xp: Any, q: Motion) -> None:
-        """Changes ``q`` after ``stage``."""
+    NAME: ClassVar[str] = ""
+    HOOKS: ClassVar = ("inputs", "slip", "drive", "loads", "tyres", "forces", "accelerations", "measured")
+
+    @property
+    def is_neutral(self) -> bool:
+        """Whether it is absent; then nothing of it is evaluated."""
+        return False
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Signals beside state and inputs that it reads, by the names of ``CONTEXT_UNITS``."""
+        return ()
+
+    @property
+    def carries(self) -> tuple[str, ...]:
+        """Names of its own states (a lag, a relaxing tyre), which the integrator advances with the car's."""
+        return ()
+
+    @property
+    def measures(self) -> bool:
+        """Whether it changes what is measured, and not what happens."""
+        return False
+
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Changes state, applied inputs or parameters of the car before anything is computed from them."""
+
+    def slip(self, xp: Any, q: Motion) -> None:
+        """Changes the slip angles."""
+
+    def drive(self, xp: Any, q: Motion) -> None:
+        """Changes the longitudinal force."""
+
+    def loads(self, xp: Any, q: Motion) -> None:
+        """Changes the axle loads."""
+
+    def tyres(self, xp: Any, q: Motion) -> None:
+        """Changes the lateral tyre forces."""
+
+    def forces(self, xp: Any, q: Motion) -> None:
+        """Changes the forces and the moment on the body."""
+
+    def accelerations(self, xp: Any, q: Motion) -> None:
+        """Changes the derivatives of the state."""
+
+    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """What is measured of the true ``state``."""
+        return state
+
+    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+        """The true state of which ``state`` is measured: the inverse of :meth:`measured`."""
+        return state
 
 
 def inputs(xp: Any, q: Motion) -> None:
@@ -179,9 +232,8 @@ def loads(xp: Any, q: Motion) -> None:
 
 def tyres(xp: Any, q: Motion) -> None:
     """Lateral tyre forces: load-dependent Pacejka with curvature, Eq. (10) to (13)."""
-    th = q.theta
-    q.F_fy = (th.S_vf + th.D_f * xp.sin(th.C_f * shape(xp, th.B_f, th.E_f, q.alpha_f))) * (q.F_zf / q.F_z0)
-    q.F_ry = (th.S_vr + th.D_r * xp.sin(th.C_r * shape(xp, th.B_r, th.E_r, q.alpha_r))) * (q.F_zr / q.F_z0)
+    q.F_fy = front_force(xp, q.theta, q.alpha_f) * (q.F_zf / q.F_z0)
+    q.F_ry = rear_force(xp, q.theta, q.alpha_r) * (q.F_zr / q.F_z0)
 
 
 def forces(xp: Any, q: Motion) -> None:
@@ -199,14 +251,38 @@ def accelerations(xp: Any, q: Motion) -> None:
     q.omega_dot = q.M_z / q.theta.I_z
 
 
-STAGES: tuple[Callable[[Any, Motion], None], ...] = (inputs, slip, drive, loads, tyres, forces, accelerations)
-STAGE_NAMES = tuple(stage.__name__ for stage in STAGES)
+def lateral_force(xp: Any, B: Array, C: Array, D: Array, E: Array, S_v: Array, alpha: Array) -> Array:
+    """Magic formula: lateral force (N) of an axle at its nominal load and slip angle ``alpha`` (rad), Eq. (10) to (13).
 
-
-def shape(xp: Any, B: Array, E: Array, alpha: Array) -> Array:
-    """Pacejka's argument psi = atan(B a - E (B a - atan(B a))), Eq. (12) and (13)."""
+    ``S_v + D sin(C atan(B a - E (B a - atan(B a))))``; the slip angle contains its shift S_h.
+    """
     slope = B * alpha
-    return xp.arctan(slope - E * (slope - xp.arctan(slope)))
+    return S_v + D * xp.sin(C * xp.arctan(slope - E * (slope - xp.arctan(slope))))
+
+
+def front_force(xp: Any, th: Coefficients, alpha: Array) -> Array:
+    """Lateral force (N) of the front axle at its nominal load."""
+    return lateral_force(xp, th.B_f, th.C_f, th.D_f, th.E_f, th.S_vf, alpha)
+
+
+def rear_force(xp: Any, th: Coefficients, alpha: Array) -> Array:
+    """Lateral force (N) of the rear axle at its nominal load."""
+    return lateral_force(xp, th.B_r, th.C_r, th.D_r, th.E_r, th.S_vr, alpha)
+
+
+def cornering_stiffness(th: Coefficients) -> tuple[Array, Array]:
+    """Slope of the lateral force (N/rad) of front and rear axle where the tyre does not slip: ``B C D``."""
+    return th.B_f * th.C_f * th.D_f, th.B_r * th.C_r * th.D_r
+
+
+def settling_rate(th: Coefficients, car: Constants) -> Array:
+    """How fast sideslip and yaw of the linear car settle, times the speed (m/s^2).
+
+    Their rates are about ``sum C / (m v_x)`` and ``sum C l^2 / (I_z v_x)``, ``C`` the cornering stiffness of an axle; this
+    is the larger one times ``v_x``.
+    """
+    C_f, C_r = cornering_stiffness(th)
+    return max((C_f + C_r) / car.m, (C_f * car.l_f**2 + C_r * car.l_r**2) / th.I_z)
 
 
 def at_least(value: Array, floor: Array) -> Array:
@@ -255,16 +331,34 @@ def motion(
         context=context or {},
         h=h,
     )
-    for stage in STAGES:
-        stage(xp, q)
-        for effect in effects:
-            effect.apply(stage.__name__, xp, q)
+    acting = [effect for effect in effects if not effect.is_neutral]
+    inputs(xp, q)
+    for effect in acting:
+        effect.inputs(xp, q)
+    slip(xp, q)
+    for effect in acting:
+        effect.slip(xp, q)
+    drive(xp, q)
+    for effect in acting:
+        effect.drive(xp, q)
+    loads(xp, q)
+    for effect in acting:
+        effect.loads(xp, q)
+    tyres(xp, q)
+    for effect in acting:
+        effect.tyres(xp, q)
+    forces(xp, q)
+    for effect in acting:
+        effect.forces(xp, q)
+    accelerations(xp, q)
+    for effect in acting:
+        effect.accelerations(xp, q)
     return q
 
 
-def measuring(effects: Sequence[StageEffect]) -> tuple[Any, ...]:
+def measuring(effects: Sequence[StageEffect]) -> tuple[StageEffect, ...]:
     """Those of ``effects`` that change what is measured."""
-    return tuple(effect for effect in effects if getattr(effect, "measures", False))
+    return tuple(effect for effect in effects if effect.measures)
 
 
 def measured_state(xp: Any, state: State, effects: Sequence[StageEffect], memory: Mapping[str, Array]) -> State:
@@ -310,7 +404,7 @@ def settled_memory(
         measured: whether ``state`` is what is measured or the true one.
     """
     known = dict(memory or {})
-    if all(name in known for effect in effects for name in getattr(effect, "carries", ())):
+    if all(name in known for effect in effects for name in effect.carries):
         return known
     sensors = measuring(effects) if measured else ()
 
@@ -319,7 +413,7 @@ def settled_memory(
         return motion(xp, true, applied, theta, constants, effects, known, context).memory
 
     first = settled({})
-    names = [name for sensor in sensors for name in getattr(sensor, "carries", ()) if name not in known]
+    names = [name for sensor in sensors for name in sensor.carries if name not in known]
     if not names:
         return first
     second = settled({name: first[name] for name in names})

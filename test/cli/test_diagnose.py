@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dynssm_ros.diagnosis.battery.cases import Case, record
+from benchmarks.hidden_causes.cases import Case, record
 from dynssm_ros.vehicle import load_vehicle, save_vehicle
 
 Run = Callable[..., tuple[int, str, str]]

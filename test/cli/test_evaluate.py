@@ -14,7 +14,7 @@ from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import load_signal_map
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.tracks import load_track
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def laps(laps_bag, tmp_path):
 @pytest.fixture
 def quick_figures(monkeypatch):
     """Figures are made but not drawn, which takes most of the time of a report."""
-    monkeypatch.setattr("dynssm_ros.evaluation.report.svg_uri", lambda figure: "data:,")
+    monkeypatch.setattr("dynssm_ros.reporting.page.svg_uri", lambda figure: "data:,")
 
 
 def test_writes_report_results_and_table(dynssm, recording, tmp_path):

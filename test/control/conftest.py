@@ -12,8 +12,8 @@ from dynssm_ros.control.horizon_model import Car, HorizonModel
 from dynssm_ros.control.nmpc import Nmpc
 from dynssm_ros.control.reference import Reference, load_reference
 from dynssm_ros.control.settings import Settings
-from dynssm_ros.simulation.lines import ClosedLine
-from dynssm_ros.simulation.tracks import Track, load_track
+from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.tracks import Track, load_track
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
 
 N = 10

@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dynssm_ros.control.controller import Controller
 from dynssm_ros.control.disturbance import SETTLING, Disturbance
-from dynssm_ros.control.learned import Fixed, true_model
-from dynssm_ros.control.pilot import Pilot
+from dynssm_ros.control.prediction_model import Fixed
 from dynssm_ros.control.race import Course, race
+from dynssm_ros.control.race_models import true_model
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.simulation.plant import Pose, make_plant
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, State
@@ -76,7 +77,7 @@ def test_the_true_model_drives_as_without(orca, club, club_line, settings):
 def steady(orca, course, knowledge, steps=130):
     """The last decision and place of a drive on a circle."""
     track, reference, settings = course
-    pilot = Pilot(knowledge, orca.inputs, reference, track, settings)
+    pilot = Controller(knowledge, orca.inputs, reference, track, settings)
     car, feedback = make_plant(orca, "euler", Pose(1.0, 0.0, np.pi / 2), State(1.5, 0.0, 1.5)), Applied(0.0, 0.0)
     for k in range(steps):
         decision = pilot.step(0.02 * k, car.pose, car.measured, feedback)

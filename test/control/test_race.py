@@ -5,14 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.control.learned import load_knowledge, true_model
 from dynssm_ros.control.race import Course, Start, _Drive, race
+from dynssm_ros.control.race_models import load_prediction_model, true_model
 from dynssm_ros.control.reference import Reference, load_reference
-from dynssm_ros.control.report import coefficients, driven_coefficients, race_json, race_report, race_table, summary
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.reporting.race_report import (
+    coefficients,
+    driven_coefficients,
+    race_json,
+    race_report,
+    race_table,
+    summary,
+)
 from dynssm_ros.simulation.laps import SimulationError
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, State, load_vehicle
 
 
@@ -126,7 +133,7 @@ def test_a_line_for_one_lap_is_not_driven_twice(course, orca, club_line):
 def test_a_model_that_needs_what_is_not_measured_is_refused(course, orca):
     banked = orca.with_effect("road_bank", {"roll_gain": 1.0})
     with pytest.raises(ConfigurationError, match="needs the signal roll"):
-        race(course, load_knowledge("single_track", banked, banked, "euler"))
+        race(course, load_prediction_model("single_track", banked, banked, "euler"))
 
 
 def test_what_effects_amount_to_is_told_as_coefficients(lap, course, orca):

@@ -9,8 +9,8 @@ from dynssm_ros.control.horizon_model import Car, HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Nmpc
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Scale, Settings
-from dynssm_ros.simulation.speed_profile import vehicle_limits
-from dynssm_ros.simulation.tracks import Track
+from dynssm_ros.track.speed_profile import vehicle_limits
+from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import load_vehicle
 
 SIZE = 9.0

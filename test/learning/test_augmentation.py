@@ -9,7 +9,7 @@ import torch
 
 from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.configuration import AugmentationConfig, PhysicsConfig
-from dynssm_ros.learning.dynssm import PhysicsLayer
+from dynssm_ros.learning.models.dynssm.network import PhysicsLayer
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 

@@ -12,11 +12,11 @@ import torch
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.calibration import PredictionErrors
 from dynssm_ros.learning.configuration import PhysicsConfig
-from dynssm_ros.learning.dynssm import PhysicsLayer
+from dynssm_ros.learning.models.dynssm.network import PhysicsLayer
 from dynssm_ros.runtime.models import SingleTrack
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.simulation.laps import simulate
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 

@@ -21,7 +21,7 @@ from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.learning import training as training_module
 from dynssm_ros.learning.configuration import ModelConfig
 from dynssm_ros.learning.dataset import split_windows
-from dynssm_ros.learning.dynssm import DynSSM
+from dynssm_ros.learning.models.dynssm.network import DynSSM
 from dynssm_ros.learning.training import Trained, check_device, train
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS

@@ -20,7 +20,7 @@ from dynssm_ros.nodes.live import LiveRun, collecting, isolated_environment, nod
 from dynssm_ros.nodes.support import SENSOR_QOS, set_pose, set_stamp
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.signals.messages import COMMAND_TOPIC, ODOMETRY_TOPIC, PARAMETERS_TOPIC
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]

@@ -10,20 +10,20 @@ from hypothesis import strategies as st
 from dynssm_ros.simulation.double_track import DoubleTrack
 from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.simulation.plant import Pose, make_plant
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, motion
+from dynssm_ros.vehicle.single_track import StageEffect
 
 AV21, ORCA = load_vehicle("av21"), load_vehicle("orca")
 PLAIN = DoubleTrack.of(AV21.constants)
 PROPORTIONAL = DoubleTrack(PLAIN.width, PLAIN.roll_front, sensitivity=0.0)
 
 
-class Keeper:
+class Keeper(StageEffect):
     """Keeps a copy of what the double track wrote."""
 
-    def apply(self, stage, xp, q):
-        if stage == "forces":
-            self.q, self.F_y = q, q.F_y
+    def forces(self, xp, q):
+        self.q, self.F_y = q, q.F_y
 
 
 def moved(state, applied, *bodies, vehicle=AV21):
@@ -96,7 +96,7 @@ wheel_states = st.tuples(
 def test_loads_add_up_and_no_wheel_pulls_at_the_road(drawn):
     *state, r, delta, F_y = drawn
     q = moved(state, (r, delta))
-    F_z = PLAIN.loads(q, F_y)
+    F_z = PLAIN.wheel_loads(q, F_y)
     assert F_z.front_left + F_z.front_right == pytest.approx(q.F_zf)
     assert F_z.rear_left + F_z.rear_right == pytest.approx(q.F_zr)
     assert min(F_z) >= -1e-9
@@ -105,7 +105,7 @@ def test_loads_add_up_and_no_wheel_pulls_at_the_road(drawn):
 
 def test_load_transfer_balances_the_moment_of_the_lateral_force():
     q, F_y = moved((40.0, 0.0, 0.2), (0.0, 0.0)), 6000.0
-    F_z = PLAIN.loads(q, F_y)
+    F_z = PLAIN.wheel_loads(q, F_y)
     couple = (F_z.front_right - F_z.front_left + F_z.rear_right - F_z.rear_left) * PLAIN.width / 2
     assert couple == pytest.approx(AV21.constants.h_cg * F_y)
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.simulation.driver import Style
 from dynssm_ros.simulation.external import drive_by_commands
 from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.simulation.plant import PlantKind, Pose, make_plant
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.driver import Style
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDelay

@@ -5,10 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
-from dynssm_ros.simulation.external import CommandHolder, Creeping, drive_by_commands
+from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
 from dynssm_ros.simulation.laps import SimulationError
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.simulation.plant import RK4_STEP
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, step
+from dynssm_ros.vehicle.low_speed import LowSpeedRolling
 
 ORCA, AV21, CLUB = load_vehicle("orca"), load_vehicle("av21"), load_track("club")
 
@@ -77,7 +79,11 @@ def test_it_stands_until_it_is_driven_and_comes_to_rest_again_under_the_brakes(v
 
 def test_above_creeping_speed_each_step_is_the_vehicle_model():
     samples = drive(ORCA, Applied(0.6, 0.03), 120)
-    fast = [pair for pair in itertools.pairwise(samples) if pair[0].state.v_x > Creeping(ORCA, "euler").speed]
+    fast = [
+        pair
+        for pair in itertools.pairwise(samples)
+        if pair[0].state.v_x > LowSpeedRolling(ORCA, ORCA.sampling_time).speed
+    ]
     assert len(fast) > 30
     for before, after in fast:
         reached = step(np, before.state, before.command, Coefficients(*ORCA.nominal), ORCA.constants, 0.02)
@@ -86,7 +92,7 @@ def test_above_creeping_speed_each_step_is_the_vehicle_model():
 
 
 def test_creeping_wheels_roll_without_slip():
-    car, limit = ORCA.constants, Creeping(ORCA, "euler").speed
+    car, limit = ORCA.constants, LowSpeedRolling(ORCA, ORCA.sampling_time).speed
     creeping = [s.state for s in drive(ORCA, Applied(0.4, 0.2), 60) if 0.1 < s.state.v_x < limit]
     assert len(creeping) > 3
     for before, after in itertools.pairwise(creeping):
@@ -95,7 +101,7 @@ def test_creeping_wheels_roll_without_slip():
 
 
 def test_creeping_speed_is_where_forward_euler_starts_to_ring():
-    limit = Creeping(ORCA, "euler").speed
+    limit = LowSpeedRolling(ORCA, ORCA.sampling_time).speed
 
     def settles(v_x):
         state = State(v_x, 0.0, 0.5)
@@ -106,7 +112,7 @@ def test_creeping_speed_is_where_forward_euler_starts_to_ring():
 
     assert settles(1.3 * limit)
     assert not settles(0.6 * limit)
-    assert Creeping(ORCA, "rk4").speed == pytest.approx(limit / 20)
+    assert LowSpeedRolling(ORCA, RK4_STEP).speed == pytest.approx(limit / 20)
 
 
 def test_it_goes_on_beside_the_road():

@@ -9,9 +9,9 @@ from dynssm_ros.signals.bags import open_bag
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
-from dynssm_ros.simulation.driver import Style
 from dynssm_ros.simulation.laps import SimulationError, drive, simulate, write_run
-from dynssm_ros.simulation.tracks import load_track
+from dynssm_ros.track.driver import Style
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, step
 
 ORCA, CLUB = load_vehicle("orca"), load_track("club")

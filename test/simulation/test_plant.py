@@ -6,6 +6,7 @@ import pytest
 from dynssm_ros.simulation import plant as plant_module
 from dynssm_ros.simulation.plant import Pose, SingleTrackPlant
 from dynssm_ros.vehicle import Applied, State, load_vehicle
+from dynssm_ros.vehicle.single_track import StageEffect
 
 START = Pose(1.0, -2.0, 0.4), State(2.0, 0.05, 1.0)
 
@@ -88,10 +89,9 @@ def test_lagging_steering_is_carried_from_step_to_step():
 def test_effects_see_time_place_and_pose():
     seen = []
 
-    class Witness:
-        def apply(self, stage, xp, q):
-            if stage == "slip":
-                seen.append(dict(q.context))
+    class Witness(StageEffect):
+        def slip(self, xp, q):
+            seen.append(dict(q.context))
 
     car = SingleTrackPlant(load_vehicle("orca"), "euler", Pose(1.0, 2.0, 0.5), State(2.0, 0.0, 0.0), lap_length=9.0)
     car._effects = (*car._effects, Witness())

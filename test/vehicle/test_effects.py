@@ -24,10 +24,10 @@ from dynssm_ros.vehicle.effects import (
 from dynssm_ros.vehicle.effects.base import lagged
 from dynssm_ros.vehicle.single_track import (
     GRAVITY,
-    STAGE_NAMES,
     Array,
     Integrator,
     Motion,
+    StageEffect,
     settled_memory,
     step_with_memory,
 )
@@ -151,13 +151,12 @@ def test_an_effect_on_the_accelerations_has_the_last_word() -> None:
 def test_each_stage_of_the_equations_can_be_entered_and_in_order() -> None:
     seen: list[str] = []
 
-    class Spy:
-        def apply(self, stage: str, xp: Any, q: Motion) -> None:
-            seen.append(stage)
-
+    stages = ("inputs", "slip", "drive", "loads", "tyres", "forces", "accelerations")
+    noted = {stage: lambda self, xp, q, stage=stage: seen.append(stage) for stage in stages}
+    Spy = type("Spy", (StageEffect,), noted)
     motion(np, STATE, APPLIED, THETA, CONSTANTS, (Spy(), Spy()))
-    assert seen == [stage for stage in STAGE_NAMES for _ in range(2)]
-    assert STAGE_NAMES == ("inputs", "slip", "drive", "loads", "tyres", "forces", "accelerations")
+    assert seen == [stage for stage in stages for _ in range(2)]
+    assert (*stages, "measured") == StageEffect.HOOKS
 
 
 def test_effects_act_in_the_order_given() -> None:

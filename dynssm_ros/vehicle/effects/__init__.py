@@ -1,10 +1,9 @@
 """Physics beyond the nominal model, one small class each.
 
-An effect has named, bounded parameters with units and a neutral value at which it is absent. It acts after one or more
-stages of :mod:`dynssm_ros.vehicle.single_track`: a method that carries a stage's name is called after that stage and
-changes the :class:`~dynssm_ros.vehicle.single_track.Motion`. Effects of :mod:`measurement` change instead what is
-measured of the motion. The vehicle file lists effects by name, and simulation, calibration, training and control use
-them without knowing which they are.
+An effect has named, bounded parameters with units and a neutral value at which it is absent. It overrides one or more
+stages of :class:`~dynssm_ros.vehicle.single_track.StageEffect`, each called after the equations of that stage. Effects of
+:mod:`measurement` change instead what is measured of the motion. The vehicle file lists effects by name. Simulation,
+calibration, training and control use them without knowing which they are.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle.effects.actuators import SteeringGain, SteeringLag, SteeringOffset, ThrottleLag
 from dynssm_ros.vehicle.effects.base import (
     CONTEXT_UNITS,
+    LOCATION,
     Effect,
     Parameter,
     initial_memory,
@@ -33,22 +33,45 @@ from dynssm_ros.vehicle.effects.measurement import (
     YawRateLag,
 )
 from dynssm_ros.vehicle.effects.tyres import CombinedSlip, FrontGrip, GripDrift, GripPatch, RearGrip, TireRelaxation
-from dynssm_ros.vehicle.single_track import STAGE_NAMES
+from dynssm_ros.vehicle.single_track import StageEffect
 
 __all__ = [
     "CONTEXT_UNITS",
     "EFFECTS",
+    "LOCATION",
     "Effect",
     "Parameter",
     "build_effect",
     "initial_memory",
     "parse_effect",
+    "register_effect",
     "require_context",
 ]
 
-EFFECTS: dict[str, type[Effect]] = {
-    effect.NAME: effect
-    for effect in (
+EFFECTS: dict[str, type[Effect]] = {}
+"""All effects by name: the library, and what :func:`register_effect` adds."""
+
+
+def register_effect(effect: type[Effect]) -> type[Effect]:
+    """Makes an effect known by its name to vehicle files, simulation, diagnosis, training and control.
+
+    Use it as a decorator of a class of your own.
+
+    Raises:
+        ValueError: without a name or parameters, a name that is taken, or nothing that it changes.
+    """
+    if not (effect.NAME and effect.PARAMETERS):
+        raise ValueError(f"effect {effect.__name__}: expected NAME and PARAMETERS")
+    if EFFECTS.get(effect.NAME, effect) is not effect:
+        raise ValueError(f"effect {effect.NAME}: the name is taken by {EFFECTS[effect.NAME].__name__}")
+    if all(getattr(effect, hook) is getattr(StageEffect, hook) for hook in StageEffect.HOOKS):
+        raise ValueError(f"effect {effect.NAME}: overrides no stage and not measured; it would change nothing")
+    EFFECTS[effect.NAME] = effect
+    return effect
+
+
+for _effect in (
+
         SteeringOffset, SteeringGain, SteeringLag, ThrottleLag,
         Drag, RollingResistance, DriveGain,
         Mass, YawInertia,
@@ -59,8 +82,8 @@ EFFECTS: dict[str, type[Effect]] = {
         GripDrift, GripPatch,
         LockedDifferential,
         OdometryLeverArm, OdometryMisalignment, OdometryDelay, YawRateBias, YawRateLag,
-    )
-}  # fmt: skip
+):  # fmt: skip
+    register_effect(_effect)
 
 
 def build_effect(name: str, parameters: Mapping[str, float]) -> Effect:
@@ -100,8 +123,3 @@ def parse_effect(text: str) -> tuple[str, dict[str, float]]:
                 f"effect {text}: '{pair}'; expected NAME=NUMBER, as in drag:coefficient=0.3"
             ) from error
     return name.strip(), parameters
-
-
-assert all(any(hasattr(effect, act) for act in (*STAGE_NAMES, "measured")) for effect in EFFECTS.values()), (
-    "every effect acts at a stage or measures"
-)

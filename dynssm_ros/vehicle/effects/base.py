@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.vehicle.single_track import Array, Coefficients, Motion, at_least
+from dynssm_ros.vehicle.single_track import Array, Coefficients, Constants, Motion, StageEffect, at_least
 
 CONTEXT_UNITS: dict[str, str] = {
     "t": "s", "s": "m", "lap_length": "m", "x": "m", "y": "m", "theta": "rad", "roll": "rad",
@@ -38,6 +38,8 @@ class Parameter:
         shape: it says where or how the effect acts and not how much. The effect vanishes with its other parameters, at
             whatever value this one has.
         context: the signals that the effect needs once this parameter is not neutral.
+        local: it says how much the effect acts within the section of the lap that ``centre`` and ``length`` give.
+        tried: values at which a search tries a parameter that shapes.
     """
 
     unit: str
@@ -46,13 +48,38 @@ class Parameter:
     neutral: float
     shape: bool = False
     context: tuple[str, ...] = ()
+    local: bool = False
+    tried: tuple[float, ...] = ()
+
+    @property
+    def span(self) -> float:
+        """The farthest that it can be off its neutral value."""
+        return max(self.upper - self.neutral, self.neutral - self.lower)
+
+    @property
+    def scales(self) -> bool:
+        """Whether it multiplies what is positive; then it is fitted as a logarithm."""
+        return self.neutral == 1.0 and self.lower > 0.0
+
+    @property
+    def direction(self) -> float:
+        """1 if it can grow from its neutral value, else -1."""
+        return 1.0 if self.upper > self.neutral else -1.0
+
+
+CENTRE = Parameter("lap", 0.0, 1.0, 0.5, shape=True, tried=tuple(k / 32 for k in range(32)))
+"""Middle of the section of the lap on which a local effect acts."""
+LENGTH = Parameter("lap", 0.01, 0.8, 0.1, shape=True, tried=(0.03, 0.06, 0.12, 0.25))
+"""Length of that section."""
+LOCATION = ("centre", "length")
+"""Names of the parameters that place a local effect."""
 
 
 @dataclass(frozen=True)
-class Effect:
+class Effect(StageEffect):
     """Base of all effects. The dataclass fields of a subclass are its parameters, described in ``PARAMETERS``.
 
-    A method that carries a stage's name is called after that stage and changes the :class:`Motion`.
+    A subclass overrides the stages of :class:`~dynssm_ros.vehicle.single_track.StageEffect` at which it acts.
 
     Attributes:
         NAME: as in vehicle files.
@@ -62,6 +89,7 @@ class Effect:
         PARAMETERS: the parameters by name.
         VARIANTS: sets of parameters to be fitted together, the simplest first; empty: all of them.
         MEMORY: names of its own states. :func:`lagged` settles and integrates them.
+        SENSOR: it changes what the sensors show; the car moves as without it.
     """
 
     NAME: ClassVar[str] = ""
@@ -71,6 +99,7 @@ class Effect:
     PARAMETERS: ClassVar[dict[str, Parameter]] = {}
     VARIANTS: ClassVar[tuple[tuple[str, ...], ...]] = ()
     MEMORY: ClassVar[tuple[str, ...]] = ()
+    SENSOR: ClassVar[bool] = False
 
     @classmethod
     def variants(cls) -> tuple[tuple[str, ...], ...]:
@@ -84,7 +113,12 @@ class Effect:
         return tuple(dict.fromkeys(signal for name in names for signal in cls.PARAMETERS[name].context))
 
     @classmethod
-    def unusable(cls, constants: Any) -> str | None:
+    def magnitude(cls) -> Parameter:
+        """The first parameter that says how much."""
+        return next(about for about in cls.PARAMETERS.values() if not about.shape)
+
+    @classmethod
+    def unusable(cls, constants: Constants) -> str | None:
         """What is wrong with a car of these constants for the effect to be able to act; ``None`` if nothing is."""
         return None
 
@@ -102,7 +136,7 @@ class Effect:
             if not about.shape and not _is_number(getattr(self, name), about.neutral)
         )
 
-    @cached_property
+    @property
     def is_neutral(self) -> bool:
         """Whether the effect is absent."""
         return bool(self.PARAMETERS) and not self.active
@@ -117,11 +151,10 @@ class Effect:
         """Its own states, by name; none while it is absent."""
         return () if self.is_neutral else self.MEMORY
 
-    def apply(self, stage: str, xp: Any, q: Motion) -> None:
-        """Calls the method named like ``stage``, if the effect has one and is not neutral."""
-        act = getattr(self, stage, None)
-        if act is not None and not self.is_neutral:
-            act(xp, q)
+    @property
+    def reading_delay(self) -> float:
+        """How late (s) all states are read, in a simulation; a prediction has its own means of it."""
+        return 0.0
 
     def read(self, q: Motion, signal: str) -> Array:
         """A signal of the context.
@@ -142,7 +175,7 @@ def _is_number(value: Array, number: float) -> bool:
     return isinstance(value, (int, float)) and value == number
 
 
-def initial_memory(effects: Sequence[Effect], r: Array, delta: Array) -> dict[str, Array]:
+def initial_memory(effects: Sequence[StageEffect], r: Array, delta: Array) -> dict[str, Array]:
     """The own states of ``effects`` on the inputs, settled under throttle ``r`` and steering ``delta``.
 
     States on anything else hang on the car's motion: ``settled_memory`` finds all of them, and the step functions those
@@ -151,11 +184,12 @@ def initial_memory(effects: Sequence[Effect], r: Array, delta: Array) -> dict[st
     zero = Coefficients(*(0.0,) * len(Coefficients._fields))
     q = Motion(0.0, 0.0, 0.0, r, delta, theta=zero, m=0.0, l_f=0.0, l_r=0.0, h_cg=0.0, F_z0=0.0, load_transfer=False)
     for effect in effects:
-        effect.apply("inputs", None, q)
+        if not effect.is_neutral:
+            effect.inputs(None, q)
     return q.memory
 
 
-def require_context(effects: Iterable[Effect], available: Iterable[str], where: str) -> None:
+def require_context(effects: Iterable[StageEffect], available: Iterable[str], where: str) -> None:
     """Checks that ``where`` knows what ``effects`` need.
 
     Raises:
@@ -168,7 +202,7 @@ def require_context(effects: Iterable[Effect], available: Iterable[str], where: 
                 raise ConfigurationError(f"{where}: {_lacking(effect, signal, have)}")
 
 
-def _lacking(effect: Effect, signal: str, have: Container[str]) -> str:
+def _lacking(effect: StageEffect, signal: str, have: Container[str]) -> str:
     known = ", ".join(name for name in CONTEXT_UNITS if name in have) or "none"
     return (
         f"effect {effect.NAME} needs the signal {signal} ({CONTEXT_UNITS[signal]}), which is not known here ({known})"

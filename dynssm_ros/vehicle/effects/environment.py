@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from dynssm_ros.vehicle.effects.base import LAP, Effect, Parameter, like, section
+from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, Effect, Parameter, like, section
 from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion
 
 _HARMONICS = 3
@@ -24,9 +24,9 @@ class RoadAngle(Effect):
 
     PARAMETERS = {
         "angle": Parameter("rad", -0.5, 0.5, 0.0),
-        "section": Parameter("rad", -0.5, 0.5, 0.0, context=LAP),
-        "centre": Parameter("lap", 0.0, 1.0, 0.5, shape=True),
-        "length": Parameter("lap", 0.01, 0.8, 0.1, shape=True),
+        "section": Parameter("rad", -0.5, 0.5, 0.0, context=LAP, local=True),
+        "centre": CENTRE,
+        "length": LENGTH,
         **dict.fromkeys(_WAVES, Parameter("rad", -0.3, 0.3, 0.0, context=LAP)),
     }
     VARIANTS: ClassVar[tuple[tuple[str, ...], ...]] = (("angle",), ("angle", *_SECTION), ("angle", *_WAVES))
@@ -107,8 +107,8 @@ class Crosswind(Effect):
     PARAMETERS = {
         "x": Parameter("m/s", -25.0, 25.0, 0.0, context=("theta",)),
         "y": Parameter("m/s", -25.0, 25.0, 0.0, context=("theta",)),
-        "side": Parameter("1", 0.0, 100.0, 3.0, shape=True),
-        "arm": Parameter("m", -1.0, 1.0, 0.0, shape=True),
+        "side": Parameter("1", 0.0, 100.0, 3.0, shape=True, tried=(1.0, 3.0, 10.0)),
+        "arm": Parameter("m", -1.0, 1.0, 0.0, shape=True, tried=(-0.4, 0.4)),
     }
     VARIANTS = (("x", "y"), ("x", "y", "side"), ("x", "y", "side", "arm"))
     x: Array = 0.0

@@ -19,7 +19,7 @@ class Downforce(Effect):
     MANOEUVRE = "cornering at the limit at low and at high speed"
     PARAMETERS = {
         "coefficient": Parameter("N/(m/s)^2", -0.5, 5.0, 0.0),
-        "balance": Parameter("1", 0.0, 1.0, 0.45, shape=True),
+        "balance": Parameter("1", 0.0, 1.0, 0.45, shape=True, tried=(0.2, 0.45, 0.7)),
     }
     coefficient: Array = 0.0
     balance: Array = 0.45

@@ -18,18 +18,12 @@ from dynssm_ros.vehicle.single_track import Array, Motion, State, at_least
 class MeasurementEffect(Effect):
     """Base of the effects that change what is measured."""
 
+    SENSOR = True
+
     @property
     def measures(self) -> bool:
         """Whether there is anything to change."""
         return not self.is_neutral
-
-    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
-        """What is measured of the true ``state``."""
-        raise NotImplementedError
-
-    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
-        """The true state of which ``state`` is measured."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -102,7 +96,13 @@ class OdometryDelay(Effect):
     MANOEUVRE = "quick changes of steering and throttle"
     PARAMETERS = {"delay": Parameter("s", 0.0, 0.3, 0.0)}
     MEMORY = ("odometry_delay.r", "odometry_delay.delta")
+    SENSOR = True
     delay: Array = 0.0
+
+    @property
+    def reading_delay(self) -> float:
+        """The delay itself."""
+        return float(self.delay)
 
     def inputs(self, xp: Any, q: Motion) -> None:
         """Delays both inputs."""

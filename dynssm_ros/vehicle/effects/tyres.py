@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from dynssm_ros.vehicle.effects.base import LAP, SLOWEST, Effect, Parameter, lagged, section
+from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, SLOWEST, Effect, Parameter, lagged, section
 from dynssm_ros.vehicle.single_track import Array, Motion, at_least
 
 _LEAST_GRIP = 0.1  # of the nominal, however far a drift has gone
@@ -114,9 +114,9 @@ class GripPatch(Effect):
     ADVICE = "Inspect or clean that stretch, and drive it with the grip that it has."
     MANOEUVRE = "laps that corner at the limit on that stretch"
     PARAMETERS = {
-        "factor": Parameter("1", 0.3, 1.7, 1.0, context=LAP),
-        "centre": Parameter("lap", 0.0, 1.0, 0.5, shape=True),
-        "length": Parameter("lap", 0.01, 0.8, 0.1, shape=True),
+        "factor": Parameter("1", 0.3, 1.7, 1.0, context=LAP, local=True),
+        "centre": CENTRE,
+        "length": LENGTH,
     }
     factor: Array = 1.0
     centre: Array = 0.5

@@ -1,0 +1,189 @@
+"""Cases with a hidden cause: simulated laps whose car has effects that the vehicle file does not know.
+
+In every case the nominal values of the file are off by about 2 %, the sensors are noisy, driver and track differ, and the
+plant integrates in steps of 1 ms or has four wheels.
+
+Sizes. An effect is just noticeable where its estimate stands seven standard deviations from neutral on the reference
+drive: 90 s of the road course at 25 Hz in moderate style, the noise of ``NOISE``, and nominal values free as far as the
+file says that they are known. Twice the log-likelihood then falls by 49. Sizes are drawn evenly in their logarithm from
+there (rounded) to what a car shows that is badly set up and can still be driven. With a gentler driver or more noise the
+least of them are harder than that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynssm_ros.signals.recording import Recording, RecordingInfo
+from dynssm_ros.simulation.laps import SimulationError, simulate
+from dynssm_ros.simulation.plant import PlantKind
+from dynssm_ros.track.driver import Style
+from dynssm_ros.track.tracks import Track, load_track
+from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle
+from dynssm_ros.vehicle.effects import EFFECTS
+
+Hidden = dict[str, dict[str, float]]
+
+SIZES: dict[str, dict[str, tuple[float, float]]] = {
+    "steering_offset": {"offset": (0.004, 0.02)},
+    "steering_gain": {"factor": (0.015, 0.2)},
+    "steering_lag": {"time_constant": (0.015, 0.2)},
+    "throttle_lag": {"time_constant": (0.012, 0.4)},
+    "drag": {"coefficient": (0.12, 0.6)},
+    "rolling_resistance": {"coefficient": (0.005, 0.04)},
+    "drive_gain": {"factor": (0.12, 0.25)},
+    "mass": {"factor": (0.11, 0.2)},
+    "yaw_inertia": {"factor": (0.2, 0.5)},
+    "front_grip": {"factor": (0.1, 0.25)},
+    "rear_grip": {"factor": (0.06, 0.2)},
+    "downforce": {"coefficient": (0.25, 2.0)},
+    "load_transfer": {"factor": (0.12, 2.0)},
+    "tire_relaxation": {"length": (0.35, 1.2)},
+    "combined_slip": {"strength": (0.35, 1.0)},
+    "road_bank": {"angle": (0.015, 0.1)},
+    "road_grade": {"angle": (0.005, 0.05)},
+    "crosswind": {"speed": (0.7, 12.0)},
+    "grip_drift": {"rate": (0.0003, 0.002)},
+    "grip_patch": {"factor": (0.035, 0.4)},
+    "locked_differential": {"stiffness": (2.0, 30.0)},
+    "odometry_lever_arm": {"x": (0.08, 2.0)},
+    "odometry_misalignment": {"angle": (0.003, 0.04)},
+    "odometry_delay": {"delay": (0.008, 0.16)},
+    "yaw_rate_bias": {"bias": (0.003, 0.03)},
+    "yaw_rate_lag": {"time_constant": (0.013, 0.25)},
+}
+"""How far each effect is off neutral, from just noticeable to large, in the units of its parameters."""
+
+NOISE = (0.02, 0.02, 0.003)  # m/s, m/s, rad/s: a good odometry
+OFF = 0.02  # of the nominal values
+TRACKS = {"road_course": 1.0, "club": 140.0, "club_b": 110.0}
+"""Tracks with the factor by which they are enlarged for a full-size car; the clubs are tracks for 1:43 cars."""
+_RATES = (0.04, 0.04, 0.04, 0.02)  # s: sampling times, drawn with equal chance
+_KNOWN = 0.02  # how well the vehicle file says that they are known
+_SHIFTS = {"S_hf": 0.0007, "S_hr": 0.0007, "S_vf": 40.0, "S_vr": 40.0}  # rad, N: the same for values around 0
+_ONE_WAY = {"rear_grip": -1.0, "grip_drift": -1.0, "grip_patch": -1.0, "load_transfer": 1.0}  # a car that can be driven
+_TRIES = 6
+_ROUND = 13  # cases, of which two have a pair of effects and two none
+_PAIRS, _NONE = (4, 10), (6, 12)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A hidden cause.
+
+    Attributes:
+        hidden: effects of the simulated car, by name and parameter.
+        seed: of everything random.
+        plant: how the car was simulated.
+        duration: of the recording (s).
+        track: name of the track.
+        sampling_time: of the recording (s).
+    """
+
+    hidden: Hidden
+    seed: int
+    plant: PlantKind = "rk4"
+    duration: float = 120.0
+    track: str = "road_course"
+    sampling_time: float = 0.04
+
+    @property
+    def name(self) -> str:
+        """For humans."""
+        where = f"{self.plant}/{self.track}/{1 / self.sampling_time:.0f}Hz"
+        return f"{'+'.join(self.hidden) or 'none'}/{where}/{self.seed}"
+
+    @property
+    def road(self) -> Track:
+        """The track as it is driven."""
+        return load_track(self.track).scaled(TRACKS[self.track])
+
+
+def size(effect: str, rng: np.random.Generator) -> dict[str, float]:
+    """Random parameters of an effect, between just noticeable and large."""
+    ((low, high),) = SIZES[effect].values()
+    return sized(effect, float(np.exp(rng.uniform(np.log(low), np.log(high)))), rng)
+
+
+def sized(effect: str, amount: float, rng: np.random.Generator) -> dict[str, float]:
+    """Parameters of an effect that is ``amount`` off neutral, to a random side, direction and place."""
+    (name,) = SIZES[effect]
+    if effect == "crosswind":
+        direction = float(rng.uniform(0, 2 * np.pi))
+        return {"x": amount * float(np.cos(direction)), "y": amount * float(np.sin(direction))}
+    about = EFFECTS[effect].PARAMETERS[name]
+    either = about.lower < about.neutral and effect not in ("downforce", "rolling_resistance", "drag")
+    sign = _ONE_WAY.get(effect, float(rng.choice([-1.0, 1.0])) if either else 1.0)
+    values = {name: about.neutral + sign * amount}
+    if effect == "grip_patch":
+        values |= {"centre": float(rng.uniform(0.1, 0.9)), "length": float(rng.uniform(0.12, 0.3))}
+    return values
+
+
+def cases(seed: int, count: int, effects: Sequence[str] = tuple(EFFECTS)) -> Iterator[Case]:
+    """``count`` cases: every effect in turn, with pairs and with none in between; every fourth on four wheels."""
+    rng = np.random.default_rng(seed)
+    turn = 0
+    for k in range(count):
+        kind = k % _ROUND
+        if kind in _NONE:
+            names: list[str] = []
+        elif kind in _PAIRS:
+            names = [effects[i] for i in rng.choice(len(effects), 2, replace=False)]
+        else:
+            names, turn = [effects[turn % len(effects)]], turn + 1
+        yield Case(
+            {name: size(name, rng) for name in names},
+            seed + k,
+            "double_track" if k % 4 == 1 else "rk4",
+            track=str(rng.choice(list(TRACKS))),
+            sampling_time=float(rng.choice(_RATES)),
+        )
+
+
+def record(case: Case) -> tuple[Recording, Vehicle]:
+    """Drives a case: the recording, and the vehicle file that does not know what is hidden.
+
+    Raises:
+        SimulationError: the car cannot be driven with what is hidden, however gently.
+    """
+    true, nominal = cars(case)
+    rng = np.random.default_rng([case.seed, 7])
+    aggressiveness, variation = float(rng.uniform(0.6, 0.85)), float(rng.uniform(0.4, 0.9))
+    noise = [std * float(rng.uniform(0.5, 1.5)) for std in NOISE]
+    for attempt in range(_TRIES):
+        style = Style(aggressiveness * 0.9**attempt, variation)
+        try:
+            run = simulate(
+                true, case.road, duration=case.duration, plant=case.plant, seed=case.seed, style=style,
+                noise=(noise[0], noise[1], noise[2]),
+            )  # fmt: skip
+            break
+        except SimulationError:
+            if attempt == _TRIES - 1:
+                raise
+    columns = dict(
+        zip(
+            ("v_x", "v_y", "omega", "r_fb", "delta_fb", "r_cmd", "delta_cmd", "x", "y", "theta"),
+            (*run.measured.T, *run.feedback.T, *(run.command - run.feedback).T, *run.pose.T),
+            strict=True,
+        )
+    )
+    info = RecordingInfo(sampling_time=case.sampling_time, commands="topics", source=(case.name,))
+    return Recording(info, run.time, np.zeros(len(run.time), dtype=np.int32), columns), nominal
+
+
+def cars(case: Case) -> tuple[Vehicle, Vehicle]:
+    """The car that is driven, and the vehicle file."""
+    known = load_vehicle("av21").model_copy(update={"sampling_time": case.sampling_time})
+    return known.with_effects(case.hidden.items()), off(known, np.random.default_rng([case.seed, 8]))
+
+
+def off(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
+    """The vehicle file of somebody who knows the nominal values to about 2 %."""
+    spread = np.array([_SHIFTS.get(c, _KNOWN * abs(v)) for c, v in zip(COEFFICIENTS, vehicle.nominal, strict=True)])
+    wrong = vehicle.nominal + rng.standard_normal(len(spread)) * spread * OFF / _KNOWN
+    return vehicle.with_nominal(np.clip(wrong, vehicle.lower, vehicle.upper), spread)

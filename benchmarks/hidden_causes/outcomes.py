@@ -1,0 +1,118 @@
+"""What became of the cases: how each is judged, the rates, and who is taken for whom."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import binomtest
+
+from benchmarks.hidden_causes.cases import Case, Hidden
+from dynssm_ros.identification.diagnose import Cause
+from dynssm_ros.vehicle.effects import EFFECTS
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a case.
+
+    Attributes:
+        case: its name.
+        hidden: effects that were hidden.
+        named: effects that were named, the strongest first.
+        first: whether the first one named, or an alternative to it, was hidden; without effects, whether none was named.
+        all: whether each hidden effect was named, or is an alternative to one that was.
+        sized: whether the parameters of those named are within 15 % or two standard deviations; ``None`` if none was
+            found.
+        values: what was hidden, with its parameters.
+        found: what was named, with its parameters.
+        alternatives: what is reported as explaining the data as well, by what was named.
+        evidence: difference in the information criterion, by what was named.
+    """
+
+    case: str
+    hidden: tuple[str, ...]
+    named: tuple[str, ...]
+    first: bool
+    all: bool
+    sized: bool | None
+    values: Hidden = field(default_factory=dict)
+    found: Hidden = field(default_factory=dict)
+    alternatives: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    evidence: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def right(self) -> bool:
+        """Whether nothing is missing that counts."""
+        return self.all if len(self.hidden) > 1 else self.first
+
+
+def judge(case: Case, causes: Sequence[Cause]) -> Outcome:
+    """Compares what was found with what was hidden."""
+    hidden = set(case.hidden)
+    reach = [{cause.effect, *cause.alternatives} for cause in causes]
+    first = bool(reach and reach[0] & hidden) if hidden else not causes
+    complete = all(any(name in names for names in reach) for name in hidden) if hidden else not causes
+    right = [_right_size(cause, case.hidden[cause.effect]) for cause in causes if cause.effect in hidden]
+    return Outcome(
+        case.name,
+        tuple(case.hidden),
+        tuple(cause.effect for cause in causes),
+        first,
+        complete,
+        all(right) if right else None,
+        case.hidden,
+        {cause.effect: dict(cause.values) for cause in causes},
+        {cause.effect: tuple(cause.alternatives) for cause in causes},
+        {cause.effect: cause.delta_bic for cause in causes},
+    )
+
+
+def _right_size(cause: Cause, true: dict[str, float]) -> bool:
+    """Whether each parameter is within 15 % of what was hidden, or two standard deviations."""
+    for name, value in true.items():
+        about = EFFECTS[cause.effect].PARAMETERS[name]
+        if about.shape:
+            continue
+        room = max(0.15 * abs(value - about.neutral), 2 * cause.std.get(name, 0.0))
+        if abs(cause.values.get(name, about.neutral) - value) > room:
+            return False
+    return True
+
+
+def rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Shares of the cases that came out right, with their 95 % intervals (Wilson)."""
+    one = [o for o in outcomes if len(o.hidden) == 1]
+    two = [o for o in outcomes if len(o.hidden) == 2]
+    none = [o for o in outcomes if not o.hidden]
+    return {
+        "cases": len(outcomes),
+        "named_first": _share([o.first for o in one]),
+        "right_size": _share([o.sized for o in outcomes if o.sized is not None]),
+        "both_found": _share([o.all for o in two]),
+        "false_alarms": _share([not o.first for o in none]),
+        "more_named": _share([len(o.named) > 1 for o in one]),
+    }
+
+
+def _share(right: Sequence[bool]) -> dict[str, Any]:
+    count, of = sum(right), len(right)
+    if not of:
+        return {"of": 0, "count": 0, "share": None, "interval_95": None}
+    interval = binomtest(count, of).proportion_ci(method="wilson")
+    return {"of": of, "count": count, "share": count / of, "interval_95": [float(interval.low), float(interval.high)]}
+
+
+def matrix(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], npt.NDArray[np.intp]]:
+    """Cases of one effect or none, by what was hidden and what was named first."""
+    labels = [*EFFECTS, "none"]
+    count = np.zeros((len(labels), len(labels)), dtype=np.intp)
+    for outcome in outcomes:
+        if len(outcome.hidden) < 2:
+            hidden = outcome.hidden[0] if outcome.hidden else "none"
+            named = outcome.named[0] if outcome.named else "none"
+            count[labels.index(hidden), labels.index(hidden if outcome.first else named)] += 1
+    return labels, labels, count

@@ -1,0 +1,82 @@
+"""The results of the battery as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from benchmarks.hidden_causes.cases import Case, Hidden
+from benchmarks.hidden_causes.outcomes import Outcome, rates
+
+PAGE, FIGURE = "diagnose_battery.md", "diagnose_battery_confusion.png"
+GOALS = {"named_first": 0.95, "right_size": 0.95, "both_found": 0.85, "false_alarms": 0.05}
+_IN_WORDS = {
+    "named_first": "the hidden effect, or an alternative reported with it, is named first",
+    "right_size": "parameters of what was found are within 15 % or two standard deviations",
+    "both_found": "both effects of a pair are found",
+    "false_alarms": "something is named where nothing is hidden",
+    "more_named": "more is named than the one effect that is hidden",
+}
+_PLANTS = {"rk4": "one track, steps of 1 ms", "double_track": "four wheels"}
+
+
+def page(outcomes: Sequence[tuple[Case, Outcome | None]], seed: int) -> str:
+    """The results as Markdown.
+
+    Args:
+        outcomes: of the cases; ``None``: the car could not be driven.
+        seed: of the first case; the others' count on from it.
+    """
+    return "\n".join(_lines(outcomes, seed)) + "\n"
+
+
+def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str]:
+    outcomes = [outcome for _, outcome in of if outcome is not None]
+    undriven = len(of) - len(outcomes)
+    yield "# Hidden causes"
+    yield ""
+    yield (
+        f"Made by `python -m benchmarks.hidden_causes --seed {seed}`: {len(outcomes)} simulated drives with hidden "
+        f"effects, seeds {seed} to {seed + len(of) - 1}"
+        + (f", without {undriven} whose car could not be driven" if undriven else "")
+        + ". How they are drawn and what counts as just noticeable: the command's `--help`."
+    )
+    yield ""
+    yield f"| rate | cases | share | 95 % interval | goal | {' | '.join(_PLANTS.values())} |"
+    yield f"| --- | --- | --- | --- | --- |{' --- |' * len(_PLANTS)}"
+    by_plant = [rates([o for case, o in of if o is not None and case.plant == plant]) for plant in _PLANTS]
+    overall = rates(outcomes)
+    for name, words in _IN_WORDS.items():
+        rate = overall[name]
+        if rate["of"]:
+            low, high = rate["interval_95"]
+            goal = "" if name not in GOALS else f"{'<=' if name == 'false_alarms' else '>='} {100 * GOALS[name]:.0f} %"
+            each = " | ".join(f"{one[name]['count']} of {one[name]['of']}" for one in by_plant)
+            yield (
+                f"| {words} | {rate['of']} | {100 * rate['share']:.0f} % | {100 * low:.0f} to {100 * high:.0f} % | {goal} "
+                f"| {each} |"
+            )
+    yield ""
+    yield (
+        "Four wheels are a car that the equations do not have: an axle loses grip as load moves from one wheel to the other, "
+        "and unequal forces at the steered wheels turn the car. Small effects that are named there stand for this."
+    )
+    yield ""
+    yield f"![What was hidden and what was named first]({FIGURE})"
+    yield ""
+    yield "Cases of one effect or none; an alternative that is reported counts as named."
+    wrong = [o for o in outcomes if not o.right or o.sized is False]
+    if wrong:
+        yield ""
+        yield "## What came out wrong"
+        yield ""
+        yield "| case | hidden | named |"
+        yield "| --- | --- | --- |"
+        for o in wrong:
+            yield f"| `{o.case}` | {_with_values(o.values)} | {_with_values(o.found)} |"
+
+
+def _with_values(effects: Hidden) -> str:
+    return "; ".join(
+        f"{name} " + ", ".join(f"{key} {value:.3g}" for key, value in values.items())
+        for name, values in effects.items()
+    )

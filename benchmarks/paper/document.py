@@ -1,0 +1,189 @@
+"""The document: a pure function of the results, and the figures that it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from benchmarks.paper import figures, tables
+from benchmarks.paper.results import Comparison, Results
+from dynssm_ros.arrays import Vector
+from dynssm_ros.files import replacing
+from dynssm_ros.reporting.evaluation_report import COMMANDS_IN_WORDS
+from dynssm_ros.reporting.tables import Table
+
+MADE_BY = "Made by `make paper`; no number here is typed by hand. The paper's own numbers are those of its tables."
+_CARS = {"real": "Full-size car", "sim": "Small car"}
+_DPI = 130
+
+
+def write(results: Results, path: Path) -> None:
+    """Writes the document to ``path``, and its figures beside it."""
+    drawn = dict(draw(results))
+    for name, figure in drawn.items():
+        with replacing(path.with_name(f"{path.stem}_{name}.png")) as aside:
+            figure.savefig(aside, dpi=_DPI, metadata={"Software": None})
+    with replacing(path) as aside:
+        aside.write_text(markdown(results, {name: f"{path.stem}_{name}.png" for name in drawn}), encoding="utf-8")
+
+
+def draw(results: Results) -> Iterator[tuple[str, Figure]]:
+    """The figures by name, of the full-size car: the small one's errors differ by so much that they need none."""
+    comparisons = _comparable(results, "real")
+    relative: dict[str, dict[str, Vector]] = {}
+    for c in comparisons:
+        for model in (each for each in c.compared if each != "persistence"):
+            found = {test: c.relative(model, test) for test in c.tests}
+            relative[model] = found | relative.get(model, {})  # where studies share a test, the first one's
+    if relative:
+        yield "persistence", figures.against_persistence(relative)
+    for c in comparisons:
+        if c.ablations and c.car.full in c.models:
+            ablations = {c.variants[lacking]: c.rmse(model) for lacking, model in c.ablations.items()}
+            yield f"ablations_{c.name}", figures.against_the_full_model(c.rmse(c.car.full), ablations)
+
+
+def markdown(results: Results, pictures: dict[str, str]) -> str:
+    """The document.
+
+    Args:
+        results: of a run.
+        pictures: addresses of the figures by their names.
+    """
+    return "\n\n".join(part.strip() for part in _parts(results, pictures)) + "\n"
+
+
+def _parts(results: Results, pictures: dict[str, str]) -> Iterator[str]:
+    yield "# Results"
+    yield from _introduction(results)
+    planned = {comparison.car.reference for comparison in results.comparisons}
+    for data, title in _CARS.items():
+        if data not in planned:
+            continue
+        comparisons = _comparable(results, data)
+        yield f"## {title}"
+        yield from _missing(results, data)
+        if comparisons:
+            yield from _against_published(results, data, comparisons)
+        if data == "real" and "persistence" in pictures:
+            yield f"![One-step errors relative to persistence]({pictures['persistence']})"
+        for comparison in comparisons:
+            yield from _study(comparison, results, pictures)
+        yield from _coefficients(results, data)
+    yield from _uncertainty(results)
+    yield from _cost(results)
+
+
+def _introduction(results: Results) -> Iterator[str]:
+    made = results.made
+    yield MADE_BY
+    if made.quick:
+        yield (
+            f"> **Not results:** a quick run to try everything out, with {results.plan.epochs} epochs in each stage, "
+            "one seed, short drives, and only the first split of each study."
+        )
+    if made.stale[0]:
+        yield (
+            f"> **Out of date:** {made.stale[0]} of {made.stale[1]} steps were done by other code than the present. Remove "
+            "the run's folder and run again."
+        )
+    if results.missing:
+        lines = [f"> - {title}: {reason}" for title, reason in results.missing.items()]
+        yield "\n".join(["> **Incomplete.** These steps could not be done:", ">", *lines])
+    used = dict.fromkeys(study.commands for study in results.plan.studies.values())
+    lines = [
+        *(f"{name}: {value}" for name, value in made.protocol.items()),
+        *(f"Commands `{name}`: {COMMANDS_IN_WORDS[name].partition(': ')[2]}." for name in used),
+        "Splits: nothing of a test is trained on, calibrated on or used to stop training. The parts of a log are cut into "
+        "stretches, and no window reaches across a cut. Rows below 5 m/s are left out for the full-size car.",
+        "Car: the single-track models and DynSSM start from coefficients calibrated on the training part alone; DDM, FTHD "
+        "and the paper's configuration have the paper's bounds.",
+        f"Rollouts: over the paper's horizons (0.6 s, 0.3 s for the small car) from one row in {results.plan.stride}; "
+        "predicted states are fed back, measured actuator feedback and commands are supplied. The displacement is between "
+        "predicted and measured path, both integrated from velocities from the same pose.",
+        "Several tests of a study are taken together by the root of the mean square of their RMSE, the largest maximum "
+        "error, and the mean of all else. Bold is the best of a column.",
+        "To repeat it: `make paper`, with the logs and tracks in `DYNSSM_DATA`; it continues after a kill. "
+        '`benchmarks/paper/plan.yaml` is the plan. `ARGS="--test NAME=R.parquet"` adds a recording to be predicted.',
+    ]
+    yield "\n".join(f"- {line}" for line in lines)
+
+
+def _missing(results: Results, data: str) -> Iterator[str]:
+    """A line for each study that lacks something."""
+    for comparison in results.comparisons:
+        if comparison.car.reference != data:
+            continue
+        if not comparison.planned:
+            yield f"*{comparison.label}*: not measured, no recording was given with `--test NAME=R.parquet`."
+        elif comparison.reasons:
+            what = "not measured" if not comparison.tests else "measured in part"
+            yield f"*{comparison.label}*: {what}; {'; '.join(dict.fromkeys(comparison.reasons))}."
+
+
+def _against_published(results: Results, data: str, comparisons: Sequence[Comparison]) -> Iterator[str]:
+    reference = results.reference.open_loop[data]
+    yield "### Against the published models"
+    yield (
+        "The paper's open-loop table, and the same models trained and measured here. The tests are not the paper's, so "
+        "compare the models with each other first."
+    )
+    yield tables.published_table(comparisons, reference).markdown()
+    yield "How far errors lie below those of DDM on the same test, in percent:"
+    yield tables.reduction_table(comparisons, results.reference, data).markdown()
+    yield "The lowest RMSE in the paper's table, as a multiple of that of the full model here:"
+    yield tables.factor_table(comparisons, reference).markdown()
+
+
+def _study(comparison: Comparison, results: Results, pictures: dict[str, str]) -> Iterator[str]:
+    yield f"### {comparison.study.title[0].upper()}{comparison.study.title[1:]}, commands `{comparison.study.commands}`"
+    yield comparison.study.text
+    yield tables.error_table(comparison).markdown()
+    yield tables.relative_table(comparison).markdown()
+    if comparison.ablations and comparison.car.full in comparison.models:
+        yield f"Ablations of `{comparison.car.full}`, one-step RMSE:"
+        yield tables.ablation_table(comparison, results).markdown()
+        if f"ablations_{comparison.name}" in pictures:
+            yield f"![Ablations against the full model]({pictures[f'ablations_{comparison.name}']})"
+    if comparison.study.remark:
+        yield comparison.study.remark
+
+
+def _coefficients(results: Results, data: str) -> Iterator[str]:
+    by_name = {comparison.name: comparison for comparison in _comparable(results, data)}
+    wanted = dict.fromkeys(car.coefficients for car in results.plan.cars.values() if car.reference == data)
+    for comparison in (by_name[name] for name in wanted if name in by_name):
+        table: Table | None = tables.coefficient_table(comparison, results)
+        if table is not None:
+            yield "### Coefficients"
+            yield "What the models do with the physical coefficients inside their bounds."
+            yield table.markdown()
+
+
+def _uncertainty(results: Results) -> Iterator[str]:
+    table = tables.coverage_table([comparison for comparison in results.comparisons if comparison.tests])
+    if table.rows:
+        yield "## Stated uncertainty"
+        yield (
+            "Share of one-step errors inside the interval that the model claims to hold 90 % of them: below 90 it was too "
+            "sure, above too cautious."
+        )
+        yield table.markdown()
+
+
+def _cost(results: Results) -> Iterator[str]:
+    if results.costs:
+        yield "## Cost"
+        yield (
+            "Of one prediction. All models were timed in one run, in turn, one window per call: trained ones in ONNX "
+            "Runtime on one core, the others in numpy. FLOPs are matrix products as torch counts them, of the single-track "
+            "models every operation as numpy executes it. The paper's latencies are of its own machine."
+        )
+        yield tables.cost_table(results).markdown()
+
+
+def _comparable(results: Results, data: str) -> list[Comparison]:
+    """The studies with results on cars that are comparable with the paper's data set ``data``."""
+    return [c for c in results.comparisons if c.car.reference == data and c.tests]

@@ -1,0 +1,279 @@
+"""The plan (``benchmarks/paper/plan.yaml``): recordings, how they are split, models, and which are compared on what."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from dynssm_ros import configuration
+from dynssm_ros.configuration import StrictModel
+from dynssm_ros.control.race_models import TRUE
+from dynssm_ros.control.settings import Objective
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma
+from dynssm_ros.signals.signal_map import Commands
+from dynssm_ros.simulation.plant import PlantKind
+from dynssm_ros.track.racing_line import LineKind
+from dynssm_ros.vehicle.parameters import EffectEntry
+
+Quantity = Literal["time", "speed", "yaw_rate", "lateral_acceleration"]
+UNTRAINED = (Persistence.name, SingleTrack.name, SingleTrackEwma.name)
+MID_RANGE = "mid_range"
+FIXED = (TRUE, MID_RANGE, *UNTRAINED)
+"""Models of a race that need no training: the plant's own, the middle of the bounds, and those on the calibrated car."""
+
+
+class Log(StrictModel):
+    """A race log."""
+
+    bag: str = Field(description="rosbag2 folder or file, relative to the data folder")
+    signals: str = Field(description="signal map, by name")
+    rate: float = Field(gt=0, description="of the recording (Hz)")
+
+
+class Drive(StrictModel):
+    """A simulated drive; fields as the options of ``dynssm simulate``."""
+
+    vehicle: str
+    effects: tuple[EffectEntry, ...] = Field(default=(), description="physics that the models do not know of")
+    track: str = Field(description="built-in name, or file relative to the data folder")
+    duration: float = Field(gt=0, description="(s)")
+    plant: PlantKind
+    line: LineKind = "centre"
+    seed: int = 0
+    aggressiveness: float = Field(default=0.95, gt=0)
+    variation: float = Field(default=0.5, ge=0, le=1)
+    noise: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, 0.0), description="on v_x, v_y, omega (m/s, m/s, rad/s)"
+    )
+
+
+class Range(StrictModel):
+    """Rows of a recording by one quantity: all limits that are given must hold."""
+
+    quantity: Quantity = Field(
+        description="time since the first row (s); speed v_x (m/s), yaw_rate omega (rad/s) and lateral_acceleration "
+        "|v_x omega| (m/s^2), of means over a second"
+    )
+    at_least: float | None = None
+    below: float | None = None
+    outside: tuple[float, float] | None = Field(
+        default=None, description="not from the first value to below the second"
+    )
+
+    @model_validator(mode="after")
+    def _limited(self) -> Range:
+        if self.at_least is None and self.below is None and self.outside is None:
+            raise ValueError(f"{self.quantity}: no limit; expected at_least, below or outside")
+        return self
+
+
+class Part(StrictModel):
+    """Rows of a recording that lie in all of some ranges."""
+
+    recording: str
+    where: tuple[Range, ...] = ()
+
+
+class Split(StrictModel):
+    """What is trained on, and what is predicted then."""
+
+    car: str
+    train: Part
+    test: dict[str, Part] = Field(
+        default_factory=dict, description="by the name to show; empty: the recordings that the user gives"
+    )
+
+
+class Car(StrictModel):
+    """A car, and the models whose names have a meaning in the tables."""
+
+    vehicle: str = Field(description="vehicle file that is calibrated on each training part")
+    start: Literal["vehicle", "mid_range"] = Field(
+        default="vehicle", description="where calibration starts: the file's nominal values, or mid-range"
+    )
+    min_speed: float = Field(ge=0, description="rows that are slower are not calibrated on (m/s)")
+    reference: Literal["real", "sim"] = Field(description="which of the paper's data sets is comparable")
+    full: str = Field(
+        description="the full model; models named after it, with an underscore and more, are its ablations"
+    )
+    paper: str | None = Field(default=None, description="the full model as the paper has it")
+    ddm: str
+    fthd: str
+    coefficients: str = Field(description="study that the coefficient table is about")
+
+
+class Model(StrictModel):
+    """How a model is trained."""
+
+    variant: str = Field(default="", description="of an ablation: what it is, as the table shows it; empty: its name")
+    vehicle: str | None = Field(default=None, description="vehicle file as it is; null: the calibrated car")
+    seeds: int | None = Field(default=None, ge=1, description="at most so many, also where a study wants more")
+
+
+class Study(StrictModel):
+    """Models that are compared on some splits."""
+
+    title: str
+    text: str = Field(description="what is asked, in a sentence or two")
+    remark: str = Field(default="", description="what its authors make of the outcome, with the date")
+    splits: tuple[str, ...] = Field(min_length=1)
+    commands: Commands
+    models: tuple[str, ...] = Field(min_length=1)
+    seeds: int = Field(ge=1)
+
+
+class Race(StrictModel):
+    """Laps in closed loop; fields as the options of ``dynssm race``."""
+
+    title: str
+    text: str = Field(description="what is asked, in a sentence or two")
+    vehicle: str
+    effects: tuple[EffectEntry, ...] = Field(default=(), description="physics that only the model true knows of")
+    track: str = Field(description="built-in name, or file relative to the data folder")
+    lap_length: float | None = Field(default=None, gt=0, description="that it is scaled to (m)")
+    plant: PlantKind = "euler"
+    objective: Objective = "tracking"
+    line: str = Field(default="racing", description="centre, racing, or file relative to the data folder")
+    pace: float = Field(default=1.0, gt=0)
+    horizon: int | None = Field(default=None, ge=2, description="null: as the car needs")
+    offset_free: bool = Field(default=False, description="whether what a model mispredicts is added to it")
+    laps: int = Field(default=1, ge=1)
+    speed: float | None = Field(default=None, ge=0, description="at the start (m/s); null: the line's own")
+    split: str = Field(description="on whose training part the models were trained, with seed 0")
+    commands: Commands = "topics"
+    models: tuple[str, ...] = Field(min_length=1)
+    paper: str | None = Field(default=None, description="the paper's closed-loop table to set beside: a track")
+    ablation: bool = Field(default=False, description="whether it is the paper's closed-loop ablation")
+    figures: tuple[Literal["trajectories", "profiles", "forces", "coefficients"], ...] = ()
+
+
+class Quick(StrictModel):
+    """What a run to try things out leaves out."""
+
+    epochs: int = Field(ge=1)
+    seeds: int = Field(ge=1)
+    stride: int = Field(ge=1)
+    duration: float = Field(gt=0, description="longest drive (s)")
+
+
+class Plan(StrictModel):
+    """The whole plan; everything is referred to by its name here."""
+
+    logs: dict[str, Log]
+    drives: dict[str, Drive]
+    cars: dict[str, Car]
+    splits: dict[str, Split]
+    models: dict[str, Model]
+    studies: dict[str, Study]
+    races: dict[str, Race] = Field(default_factory=dict)
+    stride: int = Field(ge=1, description="rollouts start at every stride-th row")
+    calls: int = Field(ge=1, description="predictions of each model that are timed")
+    epochs: int | None = Field(default=None, ge=1, description="in each stage, instead of the model files'")
+    quick: Quick
+
+    @model_validator(mode="after")
+    def _names_exist(self) -> Plan:
+        recordings = [*self.logs, *self.drives]
+        for name, split in self.splits.items():
+            _check(f"splits.{name}.car", [split.car], self.cars)
+            _check(f"splits.{name}", [part.recording for part in (split.train, *split.test.values())], recordings)
+        for name, car in self.cars.items():
+            roles = [role for role in (car.full, car.paper, car.ddm, car.fthd) if role]
+            _check(f"cars.{name}", roles, self.models)
+            _check(f"cars.{name}.coefficients", [car.coefficients], self.studies)
+        for name, study in self.studies.items():
+            _check(f"studies.{name}.splits", study.splits, self.splits)
+            _check(f"studies.{name}.models", study.models, [*UNTRAINED, *self.models])
+            if len({self.splits[split].car for split in study.splits}) > 1:
+                raise ValueError(f"studies.{name}.splits: of several cars; expected the same")
+            tests = self.tests(study)
+            if len(set(tests)) < len(tests):
+                raise ValueError(f"studies.{name}.splits: tests of the same name: {', '.join(tests)}")
+        for name, race in self.races.items():
+            _check(f"races.{name}.split", [race.split], self.splits)
+            trained = [
+                model
+                for study in self.studies.values()
+                if race.split in study.splits and study.commands == race.commands
+                for model in study.models
+                if model in self.models
+            ]
+            _check(f"races.{name}.models", race.models, [*FIXED, *trained])
+        return self
+
+    def car(self, study: Study) -> Car:
+        """The car of a study."""
+        return self.cars[self.splits[study.splits[0]].car]
+
+    def seeds(self, study: Study, model: str) -> range:
+        """Seeds with which ``model`` is trained in a study."""
+        limit = self.models[model].seeds
+        return range(study.seeds if limit is None else min(limit, study.seeds))
+
+    def tests(self, study: Study) -> tuple[str, ...]:
+        """What is predicted in a study, by the names to show."""
+        return tuple(test for split in study.splits for test in self.splits[split].test)
+
+    def with_tests(self, recordings: Iterable[str]) -> Plan:
+        """The plan in which the splits without test parts have these recordings, which the user gives.
+
+        Raises:
+            ConfigurationError: the plan has a recording of that name.
+        """
+        given = {name: Part(recording=name) for name in recordings}
+        for name in given:
+            if name in {*self.logs, *self.drives}:
+                raise ConfigurationError(f"--test {name}: the plan has a recording of that name; expected another one")
+        splits = {
+            name: split if split.test else split.model_copy(update={"test": given})
+            for name, split in self.splits.items()
+        }
+        return self.model_copy(update={"splits": splits})
+
+    def shortened(self) -> Plan:
+        """The plan that tries everything out: few epochs and seeds, short drives, one split of each study."""
+        quick = self.quick
+        drives = {
+            name: drive.model_copy(update={"duration": min(drive.duration, quick.duration)})
+            for name, drive in self.drives.items()
+        }
+        studies = {
+            name: study.model_copy(update={"seeds": min(study.seeds, quick.seeds), "splits": study.splits[:1]})
+            for name, study in self.studies.items()
+        }
+        races = dict(list(self.races.items())[:1])
+        short = {"stride": quick.stride, "epochs": quick.epochs, "races": races}
+        return self.model_copy(update={**short, "drives": drives, "studies": studies})
+
+
+def load_plan(path: Path | None = None) -> Plan:
+    """Reads a plan, the shipped one if not given.
+
+    Raises:
+        ConfigurationError: unreadable, malformed, or it names what is not there, a model without a file among that.
+    """
+    path = Path(__file__).parent / "plan.yaml" if path is None else path
+    plan = configuration.validate(Plan, configuration.read_yaml(path), path)
+    vehicles = {car.vehicle for car in plan.cars.values()} | {drive.vehicle for drive in plan.drives.values()}
+    vehicles |= {model.vehicle for model in plan.models.values() if model.vehicle}
+    vehicles |= {race.vehicle for race in plan.races.values()}
+    try:
+        for name in plan.models:
+            configuration.find_config("models", name)
+        for vehicle in sorted(vehicles):
+            configuration.find_config("vehicles", vehicle)
+        for log in plan.logs.values():
+            configuration.find_config("signals", log.signals)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{path}: {error}") from error
+    return plan
+
+
+def _check(where: str, names: Iterable[str], known: Iterable[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise ValueError(f"{where}: '{name}' is not one of {', '.join(known)}")

@@ -1,0 +1,208 @@
+"""The document of the races: tables with the paper's numbers beside, and the figures that were drawn of them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from benchmarks.paper.document import MADE_BY
+from benchmarks.paper.plan import MID_RANGE, Race
+from benchmarks.paper.race_figures import lap_over_pace
+from benchmarks.paper.reference import ClosedLoop
+from benchmarks.paper.results import Entry, Results
+from benchmarks.paper.schedule import race_key
+from dynssm_ros.control.race_models import TRUE
+from dynssm_ros.files import replacing
+from dynssm_ros.reporting.tables import Column, Table, Value
+from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma
+
+_NAMES = {
+    TRUE: "the plant's own model",
+    MID_RANGE: "fixed: the middle of the bounds",
+    SingleTrack.name: "fixed: calibrated on the training laps",
+    SingleTrackEwma.name: "calibrated, less its recent errors",
+    Persistence.name: "no model: what is stays",
+}
+_CAPTIONS = {
+    "trajectories": "Paths, with marks at equal times",
+    "profiles": "State and commands over the lap",
+    "forces": "Forces over the lap",
+    "coefficients": "What each model told the controller over the lap",
+    "pace": "Lap time over the factor on the line's speed; hollow at the top: not completed",
+}
+_SWEEP = 3  # races that differ in nothing but their pace and make a figure together
+_DPI = 130
+
+
+def write_races(results: Results, root: Path, path: Path) -> None:
+    """Writes the document to ``path``, and copies the figures of the run in ``root`` beside it."""
+    pictures: dict[str, dict[str, str]] = {}
+    for name, race in results.plan.races.items():
+        pictures[name] = {}
+        for figure in race.figures if name in results.races else ():
+            pictures[name][figure] = f"{path.stem}_{name}_{figure}.png"
+            with replacing(path.with_name(pictures[name][figure])) as aside:
+                shutil.copyfile(root / race_key(name) / f"{figure}.png", aside)
+    for names in _sweeps(results):
+        pictures[names[-1]]["pace"] = f"{path.stem}_{names[0]}_pace.png"
+        with replacing(path.with_name(pictures[names[-1]]["pace"])) as aside:
+            _over_pace(results, names).savefig(aside, format="png", dpi=_DPI, metadata={"Software": None})
+    with replacing(path) as aside:
+        aside.write_text(races_markdown(results, pictures), encoding="utf-8")
+
+
+def _sweeps(results: Results) -> list[list[str]]:
+    """Names of measured races that differ in nothing but their pace, in the plan's order."""
+    alike: dict[str, list[str]] = {}
+    for name in results.races:
+        told_apart = {"title", "text", "paper", "pace", "figures"}
+        alike.setdefault(results.plan.races[name].model_dump_json(exclude=told_apart), []).append(name)
+    return [names for names in alike.values() if len(names) >= _SWEEP]
+
+
+def _over_pace(results: Results, names: list[str]) -> Figure:
+    """Their lap times, what the line allows, and the paper's."""
+    races, driven = [results.plan.races[name] for name in names], [results.races[name] for name in names]
+    models = [model for model in races[0].models if model in driven[0]["models"]]
+    over = list(zip((race.pace for race in races), driven, strict=True))
+    laps = {
+        _NAMES.get(model, model): {pace: entry["models"][model]["lap_time_s"] for pace, entry in over}
+        for model in models
+    }
+    bounds = {
+        "the line at its own speed": {pace: entry["line_lap_time_s"] for pace, entry in over},
+        "the same with no more than full throttle": {pace: entry["line_full_throttle_s"] for pace, entry in over},
+    }
+    published = {
+        f"{name}, the paper's": row.lap_time for race in races for name, row in _published(results, race).items()
+    }
+    return lap_over_pace(laps, bounds, {name: lap for name, lap in published.items() if lap is not None})
+
+
+def races_markdown(results: Results, pictures: Mapping[str, Mapping[str, str]]) -> str:
+    """The document.
+
+    Args:
+        results: of a run.
+        pictures: addresses of the figures by race and kind.
+    """
+    return "\n\n".join(part.strip() for part in _parts(results, pictures)) + "\n"
+
+
+def _parts(results: Results, pictures: Mapping[str, Mapping[str, str]]) -> Iterator[str]:
+    yield "# Results in closed loop"
+    yield MADE_BY
+    if results.made.quick:
+        yield "> **Not results:** a quick run to try everything out."
+    lines = [
+        *(f"{name}: {value}" for name, value in results.made.protocol.items()),
+        "Controller: the same for every model of a race (`dynssm_ros/control`); a model sets the coefficients and a "
+        "correction for the whole horizon, once per control step. Start: on the line, actuators at zero; until its window is "
+        "full a model drives with its nominal coefficients.",
+        "A violation is the car's centre of gravity outside the borders at any sample. A lap that was not completed has no "
+        "time.",
+        "Control step: model and plan together, the processor's time on one core; other steps of the run used the other "
+        "cores meanwhile.",
+        "Models are trained with seed 0 on what `benchmarks/paper/plan.yaml` says; `make paper` repeats it all.",
+    ]
+    yield "\n".join(f"- {line}" for line in lines)
+    for name, race in results.plan.races.items():
+        yield f"## {race.title}"
+        yield race.text
+        if name not in results.races:
+            yield f"*Not measured*: {results.reasons.get(race_key(name), 'not run')}."
+            continue
+        driven = results.races[name]
+        yield _course(race, driven)
+        yield race_table(race, driven, _published(results, race)).markdown()
+        yield _said(driven["models"])
+        for figure, address in pictures.get(name, {}).items():
+            yield f"![{_CAPTIONS[figure]}: {race.title}]({address})"
+
+
+def _course(race: Race, driven: Entry) -> str:
+    """What was driven, in a line."""
+    parts = [
+        f"{driven['track']}, {driven['track_length_m']:.4g} m",
+        f"plant {driven['plant']}" + (f" with {_effects(race)}" if race.effects else ""),
+        f"{driven['objective']} of the {driven['line']} line, which takes {driven['line_lap_time_s']:.3f} s at its own speed"
+        + (f" ({race.pace:g} of it)" if race.pace != 1 else ""),
+        f"{driven['horizon']} steps ahead",
+    ]
+    return "; ".join(parts) + "."
+
+
+def _effects(race: Race) -> str:
+    return ", ".join(
+        f"{each.name} ({', '.join(f'{key} {value:g}' for key, value in each.parameters.items())})"
+        for each in race.effects
+    )
+
+
+def race_table(race: Race, driven: Entry, published: Mapping[str, ClosedLoop]) -> Table:
+    """The models of a race, the paper's rows first.
+
+    Args:
+        race: as planned.
+        driven: as it came out.
+        published: the paper's rows by the names to show.
+    """
+    columns = (
+        Column("model"),
+        Column("lap", "s"),
+        Column("violation"),
+        Column("v_x", "m/s", "mean"),
+        Column("|v_y|", "m/s", "mean"),
+        Column("|ω|", "rad/s", "mean"),
+        Column("steering variation", "rad"),
+        Column("p50", "ms", "control step"),
+        Column("p99", "ms", "control step"),
+        Column("missing plans"),
+    )
+    rows: list[list[Value]] = [
+        [f"{name}, the paper's", _lap(None if row.violation else row.lap_time), "yes" if row.violation else "no",
+         row.mean_v_x, row.mean_abs_v_y, row.mean_abs_omega, row.steering_total_variation, None, None, None]
+        for name, row in published.items()
+    ]  # fmt: skip
+    for model in race.models:
+        if model not in driven["models"]:
+            continue
+        row = driven["models"][model]
+        rows.append(
+            [_NAMES.get(model, f"`{model}`"), _lap(row["lap_time_s"]), "yes" if row["violation"] else "no", row["mean_v_x"],
+             row["mean_abs_v_y"], row["mean_abs_omega"], row["steering_total_variation"], row["solve_ms"]["p50"],
+             row["solve_ms"]["p99"], row["infeasible"] + row["late"]]
+        )  # fmt: skip
+    return Table(columns, rows)
+
+
+def _published(results: Results, race: Race) -> dict[str, ClosedLoop]:
+    """The paper's rows for a race."""
+    rows = dict(results.reference.closed_loop[race.paper]) if race.paper else {}
+    if race.ablation:
+        rows |= {f"DynSSM, {name}": row for name, row in results.reference.closed_loop_ablation.items()}
+    return rows
+
+
+def _said(models: Mapping[str, Entry]) -> str:
+    """What became of each model against the plant's own, and why laps ended."""
+    lost = [f"{_name(model)} {row['failure']}" for model, row in models.items() if row["failure"]]
+    said = [f"Not completed: {'; '.join(lost)}."] if lost else []
+    mark = models[TRUE]["lap_time_s"] if TRUE in models else None
+    others = {m: row["lap_time_s"] for m, row in models.items() if m != TRUE and row["lap_time_s"] is not None}
+    if mark is not None and others:
+        listed = ", ".join(f"{_name(model)} {100 * (lap / mark - 1):+.2f} %" for model, lap in others.items())
+        said.append(f"Lap time against the plant's own model: {listed}.")
+    return " ".join(said)
+
+
+def _lap(seconds: float | None) -> str:
+    """A lap time to the millisecond: models differ by little."""
+    return "–" if seconds is None else f"{seconds:.3f}"
+
+
+def _name(model: str) -> str:
+    return f"`{model}`"

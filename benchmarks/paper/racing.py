@@ -1,0 +1,87 @@
+"""The races of a plan as steps: laps in closed loop with trained models, their figures, and their numbers."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+from benchmarks.paper.plan import MID_RANGE, Race
+from benchmarks.paper.steps import Step, digest, in_data, named_track
+from dynssm_ros.control.prediction_model import PredictionModel
+from dynssm_ros.control.race import Course, Start
+from dynssm_ros.control.race import race as drive
+from dynssm_ros.control.race_models import load_prediction_model
+from dynssm_ros.control.reference import load_reference
+from dynssm_ros.control.settings import Settings
+from dynssm_ros.files import replacing, write_json
+from dynssm_ros.reporting import race_report as report
+from dynssm_ros.track.racing_line import LineKind
+from dynssm_ros.track.tracks import load_track
+from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
+
+NUMBERS = "results.json"
+_DPI = 130
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveLaps(Step):
+    """Every model of a race in the controller in turn; the output is a folder with numbers and figures.
+
+    Attributes:
+        race: what is driven.
+        trained: keys of the trainings, by the models' names.
+        calibrated: key of the calibrated car.
+        data: folder with tracks and lines.
+    """
+
+    race: Race
+    trained: Mapping[str, str]
+    calibrated: str
+    data: Path | None = field(repr=False)
+
+    def recipe(self) -> dict[str, Any]:
+        """The race, the car, and what is in the files of track and line."""
+        named = {self.race.track: named_track(self.data, self.race.track), self.race.line: self._line()}
+        return {
+            "race": self.race.model_dump(mode="json", exclude={"title", "text", "paper", "ablation"}),
+            "vehicle": load_vehicle(self.race.vehicle).model_dump(mode="json"),
+            "files": {name: digest(file) for name, file in named.items() if isinstance(file, Path)},
+        }
+
+    def make(self, root: Path, there: frozenset[str]) -> None:
+        """Drives."""
+        race, vehicle = self.race, load_vehicle(self.race.vehicle)
+        driven = vehicle.with_effects((each.name, each.parameters) for each in race.effects)
+        track = load_track(named_track(self.data, race.track))
+        if race.lap_length is not None:
+            track = track.scaled(race.lap_length / track.length)
+        reference = load_reference(str(self._line()), vehicle, track, race.pace)
+        settings = Settings.of(vehicle, race.objective, race.horizon, race.offset_free)
+        course = Course(driven, track, race.plant, reference, settings, race.laps, Start(speed=race.speed))
+        models = [name for name in race.models if self.trained.get(name) in there or name not in self.trained]
+        races = [drive(course, self._knowledge(name, driven, root)) for name in models]
+        with replacing(root / self.key) as folder:
+            folder.mkdir()
+            write_json(folder / NUMBERS, report.race_json(races))
+            for figure in race.figures:
+                getattr(report, figure)(races).savefig(folder / f"{figure}.png", dpi=_DPI, metadata={"Software": None})
+
+    def _line(self) -> str | Path:
+        return self.race.line if self.race.line in get_args(LineKind) else in_data(self.data, self.race.line)
+
+    def _knowledge(self, name: str, driven: Vehicle, root: Path) -> PredictionModel:
+        """What the controller is to know, under its name in the plan."""
+        known = load_vehicle(root / self.calibrated)
+        with tempfile.TemporaryDirectory(prefix="dynssm-") as folder:
+            given = str(root / self.trained[name]) if name in self.trained else name
+            if name == MID_RANGE:
+                given = str(Path(folder) / f"{MID_RANGE}.yaml")
+                save_vehicle(
+                    known.with_nominal((known.lower + known.upper) / 2), Path(given), "The middle of all bounds."
+                )
+            knowledge = load_prediction_model(given, known, driven, self.race.plant)
+        knowledge.name = name
+        return knowledge

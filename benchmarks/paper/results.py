@@ -1,0 +1,216 @@
+"""What came out of a run, in the form in which tables and figures ask for it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.paper.plan import Car, Plan, Study
+from benchmarks.paper.racing import NUMBERS
+from benchmarks.paper.reference import Reference
+from benchmarks.paper.runner import Outcome
+from benchmarks.paper.schedule import COSTS, race_key, score_key
+from benchmarks.paper.steps import Step
+from dynssm_ros.arrays import Vector
+from dynssm_ros.evaluation.spread import Spread, spreads
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+
+Entry = Mapping[str, Any]
+"""Scores of one training of a model on one test, as :meth:`~dynssm_ros.evaluation.score.Score.to_json` writes them."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """How the results came about.
+
+    Attributes:
+        protocol: by name: machine, versions, date ...
+        quick: whether the plan was shortened to try things out.
+        stale: number of steps that were done by other code than the present, of how many.
+    """
+
+    protocol: Mapping[str, str] = field(default_factory=dict)
+    quick: bool = False
+    stale: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True)
+class Results:
+    """All results of a run.
+
+    Attributes:
+        plan: as it was run.
+        reference: the paper's numbers.
+        scores: content of the steps that evaluate, by their keys, as far as they are done.
+        races: what was driven in closed loop, by the plan's names, as ``dynssm race`` writes it, as far as it is done.
+        costs: of the models, by name: parameters, flops, latency_us, integrator.
+        missing: why steps are not done, by their titles; steps that only lack others are left out.
+        reasons: why scores are not there, by their keys.
+        made: how it came about.
+    """
+
+    plan: Plan
+    reference: Reference
+    scores: Mapping[str, Entry]
+    races: Mapping[str, Entry]
+    costs: Mapping[str, Entry]
+    missing: Mapping[str, str]
+    reasons: Mapping[str, str]
+    made: Made
+
+    @property
+    def comparisons(self) -> list[Comparison]:
+        """One for each study."""
+        return [Comparison(self, name) for name in self.plan.studies]
+
+
+class Comparison:
+    """The results of a study.
+
+    A model appears if it has results on all tests. Where a study has several tests, one number for all of them is made
+    of the errors on each: the root of the mean square for RMSE, the largest for maximum errors, else the mean.
+    """
+
+    def __init__(self, results: Results, name: str) -> None:
+        self._plan = plan = results.plan
+        self.name = name
+        self.study: Study = plan.studies[name]
+        self.car: Car = plan.car(self.study)
+        self.planned = plan.tests(self.study)
+        keys = [score_key(split, self.study.commands) for split in self.study.splits if plan.splits[split].test]
+        self._tests: dict[str, Entry] = {}
+        for key in keys:
+            self._tests |= results.scores.get(key, {"tests": {}})["tests"]
+        self.reasons = [results.reasons[key] for key in keys if key in results.reasons]
+        wanted = {m: plan.seeds(self.study, m) if m in plan.models else (None,) for m in self.study.models}
+        self._runs = {model: self._complete(model, seeds) for model, seeds in wanted.items()}
+
+    @property
+    def label(self) -> str:
+        """Title of the study, with its command protocol."""
+        return f"{self.study.title}, {self.study.commands}"
+
+    @property
+    def tests(self) -> tuple[str, ...]:
+        """Tests with results."""
+        return tuple(test for test in self.planned if test in self._tests)
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Models with results, in the plan's order."""
+        return tuple(model for model, runs in self._runs.items() if runs)
+
+    @property
+    def ablations(self) -> dict[str, str]:
+        """Models that are the full one less something, by what they lack."""
+        prefix = f"{self.car.full}_"
+        return {m.removeprefix(prefix): m for m in self.models if m.startswith(prefix) and m != self.car.paper}
+
+    @property
+    def variants(self) -> dict[str, str]:
+        """The ablations in words, by what they lack."""
+        return {lacking: self._plan.models[model].variant or lacking for lacking, model in self.ablations.items()}
+
+    @property
+    def compared(self) -> tuple[str, ...]:
+        """The models that are no ablations."""
+        return tuple(model for model in self.models if model not in self.ablations.values())
+
+    def seeds(self, model: str) -> int:
+        """Number of trainings that the results of ``model`` are of."""
+        return len(self._runs[model])
+
+    def test(self, name: str) -> Entry:
+        """About a test: rows, starts, duration_s, horizon_s ..."""
+        return self._tests[name]
+
+    def entries(self, model: str) -> list[Entry]:
+        """Those of all trainings and tests."""
+        return [entry for run in self._runs[model] for entry in run]
+
+    def rmse(self, model: str) -> list[Spread]:
+        """One-step RMSE of each state."""
+        return self._pooled(model, lambda entry: by_name(entry["rmse"]), lambda each: np.sqrt((each**2).mean(axis=0)))
+
+    def max_error(self, model: str) -> list[Spread]:
+        """Largest one-step error of each state."""
+        return self._pooled(model, lambda entry: by_name(entry["max_error"]), lambda each: each.max(axis=0))
+
+    def displacement(self, model: str) -> list[Spread]:
+        """ADE and FDE (m)."""
+        return self._pooled(model, lambda entry: _numbers([entry["ade"], entry["fde"]]), _mean)
+
+    def coverage(self, model: str) -> list[Spread] | None:
+        """Share of errors inside the 90 % interval, for each state; ``None`` for a model that states none."""
+        if any(entry["coverage_90"] is None for entry in self.entries(model)):
+            return None
+        return self._pooled(model, lambda entry: by_name(entry["coverage_90"]), _mean)
+
+    def relative(self, model: str, test: str) -> Vector:
+        """One-step RMSE of each state as a multiple of persistence's, mean over the seeds, shape ``(3,)``."""
+        k = self.tests.index(test)
+        found = np.stack([by_name(run[k]["rmse"]) for run in self._runs[model]]).mean(axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            multiple: Vector = found / by_name(self._tests[test]["persistence_rmse"])
+        return multiple
+
+    def _complete(self, model: str, seeds: Sequence[int | None]) -> list[list[Entry]]:
+        """Trainings, each with its entries of all tests; those that lack one are left out."""
+        runs = []
+        for seed in seeds:
+            found = [
+                entry
+                for test in self.tests
+                for entry in self._tests[test]["models"].get(model, [])
+                if entry["seed"] == seed
+            ]
+            if found and len(found) == len(self.tests):
+                runs.append(found)
+        return runs
+
+    def _pooled(self, model: str, measure: Callable[[Entry], Vector], pool: Callable[[Vector], Vector]) -> list[Spread]:
+        return spreads([pool(np.stack([measure(entry) for entry in run])) for run in self._runs[model]])
+
+
+def read_results(
+    plan: Plan, reference: Reference, root: Path, steps: Sequence[Step], outcomes: Mapping[str, Outcome], made: Made
+) -> Results:
+    """Reads what the steps of ``plan`` left in ``root``."""
+    done = {key for key, outcome in outcomes.items() if outcome.state == "done"}
+    titles = {step.key: step.title for step in steps}
+    lost = {key: outcome for key, outcome in outcomes.items() if key not in done}
+    scores = {key: _read(root / key) for key in done if key.startswith("scores/")}
+    return Results(
+        plan=plan,
+        reference=reference,
+        scores=scores,
+        races={name: _read(root / race_key(name) / NUMBERS) for name in plan.races if race_key(name) in done},
+        costs=_read(root / COSTS)["models"] if COSTS in done else {},
+        missing={titles[key]: outcome.reason for key, outcome in lost.items() if outcome.cause == key},
+        reasons={key: f"{titles[outcome.cause]}: {outcome.reason}" for key, outcome in lost.items()},
+        made=made,
+    )
+
+
+def by_name(values: Entry) -> Vector:
+    """The entries of a JSON mapping in the order of the states; what is null is NaN."""
+    return _numbers([values[name] for name in STATE_SIGNALS])
+
+
+def _numbers(values: Sequence[float | None]) -> Vector:
+    return np.array([np.nan if value is None else value for value in values])
+
+
+def _mean(each: Vector) -> Vector:
+    mean: Vector = each.mean(axis=0)
+    return mean
+
+
+def _read(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return content

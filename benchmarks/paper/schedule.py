@@ -1,0 +1,172 @@
+"""A plan as steps: each once, however many studies ask for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.paper.plan import FIXED, UNTRAINED, Plan, Race, Split
+from benchmarks.paper.racing import DriveLaps
+from benchmarks.paper.steps import (
+    Calibrate,
+    Evaluate,
+    Extract,
+    Simulate,
+    Step,
+    Take,
+    TimeModels,
+    Train,
+    model_config,
+    recording_key,
+)
+from dynssm_ros.signals.signal_map import Commands
+
+
+def steps_of(plan: Plan, data: Path | None, given: Mapping[str, Path]) -> list[Step]:
+    """The steps of a plan, in the order in which it asks for them.
+
+    Args:
+        plan: what is wanted.
+        data: folder with logs and tracks; ``None`` if there is none.
+        given: recordings that the user gives, by name.
+    """
+    wanted = dict.fromkeys(
+        (split, study.commands) for study in plan.studies.values() for split in study.splits if plan.splits[split].test
+    )
+    sites = [_Site(plan, *each) for each in wanted]
+    recordings = dict.fromkeys(name for site in sites for name in site.recordings)
+    steps: list[Step] = [_recording_step(plan, name, data, given) for name in recordings]
+    steps += [step for site in sites for step in site.steps()]
+    trained: dict[str, tuple[str, ...]] = {}
+    for step in steps:
+        if isinstance(step, Train):
+            trained[step.model] = (*trained.get(step.model, ()), step.key)
+    timing = TimeModels(
+        key=COSTS, title="time the models", uses=tuple(step.key for step in steps), trained=trained, calls=plan.calls,
+        vehicle=next(iter(plan.cars.values())).vehicle,
+    )  # fmt: skip
+    return [*steps, timing, *(_race_step(name, race, data) for name, race in plan.races.items())]
+
+
+COSTS = "costs.json"
+"""Key of the step that times the models."""
+
+
+def score_key(split: str, commands: Commands) -> str:
+    """Where the scores of a split lie."""
+    return f"scores/{split}.{commands}.json"
+
+
+def model_key(split: str, commands: Commands, model: str, seed: int) -> str:
+    """Where a training lies."""
+    return f"models/{split}.{commands}/{model}.{seed}"
+
+
+def vehicle_key(split: str, commands: Commands) -> str:
+    """Where the car lies that is calibrated on the training part of a split."""
+    return f"vehicles/{split}.{commands}.yaml"
+
+
+def race_key(name: str) -> str:
+    """Where the outcome of a race lies."""
+    return f"races/{name}"
+
+
+def _race_step(name: str, race: Race, data: Path | None) -> DriveLaps:
+    models = {model: model_key(race.split, race.commands, model, 0) for model in race.models if model not in FIXED}
+    return DriveLaps(
+        key=race_key(name), title=f"race {name}", needs=(vehicle_key(race.split, race.commands),),
+        uses=tuple(models.values()), race=race, trained=models, calibrated=vehicle_key(race.split, race.commands),
+        data=data,
+    )  # fmt: skip
+
+
+def _recording_step(plan: Plan, name: str, data: Path | None, given: Mapping[str, Path]) -> Step:
+    key = recording_key(name)
+    if name in plan.logs:
+        return Extract(key=key, title=f"extract {name}", log=plan.logs[name], data=data)
+    if name in plan.drives:
+        return Simulate(key=key, title=f"simulate {name}", drive=plan.drives[name], data=data)
+    return Take(key=key, title=f"take {name}", path=given[name])
+
+
+@dataclass(frozen=True)
+class _Site:
+    """A split under a command protocol."""
+
+    plan: Plan
+    name: str
+    commands: Commands
+
+    @property
+    def split(self) -> Split:
+        return self.plan.splits[self.name]
+
+    @property
+    def shown(self) -> str:
+        return f"{self.name}, commands {self.commands}"
+
+    @property
+    def recordings(self) -> list[str]:
+        """Those of its parts."""
+        return [part.recording for part in (self.split.train, *self.split.test.values())]
+
+    @property
+    def vehicle(self) -> str:
+        """Key of the car that is calibrated here."""
+        return vehicle_key(self.name, self.commands)
+
+    def model(self, name: str, seed: int) -> str:
+        """Key of a training here."""
+        return model_key(self.name, self.commands, name, seed)
+
+    @property
+    def models(self) -> dict[str, range]:
+        """Models with their seeds that any study wants here; no seeds for those without training."""
+        wanted: dict[str, range] = {}
+        for study in self.plan.studies.values():
+            if self.name in study.splits and study.commands == self.commands:
+                for name in study.models:
+                    seeds = range(0) if name in UNTRAINED else self.plan.seeds(study, name)
+                    wanted[name] = max(wanted.get(name, seeds), seeds, key=len)
+        return wanted
+
+    def steps(self) -> Iterator[Step]:
+        """All but those that make the recordings."""
+        yield Calibrate(
+            key=self.vehicle, title=f"calibrate on {self.shown}", needs=(recording_key(self.split.train.recording),),
+            car=self.plan.cars[self.split.car], part=self.split.train, commands=self.commands,
+        )  # fmt: skip
+        models = self.models
+        for name, seeds in models.items():
+            for seed in seeds:
+                yield self._training(name, seed, models)
+        trained = {self.model(name, seed): name for name, seeds in models.items() for seed in seeds}
+        tested = dict.fromkeys(recording_key(part.recording) for part in self.split.test.values())
+        yield Evaluate(
+            key=score_key(self.name, self.commands), title=f"evaluate on {self.shown}", needs=(*tested, self.vehicle),
+            uses=tuple(trained), vehicle=self.vehicle, untrained=tuple(name for name in models if name in UNTRAINED),
+            trained=trained, tests=self.split.test, commands=self.commands, stride=self.plan.stride,
+        )  # fmt: skip
+
+    def _training(self, name: str, seed: int, others: Mapping[str, range]) -> Train:
+        """A training; one that fine-tunes goes on from a training of ``others`` where that is the same."""
+        own_vehicle = self.plan.models[name].vehicle
+        fine_tuning = model_config(name).fine_tuning
+        first = fine_tuning.starts_from.name if fine_tuning else ""
+        same = seed in others.get(first, ()) and self.plan.models[first].vehicle == own_vehicle
+        start = self.model(first, seed) if same else None
+        return Train(
+            key=self.model(name, seed),
+            title=f"train {name}, seed {seed}, on {self.shown}",
+            needs=(recording_key(self.split.train.recording), *(() if own_vehicle else (self.vehicle,))),
+            uses=(start,) if start else (),
+            model=name,
+            seed=seed,
+            epochs=self.plan.epochs,
+            part=self.split.train,
+            commands=self.commands,
+            vehicle=own_vehicle or self.vehicle,
+            start=start,
+        )

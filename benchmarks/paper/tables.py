@@ -1,0 +1,267 @@
+"""The tables of the document: the paper's numbers beside the measured ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from benchmarks.paper.reference import Channels, OpenLoop, Reference
+from benchmarks.paper.results import Comparison, Entry, Results
+from dynssm_ros.evaluation.coefficients import coefficient_unit
+from dynssm_ros.evaluation.spread import Spread
+from dynssm_ros.reporting.evaluation_figures import UNITS
+from dynssm_ros.reporting.tables import Column, Table, Value, text
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.vehicle import COEFFICIENTS
+
+TITLES = {"v_x": "v_x", "v_y": "v_y", "omega": "ω"}
+_PHYSICS_ONLY = "single_track"
+_ERRORS = ("ADE", "FDE")
+
+
+def published_table(comparisons: Sequence[Comparison], reference: Mapping[str, OpenLoop]) -> Table:
+    """The paper's open-loop table, and the same models measured on each study that has them."""
+    columns = (
+        Column("model"),
+        Column("test"),
+        *(Column(f"{TITLES[channel]} {what}", UNITS[channel]) for channel in STATE_SIGNALS for what in ("RMSE", "max")),
+        *(Column(name, "m") for name in _ERRORS),
+    )
+    rows: list[list[Value]] = []
+    for name, row in reference.items():
+        pairs = [v for pair in zip(row.rmse.values, row.max_error.values, strict=True) for v in pair]
+        rows.append([f"{name}, the paper's", "the paper's", *pairs, row.ade, row.fde])
+    for comparison in (each for each in comparisons if each.car.ddm in each.models):
+        for model in published_models(comparison):
+            errors = zip(comparison.rmse(model), comparison.max_error(model), strict=True)
+            spreads = [*(each for pair in errors for each in pair), *comparison.displacement(model)]
+            rows.append([f"`{model}`", comparison.label, *(each.mean for each in spreads)])
+    return Table(columns, rows)
+
+
+def published_models(comparison: Comparison) -> list[str]:
+    """DDM, FTHD, the paper's configuration of DynSSM, and the full one, as far as they have results."""
+    car = comparison.car
+    return [model for model in (car.ddm, car.fthd, car.paper, car.full) if model in comparison.models]
+
+
+def reduction_table(comparisons: Sequence[Comparison], reference: Reference, data: str) -> Table:
+    """How much lower the errors are than DDM's, in percent; above 0 is better."""
+    columns = (
+        Column("model"),
+        Column("test"),
+        *(Column(TITLES[channel], "%") for channel in STATE_SIGNALS),
+        *(Column(name, "%") for name in _ERRORS),
+    )
+    paper = reference.open_loop[data]
+    rows: list[list[Value]] = [
+        ["DynSSM, the paper's table", "the paper's", *_reductions(paper["DynSSM"], paper["DDM"])]
+    ]
+    if data == "real":
+        claims = [_percentage(value) for value in reference.claims.rmse.values]
+        rows.append(["DynSSM, the paper's abstract: up to, over DDM or FTHD", "the paper's", *claims, None, None])
+    for comparison in comparisons:
+        car = comparison.car
+        if car.ddm not in comparison.models:
+            continue
+        base = [*comparison.rmse(car.ddm), *comparison.displacement(car.ddm)]
+        for model in (car.paper, car.full):
+            if model in comparison.models:
+                own = [*comparison.rmse(model), *comparison.displacement(model)]
+                shares = [1 - _ratio(a.mean, b.mean) for a, b in zip(own, base, strict=True)]
+                rows.append([f"`{model}`", comparison.label, *(_percentage(share) for share in shares)])
+    return Table(columns, rows)
+
+
+def factor_table(comparisons: Sequence[Comparison], reference: Mapping[str, OpenLoop]) -> Table:
+    """The lowest RMSE of the paper's table over that of the full model."""
+    best = np.min([row.rmse.values for row in reference.values()], axis=0)
+    columns = (Column("test"), *(Column(TITLES[channel], "times lower") for channel in STATE_SIGNALS))
+    rows: list[list[Value]] = [
+        [c.label, *(_ratio(b, s.mean) for b, s in zip(best, c.rmse(c.car.full), strict=True))]
+        for c in comparisons
+        if c.car.full in c.models
+    ]
+    return Table(columns, rows)
+
+
+def error_table(comparison: Comparison) -> Table:
+    """One-step RMSE and displacement of all models of a study but the ablations, all tests taken together."""
+    columns = (
+        Column("model"),
+        *(Column(TITLES[channel], UNITS[channel], "RMSE", "min") for channel in STATE_SIGNALS),
+        *(Column(name, "m", "", "min") for name in _ERRORS),
+    )
+    rows: list[list[Value]] = [
+        [f"`{model}`", *comparison.rmse(model), *comparison.displacement(model)] for model in comparison.compared
+    ]
+    rows_scored = sum(comparison.test(test)["rows"] for test in comparison.tests)
+    together = " on all tests together" if len(comparison.tests) > 1 else ""
+    return Table(
+        columns, rows, f"Errors{together}: {rows_scored:,} one-step predictions of each model. {_seeds(comparison)}"
+    )
+
+
+def relative_table(comparison: Comparison) -> Table:
+    """One-step RMSE as a multiple of persistence's, test by test."""
+    columns = (
+        Column("model"),
+        *(Column(TITLES[channel], "", f"{test}:", "min") for test in comparison.tests for channel in STATE_SIGNALS),
+    )
+    rows: list[list[Value]] = [
+        [f"`{model}`", *(float(v) for test in comparison.tests for v in comparison.relative(model, test))]
+        for model in comparison.compared
+    ]
+    return Table(columns, rows, "One-step RMSE over that of persistence; above 1 is worse than no model at all.")
+
+
+def ablation_table(comparison: Comparison, results: Results) -> Table:
+    """The full model and its ablations, with the paper's RMSE where it has that variant."""
+    paper = results.reference.ablation.get(comparison.car.reference, {})
+    columns: list[Column] = [Column("variant")]
+    for channel in STATE_SIGNALS:
+        columns.append(Column(TITLES[channel], UNITS[channel], "", "min"))
+        if paper:
+            columns.append(Column(f"{TITLES[channel]}, the paper's", UNITS[channel]))
+    columns.append(Column("parameters"))
+    variants = {_PHYSICS_ONLY: _PHYSICS_ONLY} if _PHYSICS_ONLY in comparison.models else {}
+    variants |= comparison.ablations | {"full": comparison.car.full}
+    names = {_PHYSICS_ONLY: "physics only, calibrated", "full": "full model"} | comparison.variants
+    rows: list[list[Value]] = []
+    for lacking, model in variants.items():
+        row: list[Value] = [names[lacking]]
+        theirs: Channels | None = paper[lacking].rmse if lacking in paper else None
+        for k, spread in enumerate(comparison.rmse(model)):
+            row += [spread, *([theirs.values[k] if theirs else None] if paper else [])]
+        row.append(results.costs[model]["parameters"] if model in results.costs else None)
+        rows.append(row)
+    return Table(tuple(columns), rows, f"{better_ablations(comparison)} {_seeds(comparison)}")
+
+
+def better_ablations(comparison: Comparison) -> str:
+    """Says which ablations beat the full model by more than the spread of both over the seeds.
+
+    A variant that was trained once is taken to vary as the full model does.
+    """
+    full = comparison.rmse(comparison.car.full)
+    if comparison.seeds(comparison.car.full) < 2:
+        return "The full model was trained once, so the spread over seeds is not known."
+    found = []
+    for lacking, model in comparison.ablations.items():
+        once = comparison.seeds(model) < 2
+        for channel, own, whole in zip(STATE_SIGNALS, comparison.rmse(model), full, strict=True):
+            if whole.mean - own.mean > math.hypot(whole.std if once else own.std, whole.std):
+                percent = _percentage(1 - own.mean / whole.mean)
+                found.append(f"{comparison.variants[lacking]} in {TITLES[channel]} by {text(percent)} %")
+    if not found:
+        return "No ablation is better than the full model beyond the spread over seeds."
+    return f"Better than the full model beyond the spread over seeds: {', '.join(found)}."
+
+
+def coefficient_table(comparison: Comparison, results: Results) -> Table | None:
+    """The adapted coefficients against their bounds; ``None`` if no model adapts any."""
+    paper = results.reference.coefficients[comparison.car.reference]
+    models = [model for model in (comparison.car.paper, comparison.car.full) if model in comparison.models]
+    statistics = {model: found for model in models if (found := _coefficients(comparison.entries(model)))}
+    if not statistics:
+        return None
+    columns = [Column("coefficient"), Column("bounds, the paper's"), Column("the paper's")]
+    for model in statistics:
+        columns += [Column("bounds", "", f"`{model}`"), Column("adapted"), Column("at a bound", "%")]
+    rows: list[list[Value]] = []
+    for name in COEFFICIENTS:
+        unit = coefficient_unit(name)
+        theirs = paper.get(name)
+        row: list[Value] = [f"{name} ({unit})" if unit else name]
+        row += [_range(theirs.bounds), _plus_minus(theirs.mean, theirs.std)] if theirs else ["–", "–"]
+        for found in statistics.values():
+            bounds, mean, std, at_bound = found[name]
+            row += [_range(bounds), _plus_minus(mean, std), _percentage(at_bound)]
+        rows.append(row)
+    kept = "".join(f" `{model}` keeps its own constant." for model in models if model not in statistics)
+    return Table(tuple(columns), rows, f"Mean ± standard deviation over the predictions; {comparison.label}.{kept}")
+
+
+def coverage_table(comparisons: Sequence[Comparison]) -> Table:
+    """How often the error lies inside the model's own 90 % interval."""
+    columns = (Column("test"), Column("model"), *(Column(TITLES[channel], "%") for channel in STATE_SIGNALS))
+    rows: list[list[Value]] = []
+    for comparison in comparisons:
+        for model in (comparison.car.paper, comparison.car.full):
+            covered = comparison.coverage(model) if model in comparison.models else None
+            if covered is not None:
+                rows.append(
+                    [comparison.label, f"`{model}`", *(Spread(100 * s.mean, 100 * s.std, s.n) for s in covered)]
+                )
+    return Table(columns, rows)
+
+
+def cost_table(results: Results) -> Table:
+    """Size, operations and time of all models but the ablations, side by side, and the paper's."""
+    columns = (
+        Column("model"), Column("parameters"), Column("FLOPs"), Column("latency p50", "µs"), Column("p99", "µs"),
+        Column("physics step"),
+    )  # fmt: skip
+    ablations = {model for comparison in results.comparisons for model in comparison.ablations.values()}
+    rows: list[list[Value]] = []
+    for data, models in results.reference.open_loop.items():
+        for name, row in models.items():
+            car = "AV-21" if data == "real" else "ORCA"
+            rows.append([f"{name}, {car}, the paper's", row.parameters, row.flops, 1e6 * row.latency, None, "–"])
+    for name, cost in results.costs.items():
+        if name not in ablations:
+            latency = cost["latency_us"]
+            times = (latency["p50"], latency["p99"])
+            rows.append([f"`{name}`", cost["parameters"], cost["flops"], *times, _step(cost)])
+    return Table(columns, rows)
+
+
+def _coefficients(entries: Sequence[Entry]) -> dict[str, tuple[tuple[float, float], float, float, float]]:
+    """Bounds, mean, standard deviation and share at a bound over all entries; empty if they have none."""
+    each = [entry["coefficients"] for entry in entries]
+    if any(found is None for found in each):
+        return {}
+    statistics = {}
+    for name in COEFFICIENTS:
+        mean, std, at_bound = (np.array([found[name][key] for found in each]) for key in ("mean", "std", "at_bound"))
+        spread = math.sqrt(float((std**2).mean() + mean.var()))  # within the entries and between them
+        lower, upper = each[0][name]["bounds"]
+        statistics[name] = ((lower, upper), float(mean.mean()), spread, float(at_bound.mean()))
+    return statistics
+
+
+def _reductions(row: OpenLoop, base: OpenLoop) -> list[Value]:
+    pairs = zip([*row.rmse.values, row.ade, row.fde], [*base.rmse.values, base.ade, base.fde], strict=True)
+    return [_percentage(1 - own / other) for own, other in pairs]
+
+
+def _seeds(comparison: Comparison) -> str:
+    numbers = {model: comparison.seeds(model) for model in comparison.models}
+    several = {model: n for model, n in numbers.items() if n > 1}
+    if not several:
+        return "One seed each."
+    return f"± is the standard deviation over {max(several.values())} seeds; models without it were trained once."
+
+
+def _step(cost: Entry) -> str:
+    """How the physics of a trained model is integrated."""
+    times = f", {cost['substeps']} times" if cost["integrator"] and cost["substeps"] > 1 else ""
+    return f"{cost['integrator'] or '–'}{times}"
+
+
+def _percentage(share: float) -> float:
+    return 100 * share
+
+
+def _ratio(a: float, b: float) -> float:
+    return a / b if b else math.inf
+
+
+def _range(bounds: tuple[float, float]) -> str:
+    return f"{bounds[0]:g} … {bounds[1]:g}"
+
+
+def _plus_minus(mean: float, std: float) -> str:
+    return f"{text(mean)} ± {text(std)}"

@@ -1,0 +1,147 @@
+"""The driver of a car in closed loop: what is measured becomes a command that can always be sent.
+
+Races and the controller node use the same class, so that what a race shows is what runs live.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple, get_args
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.control.disturbance import Disturbance
+from dynssm_ros.control.horizon_model import CONTEXT, STATES, HorizonModel
+from dynssm_ros.control.nmpc import Adapted, Nmpc, Plan, Status
+from dynssm_ros.control.prediction_model import PredictionModel
+from dynssm_ros.control.reference import Reference
+from dynssm_ros.control.settings import Settings
+from dynssm_ros.track.tracks import Track
+from dynssm_ros.vehicle import Applied, Coefficients, State
+from dynssm_ros.vehicle.effects import require_context
+from dynssm_ros.vehicle.kinematics import SCALAR, Pose
+from dynssm_ros.vehicle.parameters import InputLimits
+from dynssm_ros.vehicle.single_track import settled_memory
+
+LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
+_VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
+_MEASURED = slice(3, len(STATES))  # what a window's row begins with
+_KNOWN = (*STATES[:3], *CONTEXT)  # what effects may read
+
+
+class Decision(NamedTuple):
+    """What one control step came to.
+
+    Attributes:
+        command: absolute throttle and steering to apply from now on: finite, within the limits and the steering rate.
+        plan: whose first step that is.
+        adapted: what was planned with: what the model said, and what was found to be missing from that.
+        seconds: that it took, model and plan together, by the controller's clock.
+    """
+
+    command: Applied
+    plan: Plan
+    adapted: Adapted
+    seconds: float
+
+    @property
+    def theta(self) -> Vector:
+        """Coefficients of the horizon's first step, shape ``(17,)``."""
+        return _first(self.adapted.theta)
+
+    @property
+    def correction(self) -> Vector:
+        """Likewise the correction (m/s, m/s, rad/s), shape ``(3,)``."""
+        return _first(self.adapted.correction)
+
+
+class Controller:
+    """A model and the controller of one car on one track. It remembers the window that the model reads and its last plan.
+
+    It is to be asked once per T_s. A step without a plan in time is driven by the plan before, moved on, and counted.
+
+    Args:
+        model: what is known of the car.
+        limits: of the actuators.
+        reference: the line.
+        track: whose borders hold.
+        settings: of the controller; its deadline counts for model and plan together.
+        clock: time now (s), of any origin.
+
+    Raises:
+        ConfigurationError: the model's physics needs a signal that there is not.
+    """
+
+    def __init__(
+        self,
+        model: PredictionModel,
+        limits: InputLimits,
+        reference: Reference,
+        track: Track,
+        settings: Settings,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        require_context(model.car.effects, _KNOWN, f"model {model.name}")
+        self.counts: dict[Status, int] = dict.fromkeys(get_args(Status), 0)
+        """Steps by what became of their plan."""
+        self._model = model
+        self._track = track
+        self._clock = clock
+        horizon = HorizonModel(model.car, settings.N, settings.travel)
+        self._nmpc = Nmpc(horizon, limits, reference, track, settings, clock)
+        self._disturbance = Disturbance.of(settings, model.car.T_s)
+        self._history: deque[Vector] = deque(maxlen=max(model.H, 1))
+
+    def forget(self) -> None:
+        """Begins anew, as after a gap in what was measured: without a window, a plan, or an error of the model."""
+        self._history.clear()
+        self._disturbance.forget()
+        self._nmpc.forget()
+
+    def step(self, t: float, pose: Pose, seen: State, feedback: Applied) -> Decision:
+        """One control step.
+
+        Args:
+            t: time since the start of the drive (s).
+            pose: where the car is (m, m, rad).
+            seen: its measured velocities (m/s, m/s, rad/s).
+            feedback: what its actuators do now.
+
+        Returns:
+            What to send. It is safe whatever came in: what is not finite counts as measured as it was planned.
+        """
+        began = self._clock()
+        previous = self._nmpc.previous
+        increments = np.zeros(2) if previous is None else previous.u[0]
+        self._history.append(np.array([*seen, *feedback, *increments]))
+        self._disturbance.measured(np.array(seen))
+        adapted = self._disturbance.added(self._model.read(np.array(self._history), previous))
+        memory = self._settled(t, pose, seen, feedback, adapted) if previous is None else previous.x[0, len(STATES) :]
+        plan = self._nmpc.plan(np.array([*pose, *seen, *feedback, *memory]), adapted, t, began)
+        command = self._nmpc.command(plan)
+        measured = plan.x[0, _MEASURED]
+        increments = np.subtract(command, measured[-2:])
+        self._history[-1] = np.array([*measured, *increments])
+        if np.all(np.isfinite([*pose, *seen, *feedback])):
+            self._disturbance.expects(self._nmpc.following(plan.x[0], increments, adapted, t)[_VELOCITIES])
+        self.counts[plan.status] += 1
+        return Decision(command, plan, adapted, self._clock() - began)
+
+    def _settled(self, t: float, pose: Pose, seen: State, feedback: Applied, adapted: Adapted) -> Vector:
+        """The memory of the model's effects at the start; zeros while that is not known."""
+        car = self._model.car
+        if not (car.memory and np.all(np.isfinite([*pose, *seen, *feedback]))):
+            return np.zeros(len(car.memory))
+        s = float(self._track.project(pose[:2])[0])
+        context = {"t": t, "s": s, "lap_length": self._track.length, **pose._asdict()}
+        theta = Coefficients(*(float(value) for value in _first(adapted.theta)))
+        memory = settled_memory(SCALAR, seen, feedback, theta, car.constants, car.effects, None, context)
+        return np.array([memory[name] for name in car.memory])
+
+
+def _first(values: Vector) -> Vector:
+    """Of one vector for all steps, or of a vector per step."""
+    return values if values.ndim == 1 else np.asarray(values[0])

@@ -1,0 +1,261 @@
+"""The controller of a car that does not wait: plans for the instant at which the command will act, and tells how it goes.
+
+The odometry of an instant is answered while the car drives on, under the command that was sent before; the answer acts one
+T_s later. So each step first carries the measured state to that instant, by what the predictor says of the car, and plans
+from there. The command is stamped with that instant, which is how recordings pair commands with states.
+
+From far below the line's speed, as from standstill or after a spin, a short horizon sees no way that leads back to the line.
+So pure pursuit drives until the car is up to speed.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.control.controller import LOST, Controller
+from dynssm_ros.control.disturbance import Disturbance
+from dynssm_ros.control.horizon_model import STATES
+from dynssm_ros.control.nmpc import Status
+from dynssm_ros.control.reference import Reference
+from dynssm_ros.control.remote import RemoteModel
+from dynssm_ros.control.settings import Settings
+from dynssm_ros.runtime.health import Level
+from dynssm_ros.signals.history import Refusal
+from dynssm_ros.track.driver import Driver, Style
+from dynssm_ros.track.speed_profile import vehicle_limits
+from dynssm_ros.track.tracks import Track
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, State, Vehicle
+from dynssm_ros.vehicle.kinematics import Pose
+
+LAUNCH = 0.3, 0.7  # shares of the line's speed: below the first pursuit takes over, above the second it ends
+_LAUNCH_STYLE = Style(aggressiveness=0.7, variation=0.0)
+_REMEMBERED = 1000  # control steps that the percentiles are of
+_TOLERATED = 0.01  # share of plans that may be missing before it is called a warning
+_LARGEST = 1e6  # m, rad, m/s, rad/s; what is larger is as good as infinite
+_EARLY = 0.25  # of T_s that odometry may come before its time; what comes earlier is for a later step
+
+
+class Laps:
+    """Follows a car around a track and counts laps, from where it was first seen and anew after each gap."""
+
+    def __init__(self, track: Track) -> None:
+        self.count = 0
+        """Complete laps."""
+        self.last = math.nan
+        """Time of the last of them (s)."""
+        self.s = math.nan
+        """Along the centre line, counted on over the laps (m)."""
+        self.lateral = math.nan
+        """Beside the centre line (m, positive left)."""
+        self.outside = 0.0
+        """How far the car's centre is outside the borders (m)."""
+        self.worst = 0.0
+        """How far it ever was."""
+        self._track = track
+        self._start = self._mark = math.nan  # where (m) and when (s) the present lap began
+        self._before = math.nan, math.nan
+
+    @property
+    def width(self) -> float:
+        """Of the road here (m)."""
+        return float(np.sum(self._track.widths(self.s)))
+
+    def passed(self, t: float, x: float, y: float, together: bool = True) -> None:
+        """Takes the car at ``x, y`` (m) at ``t`` (s, of any origin).
+
+        Args:
+            t: time.
+            x: place.
+            y: place.
+            together: whether nothing is missing since the time before; if not it is looked for on the whole track.
+        """
+        together = together and not math.isnan(self.s)
+        at, self.lateral = (float(value) for value in self._track.project([x, y], self.s if together else None))
+        if not together:
+            self.s = self._start = at
+            self._mark, self._before = t, (t, at)
+        self.s = self._track.centre.counted_on(at, self.s)
+        self.outside = max(0.0, -float(self._track.room(self.s, self.lateral)))
+        self.worst = max(self.worst, self.outside)
+        goal = self._start + self._track.length
+        if self.s >= goal:
+            before, was = self._before
+            crossing = before + (t - before) * (goal - was) / (self.s - was)
+            self.count, self.last = self.count + 1, crossing - self._mark
+            self._start, self._mark = goal, crossing
+        self._before = t, self.s
+
+
+class LiveController:
+    """Drives one car on one track from what comes over a bus.
+
+    Odometry that is not finite, comes twice or in disorder is refused. After a gap, or when its time jumps back, everything
+    begins anew. Far beside the road the car is braked.
+
+    Args:
+        vehicle: the car.
+        reference: the line.
+        track: where.
+        settings: of the controller.
+        max_age: how old the odometry behind the predictor's coefficients may be (s).
+        max_gap: longest time between two odometry messages that is no gap (s).
+        clock: time now (s), of any origin, for the deadline.
+
+    Raises:
+        ConfigurationError: the vehicle has effects on signals that there are not.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        reference: Reference,
+        track: Track,
+        settings: Settings,
+        max_age: float = 0.5,
+        max_gap: float = 0.2,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self.vehicle = vehicle
+        self.period = round(vehicle.sampling_time * 1e9)
+        """T_s (ns): a command acts that long after the stamp of the odometry that it answers."""
+        self.remote = RemoteModel(vehicle, max_age, Disturbance.of(settings, vehicle.sampling_time))
+        """What the predictor says; what that mispredicts is told where it is measured, and not from where it is planned."""
+        settings = replace(settings, offset_free=False)
+        self._pilot = Controller(self.remote, vehicle.inputs, reference, track, settings, clock)
+        self._pursuit = Driver(vehicle, reference.line, vehicle_limits(vehicle), _LAUNCH_STYLE)
+        self._reference = reference
+        self._brakes = vehicle.inputs.throttle[0]
+        self._max_age, self._max_gap = max_age, max_gap * 1e9
+        self._track = track
+        self._reset()
+        # what is loaded, compiled or allocated by the first step is so before the car waits for it
+        x, y = (float(value) for value in reference.line.position(0.0))
+        start = Pose(x, y, float(reference.line.heading(0.0)))
+        self.step(0, start, State(float(reference.speed_at(0.0)), 0.0, 0.0))
+        self._reset()
+
+    def _reset(self) -> None:
+        self.laps = Laps(self._track)
+        self.counts: Counter[Status] = Counter()
+        """Plans by what became of them."""
+        self._recent: deque[tuple[float, bool]] = deque(maxlen=_REMEMBERED)  # seconds, and whether there was a plan
+        self._last: int | None = None  # stamp of the newest odometry (ns)
+        self._first = self._planned = 0
+        self._heading = 0.0
+        self._sent = Applied(0.0, 0.0)
+        self._restart()
+        self.remote.forget()
+
+    def _restart(self) -> None:
+        """Forgets the plan."""
+        self._pilot.forget()
+        self._launching = False
+        self._memory: Vector | None = None
+
+    def step(self, stamp: int, pose: Pose, seen: State) -> Applied | Refusal | None:
+        """Answers an odometry message.
+
+        Args:
+            stamp: of the message (ns).
+            pose: where the car is (m, m, rad; the heading may be wrapped).
+            seen: its velocities (m/s, m/s, rad/s).
+
+        Returns:
+            The command from ``stamp + period`` on, finite and within the limits; why the message is refused; or nothing if
+            it is too early for a new plan.
+        """
+        if not all(abs(value) < _LARGEST for value in (*pose, *seen)):
+            return Refusal.NOT_FINITE
+        since = math.inf if self._last is None else stamp - self._last
+        if -self._max_gap <= since <= 0:
+            return Refusal.REPEATED
+        together = 0 < since <= self._max_gap
+        if together and stamp - self._planned < (1 - _EARLY) * self.period:
+            self._last = stamp
+            return None
+        if not together:
+            self._restart()
+        if since < 0:
+            self.remote.forget()
+        if since < 0 or self._last is None:
+            self.laps, self._first = Laps(self._track), stamp
+        self._last = self._planned = stamp
+        return self._answer(stamp, pose, seen, together)
+
+    def _answer(self, stamp: int, pose: Pose, seen: State, together: bool) -> Applied:
+        t = (stamp - self._first) / 1e9
+        self.laps.passed(t, pose.x, pose.y, together)
+        if self.laps.outside > LOST * self.laps.width:
+            return self.brake()
+        self._heading += math.remainder(pose.theta - self._heading, 2 * math.pi)
+        context = t, self.laps.s % self._track.length, self._track.length
+        x = self.remote.start(Pose(pose.x, pose.y, self._heading), seen, self._sent, context, self._memory)
+        self.remote.measured(stamp, x, context)
+        self.remote.update(stamp)
+        following = self.remote.ahead(x, context)
+        ahead = Pose(*following[:3].tolist()), State(*following[3:6].tolist())
+        self._sent = self._pursued(*ahead) or self._planned_command(t + self.period / 1e9, *ahead)
+        return self._sent
+
+    def _pursued(self, pose: Pose, state: State) -> Applied | None:
+        """The command of a launch; ``None`` while there is none."""
+        on_line = float(self._reference.line.project(pose[:2])[0])
+        share = LAUNCH[1] if self._launching else LAUNCH[0]
+        launching = state.v_x <= share * float(self._reference.speed_at(on_line))
+        if launching != self._launching:
+            self._restart()
+            self._launching = launching
+        return self._pursuit.command(0.0, pose, state, on_line, self._sent) if launching else None
+
+    def _planned_command(self, t: float, pose: Pose, state: State) -> Applied:
+        decision = self._pilot.step(t, pose, state, self._sent)
+        self._memory = decision.plan.x[0, len(STATES) :]
+        self.counts[decision.plan.status] += 1
+        self._recent.append((decision.seconds, decision.plan.status == "solved"))
+        return decision.command
+
+    def brake(self) -> Applied:
+        """The command for when there is nothing to plan from: full brakes, the steering held."""
+        self._restart()
+        self._sent = Applied(self._brakes, self._sent.delta)
+        return self._sent
+
+    def verdict(self) -> tuple[Level, str]:
+        """How it goes, in words."""
+        if self.laps.outside > LOST * self.laps.width:
+            return Level.ERROR, f"{self.laps.outside:.3g} m outside the borders: brakes"
+        output, level, words = self.remote.output, Level.OK, ""
+        if output.source == RemoteModel.NOMINAL:
+            level, words = Level.WARN, f", nothing from the predictor for {self._max_age:g} s"
+        missing = sum(not planned for _, planned in self._recent)
+        if missing > _TOLERATED * len(self._recent):
+            level, words = Level.WARN, f"{words}; {missing} of {len(self._recent)} plans infeasible or late"
+        return level, f"{'gets up to speed' if self._launching else 'drives'}, {output.source}{words}"
+
+    def values(self) -> dict[str, str]:
+        """All figures by name, for the key-value list of a diagnostic status."""
+        p50, p99 = np.percentile([seconds for seconds, _ in self._recent] or [math.nan], [50, 99])
+        laps, output = self.laps, self.remote.output
+        theta, correction = (np.atleast_2d(part)[0] for part in self.remote.planned_with)
+        return {
+            "coefficients": output.source,
+            "age of the coefficients (s)": f"{output.age:.3f}",
+            "step p50 (ms)": f"{1e3 * p50:.3f}",
+            "step p99 (ms)": f"{1e3 * p99:.3f}",
+            **{f"plans {status}": str(self.counts[status]) for status in get_args(Status)},
+            "laps": str(laps.count),
+            "last lap (s)": f"{laps.last:.3f}",
+            "place on the track (m)": f"{laps.s % self._track.length:.3f}",
+            "beside the centre line (m)": f"{laps.lateral:.4f}",
+            "most outside the borders (m)": f"{laps.worst:.4f}",
+            **{name: f"{value:.6g}" for name, value in zip(COEFFICIENTS, theta, strict=True)},
+            **{f"added to {name}": f"{value:.6g}" for name, value in zip(State._fields, correction, strict=True)},
+        }

@@ -1,0 +1,122 @@
+"""Any model behind the controller: what it says of the present becomes coefficients and a correction for the horizon."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.control.horizon_model import INPUTS, STATES, Car
+from dynssm_ros.control.nmpc import Adapted, Plan
+from dynssm_ros.runtime.models import OnnxModel, WindowModel
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
+from dynssm_ros.vehicle import Coefficients, State, Vehicle, step
+
+_MEASURED = slice(STATES.index("v_x"), len(STATES))  # of the controller's state: what a window's row begins with
+
+
+class PredictionModel(Protocol):
+    """What the controller asks of a model."""
+
+    name: str
+    car: Car
+    """The physics that its coefficients are for."""
+    H: int
+    """Rows of history that it reads; 0: none."""
+
+    def read(self, rows: Vector, previous: Plan | None) -> Adapted:
+        """Coefficients and correction for the horizon.
+
+        Args:
+            rows: history with the columns ``WINDOW_COLUMNS``, the present last, shape ``(k, 7)``. The command in the
+                last row is the one that the last plan has for now.
+            previous: the last plan as it stands now; ``None`` at the start.
+        """
+
+
+class Fixed:
+    """Coefficients that never change, and no correction."""
+
+    H = 0
+
+    def __init__(self, name: str, car: Car, theta: Vector) -> None:
+        self.name = name
+        self.car = car
+        self._adapted = Adapted(theta, np.zeros(3))
+
+    def read(self, rows: Vector, previous: Plan | None) -> Adapted:
+        """The same, whatever happens."""
+        return self._adapted
+
+
+class Adaptive:
+    """A model that reads a history window and predicts the next state.
+
+    Its coefficients, and what it adds to the single-track step with them, hold over the horizon; a model without
+    coefficients corrects the nominal car. Until the window is full the nominal car drives, without a correction.
+
+    Args:
+        model: the model.
+        vehicle: the nominal car of a model that has none of its own.
+        along_horizon: reads the model anew at each step of the last plan instead, as if that had been driven.
+    """
+
+    def __init__(self, model: WindowModel, vehicle: Vehicle, along_horizon: bool = False) -> None:
+        own = model.vehicle or vehicle
+        card = model.artifact.card if isinstance(model, OnnxModel) else None
+        self.name = model.name
+        self.H = model.H
+        self.car = Car.of(own) if card is None else Car.of(own, card.integrator, card.substeps)
+        self._model = model
+        self._along_horizon = along_horizon
+        self._nominal = Adapted(own.nominal, np.zeros(3))
+
+    def read(self, rows: Vector, previous: Plan | None) -> Adapted:
+        """See :class:`PredictionModel`. What is not finite is replaced by the nominal car."""
+        if len(rows) < self.H:
+            return self._nominal
+        windows = rows[None, -self.H :]
+        if self._along_horizon and previous is not None:
+            ahead = np.concatenate([rows, _planned_rows(previous)])
+            N = len(previous.u)
+            windows = np.stack([ahead[k : k + self.H] for k in range(len(rows) - self.H, len(rows) - self.H + N)])
+        if self._model.commands == "none":
+            windows = windows.copy()
+            windows[..., 5:] = 0.0
+        adapted = self._of(windows)
+        return adapted if all(np.all(np.isfinite(part)) for part in adapted) else self._nominal
+
+    def _of(self, windows: Vector) -> Adapted:
+        said = self._model.predict(windows)
+        theta = self._nominal.theta if said.theta is None else said.theta
+        physics = stepped(self.car, windows[:, -1], theta) if said.physics is None else said.physics
+        correction = said.state - physics
+        if len(windows) == 1:
+            return Adapted(np.atleast_2d(theta)[0], correction[0])
+        return Adapted(theta, correction)
+
+
+def stepped(car: Car, rows: Vector, theta: Vector) -> Vector:
+    """Next states of ``car`` (m/s, m/s, rad/s), shape ``(k, 3)``.
+
+    Args:
+        car: what is stepped.
+        rows: with the columns ``WINDOW_COLUMNS``, shape ``(k, 7)``.
+        theta: coefficients, shape ``(17,)`` or ``(k, 17)``.
+    """
+    now = rows.T
+    following = step(
+        np, State(*now[:3]), applied_inputs(now), Coefficients(*np.transpose(theta)), car.constants, car.T_s, car.effects,
+        car.integrator, car.substeps,
+    )  # fmt: skip
+    return np.stack(following, axis=1)
+
+
+def _planned_rows(plan: Plan) -> Vector:
+    """Window rows of the plan's steps after the first, shape ``(N - 1, 7)``."""
+    return np.concatenate([plan.x[1:-1, _MEASURED], plan.u[1:]], axis=1)
+
+
+assert WINDOW_COLUMNS[:5] == (*STATES[3:6], "r_fb", "delta_fb"), "a window's row begins like the controller's state"
+assert len(INPUTS) == 2, "and ends with the increments"

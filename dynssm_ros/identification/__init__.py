@@ -1,0 +1,1 @@
+"""One engine for calibration and diagnosis: prediction errors, noise, least squares, candidates, selection."""

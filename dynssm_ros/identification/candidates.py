@@ -1,0 +1,305 @@
+"""What may be wrong: every effect of the library in every variant, and how well each would explain what is left.
+
+All of them are tried at once on linearised errors, with the nominal values free to move as far as is known of them.
+What an effect does somewhere on the lap is what it does everywhere, weighed with where it is, so that one simulation
+serves for all places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.identification.car import Car, Values
+from dynssm_ros.identification.noise import weights
+from dynssm_ros.identification.problem import Fit, Study, unit
+from dynssm_ros.vehicle.effects import EFFECTS
+from dynssm_ros.vehicle.effects.base import LAP, section
+
+_SHAPES: dict[str, tuple[float, ...]] = {
+    "centre": tuple(np.linspace(0.0, 1.0, 32, endpoint=False).tolist()),
+    "length": (0.03, 0.06, 0.12, 0.25),
+    "balance": (0.2, 0.45, 0.7),
+    "side": (1.0, 3.0, 10.0),
+    "arm": (-0.4, 0.4),
+}  # tried for the parameters that say where or how an effect acts
+_LADDER = (6.0, 1.5, 0.375, 0.094, 0.023)  # units: sizes at which effects are tried, a factor of 4 apart
+_HERE = 1.5  # unit at which effects are tried that act somewhere on the lap
+_REACH = (0.5, 3.0)  # times a size, for which its response serves
+_BENT = 0.1  # relative difference of responses to a small and a large size, beyond which an effect is not linear
+_SHOWS = 0.3  # of the noise, that a unit of an effect has to change
+_LEAST = 1e-5  # share of a column that the nominal values must leave for the effect to be seen
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect with the parameters to fit.
+
+    Attributes:
+        effect: its name.
+        parameters: to be fitted together.
+    """
+
+    effect: str
+    parameters: tuple[str, ...]
+
+    @property
+    def amplitudes(self) -> tuple[str, ...]:
+        """The parameters that say how much."""
+        return tuple(p for p in self.parameters if not EFFECTS[self.effect].PARAMETERS[p].shape)
+
+    @property
+    def shapes(self) -> tuple[str, ...]:
+        """The parameters that say where or how."""
+        return tuple(p for p in self.parameters if EFFECTS[self.effect].PARAMETERS[p].shape)
+
+    @property
+    def somewhere(self) -> bool:
+        """Whether it acts on a part of the lap only."""
+        return "centre" in self.parameters
+
+    @property
+    def free(self) -> tuple[tuple[str, str], ...]:
+        """For a fit."""
+        return tuple((self.effect, p) for p in self.parameters)
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """How much a candidate would gain, by linearised errors.
+
+    Attributes:
+        candidate: what was tried.
+        values: with which parameters.
+        gain: decrease of the squared error in units of the noise.
+    """
+
+    candidate: Candidate
+    values: Values
+    gain: float
+
+
+def candidates(study: Study, car: Car) -> tuple[list[Candidate], dict[str, str]]:
+    """The effects that can be tried, and for those that cannot, why."""
+    found, left = [], {}
+    have = set(study.windows.data.context)
+    for name, effect in EFFECTS.items():
+        reason = effect.unusable(car.vehicle.constants)
+        if reason is not None:
+            left[name] = reason
+            continue
+        if effect.MEMORY and any(entry.name == name for entry in car.vehicle.effects):
+            left[name] = "the vehicle file has it already"
+            continue
+        usable = [v for v in effect.variants() if set(effect.signals(v)) <= have]
+        found += [Candidate(name, variant) for variant in usable]
+        if not usable:
+            left[name] = f"the recording has no {', '.join(s for s in effect.signals() if s not in have)}"
+    return found, left
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a parameter does to the errors, per unit, when it is as large as ``size`` (units, signed)."""
+
+    size: float
+    errors: Vector
+
+
+class Responses:
+    """What each parameter of the library does to the errors, simulated once for a car and reused.
+
+    Many effects do not grow like their size: a lag, say, has hardly any slope where it begins. Their responses are those
+    to several sizes.
+    """
+
+    def __init__(self, study: Study, car: Car, errors: Vector) -> None:
+        self._study, self._car, self._errors = study, car, errors
+        self._known: dict[tuple[str, str, bool, tuple[tuple[str, float], ...]], list[Response]] = {}
+        windows = study.windows
+        if "s" in windows.data.context:
+            lap = np.stack([windows.context(k)["s"] for k in range(windows.steps)])
+            self._lap = lap / windows.context(0)["lap_length"]
+
+    def of(self, candidate: Candidate, parameter: str, shape: Values) -> tuple[list[Response], Vector | None]:
+        """The responses, and the share of them that each window sees, if not all, shape ``(W,)``.
+
+        A response to one size alone serves for all.
+        """
+        effect = candidate.effect
+        place = {k: v for k, v in shape.items() if k in ("centre", "length")}
+        form = {k: v for k, v in shape.items() if k not in place}
+        about = EFFECTS[effect].PARAMETERS[parameter]
+        local = bool(place) and about.context == LAP and parameter in ("factor", "section")
+        key = (effect, parameter, local, tuple(sorted(form.items())))
+        if key not in self._known:
+            everywhere = {"s": 0.5, "lap_length": 1.0} if local else None
+            if candidate.somewhere:
+                found = self._simulated(effect, parameter, form, (_HERE, -_HERE), everywhere)
+            else:
+                found = self._simulated(effect, parameter, form, (_LADDER[1], _LADDER[3]), everywhere)
+                if _differ(found):
+                    both = (*_LADDER, *(-size for size in _LADDER))
+                    found = self._simulated(effect, parameter, form, both, everywhere)
+                else:
+                    found = found[:1]
+            self._known[key] = found
+        share = np.asarray(section(np, self._lap, **place)).mean(axis=0) if local else None
+        return self._known[key], share
+
+    def _simulated(
+        self, effect: str, parameter: str, form: Values, sizes: Sequence[float], everywhere: dict[str, float] | None
+    ) -> list[Response]:
+        """Responses to those sizes that the parameter can have; at least one."""
+        about, one = EFFECTS[effect].PARAMETERS[parameter], unit(effect, parameter)
+        start = dict(self._car.effects.get(effect, {})) | form
+        wanted = (
+            float(np.clip(about.neutral + size * one, about.lower, about.upper)) - about.neutral for size in sizes
+        )
+        steps = sorted({step for step in wanted if step != 0.0}) or [-sizes[0] * one]
+        cars = [self._car.with_effect(effect, start | {parameter: about.neutral + step}) for step in steps]
+        changes = self._study.errors_of(cars, everywhere) - self._errors
+        return [Response(step / one, change * one / step) for step, change in zip(steps, changes, strict=True)]
+
+
+def _differ(found: list[Response]) -> bool:
+    """Whether the responses to several sizes are not the same per unit."""
+    sizes = [np.linalg.norm(response.errors) for response in found]
+    apart = max(np.linalg.norm(response.errors - found[0].errors) for response in found)
+    return bool(apart > _BENT * max(sizes))
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A response as the errors see it, window by window.
+
+    Attributes:
+        white: whitened, shape ``(W, 3 K)``.
+        taken: its products with the basis of what the fitted values can take up, shape ``(W, P)``.
+        along: its products with the errors, shape ``(W,)``.
+    """
+
+    white: Vector
+    taken: Vector
+    along: Vector
+
+
+class Scan:
+    """Tries candidates on what a fit leaves.
+
+    Args:
+        study: the windows.
+        fit: of the car so far, with its derivatives.
+        responses: of the library, which may be those of a car nearby.
+    """
+
+    def __init__(self, study: Study, fit: Fit, responses: Responses) -> None:
+        self._fit, self._responses = fit, responses
+        self._columns: dict[int, _Column] = {}
+        self._products: dict[tuple[int, int], Vector] = {}
+        white = fit.noise.whiten(fit.errors)
+        self._root = np.sqrt(weights(white))[:, None]
+        J = fit.noise.whiten(fit.jacobian) * self._root[..., None]
+        known = study.known_before(fit.position)
+        # what is known of the values as further rows, so that projecting is plain least squares
+        tall = np.concatenate([J.reshape(-1, J.shape[2]), np.diag(np.sqrt(known))])
+        basis = np.linalg.qr(tall)[0]
+        left = np.concatenate([(white * self._root).ravel(), np.sqrt(known) * fit.position])
+        left = left - basis @ (basis.T @ left)
+        rows = J.shape[0] * J.shape[1]
+        self._basis = basis[:rows].reshape(*J.shape[:2], -1)
+        self._left = left[:rows].reshape(J.shape[:2])
+
+    def try_all(self, found: list[Candidate]) -> Iterator[Prospect]:
+        """The best place, form and size of each candidate that shows at all."""
+        for candidate in found:
+            best = None
+            for combination in product(*(_SHAPES[p] for p in candidate.shapes)):
+                prospect = self._try(candidate, dict(zip(candidate.shapes, combination, strict=True)))
+                if prospect is not None and (best is None or prospect.gain > best.gain):
+                    best = prospect
+            if best is not None:
+                yield best
+
+    def _try(self, candidate: Candidate, shape: Values) -> Prospect | None:
+        responses = [self._responses.of(candidate, p, shape) for p in candidate.amplitudes]
+        bent = np.array([len(known) > 1 for known, _ in responses]) & (not candidate.somewhere)
+        sizes = sorted({abs(r.size) for (known, _), b in zip(responses, bent, strict=True) if b for r in known})
+        best: tuple[float, Vector] | None = None
+        for size in sizes or [_HERE]:
+            signs = np.ones(len(responses))
+            for _ in range(2):
+                gram, along, seen = self._normal(
+                    [_nearest(known, sign * size).errors for (known, _), sign in zip(responses, signs, strict=True)],
+                    [share for _, share in responses],
+                )
+                if not seen:
+                    break
+                amounts = np.linalg.lstsq(gram, along, rcond=1e-10)[0]
+                if (np.sign(amounts) == signs).all():
+                    break
+                signs = np.where(amounts < 0, -1.0, 1.0)
+            if not seen:
+                continue
+            # the slope serves for all: with nominal values that make up for it, it goes on
+            if sizes and size > sizes[0]:
+                limited = np.sign(amounts) * np.clip(np.abs(amounts), size * _REACH[0], size * _REACH[1])
+                amounts = np.where(bent, limited, amounts)
+            gain = float(2 * along @ amounts - amounts @ gram @ amounts)
+            if best is None or gain > best[0]:
+                best = gain, np.asarray(amounts, dtype=np.float64)
+        if best is None:
+            return None
+        values = dict(shape)
+        for parameter, amount in zip(candidate.amplitudes, best[1], strict=True):
+            about = EFFECTS[candidate.effect].PARAMETERS[parameter]
+            wanted = about.neutral + float(amount) * unit(candidate.effect, parameter)
+            margin = 0.02 * (about.upper - about.lower)
+            values[parameter] = float(
+                np.clip(wanted, about.lower + margin * (about.lower < about.neutral), about.upper - margin)
+            )
+        return Prospect(candidate, values, best[0])
+
+    def _normal(self, raw: list[Vector], shares: list[Vector | None]) -> tuple[Vector, Vector, bool]:
+        """Normal equations of the amounts, with what the fitted values can take up projected out.
+
+        And whether there is anything to be seen: a unit of each, if they all went on like this, changes what was
+        measured, and not only as they do.
+        """
+        columns = [self._column(r) for r in raw]
+        weight = [np.ones(len(self._left)) if s is None else s for s in shares]
+        taken = np.stack([w @ c.taken for c, w in zip(columns, weight, strict=True)])
+        whole = np.array(
+            [
+                [(w * v) @ self._product(a, b) for b, v in zip(raw, weight, strict=True)]
+                for a, w in zip(raw, weight, strict=True)
+            ]
+        )
+        gram = whole - taken @ taken.T
+        along = -np.array([w @ c.along for c, w in zip(columns, weight, strict=True)])
+        size, left = np.diag(whole), np.diag(gram)
+        return gram, along, bool((size > _SHOWS**2).all() and (left > _LEAST**2 * size).any())
+
+    def _column(self, raw: Vector) -> _Column:
+        if id(raw) not in self._columns:
+            white = self._fit.noise.whiten(raw) * self._root
+            taken = np.einsum("wn,wnp->wp", white, self._basis)
+            self._columns[id(raw)] = _Column(white, taken, np.einsum("wn,wn->w", white, self._left))
+        return self._columns[id(raw)]
+
+    def _product(self, a: Vector, b: Vector) -> Vector:
+        """Products of two responses, shape ``(W,)``."""
+        key = (min(id(a), id(b)), max(id(a), id(b)))
+        if key not in self._products:
+            self._products[key] = np.einsum("wn,wn->w", self._column(a).white, self._column(b).white)
+        return self._products[key]
+
+
+def _nearest(known: list[Response], size: float) -> Response:
+    """The response to the size nearest to ``size``; to the other sign where there is none."""
+    alike = [r for r in known if r.size * size > 0] or known
+    return min(alike, key=lambda r: abs(np.log(abs(r.size / size))))

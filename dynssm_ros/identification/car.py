@@ -1,0 +1,136 @@
+"""The car as a fit moves it: nominal values that are known more or less well, and effects on top of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, Vehicle
+from dynssm_ros.vehicle.effects import EFFECTS, Effect
+from dynssm_ros.vehicle.parameters import VehicleConstants
+
+Values = dict[str, float]
+
+MASS_STD = 0.01  # of the mass: vehicle files do not say how well it was weighed
+_LIGHTEST = 0.1  # of the nominal mass
+_ON_BOUND = 1e-3  # of the range, that a nominal value keeps from its bounds
+
+
+@dataclass(frozen=True)
+class Car:
+    """A vehicle with moved nominal values and effects.
+
+    Attributes:
+        vehicle: as the file has it; its own effects always act, before those of ``effects``.
+        moved: how far each of the 17 coefficients, and then the mass, is off its nominal value, in standard
+            deviations of what is known of it; shape ``(18,)``. Those that are positive move as logarithms.
+        effects: values by effect and parameter, in the order in which they act.
+    """
+
+    vehicle: Vehicle
+    moved: Vector
+    effects: Mapping[str, Values]
+
+    @classmethod
+    def of(cls, vehicle: Vehicle) -> Car:
+        """The car as the vehicle file has it."""
+        return cls(vehicle, np.zeros(len(COEFFICIENTS) + 1), {})
+
+    @property
+    def limits(self) -> tuple[Vector, Vector]:
+        """The least and the largest of :attr:`moved`."""
+        vehicle, known, scales = self.vehicle, knowledge(self.vehicle), _scaling(self.vehicle)
+        margin = _ON_BOUND * (vehicle.upper - vehicle.lower)
+        nominal = np.where(scales, vehicle.nominal, 1.0)
+        bounds = [
+            np.where(scales, nominal * np.log(np.where(scales, b, 1.0) / nominal), b - vehicle.nominal) / known
+            for b in (vehicle.lower + margin, vehicle.upper - margin)
+        ]
+        mass = np.log([_LIGHTEST, 1.0 / _LIGHTEST]) / MASS_STD
+        return np.append(bounds[0], mass[0]), np.append(bounds[1], mass[1])
+
+    @property
+    def theta(self) -> Coefficients:
+        """The coefficients, inside their bounds."""
+        step = np.clip(self.moved, *self.limits)[:-1] * knowledge(self.vehicle)
+        nominal, scales = self.vehicle.nominal, _scaling(self.vehicle)
+        grown = nominal * np.exp(np.where(scales, step / np.where(scales, nominal, 1.0), 0.0))
+        return Coefficients(*np.where(scales, grown, nominal + step).tolist())
+
+    @property
+    def constants(self) -> VehicleConstants:
+        """Mass and geometry."""
+        factor = float(np.exp(MASS_STD * np.clip(self.moved, *self.limits)[-1]))
+        return self.vehicle.constants.model_copy(update={"m": self.vehicle.constants.m * factor})
+
+    @property
+    def active(self) -> tuple[Effect, ...]:
+        """All effects, ready to act."""
+        return (*self.vehicle.active_effects, *(EFFECTS[name](**values) for name, values in self.effects.items()))
+
+    def with_effect(self, name: str, values: Values) -> Car:
+        """The same car with an effect added or changed."""
+        return replace(self, effects={**self.effects, name: dict(values)})
+
+    def without(self, name: str) -> Car:
+        """The same car without an effect."""
+        return replace(self, effects={key: values for key, values in self.effects.items() if key != name})
+
+    def extended(self, std: Vector) -> Vehicle:
+        """The vehicle to write: refitted nominal values, what is now known of them, and the effects.
+
+        Args:
+            std: standard deviations of the 17 coefficients.
+        """
+        vehicle = self.vehicle.with_nominal(np.array(self.theta), std)
+        vehicle = vehicle.model_copy(update={"constants": self.constants})
+        return vehicle.with_effects(self.effects.items())
+
+
+class Fleet(NamedTuple):
+    """``P`` cars as one, whose values are arrays of shape ``(P, 1)`` that broadcast against ``W`` simulations.
+
+    What is the same in all of them stays a number.
+    """
+
+    theta: Coefficients
+    constants: Any
+    effects: tuple[Effect, ...]
+
+    @classmethod
+    def of(cls, cars: Sequence[Car]) -> Fleet:
+        """Cars of one vehicle with the same effects in the same order."""
+        first = cars[0]
+        if len(cars) == 1:
+            return cls(first.theta, first.constants, first.active)
+        theta = Coefficients(*map(_together, zip(*(car.theta for car in cars), strict=True)))
+        constants = SimpleNamespace(**dict(first.constants) | {"m": _together([car.constants.m for car in cars])})
+        own = [
+            EFFECTS[name](**{key: _together([car.effects[name][key] for car in cars]) for key in values})
+            for name, values in first.effects.items()
+        ]
+        return cls(theta, constants, (*first.vehicle.active_effects, *own))
+
+
+def _together(values: Sequence[float]) -> Any:
+    """The number that all are, or a column of them."""
+    column = np.array(values)
+    return float(column[0]) if (column == column[0]).all() else column[:, None]
+
+
+def _scaling(vehicle: Vehicle) -> npt.NDArray[np.bool_]:
+    """The coefficients that move as logarithms, so that an effect that multiplies can make up for them exactly."""
+    return np.asarray((vehicle.lower >= 0) & (vehicle.nominal > 0))
+
+
+def knowledge(vehicle: Vehicle) -> Vector:
+    """Standard deviations of the 17 nominal values; where the file has none, that of a uniform spread in the bounds."""
+    uniform = (vehicle.upper - vehicle.lower) / np.sqrt(12.0)
+    stated = [vehicle.coefficients[name].std for name in COEFFICIENTS]
+    return np.array([u if s is None else max(s, 1e-6 * u) for s, u in zip(stated, uniform, strict=True)])

@@ -1,0 +1,374 @@
+"""The whole diagnosis: show, name, extend, measure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.errors import ConfigurationError, RecordingError
+from dynssm_ros.identification.car import Car, knowledge
+from dynssm_ros.identification.improvement import Gain, measure
+from dynssm_ros.identification.integrator import Searched, searched
+from dynssm_ros.identification.minimum_effect import noticeable, room
+from dynssm_ros.identification.noise import weights
+from dynssm_ros.identification.problem import per_unit
+from dynssm_ros.identification.residuals import Bunched, Systematic, bunched, systematic
+from dynssm_ros.identification.selection import Refined, Selection
+from dynssm_ros.identification.windows import WARM_UP, Track, Windows
+from dynssm_ros.signals.recording import Recording, default_min_speed
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
+from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.effects import EFFECTS, require_context
+from dynssm_ros.vehicle.single_track import Integrator
+
+Verdict = Literal["effects", "none", "unexplained"]
+Say = Callable[[str], None]
+
+_HORIZON = 0.5  # s
+_HOLDOUT = 0.25
+_COMPARED = 13  # rows of each simulation, at most: more hang together
+_MOST = 500  # windows in the fit, evenly spread: more would cost time and tell little
+_MEASURED = 3000  # in the held-out rows
+_LEAST = 24  # windows with which a fit can begin
+_LEAST_LAPS = 3  # with which whole laps are held out
+GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
+
+
+@dataclass(frozen=True)
+class Cause:
+    """An effect that the data ask for.
+
+    Attributes:
+        effect: its name.
+        values: parameters with which it acts.
+        std: standard deviations of those that were fitted.
+        gain: decrease of twice the negative log-likelihood by it.
+        delta_bic: what is left when its parameters are paid for.
+        heldout_gain: share of the error on the held-out rows that is gone by it.
+        alternatives: effects that explain the data as well.
+    """
+
+    effect: str
+    values: dict[str, float]
+    std: dict[str, float]
+    gain: float
+    delta_bic: float
+    heldout_gain: float
+    alternatives: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What the simulation gets wrong, and why.
+
+    Attributes:
+        verdict: ``effects``: causes are named; ``none``: right within noise; ``unexplained``: wrong, and nothing of the
+            library says why.
+        causes: the strongest first.
+        vehicle: the vehicle with effects and refitted nominal values.
+        gain: on the held-out rows.
+        left: what is systematic in the errors of the extended car, on the rows of the fit.
+        bunched: how those errors are spread over time.
+        noticeable: how far off neutral each effect that is not named would have to be to be named (the unit of its
+            first parameter).
+        selection: how it was found.
+        car: the extended car as fitted.
+        std: standard deviations of the 17 coefficients and of the mass, relative to what was known of them.
+        notes: what limits the diagnosis.
+        protocol: how it was obtained, by name.
+        windows: of the fit.
+    """
+
+    verdict: Verdict
+    causes: tuple[Cause, ...]
+    vehicle: Vehicle
+    gain: Gain
+    left: Systematic
+    bunched: Bunched
+    noticeable: Mapping[str, float]
+    selection: Selection
+    car: Car
+    std: Vector
+    notes: tuple[str, ...]
+    protocol: Mapping[str, str]
+    windows: Windows
+
+    def to_json(self, vehicle_path: str) -> dict[str, Any]:
+        """For programs; ``vehicle_path`` is where the extended vehicle was written."""
+        gain = self.gain
+        at = gain.horizon
+        rmse = {name: by_channel(values[at]) for name, values in gain.rmse.items()}
+        return {
+            "verdict": self.verdict,
+            "causes": [
+                {
+                    "effect": cause.effect,
+                    "parameters": {
+                        name: {
+                            "value": value,
+                            "std": cause.std.get(name),
+                            "unit": EFFECTS[cause.effect].PARAMETERS[name].unit,
+                        }
+                        for name, value in cause.values.items()
+                    },
+                    "evidence": {"delta_bic": cause.delta_bic, "heldout_gain": cause.heldout_gain},
+                    "alternatives": list(cause.alternatives),
+                }
+                for cause in self.causes
+            ],
+            "gain": {
+                "horizon_s": float(gain.horizons[at]),
+                "before": rmse[GIVEN],
+                "recalibrated": rmse[RECALIBRATED],
+                "after": rmse[EXTENDED],
+                "reduction": by_channel(gain.reduction[at]),
+                "interval_95": _intervals(gain.interval[:, at]),
+                "reduction_from_recalibrated": by_channel(gain.reduction_from(RECALIBRATED)[at]),
+                "interval_95_from_recalibrated": _intervals(gain.interval_from(RECALIBRATED)[:, at]),
+            },
+            "systematic": {
+                "before": by_channel(gain.systematic[GIVEN][at].share),
+                "recalibrated": by_channel(gain.systematic[RECALIBRATED][at].share),
+                "after": by_channel(gain.systematic[EXTENDED][at].share),
+                "gone": by_channel(gain.systematic_gone(GIVEN)[at]),
+            },
+            "noticeable": {effect: size if np.isfinite(size) else None for effect, size in self.noticeable.items()},
+            "notes": list(self.notes),
+            "vehicle": vehicle_path,
+        }
+
+
+def by_channel(values: Vector) -> dict[str, float | None]:
+    """Values of the three channels by name; ``None`` where there is none."""
+    return {c: float(value) if np.isfinite(value) else None for c, value in zip(STATE_SIGNALS, values, strict=True)}
+
+
+def _intervals(bounds: Vector) -> dict[str, list[float]]:
+    return {channel: [float(low), float(high)] for channel, low, high in zip(STATE_SIGNALS, *bounds, strict=True)}
+
+
+def diagnose(
+    recording: Recording,
+    vehicle: Vehicle,
+    horizon: float = _HORIZON,
+    holdout: float = _HOLDOUT,
+    min_speed: float | None = None,
+    integrator: Integrator | None = None,
+    line: ClosedLine | None = None,
+    say: Say = lambda words: None,
+) -> Diagnosis:
+    """Finds out what a vehicle file gets wrong about a recording.
+
+    Args:
+        recording: measured laps of one car.
+        vehicle: the nominal car. How well its coefficients are known decides whether one that has to move is a cause.
+        horizon: time that is simulated from a measured state on (s).
+        holdout: share of the recording, at its end, that neither fit nor selection sees; whole laps if there are three.
+        min_speed: stretches below are left out (m/s); ``None``: :func:`default_min_speed`.
+        integrator: of the simulation; ``None``: Runge-Kutta, unless Euler steps are clearly closer to the data.
+        line: of the track, from which positions on the lap are counted; ``None``: the first full lap of the recording.
+        say: told what is being done.
+
+    Raises:
+        RecordingError: another sampling time than the vehicle's, a constant or missing channel, too few rows.
+        ConfigurationError: an effect of the vehicle needs a signal that the recording has not; options out of range.
+    """
+    at = _prepare(recording, vehicle, horizon, holdout, min_speed, line)
+    found = searched(at.fitted, at.car, integrator, say)
+    study, selection, fit = found.study, found.selection, found.selection.fit
+    windows = study.windows
+    at = at._replace(unseen=replace(at.unseen, integrator=windows.integrator, substeps=windows.substeps))
+    say("measuring the gain on held-out laps")
+    gain = measure(at.unseen, {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: fit.car}, at.steps)
+    sizes = noticeable(study, fit, found.search.found)
+    limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
+    limits += [*_hidden(sizes), *_not_live(fit.car.extended(knowledge(vehicle)))]
+    std = np.sqrt(np.diag(study.covariance(fit)))
+    causes = tuple(_cause(one, found, at, std) for one in selection.chosen)
+    left = systematic(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], study.block)
+    white = fit.noise.whiten(fit.errors)
+    in_noise = weights(white) * (white**2).mean(axis=1)
+    together = bunched(in_noise, windows.time, study.block, selection.inflation)
+    return Diagnosis(
+        "effects" if causes else "unexplained" if left.is_there or together.is_there else "none",
+        causes,
+        fit.car.extended(np.minimum(std[:17], 1.0) * knowledge(vehicle)),
+        gain,
+        left,
+        together,
+        sizes,
+        selection,
+        fit.car,
+        std[:18],
+        (*at.notes, *limits),
+        at.protocol | {"Integrator": windows.integrator},
+        windows,
+    )
+
+
+class _Prepared(NamedTuple):
+    """What a diagnosis works on."""
+
+    fitted: Windows
+    steps: int
+    unseen: Windows
+    car: Car
+    notes: list[str]
+    protocol: dict[str, str]
+
+
+def _prepare(
+    recording: Recording,
+    vehicle: Vehicle,
+    horizon: float,
+    holdout: float,
+    min_speed: float | None,
+    line: ClosedLine | None,
+) -> _Prepared:
+    """Checks what was given, holds laps out and lays the simulations along the rest; see :func:`diagnose`."""
+    if not 0.05 <= holdout <= 0.8:
+        raise ConfigurationError(f"holdout {holdout:g}: expected a share between 0.05 and 0.8")
+    recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
+    steps = int(np.ceil(horizon / recording.T_s - 1e-9))
+    if steps < 2:
+        raise ConfigurationError(
+            f"horizon {horizon:g} s: expected at least two sampling times ({2 * recording.T_s:g} s)"
+        )
+    asked = steps
+    every = -(-steps // _COMPARED)
+    steps = every * -(-steps // every)
+    notes = _check_signals(recording)
+    speed = default_min_speed(recording) if min_speed is None else min_speed
+    cut, split = _cut(recording, holdout)
+    line = first_lap(recording.select(slice(None, cut))) if line is None else line
+    if line is None:
+        notes.append("no full lap with positions: effects that live at a place of the track cannot be judged")
+    context = lap_context(recording, line)
+    source = ", ".join(recording.info.source)
+    require_context(vehicle.active_effects, context, f"recording {source}")
+    track = Track(recording.matrix.T, context, recording.T_s, (recording.time - recording.time[0]) / 1e9)
+    fitted, unseen = _windows(recording, track, steps, 2 * asked, speed, cut)
+    protocol = {
+        "Recording": source,
+        "Commands": recording.info.commands,
+        "Vehicle": vehicle.name,
+        "Held out": split,
+        "Fit": f"{len(fitted)} simulations of {steps * recording.T_s:g} s, from {speed:g} m/s",
+        "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * recording.T_s:g} s",
+    }
+    return _Prepared(replace(fitted, every=every), asked, unseen, Car.of(vehicle), notes, protocol)
+
+
+def _cause(one: Refined, found: Searched, at: _Prepared, std: Vector) -> Cause:
+    effect, fit = one.candidate.effect, found.selection.fit
+    known = {
+        name: float(std[18 + k]) * per_unit(effect, name, fit.car.effects[effect][name])
+        for k, (owner, name) in enumerate(fit.free)
+        if owner == effect
+    }
+    other = found.search.leave_out(found.selection, one).car
+    errors = [at.unseen.errors(car)[:, at.steps - 1] for car in (other, fit.car)]
+    without, with_it = ((e**2).mean(axis=0) for e in errors)
+    return Cause(
+        effect,
+        dict(fit.car.effects[effect]),
+        known,
+        one.gain,
+        float(one.delta_bic),
+        float(1.0 - np.sqrt((with_it / np.maximum(without, 1e-300)).mean())),
+        tuple(found.selection.alternatives[effect]),
+    )
+
+
+def _hidden(sizes: Mapping[str, float]) -> Iterator[str]:
+    """What these laps cannot show at any size that is possible, and how to drive so that they do."""
+    hidden = [effect for effect, size in sizes.items() if size > room(effect)]
+    if hidden:
+        yield (
+            f"no excitation: {', '.join(hidden)} would not be noticed at any possible size, because these laps hardly show "
+            "it or the nominal values are known too badly; what would show it: "
+            + "; ".join(dict.fromkeys(EFFECTS[effect].MANOEUVRE for effect in hidden))
+        )
+
+
+def _not_live(vehicle: Vehicle) -> Iterator[str]:
+    """What of the extended car reads signals that a live window has not."""
+    for effect in vehicle.active_effects:
+        if effect.needs:
+            yield (
+                f"{effect.NAME} reads {', '.join(effect.needs)}: simulate and diagnose know it, train and the predictor node "
+                "do not and say so; take it out of the vehicle file for those"
+            )
+
+
+def _check_signals(recording: Recording) -> list[str]:
+    where = f"recording {', '.join(recording.info.source)}"
+    for name in STATE_SIGNALS:
+        if np.ptp(recording[name]) == 0:
+            raise RecordingError(f"{where}: {name} is constant at {recording[name][0]:g}; expected a measured channel")
+    notes = []
+    for name, feedback, command in (("throttle", "r_fb", "r_cmd"), ("steering", "delta_fb", "delta_cmd")):
+        if np.ptp(recording[feedback] + recording[command]) == 0:
+            notes.append(f"{name} is constant: effects that need it to change cannot be judged")
+    return notes
+
+
+def _cut(recording: Recording, holdout: float) -> tuple[int, str]:
+    """First held-out row, and in words."""
+    N = len(recording)
+    line = first_lap(recording)
+    lap = lap_number(recording, line)
+    if lap is not None:
+        # laps are counted from the first row's place, so that the last full ones are held out
+        total = int(lap[-1] - lap[0])
+        held = max(1, round(holdout * total))
+        if total >= _LEAST_LAPS:
+            cut = int(np.argmax(lap >= lap[-1] - held))
+            if 0 < cut < N:
+                return cut, f"the last {held} of {total} laps and what follows"
+    cut = N - max(1, round(holdout * N))
+    return cut, f"the last {100 * holdout:.0f} % as one block (fewer than {_LEAST_LAPS} laps)"
+
+
+def _windows(
+    recording: Recording, track: Track, steps: int, long: int, min_speed: float, cut: int
+) -> tuple[Windows, Windows]:
+    """Simulations for the fit, end to end before ``cut``, and for measuring, overlapping behind it.
+
+    Args:
+        recording: what was measured.
+        track: the same, as simulations read it.
+        steps: of each simulation for the fit.
+        long: of each one for measuring.
+        min_speed: of all rows (m/s).
+        cut: first held-out row.
+    """
+    warm = round(WARM_UP / recording.T_s)
+    ends = recording.window_ends(warm + 1, horizon=steps, min_speed=min_speed)
+    usable = ends[ends + steps < cut]
+    starts: list[int] = []
+    for row in usable:
+        if not starts or row >= starts[-1] + steps:
+            starts.append(int(row))
+    if len(starts) < _LEAST:
+        raise RecordingError(
+            f"recording {', '.join(recording.info.source)}: {len(starts)} stretches of {steps * recording.T_s:g} s at "
+            f"{min_speed:g} m/s or more beside the held-out part; expected at least {_LEAST}"
+        )
+    spread = np.linspace(0, len(starts) - 1, min(len(starts), _MOST)).round().astype(int)
+    chosen = np.array(starts)[spread]
+    ends = recording.window_ends(warm + 1, horizon=long, min_speed=min_speed)
+    later = ends[ends - warm >= cut]
+    if len(later) < _LEAST:
+        raise RecordingError(
+            f"recording {', '.join(recording.info.source)}: {len(later)} rows in the held-out part from which "
+            f"{long * recording.T_s:g} s can be simulated; expected at least {_LEAST}: record longer or hold out more"
+        )
+    every = max(1, steps // 4, len(later) // _MEASURED)
+    return Windows(track, chosen, steps, warm, filtered=True), Windows(track, later[::every], long, warm)

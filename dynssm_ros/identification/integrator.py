@@ -1,0 +1,86 @@
+"""Which steps the simulation makes: Runge-Kutta, unless the data were clearly made by Euler steps of the sampling time.
+
+Euler steps act about half a step late. Before the causes are known a car that errs may be closer to the data with them by
+chance, so that the choice is made anew with the causes that were found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from dynssm_ros.identification.candidates import candidates
+from dynssm_ros.identification.car import Car
+from dynssm_ros.identification.problem import Fit, Study
+from dynssm_ros.identification.selection import Search, Selection
+from dynssm_ros.identification.windows import Windows
+from dynssm_ros.vehicle.single_track import Integrator
+
+_TRIED = 300  # windows with which the integrator is chosen at first
+_CLEARLY = 20.0  # difference of twice the log-likelihood for which another integrator is taken than Runge-Kutta
+
+
+class Searched(NamedTuple):
+    """What a search found, with what it was made of.
+
+    Attributes:
+        study: of the windows in the steps that were taken.
+        search: all fits.
+        selection: the causes.
+        impossible: effects that cannot be tried, and why.
+    """
+
+    study: Study
+    search: Search
+    selection: Selection
+    impossible: dict[str, str]
+
+
+def searched(windows: Windows, car: Car, integrator: Integrator | None, say: Callable[[str], None]) -> Searched:
+    """Searches for causes.
+
+    Args:
+        windows: for the fit.
+        car: as the vehicle file has it.
+        integrator: of the simulation; ``None``: chosen by the data.
+        say: told what is being done.
+    """
+    if integrator is not None:
+        return _search(_stepped(windows, car, integrator)[0], car, say)
+    say("choosing how the model steps")
+    runge_kutta, euler = _stepped(windows, car, "rk4"), _stepped(windows, car, "euler")
+    first, other = (euler, runge_kutta) if _by_euler(runge_kutta[1], euler[1]) else (runge_kutta, euler)
+    found = _search(first[0], car, say)
+    fit = found.selection.fit
+    fits = {first[0].integrator: fit, other[0].integrator: Study(other[0], car).fit(fit.car, fit.free)}
+    if _by_euler(fits["rk4"], fits["euler"]) == (first is euler):
+        return found
+    return _search(other[0], car, say)
+
+
+def _by_euler(runge_kutta: Fit, euler: Fit) -> bool:
+    return euler.objective < runge_kutta.objective - _CLEARLY
+
+
+def _search(windows: Windows, car: Car, say: Callable[[str], None]) -> Searched:
+    study = Study(windows, car)
+    found, impossible = candidates(study, car)
+    search = Search(study, car, found, say)
+    return Searched(study, search, search.run(), impossible)
+
+
+def _stepped(windows: Windows, car: Car, integrator: Integrator) -> tuple[Windows, Fit]:
+    """The windows in steps that are short enough for the recalibrated car too, and its fit to some of them.
+
+    That car may be much stiffer than the one of the file, and a simulation whose steps are too long for it runs away.
+    """
+    some = windows.select(np.arange(0, len(windows), -(-len(windows) // _TRIED)))
+    trial = some.stepping(integrator, car.vehicle)
+    fit = Study(trial, car).fit(car, ())
+    finer = trial.stepping(integrator, car.vehicle.with_nominal(np.array(fit.car.theta)))
+    if finer.substeps > trial.substeps:
+        trial, fit = finer, Study(finer, car).fit(fit.car, ())
+    return replace(windows, integrator=integrator, substeps=trial.substeps), fit

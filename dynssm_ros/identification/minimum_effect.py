@@ -1,0 +1,73 @@
+"""How small an effect would still be named: what the driving, the noise and badly known nominal values leave of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.identification.candidates import Candidate
+from dynssm_ros.identification.car import Values
+from dynssm_ros.identification.noise import weights
+from dynssm_ros.identification.problem import Fit, Study, unit
+from dynssm_ros.identification.selection import SURE
+from dynssm_ros.vehicle.effects import EFFECTS
+
+_PLACES = np.linspace(0.0, 1.0, 8, endpoint=False)  # of the lap
+_NOTHING = 1e-9  # of a squared error in units of the noise
+
+
+def noticeable(study: Study, fit: Fit, found: Iterable[Candidate]) -> dict[str, float]:
+    """The least change of each effect's first parameter, beside a fit, that the data would call a cause.
+
+    An effect on a stretch of the lap is taken at several places, and the middle of their answers given.
+
+    Args:
+        study: the windows.
+        fit: of the car with all causes.
+        found: what can be tried; the first candidate of an effect speaks for it, those of the fit are left out.
+
+    Returns:
+        By effect, in the unit of the parameter; infinite where it changes nothing that was measured.
+    """
+    J = (fit.noise.whiten(fit.jacobian) * _root(fit)[:, None, None]).reshape(-1, fit.jacobian.shape[2])
+    H = J.T @ J + np.diag(study.known_before(fit.position))
+    needed = (np.log(study.windows.target.size) + SURE) * study.inflation(fit)
+    taken = {effect for effect, _ in fit.free}
+    out: dict[str, float] = {}
+    for candidate in found:
+        effect = candidate.effect
+        if effect in taken or effect in out:
+            continue
+        about, parameter = EFFECTS[effect].PARAMETERS, candidate.amplitudes[0]
+        form = {name: about[name].neutral for name in candidate.shapes}
+        places = [{"centre": float(place)} for place in _PLACES] if "centre" in form else [{}]
+        left = np.median([_left(_column(study, fit, effect, parameter, form | at), J, H) for at in places])
+        out[effect] = float(np.sqrt(needed / left) * unit(effect, parameter)) if left > _NOTHING else float("inf")
+    return out
+
+
+def _column(study: Study, fit: Fit, effect: str, parameter: str, form: Values) -> Vector:
+    """What a unit of a parameter does to the whitened errors, shape ``(W * 3 K,)``."""
+    about = EFFECTS[effect].PARAMETERS[parameter]
+    sign = 1.0 if about.upper > about.neutral else -1.0
+    values = dict(fit.car.effects.get(effect, {})) | form | {parameter: about.neutral + sign * unit(effect, parameter)}
+    change = study.errors(fit.car.with_effect(effect, values)) - fit.errors
+    return (fit.noise.whiten(change) * _root(fit)[:, None]).ravel()
+
+
+def _root(fit: Fit) -> Vector:
+    return np.asarray(np.sqrt(weights(fit.noise.whiten(fit.errors))))
+
+
+def _left(column: Vector, J: Vector, H: Vector) -> float:
+    """Squared length of what fitted values cannot take up of a column."""
+    across = J.T @ column
+    return float(column @ column - across @ np.linalg.solve(H, across))
+
+
+def room(effect: str) -> float:
+    """How far off neutral the first parameter that says how much can be."""
+    about = next(p for p in EFFECTS[effect].PARAMETERS.values() if not p.shape)
+    return max(about.upper - about.neutral, about.neutral - about.lower)

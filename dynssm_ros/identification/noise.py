@@ -1,0 +1,167 @@
+"""How far off a right model may be: noise at the start, noise at each predicted row, disturbances on the way.
+
+An error after ``k`` steps is what the error of the start has become by then, minus the noise of the predicted row, plus
+the disturbances in between. With variances ``P`` of the start, ``R`` of the measurement and ``Q`` of a disturbance per
+step, the ``3 K`` errors of a window have the covariance ``G diag(P, Q, ..., Q) G' + I R``, where ``G`` follows from the
+derivatives of the steps. Errors that are divided by its root are independent of unit variance, so that sums of squares
+are likelihoods. Windows of like speed share their ``G``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dynssm_ros.arrays import Indices, Vector
+
+_VARIANCES = 9
+_GROUPS = 10
+_RANGE = 30.0  # of the logarithm of a variance above its floor
+_ROUNDING = 1e-10  # of each variance, that keeps covariances positive
+_ROUNDS = 40
+_HALVINGS = 8
+_STRIDE = 3.0  # of the logarithm of a variance in one round, at most
+_FLAT = 1e-3  # curvature added where a variance that vanishes has none
+_SETTLED = 1e-2  # of twice the logarithm of the likelihood, that another round promises
+_REWEIGHTED = 8  # times at most, that far errors are weighed anew
+_FAR = 4.0  # a window whose squared error exceeds the expected one by this factor counts only as much as that
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Where noise goes: groups of windows and their response matrices.
+
+    Attributes:
+        group: number of each window's group, shape ``(W,)``.
+        G: response of the ``3 K`` errors to the noise of the start and of each step, shape ``(M, 3 K, 3 + 3 K)``.
+    """
+
+    group: Indices
+    G: Vector
+
+    @classmethod
+    def of(cls, transitions: Vector, speed: Vector) -> Spread:
+        """Groups windows by speed (m/s), shape ``(W,)``, and follows noise along ``transitions`` ``(W, K, 3, 3)``."""
+        count = int(np.clip(len(speed) // 6, 1, _GROUPS))
+        edges = np.quantile(speed, np.linspace(0, 1, count + 1)[1:-1])
+        group = np.searchsorted(edges, speed)
+        steps = transitions.shape[1]
+        G = np.zeros((count, steps, 3, 3 + 3 * steps))
+        for m in range(count):
+            member = group == m
+            mean = transitions[member].mean(axis=0) if member.any() else np.broadcast_to(np.eye(3), (steps, 3, 3))
+            state = np.zeros((3, 3 + 3 * steps))
+            state[:, :3] = np.eye(3)
+            for k in range(steps):
+                state = mean[k] @ state
+                state[:, 3 + 3 * k : 6 + 3 * k] += np.eye(3)
+                G[m, k] = state
+        return cls(group, G.reshape(count, 3 * steps, -1))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variances of measurement, disturbance and start, ``v = (R, Q, P)``, shape ``(9,)``, and what they make of errors."""
+
+    spread: Spread
+    v: Vector
+
+    @cached_property
+    def roots(self) -> Vector:
+        """Cholesky factors of the covariances, shape ``(M, 3 K, 3 K)``."""
+        return np.asarray(np.linalg.cholesky(_covariance(self.spread.G, self.v)), dtype=np.float64)
+
+    @cached_property
+    def _inverse_roots(self) -> Vector:
+        return np.asarray(np.linalg.inv(self.roots), dtype=np.float64)
+
+    @cached_property
+    def log_det(self) -> float:
+        """Sum over the windows of the logarithm of the covariance's determinant."""
+        per_group = 2 * np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1)
+        return float(per_group[self.spread.group].sum())
+
+    def whiten(self, errors: Vector) -> Vector:
+        """Errors or their derivatives ``(W, 3 K, ...)`` as independent ones of unit variance."""
+        flat = errors.reshape(*errors.shape[:2], -1)
+        out = np.empty_like(flat)
+        for m, inverse in enumerate(self._inverse_roots):
+            member = np.flatnonzero(self.spread.group == m)
+            out[member] = np.matmul(inverse, flat[member])
+        return out.reshape(errors.shape)
+
+
+def weights(white: Vector) -> Vector:
+    """Weight of each window, 1 unless its whitened errors ``(W, 3 K)`` are far out."""
+    size = (white**2).sum(axis=1)
+    return np.asarray(np.minimum(1.0, _FAR * white.shape[1] / np.maximum(size, 1e-300)))
+
+
+def fit_noise(spread: Spread, errors: Vector, start: Vector, floor: Vector) -> Noise:
+    """The variances that make ``errors`` ``(W, 3 K)`` most likely.
+
+    Args:
+        spread: how noise spreads.
+        errors: of a model, m/s and rad/s.
+        start: variances to begin with, shape ``(9,)``. Where one is far too small the others may settle as if there were
+            none of it: let them be too large.
+        floor: the least that they may be, shape ``(9,)``.
+    """
+    noise = Noise(spread, np.maximum(start, floor))
+    for _ in range(_REWEIGHTED):
+        weight = weights(noise.whiten(errors))
+        before, noise = noise, Noise(spread, _most_likely(spread, errors * np.sqrt(weight)[:, None], noise.v, floor))
+        if abs(noise.log_det - before.log_det) < _SETTLED:
+            break
+    return noise
+
+
+def _most_likely(spread: Spread, errors: Vector, start: Vector, floor: Vector) -> Vector:
+    """Fisher scoring in the logarithms of the variances, within their bounds."""
+    count = np.bincount(spread.group, minlength=len(spread.G)).astype(float)
+    moment = np.stack([errors[spread.group == m].T @ errors[spread.group == m] for m in range(len(spread.G))])
+    bases = np.stack([_covariance(spread.G, one) for one in np.eye(_VARIANCES)])
+    low = np.log(floor)
+    high = low + _RANGE
+
+    def likelihood(log_v: Vector) -> tuple[float, Vector]:
+        """Twice the negative logarithm of the likelihood, and the covariances' inverses."""
+        C = np.tensordot(np.exp(log_v), bases, 1)
+        root = np.linalg.cholesky(C)
+        inverse = np.linalg.inv(C)
+        log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        return float(count @ log_det + np.einsum("mij,mij->", inverse, moment)), inverse
+
+    log_v = np.clip(np.log(start), low, high)
+    value, inverse = likelihood(log_v)
+    for _ in range(_ROUNDS):
+        shares = np.exp(log_v)[:, None, None, None] * (inverse @ bases)  # sum to one
+        fitted = inverse @ moment
+        slope = np.einsum("m,kmii->k", count, shares) - np.einsum("kmij,mji->k", shares, fitted)
+        curvature = np.einsum("m,kmij,lmji->kl", count, shares, shares)
+        free = ~((log_v <= low) & (slope > 0) | (log_v >= high) & (slope < 0))
+        step = np.zeros(_VARIANCES)
+        step[free] = -np.linalg.solve(curvature[np.ix_(free, free)] + _FLAT * np.eye(free.sum()), slope[free])
+        step = np.clip(step, -_STRIDE, _STRIDE)
+        if -slope @ step < _SETTLED:
+            break
+        for _ in range(_HALVINGS):
+            there = np.clip(log_v + step, low, high)
+            new, inverse_there = likelihood(there)
+            if new < value:
+                break
+            step = step / 2
+        else:
+            break
+        log_v, value, inverse = there, new, inverse_there
+    return np.asarray(np.exp(log_v))
+
+
+def _covariance(G: Vector, v: Vector) -> Vector:
+    size = G.shape[1]
+    R, Q, P = v.reshape(3, 3)
+    inside = np.concatenate([P, np.tile(Q, size // 3)])
+    C = (G * inside) @ np.swapaxes(G, 1, 2) + np.diag(np.tile(R, size // 3))
+    return np.asarray(C * (1.0 + _ROUNDING * np.eye(size)))

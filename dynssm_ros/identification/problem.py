@@ -1,0 +1,302 @@
+"""Fitting a car to windows of a recording: nominal values under what is known of them, effects within their bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import lsq_linear
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.identification.car import Car
+from dynssm_ros.identification.noise import Noise, Spread, fit_noise, weights
+from dynssm_ros.identification.windows import Windows
+from dynssm_ros.vehicle.effects import EFFECTS
+
+Free = tuple[tuple[str, str], ...]
+"""Effect and parameter of each value that is fitted beside the nominal ones."""
+
+BLOCK = 3.0  # s; errors farther apart count as independent
+_UNIT = 0.1  # of the way from neutral to the upper bound: in this unit effects are fitted
+_FREE = 10.0  # of these units an effect's parameter may be, as one standard deviation
+_ROUNDS = 30
+_KEPT = 0.5  # of what a quadratic promises: derivatives that keep less are too old
+_LOUD, _LEAST = 1e-2, 1e-12  # of the variance of a channel: more than any noise, and less
+_DAMPING = (0.0, 0.03, 0.3, 3.0, 30.0)
+_CONVERGED = 0.3  # of the squared error
+
+
+def unit(effect: str, parameter: str) -> float:
+    """The unit in which a parameter is fitted."""
+    about = EFFECTS[effect].PARAMETERS[parameter]
+    return _UNIT * max(about.upper - about.neutral, about.neutral - about.lower)
+
+
+def _scales(effect: str, parameter: str) -> bool:
+    """Whether it multiplies, and so is fitted as a logarithm."""
+    about = EFFECTS[effect].PARAMETERS[parameter]
+    return about.neutral == 1.0 and about.lower > 0.0
+
+
+def _in_units(effect: str, parameter: str, value: float) -> float:
+    """A parameter's value as a fit has it: 0 where it is neutral."""
+    off = np.log(value) if _scales(effect, parameter) else value - EFFECTS[effect].PARAMETERS[parameter].neutral
+    return float(off / unit(effect, parameter))
+
+
+def _value(effect: str, parameter: str, in_units: float) -> float:
+    """The inverse of :func:`_in_units`, within the bounds."""
+    about, off = EFFECTS[effect].PARAMETERS[parameter], in_units * unit(effect, parameter)
+    value = np.exp(off) if _scales(effect, parameter) else about.neutral + off
+    return float(np.clip(value, about.lower, about.upper))
+
+
+def per_unit(effect: str, parameter: str, value: float) -> float:
+    """How much a parameter that has ``value`` changes per unit of a fit."""
+    return unit(effect, parameter) * (value if _scales(effect, parameter) else 1.0)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A car fitted to windows.
+
+    Attributes:
+        car: as fitted.
+        free: the effects' parameters that were fitted.
+        errors: its errors, shape ``(W, 3 K)``.
+        jacobian: their derivatives by the 18 nominal values (in standard deviations) and by ``free`` (in units), shape
+            ``(W, 3 K, 18 + len(free))``.
+        noise: under which it was fitted.
+        objective: twice the negative logarithm of likelihood and knowledge.
+    """
+
+    car: Car
+    free: Free
+    errors: Vector
+    jacobian: Vector
+    noise: Noise
+    objective: float
+
+    @property
+    def position(self) -> Vector:
+        """The fitted values: 18 of the nominal car and those of ``free``."""
+        return position(self.car, self.free)
+
+
+def position(car: Car, free: Free) -> Vector:
+    """The values of a car in the units of a fit."""
+    return np.concatenate([car.moved, [_in_units(e, name, car.effects[e][name]) for e, name in free]])
+
+
+def limits(car: Car, free: Free) -> tuple[Vector, Vector]:
+    """The least and the largest values, in the units of a fit."""
+    bounds = [(EFFECTS[e].PARAMETERS[name].lower, EFFECTS[e].PARAMETERS[name].upper) for e, name in free]
+    inside = np.array([[_in_units(*pair, bound) for bound in b] for pair, b in zip(free, bounds, strict=True)])
+    lower, upper = car.limits
+    return np.concatenate([lower, inside.reshape(-1, 2)[:, 0]]), np.concatenate([upper, inside.reshape(-1, 2)[:, 1]])
+
+
+def placed(car: Car, free: Free, p: Vector) -> Car:
+    """The car at other values, within their bounds."""
+    n = len(car.moved)
+    p = np.clip(p, *limits(car, free))
+    effects = {name: dict(values) for name, values in car.effects.items()}
+    for (effect, name), value in zip(free, p[n:], strict=True):
+        effects[effect][name] = _value(effect, name, value)
+    return replace(car, moved=p[:n], effects=effects)
+
+
+class Study:
+    """Windows with their noise, and fits to them.
+
+    Args:
+        windows: the simulations that are compared with the measurement.
+        car: gives the derivatives along which noise spreads.
+    """
+
+    def __init__(self, windows: Windows, car: Car) -> None:
+        self.windows = windows
+        speed = windows.target[:, :, 0].mean(axis=1)
+        self.spread = Spread.of(windows.transitions(car), speed)
+        block = (windows.time // BLOCK).astype(np.intp)
+        self.block: npt.NDArray[np.intp] = np.unique(block, return_inverse=True)[1]
+        self._channels = np.tile(windows.spread**2, 3)
+
+    def errors(self, car: Car, context: dict[str, float] | None = None) -> Vector:
+        """Errors of a car, shape ``(W, 3 K)``."""
+        return self.windows.errors(car, context).reshape(len(self.windows), -1)
+
+    def errors_of(self, cars: Sequence[Car], context: dict[str, float] | None = None) -> Vector:
+        """Errors of several cars that differ in values alone, shape ``(P, W, 3 K)``."""
+        return self.windows.errors_of(cars, context).reshape(len(cars), len(self.windows), -1)
+
+    def noise(self, errors: Vector) -> Noise:
+        """The noise under which ``errors`` are most likely, whatever it was taken for before."""
+        return fit_noise(self.spread, errors, _LOUD * self._channels, _LEAST * self._channels)
+
+    def columns(self, car: Car, errors: Vector, free: Free, first: int = 0) -> Vector:
+        """Derivatives of ``errors`` by the 18 nominal values and by ``free``, from the ``first`` on.
+
+        Shape ``(W, 3 K, P - first)``.
+        """
+        at, n = position(car, free), len(car.moved)
+        upper = limits(car, free)[1]
+        cars, done = [], np.empty(len(at) - first)
+        for k in range(first, len(at)):
+            step = 0.05 if k < n else 0.02
+            moved = at.copy()
+            moved[k] += step if at[k] + step <= upper[k] else -step
+            done[k - first] = moved[k] - at[k]
+            cars.append(placed(car, free, moved))
+        change = self.errors_of(cars) - errors
+        return np.asarray(np.moveaxis(change, 0, -1) / done)
+
+    def objective(self, errors: Vector, p: Vector, noise: Noise) -> float:
+        """Twice the negative logarithm of likelihood and knowledge."""
+        white = noise.whiten(errors)
+        size, limit = (white**2).sum(axis=1), 4.0 * white.shape[1]
+        far = np.maximum(size / limit, 1.0)
+        return float(
+            (np.minimum(size, limit) + limit * np.log(far)).sum() + noise.log_det + (p * self.known_before(p)) @ p
+        )
+
+    @staticmethod
+    def known_before(p: Vector) -> Vector:
+        """Inverse variance of what is known of each value beforehand."""
+        known = np.full(len(p), _FREE**-2)
+        known[:18] = 1.0
+        return known
+
+    def fit(self, car: Car, free: Free, near: Fit | None = None, rounds: int = _ROUNDS, rough: bool = False) -> Fit:
+        """Levenberg-Marquardt from ``car``; the noise is fitted along.
+
+        Derivatives by the nominal values hardly change, so they are those of a fit nearby while they keep what they promise
+        and until it has settled with them.
+
+        Args:
+            car: where to start; has the effects of ``free``.
+            free: which of their parameters are fitted.
+            near: a fit of a like car, whose derivatives serve to begin with.
+            rounds: of linearising anew, at most.
+            rough: whether it may end with the derivatives of ``near``.
+        """
+        car = placed(car, free, position(car, free))
+        errors, n = self.errors(car), len(car.moved)
+        noise = self.noise(errors)
+        p = position(car, free)
+        lower, upper = limits(car, free)
+        best = self.objective(errors, p, noise)
+        nominal = None if near is None else near.jacobian[..., :n]
+        jacobian = np.empty(0)
+        for last in range(rounds, 0, -1):
+            stale = nominal is not None
+            if nominal is not None and last > 1:
+                jacobian = np.concatenate([nominal, self.columns(car, errors, free, n)], axis=2) if free else nominal
+            else:
+                jacobian, stale = self.columns(car, errors, free), False
+            H, g = self._normal(errors, jacobian, p, noise)
+            before, promised, gained = best, 0.0, 0.0
+            for damping in _DAMPING:
+                step = _step(H + damping * np.diag(np.diag(H)), g, lower - p, upper - p)
+                other = placed(car, free, p + step)
+                there = self.errors(other)
+                value = self.objective(there, position(other, free), noise)
+                if value < best:
+                    promised = -float(2 * g @ step + step @ H @ step)
+                    gained = best - value
+                    car, errors, p = other, there, position(other, free)
+                    if gained > _CONVERGED:
+                        noise = self.noise(errors)
+                    best = self.objective(errors, p, noise)
+                    break
+            settled = before - best < _CONVERGED
+            if settled and (rough or not stale):
+                break
+            if stale and (settled or gained < _KEPT * promised):
+                nominal = None
+            elif not stale:
+                nominal = jacobian[..., :n]
+        return Fit(car, free, errors, jacobian, noise, best)
+
+    def part(self, fit: Fit, every: int) -> tuple[Study, Fit]:
+        """One window of each ``every``, and what ``fit`` is there."""
+        other = copy(self)
+        other.windows = self.windows.select(np.arange(0, len(self.windows), every))
+        other.spread = Spread(self.spread.group[::every], self.spread.G)
+        other.block = self.block[::every]
+        noise, errors = Noise(other.spread, fit.noise.v), fit.errors[::every]
+        objective = other.objective(errors, fit.position, noise)
+        return other, replace(fit, errors=errors, jacobian=fit.jacobian[::every], noise=noise, objective=objective)
+
+    def eased(self, cars: Sequence[Car], near: Fit) -> list[Car]:
+        """The same cars with the values of ``near`` moved to where its derivatives say that they fit best."""
+        out = []
+        for car, errors in zip(cars, self.errors_of(cars), strict=True):
+            p = position(car, near.free)
+            H, g = self._normal(errors, near.jacobian, p, near.noise)
+            lower, upper = limits(car, near.free)
+            out.append(placed(car, near.free, p + _step(H, g, lower - p, upper - p)))
+        return out
+
+    def _normal(self, errors: Vector, jacobian: Vector, p: Vector, noise: Noise) -> tuple[Vector, Vector]:
+        """Second and first derivatives of half the objective, as Gauss and Newton approximate them."""
+        white = noise.whiten(errors)
+        root = np.sqrt(weights(white))[:, None]
+        J = (noise.whiten(jacobian) * root[..., None]).reshape(-1, len(p))
+        known = self.known_before(p)
+        H = J.T @ J + np.diag(known)
+        g = J.T @ (white * root).ravel() + known * p
+        return H, g
+
+    def covariance(self, fit: Fit) -> Vector:
+        """Covariance of the fitted values in the units of the fit, robust against errors that hang together in blocks.
+
+        Shape ``(P, P)``.
+        """
+        information, _ = self._scores(fit)
+        known = np.diag(self.known_before(fit.position))
+        bread = np.linalg.inv(information + known)
+        return np.asarray(bread @ (self.inflation(fit) * information + known) @ bread)
+
+    def inflation(self, fit: Fit, last: int = 0) -> float:
+        """How many times larger the variance of the scores is than independent errors would make it, at least 1.
+
+        The larger one of the mean over all that the data tell of and, with ``last``, what is sure of that of the last
+        values, with what the others can take up projected out.
+        """
+        information, meat = self._scores(fit)
+        values, vectors = np.linalg.eigh(information)
+        told = values > 1.0
+        ratio = np.einsum("pi,pq,qi->i", vectors[:, told], meat, vectors[:, told]) / values[told]
+        inflation = float(ratio.mean()) if told.any() else 1.0
+        if last:
+            known = np.diag(self.known_before(fit.position))
+            n = len(information) - last
+            taken = np.linalg.solve((information + known)[:n, :n], information[:n, n:])
+            left = np.concatenate([-taken, np.eye(last)])
+            own = np.linalg.solve(left.T @ information @ left + 1e-9 * np.eye(last), left.T @ meat @ left)
+            chance = 1.0 + 2.0 * np.sqrt(2.0 / (self.block.max() + 1))
+            inflation = max(inflation, float(np.trace(own)) / last / chance)
+        return max(1.0, inflation)
+
+    def _scores(self, fit: Fit) -> tuple[Vector, Vector]:
+        """The information on the fitted values, and what blocks of errors make of it, both ``(P, P)``."""
+        white = fit.noise.whiten(fit.errors)
+        root = np.sqrt(weights(white))
+        J = fit.noise.whiten(fit.jacobian) * root[:, None, None]
+        scores = np.einsum("wnp,wn->wp", J, white * root[:, None])
+        flat = J.reshape(-1, J.shape[2])
+        information = flat.T @ flat
+        blocks = np.zeros((self.block.max() + 1, len(information)))
+        np.add.at(blocks, self.block, scores)
+        blocks -= blocks.mean(axis=0)
+        return information, blocks.T @ blocks * len(blocks) / max(1, len(blocks) - 1)
+
+
+def _step(H: Vector, g: Vector, lower: Vector, upper: Vector) -> Vector:
+    """The step that a quadratic asks for within bounds: what would leave them stays on them, the others follow."""
+    root = np.linalg.cholesky(H)
+    return np.asarray(lsq_linear(root.T, -np.linalg.solve(root, g), (lower, upper), "bvls").x)

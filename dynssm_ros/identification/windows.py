@@ -1,0 +1,186 @@
+"""Short simulations along a recording: each starts at a measured row and runs free from there.
+
+The effects' own states are led along the measured rows before the start, so that a lag is where it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.identification.car import Car, Fleet
+from dynssm_ros.signals.inputs import applied_inputs
+from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.single_track import Integrator, settled_memory, settling_rate, step_with_memory
+
+_FINEST = 16  # integration steps per sampling time, at most
+WARM_UP = 0.64  # s of measured rows along which a simulation is led before it runs free
+_FOLLOWING = 0.16  # s, time constant with which a simulation that is led follows the measured rows
+_WILD = 1e3  # a prediction farther off than this many spreads of its channel counts as that far
+
+
+@dataclass(frozen=True)
+class Track:
+    """The rows of a recording as the simulations read them.
+
+    Attributes:
+        rows: model inputs, shape ``(7, N)``.
+        context: other signals by name, each of shape ``(N,)``.
+        T_s: sampling time (s).
+        time: of each row since the first (s), shape ``(N,)``.
+    """
+
+    rows: Vector
+    context: dict[str, Vector]
+    T_s: float
+    time: Vector
+
+
+@dataclass(frozen=True)
+class Windows:
+    """``W`` simulations, compared with the measurement at ``K`` rows each.
+
+    Attributes:
+        data: what is simulated.
+        starts: rows from which the simulations start, shape ``(W,)``; ``warm`` rows before each belong to its stretch.
+        steps: sampling times simulated, a multiple of ``every``.
+        warm: rows of warm-up.
+        integrator: how the model steps.
+        substeps: integration steps per sampling time.
+        every: compared is every so many rows, so that ``K = steps / every``.
+        filtered: whether a simulation is led up to its start by the rows before as an observer is, and not put on the
+            measured row. The noise of a row would otherwise be seen in what the car does next, and effects that answer
+            to it, such as a relaxing tyre, be taken for smaller than they are.
+    """
+
+    data: Track = field(repr=False)
+    starts: Indices
+    steps: int
+    warm: int
+    integrator: Integrator = "rk4"
+    substeps: int = 1
+    every: int = 1
+    filtered: bool = False
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def select(self, chosen: Indices | npt.NDArray[np.bool_]) -> Windows:
+        """Some of the simulations."""
+        return replace(self, starts=self.starts[chosen])
+
+    def stepping(self, integrator: Integrator, vehicle: Vehicle) -> Windows:
+        """The same simulations in Euler steps of the sampling time, or in Runge-Kutta steps that are short enough.
+
+        A step is at most the inverse of the rate at which the linear car settles; see :func:`settling_rate`.
+        """
+        if integrator == "euler":
+            return replace(self, integrator=integrator, substeps=1)
+        slow = max(float(np.quantile(self.data.rows[0, self.starts], 0.05)), 0.1)
+        rate = settling_rate(Coefficients(*vehicle.nominal), vehicle.constants) / slow
+        count = int(np.clip(np.ceil(self.data.T_s * rate), 1, _FINEST))
+        return replace(self, integrator=integrator, substeps=count)
+
+    @cached_property
+    def target(self) -> Vector:
+        """Measured states of the predicted rows, shape ``(W, K, 3)``."""
+        at = self.starts[:, None] + np.arange(self.every, self.steps + 1, self.every)
+        return np.moveaxis(self.data.rows[:3, at], 0, -1)
+
+    @cached_property
+    def time(self) -> Vector:
+        """Time of each start (s), shape ``(W,)``."""
+        return self.data.time[self.starts]
+
+    def context(self, shift: int) -> dict[str, Vector]:
+        """The other signals ``shift`` rows after the starts."""
+        return {name: values[self.starts + shift] for name, values in self.data.context.items()}
+
+    def errors(self, car: Car, context: dict[str, float] | None = None) -> Vector:
+        """Predicted minus measured states (m/s, m/s, rad/s), shape ``(W, K, 3)``; see :meth:`errors_of`."""
+        return np.asarray(self.errors_of([car], context)[0])
+
+    def errors_of(self, cars: Sequence[Car], context: dict[str, float] | None = None) -> Vector:
+        """Predicted minus measured states of ``P`` cars at once, shape ``(P, W, K, 3)``.
+
+        Args:
+            cars: what is simulated; they differ in values alone.
+            context: values that replace signals of the recording, the same in all rows.
+        """
+        fleet = Fleet.of(cars)
+        carries = any(effect.carries for effect in fleet.effects)
+        shift = -self.warm if carries or self.filtered else 0
+        taken = 1.0 - np.exp(-self.data.T_s / _FOLLOWING) if self.filtered else 1.0
+        first = self.data.rows[:, self.starts + shift]
+        here = self.context(shift) | (context or {})
+        state = State(*first[:3])
+        memory = settled_memory(
+            np, state, Applied(*first[3:5]), fleet.theta, fleet.constants, fleet.effects, context=here
+        )
+        out = np.empty((len(cars), len(self), self.steps // self.every, 3))
+        with np.errstate(all="ignore"):
+            for k in range(shift, self.steps):
+                rows = self.data.rows[:, self.starts + k]
+                if k <= 0:
+                    state = State(*(led + taken * (row - led) for led, row in zip(state, rows[:3], strict=True)))
+                state, memory = self._step(fleet, state, memory, rows, k, context)
+                if k >= 0 and (k + 1) % self.every == 0:
+                    for channel, value in enumerate(state):
+                        out[:, :, k // self.every, channel] = value
+        limit = _WILD * self.spread
+        out -= self.target
+        return np.asarray(np.clip(np.nan_to_num(out, copy=False, nan=1e9, posinf=1e9, neginf=-1e9), -limit, limit))
+
+    def transitions(self, car: Car) -> Vector:
+        """Derivatives of each compared row by the one before, along the measured rows, shape ``(W, K, 3, 3)``."""
+        fleet = Fleet.of([car])
+        fleet = fleet._replace(effects=tuple(effect for effect in fleet.effects if not effect.carries))
+        out = np.empty((len(self), self.steps, 3, 3))
+        for k in range(self.steps):
+            rows = self.data.rows[:, self.starts + k]
+            state = State(*rows[:3])
+            base, _ = self._step(fleet, state, {}, rows, k, None)
+            for j in range(3):
+                h = 1e-4 * self.spread[j]
+                there = State(*(v + h * (i == j) for i, v in enumerate(state)))
+                moved, _ = self._step(fleet, there, {}, rows, k, None)
+                out[:, k, :, j] = np.stack([(a - b) / h for a, b in zip(moved, base, strict=True)], axis=-1)
+        steps = np.clip(np.nan_to_num(out), -10.0, 10.0).reshape(len(self), -1, self.every, 3, 3)
+        through = steps[:, :, 0]
+        for k in range(1, self.every):
+            through = steps[:, :, k] @ through
+        return np.asarray(through)
+
+    @cached_property
+    def spread(self) -> Vector:
+        """Standard deviation of the measured states, shape ``(3,)``."""
+        return np.asarray(np.maximum(self.target.reshape(-1, 3).std(axis=0), 1e-6))
+
+    def _step(
+        self,
+        fleet: Fleet,
+        state: State,
+        memory: Mapping[str, Vector],
+        rows: Vector,
+        k: int,
+        context: Mapping[str, float] | None,
+    ) -> tuple[State, dict[str, Vector]]:
+        """One step from the rows ``k`` after the starts."""
+        return step_with_memory(
+            np,
+            state,
+            memory,
+            applied_inputs(rows),
+            fleet.theta,
+            fleet.constants,
+            self.data.T_s,
+            fleet.effects,
+            self.integrator,
+            self.substeps,
+            self.context(k) | dict(context or {}),
+        )

@@ -1,0 +1,1 @@
+"""The trainable models: a contract, a registry, one file or folder per model."""

@@ -1,0 +1,1 @@
+"""DynSSM: physics with adapted coefficients, an innovation filter and a gated residual."""

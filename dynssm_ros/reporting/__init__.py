@@ -1,0 +1,1 @@
+"""Tables, figures, pages and animations: one file per report. Imports matplotlib."""

@@ -1,0 +1,194 @@
+"""Figures of a diagnosis and of a battery of cases."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.identification.improvement import Gain
+from dynssm_ros.reporting.evaluation_figures import (
+    MEASURED,
+    NO_MODEL,
+    PALETTE,
+    SYMBOLS,
+    UNITS,
+    WIDTH,
+    liveliest,
+    styled,
+)
+from dynssm_ros.reporting.tables import text
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+
+_BINS = 16
+_FEWEST = 8  # simulations in a bin
+_COLOURS = (NO_MODEL, PALETTE[1], PALETTE[0])  # as given, recalibrated, extended
+_SECONDS = 15.0  # of the stretch that is shown in full
+_LONGEST = 2.2  # of the recalibrated car's error; what the car as given exceeds leaves the panel
+
+
+@styled
+def simulated_and_measured(gain: Gain) -> Figure:
+    """The liveliest held-out stretch: measured, and simulations that start anew from measured states."""
+    windows = gain.windows
+    T_s, rows = windows.data.T_s, windows.data.rows
+    at = windows.starts
+    shown = at[liveliest(windows.time, rows[:3, at].T, _SECONDS)]
+    starts = [int(shown[0])]
+    for start in shown:
+        if start >= starts[-1] + windows.steps:
+            starts.append(int(start))
+    runs = replace(windows, starts=np.array(starts))
+    figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True)
+    whole = np.arange(starts[0], starts[-1] + windows.steps + 1)
+    here = runs.starts[:, None] + np.arange(windows.steps + 1)
+    for c, (panel, channel) in enumerate(zip(axes, STATE_SIGNALS, strict=True)):
+        panel.plot(whole * T_s, rows[c, whole], color=MEASURED, lw=2.2, alpha=0.75, label="measured")
+        panel.set_ylabel(f"{SYMBOLS[channel]} ({UNITS[channel]})")
+        low, high = np.ptp(rows[c, whole]) * np.array([-0.4, 0.4]) + [rows[c, whole].min(), rows[c, whole].max()]
+        panel.set_ylim(low, high)
+    for (name, car), colour in zip(gain.cars.items(), _COLOURS, strict=True):
+        predicted = runs.errors(car) + runs.target
+        path = np.concatenate([np.moveaxis(rows[:3, runs.starts], 0, 1)[:, None], predicted], axis=1)
+        path = np.concatenate([path, np.full((len(path), 1, 3), np.nan)], axis=1)  # lifts the pen
+        t = np.concatenate([here, here[:, -1:]], axis=1) * T_s
+        for c, panel in enumerate(axes):
+            panel.plot(t.ravel(), path[..., c].ravel(), color=colour, lw=1.0, label=name)
+    axes[-1].set_xlabel("time (s)")
+    figure.align_ylabels()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+@styled
+def gain_by_horizon(gain: Gain) -> Figure:
+    """Errors of each car at each horizon, a panel per channel."""
+    figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
+    axes = figure.subplots(1, 3)
+    places = np.arange(len(gain.horizons))
+    width = 0.8 / len(gain.rmse)
+    for c, (panel, channel) in enumerate(zip(axes, STATE_SIGNALS, strict=True)):
+        others = np.max([values[:, c] for values in list(gain.rmse.values())[1:]])
+        for k, (name, values) in enumerate(gain.rmse.items()):
+            at = places + (k - 1) * width
+            panel.bar(at, np.minimum(values[:, c], _LONGEST * others), 0.9 * width, color=_COLOURS[k], label=name)
+            for x, value in zip(at, values[:, c], strict=True):
+                if value > _LONGEST * others:
+                    panel.text(x, _LONGEST * others, text(float(value)), ha="center", va="bottom", fontsize=8)
+        panel.set_xticks(places, [f"{ahead:.4g} s" for ahead in gain.horizons])
+        panel.set_title(f"{SYMBOLS[channel]} ({UNITS[channel]})", pad=14)
+        panel.grid(axis="x", visible=False)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
+    return figure
+
+
+@styled
+def evidence(tried: Mapping[str, float], named: Sequence[str]) -> Figure:
+    """Gain of each effect alone, the largest at the top; named causes are coloured."""
+    ordered = sorted(tried.items(), key=lambda item: item[1])
+    figure = Figure(figsize=(WIDTH, 0.8 + 0.22 * max(len(ordered), 1)), layout="constrained")
+    panel = figure.subplots()
+    colours = [PALETTE[0] if name in named else NO_MODEL for name, _ in ordered]
+    panel.barh(range(len(ordered)), [max(value, 1e-3) for _, value in ordered], color=colours)
+    panel.set_yticks(range(len(ordered)), [name for name, _ in ordered])
+    panel.set_xscale("symlog", linthresh=10.0)
+    panel.set_xlabel("decrease of twice the negative log-likelihood by this effect alone")
+    panel.grid(axis="y", visible=False)
+    panel.margins(y=0.01)
+    return figure
+
+
+@styled
+def errors_over_time(gain: Gain) -> Figure:
+    """Errors one step and the horizon ahead over time, of the recalibrated and of the extended car."""
+    figure = Figure(figsize=(WIDTH, 5.0), layout="constrained")
+    axes = figure.subplots(3, 2, sharex=True)
+    order = np.argsort(gain.windows.time)
+    t = gain.windows.time[order]
+    for (name, values), colour in zip(list(gain.errors.items())[1:], _COLOURS[1:], strict=True):
+        for column, h in enumerate((0, gain.horizon)):
+            for c in range(3):
+                axes[c, column].plot(t, values[order, h, c], color=colour, lw=0.8, label=name)
+    for column, h in enumerate((0, gain.horizon)):
+        axes[0, column].set_title(f"{gain.horizons[h]:.4g} s ahead")
+        axes[2, column].set_xlabel("time (s)")
+        for c, channel in enumerate(STATE_SIGNALS):
+            axes[c, column].axhline(0.0, color=MEASURED, lw=0.8)
+            axes[c, column].set_ylabel(f"{SYMBOLS[channel]} error ({UNITS[channel]})")
+    figure.align_ylabels()
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    return figure
+
+
+@styled
+def errors_over(label: str, x: Vector, gain: Gain) -> Figure:
+    """Mean and spread of the errors against something, one step and the horizon ahead, a column per channel.
+
+    Args:
+        label: of the abscissa.
+        x: abscissa of each simulation, shape ``(W,)``.
+        gain: whose errors are shown.
+    """
+    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
+    axes = figure.subplots(2, 3, sharex=True)
+    bins = _binned(x)
+    centre = [x[b].mean() for b in bins]
+    for row, h in enumerate((0, gain.horizon)):
+        for c, channel in enumerate(STATE_SIGNALS):
+            panel: Axes = axes[row, c]
+            reach = 0.0
+            for (name, errors), colour in zip(gain.errors.items(), _COLOURS, strict=True):
+                mean = np.array([errors[b, h, c].mean() for b in bins])
+                panel.plot(centre, mean, "o-", color=colour, ms=2.5, label=name)
+                if colour != NO_MODEL:
+                    spread = np.array([errors[b, h, c].std() for b in bins])
+                    panel.fill_between(centre, mean - spread, mean + spread, color=colour, alpha=0.15, lw=0)
+                    reach = max(reach, float((np.abs(mean) + spread).max()))
+            panel.set_ylim(-1.25 * reach, 1.25 * reach) if reach > 0 else None
+            panel.axhline(0.0, color=MEASURED, lw=0.8)
+            if row == 0:
+                panel.set_title(f"{SYMBOLS[channel]} error ({UNITS[channel]})")
+            else:
+                panel.set_xlabel(label)
+        axes[row, 0].set_ylabel(f"{gain.horizons[h]:.4g} s ahead")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
+    return figure
+
+
+def _binned(x: Vector) -> list[npt.NDArray[np.intp]]:
+    """Numbers of the values in equally wide bins, without bins that are nearly empty."""
+    low, high = np.quantile(x, [0.005, 0.995])
+    edges = np.linspace(low, high, _BINS + 1)[1:-1]
+    number = np.searchsorted(edges, x)
+    bins = [np.flatnonzero(number == k) for k in range(_BINS)]
+    filled = [b for b in bins if len(b) >= _FEWEST]
+    return filled or [np.arange(len(x))]
+
+
+@styled
+def confusion(hidden: Sequence[str], named: Sequence[str], count: npt.NDArray[np.intp]) -> Figure:
+    """Confusion matrix.
+
+    Args:
+        hidden: labels of the rows.
+        named: labels of the columns.
+        count: cases, shape ``(len(hidden), len(named))``.
+    """
+    figure = Figure(figsize=(WIDTH, 0.72 * WIDTH + 1.2), layout="constrained")
+    panel = figure.subplots()
+    share = count / np.maximum(count.sum(axis=1, keepdims=True), 1)
+    panel.imshow(share, cmap="Blues", vmin=0, vmax=1.2)
+    for i, j in np.argwhere(count > 0):
+        ink = "white" if share[i, j] > 0.5 else "black"
+        panel.text(j, i, str(count[i, j]), ha="center", va="center", fontsize=8, color=ink)
+    panel.set_xticks(range(len(named)), named, rotation=90, fontsize=8)
+    panel.set_yticks(range(len(hidden)), hidden, fontsize=8)
+    panel.set(xlabel="named first", ylabel="hidden")
+    panel.grid(visible=False)
+    return figure

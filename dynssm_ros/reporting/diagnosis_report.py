@@ -1,0 +1,316 @@
+"""A diagnosis in words, tables and diagnosis_figures."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+
+import numpy as np
+
+from dynssm_ros.identification.diagnose import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
+from dynssm_ros.identification.minimum_effect import room
+from dynssm_ros.identification.residuals import Systematic
+from dynssm_ros.identification.selection import SURE
+from dynssm_ros.reporting import diagnosis_figures
+from dynssm_ros.reporting.evaluation_figures import UNITS
+from dynssm_ros.reporting.page import Report, Section
+from dynssm_ros.reporting.tables import Column, Table, Value, percent, text
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS
+from dynssm_ros.vehicle.effects import EFFECTS
+
+_LITTLE = 0.02  # of the squared error; less is not worth a word
+_WIDTH = 110
+
+
+def in_words(diagnosis: Diagnosis) -> str:
+    """The result for a terminal: cause, size, evidence, gain, what to do, what is left."""
+    lines = [headline(diagnosis)]
+    for number, cause in enumerate(diagnosis.causes, 1):
+        lines += ["", f"{number}. {cause.effect}: {size_in_words(cause)}"]
+        lines += [f"   {line}" for words in _about(cause) for line in textwrap.wrap(words, _WIDTH)]
+    lines += ["", *gain_in_words(diagnosis)]
+    for words in (left_in_words(diagnosis), *(f"Note: {note}." for note in diagnosis.notes)):
+        lines += textwrap.wrap(words, _WIDTH)
+    return "\n".join(lines)
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """The verdict in a sentence."""
+    if diagnosis.verdict == "effects":
+        listed = ", ".join(cause.effect for cause in diagnosis.causes)
+        return f"The simulation lacks: {listed}."
+    if diagnosis.verdict == "none":
+        return "The simulation is right within the noise of the measurement, once its nominal values are recalibrated."
+    return "Something is wrong that no effect of the library explains."
+
+
+def pattern_in_words(left: Systematic) -> str:
+    """What systematic error goes with, and where on the lap it is farthest off."""
+    parts = []
+    for c, channel in enumerate(STATE_SIGNALS):
+        if left.share[c] > _LITTLE:
+            goes = ", ".join(f"{name} ({value:+.2f})" for name, value in left.pattern[channel].items())
+            where = "; farthest off {:.0f} to {:.0f} m into the lap"
+            parts.append(
+                f"{channel}, {percent(left.share[c])} of the squared error: goes with {goes}"
+                + (where.format(*left.stretch[channel]) if left.stretch else "")
+            )
+    return ". ".join(parts) + "." if parts else "the pattern is too weak to say with what it goes."
+
+
+def left_in_words(diagnosis: Diagnosis) -> str:
+    """What the extended car gets wrong beyond noise; empty if there is nothing."""
+    parts = []
+    if diagnosis.left.is_there:
+        parts.append(f"Systematic error that is left, and what it goes with: {pattern_in_words(diagnosis.left)}")
+    if diagnosis.bunched.is_there:
+        low, high = diagnosis.bunched.when
+        parts.append(
+            "Errors come together over seconds as noise does not, so that something is missing that comes and goes; they are "
+            f"largest {low:.0f} to {high:.0f} s into the recording."
+        )
+    return " ".join(parts)
+
+
+def size_in_words(cause: Cause) -> str:
+    """The parameters with unit and standard deviation."""
+    parts = []
+    for name, value in cause.values.items():
+        unit = EFFECTS[cause.effect].PARAMETERS[name].unit
+        unit = "" if unit == "1" else f" {unit}"
+        spread = f" ± {cause.std[name]:.2g}" if name in cause.std else " (assumed)"
+        parts.append(f"{name} = {value:.4g}{spread}{unit}")
+    return ", ".join(parts)
+
+
+def evidence_in_words(cause: Cause) -> str:
+    """How sure the cause is, and what it takes away."""
+    held_out = (
+        f"it takes away {percent(cause.heldout_gain)} of the error on held-out laps"
+        if cause.heldout_gain > 0
+        else f"on held-out laps it takes nothing away ({percent(cause.heldout_gain)})"
+    )
+    return f"the information criterion is better by {cause.delta_bic:.0f} (above {SURE:.0f} is very strong); {held_out}"
+
+
+def alternatives_in_words(cause: Cause) -> str:
+    """What the data cannot tell from a cause, and how to tell them apart."""
+    ways = "; ".join(f"{name}: {EFFECTS[name].MANOEUVRE}" for name in (cause.effect, *cause.alternatives))
+    return f"The data fit {' or '.join(cause.alternatives)} as well. To tell them apart, drive ({ways})."
+
+
+def gain_in_words(diagnosis: Diagnosis) -> list[str]:
+    """Errors before and after, by channel."""
+    gain = diagnosis.gain
+    at = gain.horizon
+    low, high = gain.interval_from(RECALIBRATED)[:, at]
+    lines = [f"Error on held-out laps {gain.horizons[at]:.4g} s ahead:"]
+    for c, channel in enumerate(STATE_SIGNALS):
+        values = ", ".join(f"{text(float(values[at, c]))} {name}" for name, values in gain.rmse.items())
+        lines.append(
+            f"   {channel} ({UNITS[channel]}): {values}: {percent(float(gain.reduction[at, c]))} less than as given, "
+            f"{percent(float(gain.reduction_from(RECALIBRATED)[at, c]))} less than recalibrated "
+            f"(95 %: {percent(float(low[c]))} to {percent(float(high[c]))})"
+        )
+    return lines
+
+
+def diagnosis_report(diagnosis: Diagnosis) -> Report:
+    """The report with diagnosis_figures."""
+    return Report(
+        f"Diagnosis of {diagnosis.vehicle.name}",
+        f"{headline(diagnosis)} {left_in_words(diagnosis)}".strip(),
+        tuple(_sections(diagnosis)),
+        diagnosis.protocol,
+        _causes(diagnosis) if diagnosis.causes else None,
+    )
+
+
+def _about(cause: Cause) -> Iterator[str]:
+    effect = EFFECTS[cause.effect]
+    yield effect.SUMMARY
+    yield f"Evidence: {evidence_in_words(cause)}."
+    yield f"What to do: {effect.ADVICE}"
+    if cause.alternatives:
+        yield alternatives_in_words(cause)
+
+
+def _causes(diagnosis: Diagnosis) -> Table:
+    columns = (
+        Column("cause"), Column("size"), Column("better by", group="information criterion"),
+        Column("less", "%", "held-out error"), Column("the data fit as well"),
+    )  # fmt: skip
+    rows: list[list[Value]] = [
+        [
+            cause.effect,
+            size_in_words(cause),
+            cause.delta_bic,
+            100 * cause.heldout_gain,
+            ", ".join(cause.alternatives) or "nothing else",
+        ]
+        for cause in diagnosis.causes
+    ]
+    return Table(columns, rows)
+
+
+def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
+    for cause in diagnosis.causes:
+        yield Section(cause.effect, " ".join((f"{size_in_words(cause)}.", *_about(cause))))
+    yield from _gained(diagnosis)
+    yield from _shown(diagnosis)
+    yield from _found(diagnosis)
+    if diagnosis.notes:
+        yield Section("Limits", " ".join(f"{note[0].upper()}{note[1:]}." for note in diagnosis.notes))
+
+
+def _gained(diagnosis: Diagnosis) -> Iterator[Section]:
+    gain = diagnosis.gain
+    yield Section(
+        "Simulated and measured",
+        f"A lively stretch of the held-out laps. Each simulation starts at a measured state and runs free for "
+        f"{gain.horizons[-1]:.4g} s, with the measured throttle and steering.",
+        diagnosis_figures.simulated_and_measured(gain),
+    )
+    yield Section(
+        "Gain on held-out laps",
+        "Root mean square error of simulations that start at measured states of laps that neither the fit nor the "
+        f"selection saw: the car {GIVEN}, its nominal values {RECALIBRATED} without any cause, and {EXTENDED} by the "
+        "causes. Intervals are from a bootstrap over blocks in time. What is systematic the signals and the place on the "
+        "lap foretell, on parts of the data to which that was not fitted.",
+        diagnosis_figures.gain_by_horizon(gain),
+        _gain_table(diagnosis),
+    )
+    yield Section(
+        "Systematic error and noise",
+        "The same errors in two parts: what the signals and the place on the lap foretell, and the rest, which is noise "
+        "or what the signals do not show. By place alone is what repeats lap after lap. Gone is the share of the "
+        f"systematic squared error of the car {GIVEN} that the extended one does not make. {left_in_words(diagnosis)}",
+        None,
+        _systematic_table(diagnosis),
+    )
+
+
+def _shown(diagnosis: Diagnosis) -> Iterator[Section]:
+    gain = diagnosis.gain
+    windows = gain.windows
+    rows = windows.data.rows
+    yield Section(
+        "Errors over time",
+        f"Predicted minus measured on the held-out laps, one step and {gain.horizons[gain.horizon]:.4g} s ahead.",
+        diagnosis_figures.errors_over_time(gain),
+    )
+    # what was going on half the way into the simulation
+    at = windows.starts + round(gain.horizons[gain.horizon] / windows.data.T_s / 2)
+    against = {
+        "speed (m/s)": rows[0, at],
+        "lateral acceleration (m/s²)": rows[0, at] * rows[2, at],
+        "steering (rad)": rows[4, at] + rows[6, at],
+        "throttle (negative: brake)": rows[3, at] + rows[5, at],
+    }
+    if "s" in windows.data.context:
+        against["position on the lap (m)"] = windows.data.context["s"][at]
+    for label, values in against.items():
+        yield Section(
+            f"Errors against {label.split(' (')[0]}",
+            "Mean and spread in bins: where the mean is off zero by more than the line's wiggling, the error is "
+            f"systematic. The car {GIVEN} may leave the panel.",
+            diagnosis_figures.errors_over(label, values, gain),
+        )
+
+
+def _found(diagnosis: Diagnosis) -> Iterator[Section]:
+    yield Section(
+        "Evidence by effect",
+        "How much each effect, alone, would improve the fit of the recalibrated car. Named causes are coloured. Effects "
+        "that leave like traces share the evidence; the causes named explain it best together.",
+        diagnosis_figures.evidence(diagnosis.selection.tried, [cause.effect for cause in diagnosis.causes]),
+    )
+    yield Section(
+        "What these laps would show",
+        "How far off neutral each effect that was not named would have to be to be named: the driving must excite it, and "
+        "the nominal values must be known well enough not to take it up. Where the bounds of the effect do not reach that "
+        "far, it cannot be judged.",
+        None,
+        _noticeable_table(diagnosis),
+    )
+    yield Section(
+        "Nominal values",
+        "What the fit makes of them. Moved: by how many of the standard deviations that the vehicle file states.",
+        None,
+        _nominal_table(diagnosis),
+    )
+
+
+def _gain_table(diagnosis: Diagnosis) -> Table:
+    gain = diagnosis.gain
+    columns = (
+        Column("channel"), Column("ahead", "s"), *(Column(name, group="error") for name in gain.rmse),
+        *(
+            Column(title, "%", f"less than {name}")
+            for name in (GIVEN, RECALIBRATED) for title in ("share", "from", "to")
+        ),
+    )  # fmt: skip
+    less = [(gain.reduction_from(name), *gain.interval_from(name)) for name in (GIVEN, RECALIBRATED)]
+    rows: list[list[Value]] = []
+    for c, channel in enumerate(STATE_SIGNALS):
+        for k, ahead in enumerate(gain.horizons):
+            values = [float(values[k, c]) for values in gain.rmse.values()]
+            shares = [round(100 * float(v[k, c])) for one in less for v in one]
+            rows.append([f"{channel} ({UNITS[channel]})", f"{ahead:.4g}", *values, *shares])
+    return Table(columns, rows)
+
+
+def _systematic_table(diagnosis: Diagnosis) -> Table:
+    gain = diagnosis.gain
+    columns = (
+        Column("channel"), Column("ahead", "s"),
+        *(Column(title, "", name) for name in gain.rmse for title in ("systematic", "rest")),
+        Column("gone", "%", "systematic"),
+        *(Column(name, "%", "systematic by place alone") for name in (GIVEN, EXTENDED)),
+    )  # fmt: skip
+    gone = gain.systematic_gone(GIVEN)
+    rows: list[list[Value]] = []
+    for c, channel in enumerate(STATE_SIGNALS):
+        for k, ahead in enumerate(gain.horizons):
+            parts: list[Value] = []
+            for name, values in gain.rmse.items():
+                share = float(gain.systematic[name][k].share[c])
+                parts += [float(values[k, c] * np.sqrt(part)) for part in (share, 1.0 - share)]
+            place = [100 * float(gain.systematic[name][k].by_place[c]) for name in (GIVEN, EXTENDED)]
+            rows.append([f"{channel} ({UNITS[channel]})", f"{ahead:.4g}", *parts, 100 * float(gone[k, c]), *place])
+    return Table(columns, rows)
+
+
+def _noticeable_table(diagnosis: Diagnosis) -> Table:
+    columns = (Column("effect"), Column("noticed from"), Column("unit"), Column("judged"))
+    rows: list[list[Value]] = []
+    for effect, size in sorted(diagnosis.noticeable.items(), key=lambda item: item[1] / room(item[0])):
+        unit = next(p.unit for p in EFFECTS[effect].PARAMETERS.values() if not p.shape)
+        rows.append([effect, size, "" if unit == "1" else unit, "yes" if size <= room(effect) else "no"])
+    return Table(columns, rows)
+
+
+def _nominal_table(diagnosis: Diagnosis) -> Table:
+    given, found = diagnosis.car.vehicle, diagnosis.vehicle
+    columns = (
+        Column("coefficient"),
+        Column("given"),
+        Column("refitted"),
+        Column("std"),
+        Column("moved"),
+        Column("unit"),
+    )
+    rows: list[list[Value]] = [
+        [
+            name,
+            given.coefficients[name].nominal,
+            found.coefficients[name].nominal,
+            found.coefficients[name].std,
+            float(np.round(diagnosis.car.moved[k], 2)),
+            COEFFICIENT_UNITS[name],
+        ]
+        for k, name in enumerate(COEFFICIENTS)
+    ]
+    rows.append(["m", given.constants.m, found.constants.m, None, float(np.round(diagnosis.car.moved[17], 2)), "kg"])
+    return Table(columns, rows)

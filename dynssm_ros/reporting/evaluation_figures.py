@@ -1,0 +1,429 @@
+"""Figures, each a function of plain arrays that returns a :class:`~matplotlib.figure.Figure`.
+
+Colours are Okabe and Ito's, continued by Paul Tol's, which stay apart for colour-blind readers; measured values are
+black, persistence is grey.
+Nothing here touches pyplot's global state, so figures can be drawn in any thread and without a display.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from typing import Any, ParamSpec
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter, ScalarFormatter
+
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.evaluation.coefficients import coefficient_unit, range_used, resting
+from dynssm_ros.evaluation.metrics import explained
+from dynssm_ros.reporting.tables import percent, text
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
+
+SYMBOLS = {"v_x": "$v_x$", "v_y": "$v_y$", "omega": r"$\omega$"}
+UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
+MEASURED = "#1a1a1a"
+NO_MODEL = "#9a9a9a"
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#332288", "#882255", "#999933")
+WIDTH = 9.6  # inches; the width of a report's text
+MAX_POINTS = 1500  # more points on a line than this are not seen
+OUTLYING = 3.0  # a model whose largest value exceeds the models' median by this factor may leave the panel
+MAX_BAR = 2.0  # bars end at this multiple of persistence, and say how long they are
+STYLE: dict[Any, Any] = {
+    "font.size": 9.5,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#666666",
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.7,
+    "xtick.color": "#444444",
+    "ytick.color": "#444444",
+    "legend.frameon": False,
+    "lines.linewidth": 1.3,
+}
+_P = ParamSpec("_P")
+
+
+def styled(draw: Callable[_P, Figure]) -> Callable[_P, Figure]:
+    """Decorator: draws in the package's style."""
+
+    @wraps(draw)
+    def in_style(*args: _P.args, **kwargs: _P.kwargs) -> Figure:
+        with mpl.rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return in_style
+
+
+def model_colours(names: list[str]) -> dict[str, str]:
+    """A colour for each model, grey for persistence."""
+    others = [name for name in names if name != "persistence"]
+    return {"persistence": NO_MODEL} | {name: PALETTE[k % len(PALETTE)] for k, name in enumerate(others)}
+
+
+@styled
+def predicted_and_measured(
+    time: Vector, measured: Vector, predicted: Mapping[str, Vector], seconds: float = 12.0
+) -> Figure:
+    """One-step predictions over the liveliest stretch: values at the left, errors at the right.
+
+    Args:
+        time: of the predicted rows (s), shape ``(N,)``.
+        measured: states, shape ``(N, 3)``.
+        predicted: predicted states by model name, each ``(N, 3)``.
+        seconds: length of the stretch.
+    """
+    shown = liveliest(time, measured, seconds)
+    colours = model_colours(list(predicted))
+    figure = Figure(figsize=(WIDTH, 6.2), layout="constrained")
+    axes = figure.subplots(3, 2, sharex=True)
+    t = time[shown]
+    for k, channel in enumerate(STATE_SIGNALS):
+        values, errors = axes[k]
+        values.plot(t, measured[shown, k], color=MEASURED, lw=2.2, alpha=0.75, label="measured")
+        for depth, (name, states) in enumerate(predicted.items()):  # the first model lies on top
+            style: dict[str, Any] = {"color": colours[name], "lw": 1.0, "zorder": 3 - 0.1 * depth}
+            values.plot(t, states[shown, k], label=name, **style)
+            errors.plot(t, states[shown, k] - measured[shown, k], **style)
+        errors.axhline(0.0, color=MEASURED, lw=0.8)
+        values.set_ylabel(f"{SYMBOLS[channel]} ({UNITS[channel]})")
+        errors.set_ylabel(f"{SYMBOLS[channel]} error ({UNITS[channel]})")
+    axes[0, 0].set_title("Predicted one step ahead, and measured")
+    axes[0, 1].set_title("Error: predicted minus measured")
+    for bottom in axes[2]:
+        bottom.set_xlabel("time (s)")
+    figure.align_ylabels()
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+@styled
+def increments(current: Vector, measured: Vector, predicted: Mapping[str, Vector]) -> Figure:
+    """Predicted against measured change of the state, a row of panels per model.
+
+    Args:
+        current: states the predictions start from, shape ``(N, 3)``.
+        measured: states one step later, shape ``(N, 3)``.
+        predicted: predicted states by model name, each ``(N, 3)``.
+    """
+    shown = {name: states for name, states in predicted.items() if name != "persistence"} or dict(predicted)
+    colours = model_colours(list(predicted))
+    figure = Figure(figsize=(WIDTH, 0.5 + 2.6 * len(shown)), layout="constrained")
+    axes = figure.subplots(len(shown), 3, squeeze=False)
+    truth = measured - current
+    every = slice(None, None, max(1, len(truth) // 4000))
+    for row, (name, states) in zip(axes, shown.items(), strict=True):
+        share = explained(truth, states - current)
+        for k, channel in enumerate(STATE_SIGNALS):
+            panel: Axes = row[k]
+            limit = max(float(np.percentile(np.abs(truth[:, k]), 99.7)), 1e-12) * 1.05
+            panel.plot([-limit, limit], [-limit, limit], color=MEASURED, lw=0.8)
+            panel.axhline(0.0, color=NO_MODEL, lw=0.8, ls="--")
+            panel.plot(
+                truth[every, k],
+                (states - current)[every, k],
+                ".",
+                color=colours[name],
+                ms=2.5,
+                alpha=0.35,
+                mew=0,
+                rasterized=True,
+            )
+            panel.set(xlim=(-limit, limit), ylim=(-limit, limit))
+            worth = f"{percent(share[k])} explained" if share[k] > 0 else "none explained"
+            panel.set_title(f"{SYMBOLS[channel]}: {worth}", fontsize=9.5)
+            panel.set_xlabel(f"measured change ({UNITS[channel]})")
+            panel.locator_params(nbins=4)
+            panel.ticklabel_format(style="sci", scilimits=(-3, 3), useMathText=True)
+        row[0].set_ylabel(f"{name}\npredicted change")
+    return figure
+
+
+@styled
+def relative_errors(rmse: Mapping[str, Vector], std: Mapping[str, Vector], persistence: Vector) -> Figure:
+    """One-step RMSE as a share of persistence's; shorter is better, beyond 100 % is worse than no model.
+
+    Args:
+        rmse: by model name, mean over the seeds, each ``(3,)``.
+        std: its standard deviation over the seeds, 0 for a single one, each ``(3,)``; drawn as whiskers.
+        persistence: RMSE of the prediction that nothing changes, shape ``(3,)``.
+    """
+    names = [name for name in rmse if name != "persistence"] or list(rmse)
+    colours = model_colours(names)
+    figure = Figure(figsize=(WIDTH, 1.3 + 0.26 * len(names) * 3), layout="constrained")
+    panel = figure.subplots()
+    thickness = 0.8 / len(names)
+    longest = 1.0
+    small: dict[str, Any] = {"fontsize": 8.5, "bbox": {"facecolor": "white", "lw": 0, "pad": 0.8}}
+    for k, name in enumerate(names):
+        share, spread = (
+            np.divide(values[name], persistence, out=np.full(3, np.nan), where=persistence > 0)
+            for values in (rmse, std)
+        )
+        drawn = np.minimum(np.nan_to_num(share, nan=0.0, posinf=MAX_BAR), MAX_BAR)
+        longest = max(longest, float(drawn.max()))
+        places = np.arange(3) - 0.4 + thickness * (k + 0.5)
+        panel.barh(places, drawn, 0.86 * thickness, color=colours[name], label=name)
+        for place, value, end, whisker in zip(places, share, drawn, spread, strict=True):
+            written = (percent(value) if np.isfinite(value) else "not finite") + (" (cut)" if value > end else "")
+            whole = value == end and whisker > 0
+            if whole:
+                panel.errorbar(end, place, xerr=whisker, color=MEASURED, lw=1.0, capsize=2.5)
+            tip = end + whisker if whole else end
+            panel.annotate(written, (tip, place), (4, 0), textcoords="offset points", va="center", **small)
+    panel.axvline(1.0, color=MEASURED, lw=1.0, ls="--")
+    panel.annotate("persistence", (1.0, -0.55), (4, 0), textcoords="offset points", va="center", **small)
+    panel.set_yticks(
+        range(3), [f"{SYMBOLS[c]}\n100 % = {v:.3g} {UNITS[c]}" for c, v in zip(STATE_SIGNALS, persistence, strict=True)]
+    )
+    panel.set(xlim=(0, 1.12 * longest), ylim=(2.5, -0.7), xlabel="one-step RMSE relative to persistence")
+    panel.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    panel.grid(axis="y", visible=False)
+    figure.legend(loc="outside upper left", ncols=4)
+    return figure
+
+
+@styled
+def rollout_growth(time: Vector, errors: Mapping[str, Vector], std: Mapping[str, Vector]) -> Figure:
+    """How the error grows with the time ahead: the three states, and the displacement.
+
+    Args:
+        time: ahead (s), shape ``(n,)``.
+        errors: by model name, mean over the seeds of the RMSE of the states and of the displacement, each ``(n, 4)``.
+        std: their standard deviation over the seeds, 0 for a single one; drawn as a band.
+    """
+    colours = model_colours(list(errors))
+    figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True).ravel()
+    for depth, (name, values) in enumerate(errors.items()):  # the first model lies on top
+        shown = np.where(np.isfinite(values), values, np.nan)
+        style: dict[str, Any] = {"color": colours[name], "zorder": 3 - 0.1 * depth}
+        for k, panel in enumerate(axes):
+            panel.plot(time, shown[:, k], marker="o", ms=3, label=name, **style)
+            if std[name][:, k].any():
+                low, high = shown[:, k] - std[name][:, k], shown[:, k] + std[name][:, k]
+                panel.fill_between(time, low, high, alpha=0.2, lw=0, **style)
+    for panel, channel in zip(axes, STATE_SIGNALS, strict=False):
+        panel.set_title(f"{SYMBOLS[channel]}: RMSE ({UNITS[channel]})")
+    axes[3].set_title("Displacement: mean distance (m)")
+    for k, panel in enumerate(axes):
+        panel.set_xlim(left=0.0)
+        panel.set_ylim(0.0, room({name: values[:, k] for name, values in errors.items()}))
+    for panel in axes[2:]:
+        panel.set_xlabel("time ahead (s)")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+@styled
+def adapted_parameters(
+    x: Vector, theta: Vector, vehicle: Vehicle | None = None, x_label: str = "time (s)", colour: str = PALETTE[0]
+) -> Figure:
+    """Adapted coefficients along the run; what lies outside the admissible range is shaded.
+
+    Args:
+        x: abscissa of each row, for instance time or distance driven, shape ``(N,)``; steps back or holes cut the line.
+        theta: coefficients, shape ``(N, 17)``.
+        vehicle: gives range and nominal value; without it the axes follow the values.
+        x_label: what ``x`` is, with its unit.
+        colour: of the lines.
+    """
+    figure = Figure(figsize=(WIDTH, 9.6), layout="constrained")
+    axes = figure.subplots(6, 3, sharex=True).ravel()
+    every = slice(None, None, max(1, len(x) // MAX_POINTS))
+    abscissa, values = _cut_at_holes(x[every], theta[every])
+    for k, name in enumerate(COEFFICIENTS):
+        panel: Axes = axes[k]
+        if vehicle is not None:
+            lower, upper = vehicle.lower[k], vehicle.upper[k]
+            margin = 0.12 * (upper - lower)
+            panel.axhspan(lower - margin, lower, color="#e9e9e9", lw=0, label="outside the bounds")
+            panel.axhspan(upper, upper + margin, color="#e9e9e9", lw=0)
+            panel.axhline(vehicle.nominal[k], color=MEASURED, lw=0.8, ls="--", label="nominal value")
+            panel.set_ylim(lower - margin, upper + margin)
+        panel.plot(abscissa, values[:, k], color=colour, lw=1.0, label="adapted")
+        panel.set_title(_coefficient_label(name))
+        panel.locator_params(axis="y", nbins=4)
+    for spare in axes[len(COEFFICIENTS) :]:
+        spare.set_axis_off()
+    for lowest in axes[-3:]:
+        lowest.set_xlabel(x_label)
+    axes[-1].legend(*axes[0].get_legend_handles_labels(), loc="upper left")
+    return figure
+
+
+@styled
+def parameter_usage(theta: Vector, vehicle: Vehicle, colour: str = PALETTE[0]) -> Figure:
+    """How much of its admissible range each coefficient uses, and whether it rests on a bound.
+
+    Args:
+        theta: adapted coefficients, shape ``(N, 17)``.
+        vehicle: gives range and nominal value.
+        colour: of the bars.
+    """
+    low, q1, median, q3, high = np.percentile(range_used(theta, vehicle), [1, 25, 50, 75, 99], axis=0)
+    at_bound = resting(theta, vehicle).mean(axis=0)
+    places = np.arange(len(COEFFICIENTS))
+    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
+    panel = figure.subplots()
+    panel.barh(places, high - low, 0.3, left=low, color=colour, alpha=0.35, label="1 % to 99 % of the time")
+    panel.barh(places, q3 - q1, 0.6, left=q1, color=colour, label="middle half of the time")
+    panel.plot(median, places, "|", color="white", ms=8, mew=1.5)
+    panel.plot(range_used(vehicle.nominal, vehicle), places, "D", color=MEASURED, ms=4.5, mfc="white", label="nominal")
+    for place, share in zip(places, at_bound, strict=True):
+        if share > 0.01:
+            panel.annotate(f"{percent(share)} of the time on a bound", (1.03, place), va="center", fontsize=8.5)
+    panel.axvspan(-0.02, 0.0, color="#e9e9e9", lw=0)
+    panel.axvspan(1.0, 1.02, color="#e9e9e9", lw=0)
+    panel.set_yticks(places, [_symbol(name) for name in COEFFICIENTS])
+    panel.set(xlim=(-0.02, 1.02 if at_bound.max() <= 0.01 else 1.3), ylim=(len(COEFFICIENTS) - 0.4, -0.6))
+    panel.set_xticks(np.linspace(0, 1, 6))
+    panel.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    panel.set_xlabel("position inside the admissible range")
+    panel.grid(axis="y", visible=False)
+    figure.legend(loc="outside upper left", ncols=3)
+    return figure
+
+
+@styled
+def latency_histogram(samples: Mapping[str, Vector], unit: str = "µs", what: str = "time per prediction") -> Figure:
+    """Distribution of latencies on a logarithmic axis, with median and 99th percentile in the legend.
+
+    Args:
+        samples: by model (or stage) name, each of any length, positive.
+        unit: of the samples.
+        what: was measured.
+    """
+    colours = model_colours(list(samples))
+    everything = np.concatenate(list(samples.values()))
+    edges = np.geomspace(everything.min() * 0.95, everything.max() * 1.05, 70)
+    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
+    panel = figure.subplots()
+    for name, values in samples.items():
+        p50, p99 = np.percentile(values, [50, 99])
+        label = f"{name}: p50 {text(float(p50))} {unit}, p99 {text(float(p99))} {unit}"
+        panel.hist(values, edges.tolist(), color=colours[name], alpha=0.75, label=label)
+        panel.axvline(p50, color=colours[name], lw=1.0)
+        panel.axvline(p99, color=colours[name], lw=1.0, ls=":")
+    panel.set_xscale("log")
+    panel.xaxis.set_major_formatter(ScalarFormatter())
+    panel.set(xlabel=f"{what} ({unit})", ylabel="calls")
+    figure.legend(loc="outside upper left", ncols=2)
+    return figure
+
+
+@styled
+def regime_errors(labels: Sequence[str], what: str, rmse: Mapping[str, Vector], std: Mapping[str, Vector]) -> Figure:
+    """One-step RMSE in each driving regime, a panel per channel.
+
+    Args:
+        labels: of the ``R`` regimes.
+        what: tells the regimes apart, with its unit.
+        rmse: by model name, mean over the seeds, each ``(R, 3)``.
+        std: its standard deviation over the seeds, 0 for a single one; drawn as whiskers.
+    """
+    colours = model_colours(list(rmse))
+    figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
+    axes = figure.subplots(1, 3)
+    places = np.arange(len(labels))
+    for depth, (name, values) in enumerate(rmse.items()):  # the first model lies on top
+        shown = np.where(np.isfinite(values), values, np.nan)
+        shift = 0.06 * (depth - (len(rmse) - 1) / 2)
+        for k, panel in enumerate(axes):
+            panel.errorbar(
+                places + shift, shown[:, k], np.where(std[name][:, k] > 0, std[name][:, k], np.nan), marker="o", ms=3.5,
+                lw=0.8, elinewidth=1.2, capsize=2.5, color=colours[name], label=name, zorder=3 - 0.1 * depth,
+            )  # fmt: skip
+    for k, (panel, channel) in enumerate(zip(axes, STATE_SIGNALS, strict=True)):
+        panel.set_title(f"{SYMBOLS[channel]}: RMSE ({UNITS[channel]})")
+        panel.set_xticks(places, labels)
+        panel.set_xlabel(what)
+        panel.set_xlim(-0.5, len(labels) - 0.5)
+        panel.set_ylim(0.0, room({name: values[:, k] for name, values in rmse.items()}))
+        panel.grid(axis="x", visible=False)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+def liveliest(time: Vector, states: Vector, seconds: float) -> Indices:
+    """Rows of the stretch of ``seconds`` without a gap in which the states change most.
+
+    Args:
+        time: of each row (s), increasing, shape ``(N,)``.
+        states: shape ``(N, 3)``.
+        seconds: length of the stretch; all of the longest gap-free run if no run is that long.
+    """
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    length = max(2, round(seconds / step))
+    runs = np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > 1.5 * step) + 1)
+    long = [run for run in runs if len(run) >= length]
+    if not long:
+        return max(runs, key=len)
+    spread = np.std(states, axis=0)
+    change = np.abs(np.diff(states, axis=0, prepend=states[:1])) / np.where(spread > 0, spread, 1.0)
+    sums = np.concatenate([[0.0], np.cumsum(change.sum(axis=1))])
+    firsts = np.concatenate([run[: len(run) - length + 1] for run in long])
+    first = int(firsts[np.argmax(sums[firsts + length] - sums[firsts])])
+    return np.arange(first, first + length)
+
+
+def _cut_at_holes(x: Vector, values: Vector) -> tuple[Vector, Vector]:
+    """Inserts a NaN row wherever ``x`` jumps, so that a line is not drawn across."""
+    steps = np.diff(x)
+    typical = float(np.median(steps)) if len(steps) else 1.0
+    holes = np.flatnonzero((steps > 2.5 * typical) | (steps < 0)) + 1
+    return np.insert(x, holes, np.nan), np.insert(values, holes, np.nan, axis=0)
+
+
+def room(models: Mapping[str, Vector]) -> float:
+    """Upper end of an axis on which persistence is seen, and all models but those far worse than most.
+
+    Args:
+        models: magnitudes drawn, by model name, of any shape.
+    """
+    finite = {name: values[np.isfinite(values)] for name, values in models.items()}
+    largest = {name: float(values.max()) for name, values in finite.items() if len(values)}
+    usual = OUTLYING * np.median(list(largest.values())) if largest else 0.0
+    kept = [value for name, value in largest.items() if value <= usual or name == "persistence"]
+    return max(1.08 * max(kept, default=0.0), 1e-12)
+
+
+def _symbol(name: str) -> str:
+    stem, _, index = name.partition("_")
+    return f"${stem}_{{{index}}}$"
+
+
+def _coefficient_label(name: str) -> str:
+    unit = coefficient_unit(name)
+    return f"{_symbol(name)} ({unit})" if unit else _symbol(name)
+
+
+@styled
+def loss_components(history: Mapping[str, Sequence[float]], best_epoch: int) -> Figure:
+    """The terms of the training objective over the epochs, the paper's loss figure.
+
+    Args:
+        history: mean loss per epoch by ``train/TERM`` and ``validation/TERM``; terms that are never used are left out.
+        best_epoch: the epoch whose weights were kept.
+    """
+    terms = [key.removeprefix("train/") for key, values in history.items() if key.startswith("train/") and any(values)]
+    figure = Figure(figsize=(WIDTH, 2.0 * len(terms) + 0.6), layout="constrained")
+    axes = figure.subplots(len(terms), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, term in zip(axes, terms, strict=True):
+        for part, colour in (("train", PALETTE[0]), ("validation", PALETTE[1])):
+            values = history[f"{part}/{term}"]
+            axis.semilogy(range(1, len(values) + 1), values, color=colour, label=part)
+        axis.axvline(best_epoch, color=NO_MODEL, linewidth=1.0, linestyle=":")
+        axis.set_ylabel(f"{term} loss")
+    axes[0].legend(loc="upper right")
+    axes[0].set_title(f"Loss components; the weights of epoch {best_epoch} (dotted) were kept")
+    axes[-1].set_xlabel("epoch")
+    return figure

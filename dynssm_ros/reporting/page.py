@@ -1,0 +1,88 @@
+"""One self-contained HTML file: a head that says what was done how, a table, sections with a figure each.
+
+Figures are inlined, nothing is loaded from elsewhere, so the file can be mailed and archived. Used by every command
+that ends with a report.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from importlib.resources import files
+from pathlib import Path
+
+import matplotlib as mpl
+from jinja2 import Environment, StrictUndefined
+from matplotlib.figure import Figure
+
+from dynssm_ros import __version__
+from dynssm_ros.files import replacing
+from dynssm_ros.reporting.tables import Table
+
+RASTER_DPI = 160  # of the rasterised parts of a figure
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a report.
+
+    Attributes:
+        title: short, names the subject.
+        text: one or two sentences on how to read the figure or table.
+        figure: shown below the text, if any.
+        table: shown below the figure, if any.
+    """
+
+    title: str
+    text: str
+    figure: Figure | None = None
+    table: Table | None = None
+
+
+@dataclass(frozen=True)
+class Report:
+    """A report as data; :meth:`save` writes it.
+
+    Attributes:
+        title: what it is about.
+        summary: the result in a sentence or two.
+        sections: in order of reading.
+        protocol: how it was obtained (recording, commands, split, integrator, seeds ...), by name.
+        table: the main figures, below the summary.
+    """
+
+    title: str
+    summary: str
+    sections: Sequence[Section]
+    protocol: Mapping[str, str] = field(default_factory=dict)
+    table: Table | None = None
+
+    def html(self) -> str:
+        """The report as HTML text."""
+        environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+        environment.filters["svg_uri"] = svg_uri
+        source = files(__package__).joinpath("templates/report.html.j2").read_text(encoding="utf-8")
+        made = f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC"
+        protocol = dict(self.protocol) | {
+            "Made": f"{made} by dynssm_ros {__version__}, Python {platform.python_version()}, {platform.machine()}"
+        }
+        return environment.from_string(source).render(report=self, protocol=protocol)
+
+    def save(self, path: str | Path) -> None:
+        """Writes the HTML file, atomically."""
+        text = self.html()
+        with replacing(path) as aside:
+            aside.write_text(text, encoding="utf-8")
+
+
+def svg_uri(figure: Figure) -> str:
+    """The figure as a ``data:`` address of an SVG image; the same figure gives the same text."""
+    buffer = io.BytesIO()
+    with mpl.rc_context({"svg.hashsalt": "dynssm"}):
+        bare = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(buffer, format="svg", dpi=RASTER_DPI, metadata=bare)
+    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -1,0 +1,310 @@
+"""The table, the figures and the report of a race."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from dynssm_ros.control.race import Course, Race
+from dynssm_ros.evaluation.coefficients import coefficient_unit
+from dynssm_ros.reporting.evaluation_figures import MEASURED, SYMBOLS, UNITS, WIDTH, model_colours, styled
+from dynssm_ros.reporting.page import Report, Section
+from dynssm_ros.reporting.tables import Column, Table, Value
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, motion
+from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDelay
+from dynssm_ros.vehicle.single_track import Motion, lateral_force
+
+_STAMPS = 0.5  # s between the time stamps on the map
+_MOVED = (
+    1e-3  # share of its bounds that a coefficient must move, and of a state's range that must be added, to be shown
+)
+_ANSWERS = 6  # coefficients at most in a figure of hidden effects
+VIOLATION = "A violation is the car's centre of gravity outside the borders at any sample."
+
+
+def race_json(races: Sequence[Race]) -> dict[str, Any]:
+    """The result for programs."""
+    course = races[0].course
+    return {
+        "track": course.track.name,
+        "track_length_m": course.track.length,
+        "vehicle": course.vehicle.name,
+        "effects": [entry.model_dump() for entry in course.vehicle.effects],
+        "plant": course.plant,
+        "objective": course.settings.objective,
+        "line": course.reference.name,
+        "line_lap_time_s": course.reference.lap_time,
+        "line_full_throttle_s": course.reference.full_throttle_time,
+        "horizon": course.settings.N,
+        "offset_free": course.settings.offset_free,
+        "laps": course.laps,
+        "models": {race.name: race.to_json() for race in races},
+    }
+
+
+def race_table(races: Sequence[Race]) -> Table:
+    """One row per model."""
+    columns = (
+        Column("model", brief=True),
+        Column("lap", "s", best="min", brief=True),
+        Column("violation", brief=True),
+        Column("outside", "m"),
+        Column("v_x", "m/s", "mean", "max", brief=True),
+        Column("|v_y|", "m/s", "mean"),
+        Column("|ω|", "rad/s", "mean"),
+        Column("steering variation", "rad"),
+        Column("p50", "ms", "control step", brief=True),
+        Column("p99", "ms", "control step", brief=True),
+        Column("infeasible", "", "plans"),
+        Column("late", "", "plans"),
+        Column("missing", "", "plans", brief=True),
+    )
+    return Table(columns, [_row(race) for race in races], VIOLATION)
+
+
+def _row(race: Race) -> list[Value]:
+    figures = race.to_json()
+    return [
+        race.name,
+        figures["lap_time_s"],
+        "yes" if figures["violation"] else "no",
+        figures["outside_m"],
+        figures["mean_v_x"],
+        figures["mean_abs_v_y"],
+        figures["mean_abs_omega"],
+        figures["steering_total_variation"],
+        figures["solve_ms"]["p50"],
+        figures["solve_ms"]["p99"],
+        race.infeasible,
+        race.late,
+        race.infeasible + race.late,
+    ]
+
+
+def race_report(races: Sequence[Race]) -> Report:
+    """The race as a page."""
+    course = races[0].course
+    sections = [
+        Section(
+            "Trajectories",
+            f"The path of each model between the borders, with a mark every {_STAMPS:g} s; the line that the controller "
+            "follows is dashed.",
+            trajectories(races),
+        ),
+        Section(
+            "State and commands", "Velocities and what the controller commanded, over the position on the lap.",
+            profiles(races),
+        ),
+        Section(
+            "Forces", "Lateral forces of front and rear axle and the drive force, as the driven car's own equations give "
+            "them for its states and commands.", forces(races),
+        ),
+        Section(
+            "Coefficients",
+            "What the controller planned with, step by step: the coefficients that a model moves, and what is added to the "
+            "stepped velocities, by the model and, if offset-free, for what it mispredicts. Where the driven car has effects "
+            "that amount to a change of a coefficient, the dashed line is what it comes to with them.",
+            coefficients(races),
+        ),
+    ]  # fmt: skip
+    return Report(f"Race on {course.track.name}", summary(races), sections, _protocol(course), race_table(races))
+
+
+def summary(races: Sequence[Race]) -> str:
+    """The result in a sentence or two."""
+    done = [race for race in races if race.completed]
+    lost = [f"{race.name} {race.failure}" for race in races if not race.completed]
+    outside = [race.name for race in done if race.outside > 0]
+    text = f"No model completed {_laps(races[0].course)}."
+    if done:
+        laps = {race.name: f"{np.mean(race.lap_times):.3f}" for race in done}
+        best = min(laps.values(), key=float)
+        fastest = [name for name, lap in laps.items() if lap == best]
+        text = f"{', '.join(fastest)} {'is' if len(fastest) == 1 else 'are'} the fastest with {best} s a lap."
+    if outside:
+        text += f" Outside the borders: {', '.join(outside)}."
+    return text + (f" Not completed: {'; '.join(lost)}." if lost else "")
+
+
+def _laps(course: Course) -> str:
+    return "a lap" if course.laps == 1 else f"{course.laps} laps"
+
+
+def _protocol(course: Course) -> dict[str, str]:
+    settings, effects = course.settings, course.vehicle.effects
+    weights = ", ".join(f"{name} {value:g}" for name, value in asdict(settings.weights).items())
+    return {
+        "Track": f"{course.track.name}, {course.track.length:.4g} m, {_laps(course)}",
+        "Plant": f"{course.vehicle.name}, {course.plant}"
+        + (f", with {', '.join(entry.name for entry in effects)}" if effects else ""),
+        "Start": f"{_start(course)}, actuators at zero; the first lap counts from there. Until its window is full a model "
+        "drives with its nominal coefficients",
+        "Line": f"{course.reference.name}, {course.reference.line.length:.4g} m, {course.reference.lap_time:.3f} s at its "
+        f"own speed, {course.reference.full_throttle_time:.3f} s with no more than full throttle",
+        "Controller": f"{settings.objective}, {settings.N} steps of {course.vehicle.sampling_time:g} s, late after "
+        f"{1e3 * settings.deadline:g} ms; weights {weights}, in wheelbases and units of {settings.scale.time:.3g} s; what a "
+        f"model mispredicts is {'added to it (offset-free)' if settings.offset_free else 'left as it is'}",
+        "Time": "of a control step: model and plan together, the processor's time on one core",
+        "Violation": VIOLATION,
+    }
+
+
+def _start(course: Course) -> str:
+    speed = course.starting()[1].v_x
+    return "standing" if speed == 0 else f"rolling at {speed:.3g} m/s"
+
+
+@styled
+def trajectories(races: Sequence[Race]) -> Figure:
+    """Paths on the track with marks at equal times.
+
+    Args:
+        races: on one course.
+    """
+    course, colours = races[0].course, model_colours([race.name for race in races])
+    figure = Figure(figsize=(WIDTH, 0.75 * WIDTH), layout="constrained")
+    axes = figure.subplots()
+    for border in (course.track.left_border, course.track.right_border):
+        axes.plot(*np.concatenate([border, border[:1]]).T, color=MEASURED, lw=1.0)
+    line = course.reference.line.points
+    axes.plot(
+        *np.concatenate([line, line[:1]]).T, color="#777777", lw=0.8, ls="--", label=f"{course.reference.name} line"
+    )
+    T_s = course.vehicle.sampling_time
+    every = max(1, round(_stamp_period(races) / T_s))
+    for race, width in zip(races, widths(len(races)), strict=True):
+        axes.plot(*race.pose[:, :2].T, color=colours[race.name], lw=width, label=race.name)
+        marks = race.pose[::every]
+        axes.plot(*marks[:, :2].T, "o", color=colours[race.name], mec="white", mew=0.5, ms=4, zorder=3)
+    for k in range(0, len(races[0].time), 2 * every):
+        x, y = (float(value) for value in races[0].pose[k, :2])
+        axes.annotate(f"{races[0].time[k]:.3g} s", (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7)
+    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+def widths(count: int) -> list[float]:
+    """Of the lines of ``count`` models: those drawn first are wider, so that cars that drive alike are all seen."""
+    return [float(width) for width in np.linspace(min(count, 3), 1.0, count)]
+
+
+def _stamp_period(races: Sequence[Race]) -> float:
+    """Time between marks: ``_STAMPS``, or more where a lap takes minutes."""
+    return _STAMPS * max(1, round(max(float(race.time[-1]) for race in races) / (40 * _STAMPS)))
+
+
+@styled
+def profiles(races: Sequence[Race]) -> Figure:
+    """State and commands over the position on the track."""
+    rows = [(f"{SYMBOLS[c]} ({UNITS[c]})", k, "state") for k, c in enumerate(STATE_SIGNALS)]
+    rows += [("throttle", 0, "command"), ("steering (rad)", 1, "command")]
+    return _panels(races, [(label, [getattr(race, what)[:, k] for race in races]) for label, k, what in rows])
+
+
+@styled
+def forces(races: Sequence[Race]) -> Figure:
+    """Axle and drive forces of the driven car over the position on the track."""
+    driven = [_motion(race) for race in races]
+    rows = {"F_fy": "$F_{fy}$ (N)", "F_ry": "$F_{ry}$ (N)", "F_d": "$F_d$ (N)"}
+    return _panels(races, [(label, [getattr(each, name) for each in driven]) for name, label in rows.items()])
+
+
+def _motion(race: Race, with_effects: bool = True) -> Motion:
+    """The driven car's equations of motion at what was driven; states of effects are settled."""
+    course = race.course
+    x, y, theta = race.pose.T
+    context = {"t": race.time, "s": race.s, "lap_length": course.track.length, "x": x, "y": y, "theta": theta}
+    effects = [
+        effect for effect in course.vehicle.active_effects if not isinstance(effect, (MeasurementEffect, OdometryDelay))
+    ]
+    nominal = Coefficients(*course.vehicle.nominal)
+    state, command = State(*race.state.T), Applied(*race.command.T)
+    constants = course.vehicle.constants
+    return motion(np, state, command, nominal, constants, effects if with_effects else [], context=context)
+
+
+def driven_coefficients(race: Race) -> dict[str, Any]:
+    """What the effects of the driven car amount to, as values of coefficients that come to the same, by name.
+
+    Slip angles that effects shift are shifts ``S_h``; lateral forces that they scale are peaks ``D``. Values are of shape
+    ``(n,)``, and not a number where a force is too small to tell. Only those that effects change.
+    """
+    nominal = Coefficients(*race.course.vehicle.nominal)
+    plain, driven = _motion(race, with_effects=False), _motion(race)
+    found: dict[str, Any] = {}
+    for axle in "fr":
+        B, C, D, E = (getattr(nominal, f"{name}_{axle}") for name in "BCDE")
+        S_h, S_v = (getattr(nominal, f"S_{name}{axle}") for name in "hv")
+        shift = getattr(driven, f"alpha_{axle}") - getattr(plain, f"alpha_{axle}")
+        force = lateral_force(np, B, C, D, E, S_v, getattr(driven, f"alpha_{axle}"))
+        told = np.abs(force) > 0.1 * D
+        load = getattr(driven, f"F_z{axle}") / driven.F_z0
+        found[f"S_h{axle}"] = S_h + shift
+        found[f"D_{axle}"] = np.where(
+            told, D * getattr(driven, f"F_{axle}y") / load / np.where(told, force, 1.0), np.nan
+        )
+    return {name: v for name, v in found.items() if np.nanmax(np.abs(v - getattr(nominal, name)), initial=0.0) > 1e-9}
+
+
+@styled
+def coefficients(races: Sequence[Race]) -> Figure:
+    """The coefficients that a model or the driven car's effects move, and what models add, over the position on the track.
+
+    Where effects are hidden in the car, those that they amount to come first, then those that answer most. What a model says
+    once and for all does not answer.
+    """
+    longest = max(races, key=lambda race: race.s[-1] - race.s[0])
+    vehicle, driven = longest.course.vehicle, driven_coefficients(longest)
+    told = [race.theta[_first_change(race.theta) if driven else 0 :] for race in races]
+    moves = np.max([np.ptp(theta, axis=0) for theta in told], axis=0) / (vehicle.upper - vehicle.lower)
+    moving = [k for k, name in enumerate(COEFFICIENTS) if moves[k] > _MOVED or name in driven]
+    if driven:
+        moving = sorted(moving, key=lambda k: (COEFFICIENTS[k] not in driven, -moves[k]))[:_ANSWERS]
+    labels = {name: f"{name} ({unit})" if (unit := coefficient_unit(name)) else name for name in COEFFICIENTS}
+    rows = [(labels[COEFFICIENTS[k]], [race.theta[:, k] for race in races]) for k in moving]
+    rows += [
+        (f"{SYMBOLS[c]} added ({UNITS[c]})", [race.correction[:, k] for race in races])
+        for k, c in enumerate(STATE_SIGNALS)
+        if not moving
+        or any(np.max(np.abs(race.correction[:, k])) > _MOVED * np.ptp(race.state[:, k]) for race in races)
+    ]
+    return _panels(races, rows, {labels[name]: values for name, values in driven.items()}, longest)
+
+
+def _first_change(theta: npt.NDArray[np.float64]) -> int:
+    """The first row that is not the first one repeated: where a model begins to speak; 0 if it never does."""
+    return int(np.argmax(np.any(theta != theta[0], axis=1)))
+
+
+def _panels(
+    races: Sequence[Race],
+    rows: list[tuple[str, list[Any]]],
+    dashed: Mapping[str, Any] | None = None,
+    along: Race | None = None,
+) -> Figure:
+    """A panel per row, over the distance driven; dashed lines by the label of the row, of the race ``along``."""
+    colours = model_colours([race.name for race in races])
+    columns = 1 if len(rows) <= 6 else 2
+    lines = -(-len(rows) // columns)
+    figure = Figure(figsize=(WIDTH, 0.6 + 1.35 * lines), layout="constrained")
+    axes = figure.subplots(lines, columns, sharex=True, squeeze=False)
+    for panel, (label, values) in zip(axes.T.flat, rows, strict=False):
+        for race, series, width in zip(races, values, widths(len(races)), strict=True):
+            panel.plot(race.s - race.s[0], series, color=colours[race.name], lw=width, label=race.name)
+        if along is not None and label in (dashed or {}):
+            panel.plot(along.s - along.s[0], (dashed or {})[label], color=MEASURED, lw=1.0, ls="--", zorder=1)
+        panel.set_ylabel(label)
+    for spare in list(axes.T.flat)[len(rows) :]:
+        spare.set_visible(False)
+    for bottom in axes[-1]:
+        bottom.set_xlabel("driven along the centre line (m)")
+    figure.align_ylabels()
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure

@@ -1,0 +1,92 @@
+"""Position on the lap: the driven path as a closed line, where on it a recording is, and measures along it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.signals.context import recording_context
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.track.lines import ClosedLine
+
+_POINTS = 200  # of the path over the diagonal of the driven area
+_NEAR = 0.03  # of that diagonal: passing a place at most this far away is coming back to it
+_STARTS = 200  # places at which a lap is tried to begin
+_ALIGNED = 0.5  # cosine between the directions in which a place is passed
+
+
+def first_lap(recording: Recording) -> ClosedLine | None:
+    """The path of the first full lap, closed smoothly; ``None`` without positions or if no lap is completed.
+
+    A lap begins anywhere, so that an out-lap from the pits does no harm, and ends where the car passes the same place
+    in the same direction again.
+    """
+    if not recording.has_pose:
+        return None
+    positions = np.stack([recording["x"], recording["y"]], axis=1)
+    starts = np.flatnonzero(np.diff(recording.segment)) + 1
+    laps = (_lap(part) for part in np.split(positions, starts))
+    return next((lap for lap in laps if lap is not None), None)
+
+
+def track_position(line: ClosedLine, recording: Recording) -> Vector:
+    """Arc length along ``line`` of each row (m), in ``[0, length)``, shape ``(N,)``."""
+    return line.project(np.stack([recording["x"], recording["y"]], axis=1))[0]
+
+
+def lap_context(recording: Recording, line: ClosedLine | None) -> dict[str, Vector]:
+    """The signals of the recording, and ``s`` (m, in ``[0, lap_length)``) and ``lap_length`` (m) along ``line``."""
+    context = recording_context(recording)
+    if line is None or "s" in context:
+        return context
+    return context | {"s": track_position(line, recording), "lap_length": np.full(len(recording), line.length)}
+
+
+def lap_number(recording: Recording, line: ClosedLine | None) -> Vector | None:
+    """How many times each row's drive has passed the start of ``line``; ``None`` without one."""
+    if line is None:
+        return None
+    s = track_position(line, recording)
+    passed = np.concatenate([[0], np.cumsum(np.diff(s) < -0.5 * line.length)])
+    back = np.concatenate([[0], np.cumsum(np.diff(s) > 0.5 * line.length)])
+    return np.asarray(passed - back, dtype=np.float64)
+
+
+def rms_along(position: Vector, errors: Vector, length: float, bins: int) -> Vector:
+    """Root mean square error in equal stretches of the lap.
+
+    Args:
+        position: track position of each row (m), in ``[0, length)``, shape ``(N,)``.
+        errors: shape ``(N, C)``.
+        length: of the lap (m).
+        bins: number of stretches.
+
+    Returns:
+        Shape ``(bins, C)``; NaN where nothing was driven.
+    """
+    index = np.minimum((position / length * bins).astype(np.intp), bins - 1)
+    count = np.bincount(index, minlength=bins)[:, None]
+    squares = np.stack([np.bincount(index, column**2, bins) for column in errors.T], axis=1)
+    return np.sqrt(np.divide(squares, count, out=np.full_like(squares, np.nan), where=count > 0))
+
+
+def _lap(positions: Vector) -> ClosedLine | None:
+    """The first closed lap of one gap-free drive, positions ``(N, 2)``."""
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(positions, axis=0).T))])
+    extent = float(np.hypot(*np.ptp(positions, axis=0)))
+    if not driven[-1] > extent:
+        return None
+    grid = np.arange(0.0, driven[-1], extent / _POINTS)
+    path = np.stack([np.interp(grid, driven, coordinate) for coordinate in positions.T], axis=1)
+    direction = np.gradient(path, axis=0)
+    direction /= np.maximum(np.hypot(*direction.T), 1e-12)[:, None]
+    for start in range(0, len(path), max(1, len(path) // _STARTS)):
+        ahead = slice(start + _POINTS // 2, None)  # half a diagonal of driving is the least that can be a lap
+        distance = np.hypot(*(path[ahead] - path[start]).T)
+        back = np.flatnonzero((distance < _NEAR * extent) & (direction[ahead] @ direction[start] > _ALIGNED))
+        if len(back):
+            passing = back[: np.flatnonzero(np.diff(back, append=len(path) + 1) > 1)[0] + 1]
+            end = start + _POINTS // 2 + int(passing[np.argmin(distance[passing])])
+            ramp = np.linspace(0.0, 1.0, end - start, endpoint=False)[:, None]
+            return ClosedLine(path[start:end] - ramp * (path[end] - path[start]))
+    return None

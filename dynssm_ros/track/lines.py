@@ -1,0 +1,113 @@
+"""Closed lines in the plane: centre lines, racing lines. Smooth, by arc length, with left as the positive side."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from dynssm_ros.arrays import Vector
+
+Floats = float | Vector
+
+_NEWTON_STEPS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLine:
+    """A closed smooth line: the periodic cubic spline by arc length through ``points``.
+
+    Attributes:
+        points: positions in driving order (m), shape ``(N, 2)``; the first is not repeated at the end.
+    """
+
+    points: Vector
+
+    def __post_init__(self) -> None:
+        points = np.array(self.points, dtype=np.float64)
+        points.flags.writeable = False
+        object.__setattr__(self, "points", points)
+
+    @cached_property
+    def s(self) -> Vector:
+        """Arc length of the points (m), shape ``(N,)``, 0 at the first."""
+        return np.asarray(self._spline.x[:-1])
+
+    @cached_property
+    def length(self) -> float:
+        """Length of one lap (m)."""
+        return float(self._spline.x[-1])
+
+    def position(self, s: Floats, lateral: Floats = 0.0) -> Vector:
+        """Positions (m) at arc length ``s`` (m, periodic), ``lateral`` metres to the left; shape ``(..., 2)``."""
+        tangent = self._spline(s, 1)
+        normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+        normal /= np.hypot(normal[..., :1], normal[..., 1:])
+        return np.asarray(self._spline(s) + np.asarray(lateral)[..., None] * normal)
+
+    def heading(self, s: Floats) -> Vector:
+        """Direction of driving (rad, counter-clockwise from x, in ``(-pi, pi]``) at ``s`` (m, periodic)."""
+        tangent = self._spline(s, 1)
+        return np.asarray(np.arctan2(tangent[..., 1], tangent[..., 0]))
+
+    def curvature(self, s: Floats) -> Vector:
+        """Curvature (1/m, positive to the left) at ``s`` (m, periodic)."""
+        first, second = self._spline(s, 1), self._spline(s, 2)
+        cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+        return np.asarray(cross / np.hypot(first[..., 0], first[..., 1]) ** 3)
+
+    def project(self, points: npt.ArrayLike, near: npt.ArrayLike | None = None) -> tuple[Vector, Vector]:
+        """Foot of the perpendicular from ``points`` (m, shape ``(..., 2)``).
+
+        Args:
+            points: positions.
+            near: arc length (m) to search around, where the line passes itself closely; the whole line if not given.
+
+        Returns:
+            Arc length in ``[0, length)`` and signed distance (m, positive to the left), each of shape ``(...)``.
+        """
+        p = np.asarray(points, dtype=np.float64)
+        s = self.s[self._tree.query(p)[1]] if near is None else np.asarray(near, dtype=np.float64)
+        longest = self.length / len(self.points)
+        for _ in range(_NEWTON_STEPS):
+            away, tangent = p - self._spline(s), self._spline(s, 1)
+            square = np.sum(tangent * tangent, axis=-1)
+            slope = np.maximum(square - np.sum(away * self._spline(s, 2), axis=-1), 0.2 * square)
+            move = np.clip(np.sum(away * tangent, axis=-1) / slope, -5 * longest, 5 * longest)
+            s = s + move
+            if np.all(np.abs(move) < 1e-11 * self.length):
+                break
+        away, tangent = p - self._spline(s), self._spline(s, 1)
+        cross = tangent[..., 0] * away[..., 1] - tangent[..., 1] * away[..., 0]
+        return np.asarray(s % self.length), np.asarray(cross / np.hypot(tangent[..., 0], tangent[..., 1]))
+
+    def counted_on(self, s: float, last: float) -> float:
+        """Arc length ``s`` (m) counted on over the laps from ``last`` (m), which is less than half a lap away."""
+        return last + math.remainder(s - last, self.length)
+
+    def scaled(self, factor: float) -> ClosedLine:
+        """The same shape, ``factor`` times as large."""
+        return ClosedLine(self.points * factor)
+
+    @cached_property
+    def _spline(self) -> CubicSpline:
+        """Position over arc length; its parameter is refined until it is the spline's own length."""
+        closed = np.concatenate([self.points, self.points[:1]])
+        pieces = np.hypot(*np.diff(closed, axis=0).T)
+        nodes, weights = np.polynomial.legendre.leggauss(5)
+        for _ in range(4):
+            knots = np.concatenate([[0.0], np.cumsum(pieces)])
+            spline = CubicSpline(knots, closed, bc_type="periodic")
+            inside = knots[:-1, None] + np.diff(knots)[:, None] * (nodes + 1) / 2
+            tangent = spline(inside, 1)
+            pieces = np.hypot(tangent[..., 0], tangent[..., 1]) @ weights / 2 * np.diff(knots)
+        return spline
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points)

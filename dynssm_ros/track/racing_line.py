@@ -1,0 +1,164 @@
+"""The racing line: least curvature between the borders of a track, with a tension that keeps it from swelling.
+
+The integral of the squared curvature and the length are minimised over lateral offsets by Gauss-Newton: on the line of
+each round, offsets ``e`` along its normals make the integrand ``(kappa + e'' + kappa^2 e / 2)^2`` (to first order, with
+the change of length), and the borders bound ``e`` on both sides. That is a quadratic program in a box with a cyclic
+banded matrix. The offsets start from the line of the round before, and not from the centre line, so that corners tighter
+than the road is wide, where the normals of the centre line cross, do no harm.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.tracks import Track, TrackError
+from dynssm_ros.vehicle import Vehicle
+
+LineKind = Literal["centre", "racing"]
+
+CAR_WIDTH = 0.65  # of the wheelbase; 1.94 m for an Indy car of 1.93 m
+SAFETY = 0.08  # of the narrowest road, kept free besides the car on either side
+MIN_POINTS, MAX_POINTS = 500, 2000
+TENSION = 0.5  # gives the fastest laps, or nearly so, on ovals, road courses and 1:43 tracks
+_ROUNDS = 40
+_REACH = 1.0  # of radius and width, as in 1 / (1/radius + 1/width): how far the first round may move a point ...
+_CALMING = 0.8  # ... and by which factor less each further one, so that no two lines alternate
+_CONVERGED = 1e-4  # of the width: move of a round
+_SLACK = 0.01  # of the margin, on top, for what the linear borders leave over
+
+
+def border_margin(vehicle: Vehicle, track: Track) -> float:
+    """What to keep between the line and the borders (m): half the car, and room for the driver's error."""
+    car = vehicle.constants
+    narrowest = float(np.min(track.width_left + track.width_right))
+    return CAR_WIDTH * (car.l_f + car.l_r) / 2 + SAFETY * narrowest
+
+
+def line_of(kind: LineKind, vehicle: Vehicle, track: Track) -> ClosedLine:
+    """The centre line, or the racing line with room for the car.
+
+    Raises:
+        TrackError: the road is too narrow for the car.
+    """
+    return track.centre if kind == "centre" else racing_line(track, border_margin(vehicle, track))
+
+
+def racing_line(track: Track, margin: float, tension: float = TENSION) -> ClosedLine:
+    """The closed line of least integral of ``kappa^2 + lambda^2`` inside the borders; its points are evenly spaced.
+
+    Args:
+        track: where.
+        margin: distance to keep from the borders (m).
+        tension: ``lambda``, what length costs, in root mean squares of the centre line's curvature. At 0 wide bends
+            swell, because a longer way round has less curvature; the larger, the shorter the line.
+
+    Raises:
+        TrackError: the road is not twice as wide as the margin everywhere, or so winding that no line was found.
+    """
+    width = track.width_left + track.width_right
+    tight = int(np.argmin(width))
+    if not 0 <= 2 * margin * (1 + _SLACK) < width[tight]:
+        raise TrackError(
+            f"track {track.name} is {width[tight]:.3g} m wide at s = {track.centre.s[tight]:.4g} m; expected more than "
+            f"twice the margin of {margin:.3g} m that a racing line keeps"
+        )
+    count = int(np.clip(2 * len(track.centre.points), MIN_POINTS, MAX_POINTS))
+    weight = tension**2 * curvature_integral(track.centre) / track.length
+    line = best = _resampled(track.centre, count)
+    least = np.inf
+    for k in range(_ROUNDS):
+        offsets = _offsets(line, track, margin * (1 + _SLACK), weight, _REACH * _CALMING**k)
+        line = _resampled(ClosedLine(line.position(line.s, offsets)), count)
+        cost = curvature_integral(line) + weight * line.length
+        if cost < least and np.min(track.clearance(line.points)) >= margin:
+            best, least = line, cost
+        if np.max(np.abs(offsets)) < _CONVERGED * np.min(width):
+            break
+    if least == np.inf:
+        raise TrackError(
+            f"track {track.name}: no racing line keeps {margin:.3g} m from the borders; expected a wider road"
+        )
+    return best
+
+
+def curvature_integral(line: ClosedLine) -> float:
+    """Integral of the squared curvature over one lap (1/m)."""
+    s = np.linspace(0.0, line.length, 8 * len(line.points), endpoint=False)
+    return float(np.mean(line.curvature(s) ** 2) * line.length)
+
+
+def _resampled(line: ClosedLine, count: int) -> ClosedLine:
+    return ClosedLine(line.position(np.linspace(0.0, line.length, count, endpoint=False)))
+
+
+def _offsets(line: ClosedLine, track: Track, margin: float, weight: float, reach: float) -> Vector:
+    """Best offsets (m) along the normals of ``line``, linearised there; shape ``(N,)``."""
+    N, h = len(line.points), line.length / len(line.points)
+    heading = line.heading(line.s)
+    normal = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+    bend = (np.roll(line.points, 1, axis=0) - 2 * line.points + np.roll(line.points, -1, axis=0)) / h**2
+    kappa = np.sum(bend * normal, axis=1)  # by the differences that ``second`` takes; the spline's would ring with it
+    same: Any = sparse.diags_array(np.ones(N), format="csr")
+    second = (same[np.roll(np.arange(N), 1)] - 2 * same + same[np.roll(np.arange(N), -1)]) / h**2
+    J = second + sparse.diags_array(kappa**2 / 2)
+    H = sparse.csc_array(J.T @ J - weight / 2 * second)
+    g = np.asarray(J.T @ kappa - weight / 2 * kappa)
+
+    s, lateral = track.project(line.points)
+    right, left = track.widths(s)
+    along = np.maximum(np.cos(heading - track.centre.heading(s)), 0.3)  # how far an offset leads across the track
+    step = reach / (np.abs(kappa) + 1 / (left + right))
+    # a point that is outside must come back, however far that is
+    upper = np.minimum((left - margin - lateral) / along, step)
+    lower = np.maximum((margin - right - lateral) / along, -step)
+    lower, upper = np.minimum(lower, upper - 1e-6 * h), np.maximum(upper, lower + 1e-6 * h)
+    return box_qp(H, g, lower, upper)
+
+
+def box_qp(H: sparse.csc_array, g: Vector, lower: Vector, upper: Vector, rounds: int = 60) -> Vector:
+    """Minimises ``x' H x / 2 + g' x`` for ``lower <= x <= upper`` by a primal-dual interior-point method.
+
+    Args:
+        H: symmetric, positive semidefinite, sparse, shape ``(N, N)``.
+        g: shape ``(N,)``.
+        lower: less than ``upper`` everywhere; both of shape ``(N,)``.
+        upper: see ``lower``.
+        rounds: of Newton's method at most.
+    """
+    x = (lower + upper) / 2
+    scale = float(np.max(np.abs(g))) + float(np.max(H.diagonal())) * 1e-6 * float(np.max(upper - lower))
+    at_lower = at_upper = np.full(len(g), scale)  # multipliers
+    for _ in range(rounds):
+        below, above = x - lower, upper - x
+        gap = float(np.mean(at_lower * below + at_upper * above)) / 2
+        residual = H @ x + g
+        if gap < 1e-10 * scale * float(np.mean(upper - lower)):
+            break
+        mu = 0.1 * gap
+        dx = spsolve(
+            H + sparse.diags_array(at_lower / below + at_upper / above, format="csc"),
+            mu / below - mu / above - residual,
+        )
+        d_lower = mu / below - at_lower - at_lower / below * dx
+        d_upper = mu / above - at_upper + at_upper / above * dx
+        move = _step_inside((below, dx), (above, -dx), (at_lower, d_lower), (at_upper, d_upper))
+        x = x + move * dx
+        at_lower, at_upper = at_lower + move * d_lower, at_upper + move * d_upper
+    return np.asarray(np.clip(x, lower, upper))
+
+
+def _step_inside(*pairs: tuple[Vector, npt.NDArray[np.float64]]) -> float:
+    """The largest step, at most 1, that keeps every ``value + step * change`` well above 0."""
+    step = 1.0
+    for value, change in pairs:
+        falling = change < 0
+        if np.any(falling):
+            step = min(step, 0.95 * float(np.min(-value[falling] / change[falling])))
+    return step

@@ -1,0 +1,220 @@
+"""Race tracks: a centre line with widths, from the racetrack-database CSV format or built in by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.errors import UserError
+from dynssm_ros.track.layouts import LAYOUTS, closed_loop
+from dynssm_ros.track.lines import ClosedLine, Floats
+
+CSV_COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
+MIN_POINTS = 10
+MAX_FOLDED = 0.25  # share of the lap; 0.04 on the published ETHZ track
+
+
+class TrackError(UserError):
+    """A track file is missing or malformed, or what it describes is not a track."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A closed ribbon of road.
+
+    Attributes:
+        name: for messages and results.
+        centre: the centre line in driving order, ``N`` points.
+        width_right: distance from the centre line to the right border at its points (m), shape ``(N,)``.
+        width_left: likewise to the left border.
+
+    Raises:
+        TrackError: too few points, repeated points, widths that are not positive, borders that cross.
+    """
+
+    name: str
+    centre: ClosedLine
+    width_right: Vector
+    width_left: Vector
+
+    def __post_init__(self) -> None:
+        for side in ("width_right", "width_left"):
+            width = np.array(getattr(self, side), dtype=np.float64)
+            width.flags.writeable = False
+            object.__setattr__(self, side, width)
+        _check_points(self)
+        _check_borders(self)
+
+    @property
+    def length(self) -> float:
+        """Length of one lap along the centre line (m)."""
+        return self.centre.length
+
+    @cached_property
+    def left_border(self) -> Vector:
+        """Points of the left border (m), shape ``(N, 2)``."""
+        return self.centre.position(self.centre.s, self.width_left)
+
+    @cached_property
+    def right_border(self) -> Vector:
+        """Points of the right border (m), shape ``(N, 2)``."""
+        return self.centre.position(self.centre.s, -self.width_right)
+
+    def widths(self, s: Floats) -> tuple[Vector, Vector]:
+        """Distances from the centre line to the right and to the left border (m) at ``s`` (m, periodic)."""
+        at, period = np.asarray(s, dtype=np.float64), self.length
+        return (
+            np.interp(at, self.centre.s, self.width_right, period=period),
+            np.interp(at, self.centre.s, self.width_left, period=period),
+        )
+
+    def project(self, points: npt.ArrayLike, near: npt.ArrayLike | None = None) -> tuple[Vector, Vector]:
+        """Track position ``s`` (m) and lateral offset (m, positive left) of ``points``; see ``ClosedLine.project``."""
+        return self.centre.project(points, near)
+
+    def clearance(self, points: npt.ArrayLike) -> Vector:
+        """Distance from ``points`` (m, shape ``(..., 2)``) to the nearer border (m), negative outside; ``(...)``."""
+        return self.room(*self.project(points))
+
+    def room(self, s: Floats, lateral: Floats) -> Vector:
+        """The same for places that are known as ``s`` and ``lateral`` (m, positive left)."""
+        right, left = self.widths(s)
+        return np.minimum(left - lateral, right + lateral)
+
+    def scaled(self, factor: float) -> Track:
+        """The same track, ``factor`` times as large in both length and width."""
+        if not factor > 0:
+            raise TrackError(f"track {self.name}: scale {factor:g}; expected a positive number")
+        return replace(
+            self,
+            centre=self.centre.scaled(factor),
+            width_right=self.width_right * factor,
+            width_left=self.width_left * factor,
+        )
+
+
+def load_track(name_or_path: str | Path) -> Track:
+    """A built-in track by name, or one from a file of the racetrack-database format.
+
+    Raises:
+        TrackError: neither a file nor a built-in name, or the file is no track.
+    """
+    path = Path(name_or_path)
+    if path.is_file():
+        return read_track(path)
+    if str(name_or_path) in LAYOUTS:
+        return built_in_track(str(name_or_path))
+    raise TrackError(f"track '{name_or_path}' is neither a file nor a built-in name ({', '.join(sorted(LAYOUTS))})")
+
+
+def built_in_track(name: str) -> Track:
+    """Builds one of the project's own tracks."""
+    layout = LAYOUTS[name]()
+    centre = ClosedLine(closed_loop(layout.segments, layout.spacing))
+    half = np.full(len(centre.points), layout.width / 2)
+    return Track(name, centre, half, half)
+
+
+def read_track(path: str | Path) -> Track:
+    """Reads ``x_m,y_m,w_tr_right_m,w_tr_left_m`` rows; a last row that repeats the first point is left out.
+
+    Raises:
+        TrackError: unreadable, other columns, a value that is not a number, or no track.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrackError(f"{path}: cannot be read ({error})") from error
+    rows = []
+    for number, line in enumerate(lines, 1):
+        cells = [cell.strip() for cell in line.lstrip("# ").split(",")]
+        if line.startswith("#"):
+            if len(cells) > 1 and tuple(cells) != CSV_COLUMNS:
+                raise TrackError(f"{path}: columns {','.join(cells)}; expected {','.join(CSV_COLUMNS)}")
+        elif line.strip():
+            rows.append(_numbers(cells, f"{path}: line {number}"))
+    table = np.array(rows).reshape(-1, len(CSV_COLUMNS))
+    if len(table) > 1 and np.array_equal(table[0, :2], table[-1, :2]):
+        table = table[:-1]
+    try:
+        return Track(path.stem, ClosedLine(table[:, :2]), table[:, 2], table[:, 3])
+    except TrackError as error:
+        raise TrackError(f"{path}: {error}") from error
+
+
+def _numbers(cells: list[str], where: str) -> list[float]:
+    if len(cells) != len(CSV_COLUMNS):
+        raise TrackError(f"{where}: {len(cells)} values; expected {len(CSV_COLUMNS)} ({','.join(CSV_COLUMNS)})")
+    try:
+        values = [float(cell) for cell in cells]
+    except ValueError as error:
+        raise TrackError(f"{where}: '{','.join(cells)}'; expected four numbers") from error
+    if not np.all(np.isfinite(values)):
+        raise TrackError(f"{where}: '{','.join(cells)}'; expected finite numbers")
+    return values
+
+
+def _check_points(track: Track) -> None:
+    points = track.centre.points
+    if len(points) < MIN_POINTS:
+        raise TrackError(f"track {track.name}: {len(points)} points; expected at least {MIN_POINTS}")
+    repeated = np.flatnonzero(np.all(points == np.roll(points, -1, axis=0), axis=1))
+    if len(repeated):
+        k = repeated[0]
+        raise TrackError(f"track {track.name}: points {k} and {(k + 1) % len(points)} are the same")
+    for side in ("width_right", "width_left"):
+        width = getattr(track, side)
+        if len(width) != len(points):
+            raise TrackError(f"track {track.name}: {len(width)} values of {side} for {len(points)} points")
+        narrow = np.flatnonzero(~(width > 0))
+        if len(narrow):
+            k = narrow[0]
+            raise TrackError(f"track {track.name}: {side} at point {k} is {width[k]:g} m; expected more than 0")
+
+
+def _check_borders(track: Track) -> None:
+    """The road must not overlap itself. Inside a corner tighter than its half width a border folds; that is allowed."""
+    N, s, length = len(track.centre.points), track.centre.s, track.length
+    curvature = track.centre.curvature(s)
+    for side, reach in (("left", curvature * track.width_left), ("right", -curvature * track.width_right)):
+        if np.mean(reach > 1) > MAX_FOLDED:
+            raise TrackError(
+                f"track {track.name}: borders cross: the {side} border runs backwards along {np.mean(reach > 1):.0%} of "
+                "the lap; expected a half width below the radius of the corners"
+            )
+    start = np.concatenate([track.left_border, track.right_border])
+    end = np.concatenate([np.roll(border, -1, axis=0) for border in (track.left_border, track.right_border)])
+    i, j = _crossings(start, end)
+    apart = np.abs(s[i % N] - s[j % N])
+    apart = np.minimum(apart, length - apart)
+    full_width = track.width_left[i % N] + track.width_right[i % N]
+    bad = np.flatnonzero((i // N != j // N) | (apart > 1.5 * full_width))
+    if len(bad):
+        k, m = i[bad[0]], j[bad[0]]
+        raise TrackError(
+            f"track {track.name}: borders cross near x = {start[k, 0]:.4g} m, y = {start[k, 1]:.4g} m "
+            f"(points {k % N} and {m % N}); expected a road that does not overlap itself"
+        )
+
+
+def _crossings(start: Vector, end: Vector) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Pairs of segments ``start[k] - end[k]`` (shapes ``(M, 2)``) that properly cross."""
+    longest = float(np.max(np.hypot(*(end - start).T)))
+    pairs = cKDTree((start + end) / 2).query_pairs(longest, output_type="ndarray")
+    i, j = pairs[:, 0], pairs[:, 1]
+
+    def side(a: Vector, b: Vector, p: Vector) -> Vector:
+        return np.asarray(
+            (b[:, 0] - a[:, 0]) * (p[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (p[:, 0] - a[:, 0]), dtype=np.float64
+        )
+
+    a, b, c, d = start[i], end[i], start[j], end[j]
+    crossing = (side(a, b, c) * side(a, b, d) < 0) & (side(c, d, a) * side(c, d, b) < 0)
+    return i[crossing], j[crossing]

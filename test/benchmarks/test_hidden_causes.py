@@ -1,0 +1,189 @@
+"""The battery of hidden causes: its cases, and how they are judged."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.hidden_causes import __main__ as command
+from benchmarks.hidden_causes import run
+from benchmarks.hidden_causes.cases import NOISE, SIZES, TRACKS, Case, cases, off, size, sized
+from benchmarks.hidden_causes.outcomes import Outcome, judge, matrix, rates
+from benchmarks.hidden_causes.page import page
+from benchmarks.hidden_causes.run import kept, run_case
+from dynssm_ros.files import write_json
+from dynssm_ros.identification.car import Car
+from dynssm_ros.identification.diagnose import Cause
+from dynssm_ros.identification.problem import Study
+from dynssm_ros.identification.windows import Track, Windows
+from dynssm_ros.simulation.laps import simulate
+from dynssm_ros.track.driver import Style
+from dynssm_ros.track.tracks import load_track
+from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle.effects import EFFECTS
+
+
+def cause(effect: str, values: dict[str, float], *alternatives: str, std: float = 0.0) -> Cause:
+    return Cause(effect, values, dict.fromkeys(values, std), 50.0, 40.0, 0.1, alternatives)
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_every_effect_has_sizes_that_the_library_admits(name: str) -> None:
+    assert name in SIZES
+    for seed in range(20):
+        values = size(name, np.random.default_rng(seed))
+        car = load_vehicle("av21").with_effect(name, values)
+        assert not car.active_effects[-1].is_neutral
+
+
+def test_the_cases_hold_every_effect_none_two_and_four_wheels() -> None:
+    listed = list(cases(0, 130))
+    assert len(listed) == 130
+    assert len({case.name for case in listed}) == 130
+    single = Counter(name for case in listed if len(case.hidden) == 1 for name in case.hidden)
+    assert set(single) == set(EFFECTS)
+    assert min(single.values()) >= 3
+    assert Counter(len(case.hidden) for case in listed)[0] == 20
+    assert Counter(len(case.hidden) for case in listed)[2] == 20
+    assert Counter(len(case.hidden) for case in listed)[1] == 90
+    assert {case.plant for case in listed} == {"rk4", "double_track"}
+    assert {case.track for case in listed} == set(TRACKS)
+    assert {case.sampling_time for case in listed} == {0.04, 0.02}
+    four_wheels = {len(case.hidden) for case in listed if case.plant == "double_track"}
+    assert four_wheels == {0, 1, 2}
+
+
+def test_the_nominal_car_is_off_by_what_it_says() -> None:
+    car = load_vehicle("av21")
+    drawn = [off(car, np.random.default_rng(seed)) for seed in range(200)]
+    moved = np.array([(other.nominal - car.nominal) for other in drawn]).std(axis=0)
+    stated = np.array([c.std for c in drawn[0].coefficients.values()])
+    np.testing.assert_allclose(moved, stated, rtol=0.25)
+
+
+def test_an_alternative_counts_and_a_wrong_name_does_not() -> None:
+    case = Case({"drag": {"coefficient": 0.4}}, 0)
+    assert judge(case, [cause("drag", {"coefficient": 0.42})]).first
+    assert judge(case, [cause("mass", {"factor": 1.1}, "drag")]).first
+    wrong = judge(case, [cause("mass", {"factor": 1.1})])
+    assert (wrong.first, wrong.all, wrong.sized) == (False, False, None)
+    assert not judge(case, []).first
+
+
+def test_sizes_are_right_within_15_percent_or_two_standard_deviations() -> None:
+    case = Case({"mass": {"factor": 1.2}}, 0)
+    assert judge(case, [cause("mass", {"factor": 1.22})]).sized
+    assert not judge(case, [cause("mass", {"factor": 1.25})]).sized
+    assert judge(case, [cause("mass", {"factor": 1.25}, std=0.03)]).sized
+
+
+def test_none_and_two_are_judged_by_all_that_is_named() -> None:
+    assert judge(Case({}, 0), []).first
+    assert not judge(Case({}, 0), [cause("mass", {"factor": 1.1})]).first
+    two = Case({"mass": {"factor": 1.2}, "drag": {"coefficient": 0.4}}, 0)
+    assert not judge(two, [cause("mass", {"factor": 1.2})]).all
+    assert judge(two, [cause("mass", {"factor": 1.2}), cause("drag", {"coefficient": 0.4})]).all
+
+
+OUTCOMES = [
+    Outcome("a", ("drag",), ("drag",), True, True, True),
+    Outcome("b", ("drag",), ("mass",), False, False, None, {"drag": {"coefficient": 0.3}}, {"mass": {"factor": 1.2}}),
+    Outcome("c", (), ("mass",), False, False, None),
+    Outcome("d", ("drag", "mass"), ("drag", "mass"), True, True, False),
+]
+OF = [*zip(cases(7, 5), [*OUTCOMES, None], strict=True)]
+
+
+def test_rates_and_confusion_count_what_happened() -> None:
+    found = rates(OUTCOMES)
+    assert {name: (rate["of"], rate["share"]) for name, rate in found.items() if name != "cases"} == {
+        "named_first": (2, 0.5),
+        "both_found": (1, 1.0),
+        "false_alarms": (1, 1.0),
+        "right_size": (2, 0.5),
+        "more_named": (2, 0.0),
+    }
+    # Wilson 1927: (p + z^2 / 2n +- z sqrt(p q / n + z^2 / 4n^2)) / (1 + z^2 / n)
+    n, z = 2, 1.959964
+    half = z * np.sqrt(0.25 / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
+    assert found["named_first"]["interval_95"] == pytest.approx([0.5 - half, 0.5 + half], abs=1e-5)
+    labels, _, count = matrix(OUTCOMES)
+    drag, mass, none = (labels.index(name) for name in ("drag", "mass", "none"))
+    assert count.sum() == 3
+    assert (count[drag, drag], count[drag, mass], count[none, mass]) == (1, 1, 1)
+
+
+def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
+    text = page(OF, 7)
+    assert "4 simulated drives with hidden effects, seeds 7 to 11, without 1 whose car could not be driven" in text
+    assert (
+        "| the hidden effect, or an alternative reported with it, is named first | 2 | 50 % | 9 to 91 % | >= 95 % "
+        "| 1 of 1 | 0 of 1 |" in text
+    )
+    assert "| `b` | drag coefficient 0.3 | mass factor 1.2 |" in text
+    assert "| `a` |" not in text
+
+
+def test_the_command_writes_rates_figure_and_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran = iter([*OUTCOMES, None])
+    monkeypatch.setattr(command, "run_case", lambda case, folder: next(ran))
+    command.main(["--out", str(tmp_path), "--page", str(tmp_path / "docs"), "--count", "5", "--seed", "7"])
+    assert (tmp_path / "docs" / "diagnose_battery_confusion.png").read_bytes()[1:4] == b"PNG"
+    assert (tmp_path / "docs" / "diagnose_battery.md").read_text() == page(OF, 7)
+    written = json.loads((tmp_path / "battery.json").read_text())
+    assert written["named_first"]["share"] == 0.5
+    assert (written["seed"], written["undriven"], len(written["outcomes"])) == (7, 1, 4)
+
+
+def test_what_is_done_is_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case({"steering_offset": {"offset": 0.02}}, 3, "euler", 40.0)
+    first = run_case(case, tmp_path)
+    assert first is not None
+    assert first.values == case.hidden
+
+    def no_more(*arguments: object, **options: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(run, "diagnose", no_more)
+    monkeypatch.setattr(run, "record", no_more)
+    assert run_case(case, tmp_path) == first
+
+
+def test_the_command_continues_with_what_is_done_in_several_processes(tmp_path: Path) -> None:
+    for case, named in zip(cases(0, 2), (("steering_offset",), ()), strict=True):
+        outcome = Outcome(case.name, tuple(case.hidden), named, bool(named), bool(named), True if named else None)
+        write_json(kept(case, tmp_path), {"outcome": asdict(outcome)})
+    module = "benchmarks.hidden_causes"
+    subprocess.run(
+        [sys.executable, "-m", module, "--out", str(tmp_path), "--count", "2", "--jobs", "2"], check=True, timeout=300
+    )
+    assert not [*tmp_path.glob("drives-*")]
+    assert json.loads((tmp_path / "battery.json").read_text())["named_first"]["share"] == 0.5
+
+
+def test_the_least_sizes_are_just_noticeable() -> None:
+    # about seven standard deviations on the reference drive, so that twice the log-likelihood changes by 49 or some more
+    car = load_vehicle("av21")
+    known = [c.std for c in off(car, np.random.default_rng(0)).coefficients.values()]
+    car = car.with_nominal(car.nominal, np.array(known, dtype=float))
+    drive = simulate(car, load_track("road_course"), duration=90.0, noise=NOISE, seed=1, style=Style(0.72, 0.65))
+    rows = np.concatenate([drive.measured.T, drive.feedback.T, (drive.command - drive.feedback).T])
+    time = (drive.time - drive.time[0]) / 1e9
+    lap = {"s": drive.s % drive.track.length, "lap_length": np.full(len(time), drive.track.length)}
+    track = Track(rows, {"t": time, "theta": drive.pose[:, 2]} | lap, car.sampling_time, time)
+    study = Study(Windows(track, np.arange(8, rows.shape[1] - 14, 13), 13, 8, "euler"), Car.of(car))
+    fit = study.fit(Car.of(car), ())
+    J = fit.noise.whiten(fit.jacobian).reshape(-1, 18)
+    for name, ((least, _),) in ((name, tuple(sizes.values())) for name, sizes in SIZES.items()):
+        values = sized(name, least, np.random.default_rng(0))
+        change = fit.noise.whiten(study.errors(fit.car.with_effect(name, values)) - fit.errors).ravel()
+        seen = J.T @ change
+        evidence = change @ change - seen @ np.linalg.solve(J.T @ J + np.eye(18), seen)
+        assert 40 < evidence < 5 * 49, name

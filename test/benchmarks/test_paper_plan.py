@@ -1,0 +1,186 @@
+"""The plan: what is shipped holds together, tests share no row with training, mistakes get one line."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from benchmarks.paper.parts import cut, quantity
+from benchmarks.paper.plan import UNTRAINED, Part, Range, load_plan
+from benchmarks.paper.reference import load_reference
+from dynssm_ros.configuration import config_root
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS
+from dynssm_ros.signals.recording import Recording, RecordingInfo
+from dynssm_ros.vehicle import COEFFICIENTS
+
+T_s = 0.04
+
+
+def make_recording(v_x, omega, segment=None):
+    N = len(v_x)
+    columns = {name: np.zeros(N) for name in WINDOW_COLUMNS} | {"v_x": v_x, "omega": omega}
+    info = RecordingInfo(sampling_time=T_s, commands="none", source=("planted",))
+    time = np.round(np.arange(N) * T_s * 1e9).astype(np.int64)
+    return Recording(info, time, np.zeros(N, np.int32) if segment is None else segment, columns)
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return load_plan()
+
+
+@pytest.fixture
+def content():
+    return yaml.safe_load((REPOSITORY / "benchmarks" / "paper" / "plan.yaml").read_text())
+
+
+@pytest.fixture
+def drive():
+    """475 s that change between slow and fast, left and right, straight and corner."""
+    t = np.arange(0.0, 475.0, T_s)
+    return make_recording(20.0 + 8.0 * np.sin(t / 17.0), 0.2 * np.sin(t / 5.0))
+
+
+def test_no_test_of_the_shipped_plan_shares_a_row_with_its_training(plan, drive):
+    for name, split in plan.splits.items():
+        for test in split.test.values():
+            if test.recording == split.train.recording:
+                trained, tested = cut(drive, split.train), cut(drive, test)
+                assert len(trained) > 1000, name
+                assert len(tested) > 1000, name
+                assert not set(trained.time) & set(tested.time), name
+
+
+def test_every_model_of_the_plan_is_shipped_and_every_shipped_one_is_in_the_plan(plan):
+    shipped = {path.stem for path in (config_root() / "models").glob("*.yaml")}
+    assert set(plan.models) == shipped
+    used = {model for study in plan.studies.values() for model in study.models}
+    assert used == {*UNTRAINED, *plan.models}
+
+
+def test_every_ablation_of_the_plan_has_words(plan):
+    for car in plan.cars.values():
+        for model in plan.models:
+            if model.startswith(f"{car.full}_") and model != car.paper:
+                assert plan.models[model].variant, model
+
+
+def test_a_part_is_cut_into_segments_where_rows_are_left_out(drive):
+    part = Part(recording="x", where=(Range(quantity="time", at_least=16.0, outside=(100.0, 200.0)),))
+    rows = cut(drive, part)
+    seconds = (rows.time - drive.time[0]) / 1e9
+    assert seconds[0] == 16.0
+    assert not ((seconds >= 100.0) & (seconds < 200.0)).any()
+    assert rows.segment.tolist() == [int(t >= 200.0) for t in seconds]
+
+
+def test_all_ranges_of_a_part_hold(drive):
+    part = Part(recording="x", where=(Range(quantity="speed", at_least=21.0), Range(quantity="yaw_rate", below=0.0)))
+    rows = cut(drive, part)
+    assert 0 < len(rows) < len(drive)
+    # the means over a second lag the values by little here
+    assert rows["v_x"].min() > 20.5
+    assert rows["omega"].max() < 0.03
+
+
+def test_quantities_are_means_over_a_second_and_stop_at_gaps():
+    v_x = np.repeat([10.0, 30.0], 50)
+    recording = make_recording(v_x, np.full(100, -0.1))
+    speed = quantity(recording, "speed")
+    assert speed[49] == pytest.approx(20.0, abs=0.5)
+    np.testing.assert_allclose(speed[[0, 30, 70, 99]], [10.0, 10.0, 30.0, 30.0])
+    np.testing.assert_allclose(quantity(recording, "lateral_acceleration")[[0, 99]], [1.0, 3.0])
+    gap = make_recording(v_x, np.zeros(100), np.repeat([0, 1], 50).astype(np.int32))
+    np.testing.assert_allclose(quantity(gap, "speed"), v_x)
+
+
+def test_given_recordings_are_the_tests_of_splits_without(plan):
+    given = plan.with_tests(["vegas"])
+    assert given.splits["whole"].test == {"vegas": Part(recording="vegas")}
+    assert given.splits["lap_1"] == plan.splits["lap_1"]
+    assert plan.with_tests([]).splits["whole"].test == {}
+    with pytest.raises(ConfigurationError, match="--test putnam: the plan has a recording of that name"):
+        plan.with_tests(["putnam"])
+
+
+def test_a_quick_plan_is_shorter_in_everything(plan):
+    quick = plan.shortened()
+    assert quick.epochs == plan.quick.epochs
+    assert {study.seeds for study in quick.studies.values()} == {1}
+    assert max(drive.duration for drive in quick.drives.values()) <= plan.quick.duration
+    assert {name: study.splits for name, study in quick.studies.items()} == {
+        name: study.splits[:1] for name, study in plan.studies.items()
+    }
+
+
+def test_models_that_take_long_are_trained_less_often_than_a_study_wants(plan):
+    study = plan.studies["unseen"]
+    assert len(plan.seeds(study, "ddm_av21")) == 1 < len(plan.seeds(study, "dynssm_av21")) == study.seeds
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda c: c["models"].update(gpt_av21={}), "models: 'gpt_av21' is neither a file nor a shipped name"),
+        (lambda c: c["cars"]["orca"].update(vehicle="trabant"), "vehicles: 'trabant' is neither a file nor"),
+        (lambda c: c["studies"]["laps"]["models"].append("x"), "studies.laps.models: 'x' is not one of persistence"),
+        (lambda c: c["studies"]["laps"]["splits"].append("x"), "studies.laps.splits: 'x' is not one of"),
+        (lambda c: c["studies"]["laps"]["splits"].append("ethz"), "studies.laps.splits: of several cars"),
+        (
+            lambda c: c["studies"]["laps"]["splits"].append("lap_1"),
+            "studies.laps.splits: tests of the same name: lap 1",
+        ),
+        (lambda c: c["splits"]["lap_1"]["train"].update(recording="x"), "splits.lap_1: 'x' is not one of "),
+        (lambda c: c["splits"]["slow"]["train"]["where"].append({"quantity": "speed"}), "speed: no limit; expected"),
+        (lambda c: c["splits"]["slow"].update(car="x"), "splits.slow.car: 'x' is not one of"),
+        (lambda c: c["cars"]["av21"].update(ddm="x"), "cars.av21: 'x' is not one of"),
+        (lambda c: c["drives"]["oval"]["effects"].append({"name": "magic"}), "unknown effect 'magic'"),
+        (lambda c: c.update(strides=3), "strides: Extra inputs"),
+    ],
+)
+def test_a_mistake_in_the_plan_is_one_line(content, tmp_path, change, expected):
+    changed = copy.deepcopy(content)
+    change(changed)
+    path = tmp_path / "plan.yaml"
+    path.write_text(yaml.safe_dump(changed))
+    with pytest.raises(ConfigurationError) as error:
+        load_plan(path)
+    assert expected in str(error.value)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_the_reference_has_every_table_for_both_cars():
+    reference = load_reference()
+    for data in ("real", "sim"):
+        assert list(reference.open_loop[data]) == ["DDM", "FTHD", "DynSSM"]
+        assert set(reference.coefficients[data]) == {
+            c for c in COEFFICIENTS if not c.startswith("C_m") and c[:3] != "C_r"
+        } | {"C_r"}
+    # the paper's own sums: the abstract's shares follow from its table, the last one against FTHD
+    real = reference.open_loop["real"]
+    shares = 1 - np.array(real["DynSSM"].rmse.values) / np.array(real["DDM"].rmse.values)
+    np.testing.assert_allclose(shares[:2], reference.claims.rmse.values[:2], atol=1e-3)
+    assert 1 - real["DynSSM"].rmse.omega / real["FTHD"].rmse.omega == pytest.approx(
+        reference.claims.rmse.omega, abs=1e-3
+    )
+    assert reference.ablation["real"]["full"].rmse == real["DynSSM"].rmse
+
+
+def test_the_bounds_in_the_reference_are_those_of_the_shipped_vehicles():
+    from dynssm_ros.vehicle import load_vehicle
+
+    for data, name in (("real", "av21_paper"), ("sim", "orca")):
+        vehicle = load_vehicle(name)
+        for coefficient, row in load_reference().coefficients[data].items():
+            assert row.bounds == vehicle.coefficients[coefficient].bounds, coefficient
+
+
+def test_an_unreadable_plan_is_named():
+    with pytest.raises(ConfigurationError, match=r"nowhere.yaml: cannot be read"):
+        load_plan(Path("nowhere.yaml"))

@@ -1,0 +1,203 @@
+"""The steps of a plan: each once, with all that it needs; and a whole small run."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from benchmarks.paper.plan import Plan, load_plan
+from benchmarks.paper.reference import load_reference
+from benchmarks.paper.results import Made, read_results
+from benchmarks.paper.runner import identity, run
+from benchmarks.paper.schedule import steps_of
+from benchmarks.paper.steps import Evaluate, Take, Train, UnavailableError, digest
+from dynssm_ros.configuration import validate
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import load_vehicle
+
+SMALL = {
+    "logs": {"away": {"bag": "nowhere", "signals": "default", "rate": 50.0}},
+    "drives": {
+        "club": {"vehicle": "orca", "track": "club", "duration": 8.0, "plant": "euler", "seed": 0},
+        "club_b": {"vehicle": "orca", "track": "club_b", "duration": 4.0, "plant": "euler", "seed": 1},
+    },
+    "cars": {
+        "orca": {
+            "vehicle": "orca", "start": "mid_range", "min_speed": 0.0, "reference": "sim", "full": "dynssm_orca",
+            "ddm": "ddm_orca", "fthd": "fthd_orca", "coefficients": "track",
+        },
+    },
+    "splits": {
+        "club": {
+            "car": "orca",
+            "train": {"recording": "club"},
+            "test": {"club b": {"recording": "club_b"}, "late": {"recording": "club", "where": [
+                {"quantity": "time", "at_least": 6.0}]}},
+        },
+        "away": {"car": "orca", "train": {"recording": "club"}, "test": {"away": {"recording": "away"}}},
+        "given": {"car": "orca", "train": {"recording": "club"}},
+    },
+    "models": {
+        "ridge_orca": {"seeds": 1}, "dynssm_orca": {}, "ddm_orca": {"vehicle": "orca"}, "fthd_orca": {"vehicle": "orca"},
+    },
+    "studies": {
+        "track": {
+            "title": "another track", "text": "T.", "splits": ["club"], "commands": "topics",
+            "models": ["persistence", "single_track", "ridge_orca", "dynssm_orca"], "seeds": 2,
+        },
+        "absent": {
+            "title": "absent", "text": "T.", "splits": ["away"], "commands": "topics", "models": ["persistence"], "seeds": 1,
+        },
+        "given": {
+            "title": "given", "text": "T.", "splits": ["given"], "commands": "topics", "models": ["ridge_orca"], "seeds": 1,
+        },
+    },
+    "stride": 20, "calls": 5, "epochs": 1,
+    "quick": {"epochs": 1, "seeds": 1, "stride": 20, "duration": 4.0},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return validate(Plan, SMALL, "small")
+
+
+@pytest.fixture(scope="module")
+def small_run(plan, tmp_path_factory):
+    """The small plan as it was run: its folder, steps, outcomes and results."""
+    root = tmp_path_factory.mktemp("paper")
+    steps = steps_of(plan, None, {})
+    outcomes = run(steps, root, 1, lambda *_: None)
+    return root, steps, outcomes, read_results(plan, load_reference(), root, steps, outcomes, Made())
+
+
+def by_key(steps):
+    return {step.key: step for step in steps}
+
+
+def test_each_step_of_the_shipped_plan_is_there_once_with_what_it_builds_on():
+    plan = load_plan()
+    for given in ({}, {"vegas": "vegas.parquet"}):
+        steps = steps_of(plan.with_tests(given), None, given)
+        keys = [step.key for step in steps]
+        assert len(set(keys)) == len(keys)
+        assert all({*step.needs, *step.uses} <= set(keys) for step in steps)
+        assert {step.key for step in steps if isinstance(step, Take)} == {
+            f"recordings/{name}.parquet" for name in given
+        }
+        assert ("scores/whole.lookahead.json" in keys) == bool(given)
+
+
+def test_every_training_of_a_split_is_evaluated():
+    steps = steps_of(load_plan(), None, {})
+    trained = {step.key for step in steps if isinstance(step, Train)}
+    assert trained == {key for step in steps if isinstance(step, Evaluate) for key in step.trained}
+
+
+def test_studies_that_share_a_split_share_its_trainings(plan):
+    other = plan.studies["track"].model_copy(update={"models": ("ridge_orca", "dynssm_orca"), "seeds": 1})
+    both = plan.model_copy(update={"studies": {"other": other, "track": plan.studies["track"]}})
+    (alone,) = (step for step in steps_of(plan, None, {}) if step.key == "scores/club.topics.json")
+    (shared,) = (step for step in steps_of(both, None, {}) if step.key == "scores/club.topics.json")
+    assert set(shared.trained) == set(alone.trained)
+    assert len(alone.trained) == 3  # ridge once, the full model with two seeds
+    assert shared.untrained == alone.untrained == ("persistence", "single_track")
+
+
+def test_a_model_is_trained_on_the_car_that_the_plan_says():
+    steps = by_key(steps_of(load_plan(), None, {}))
+    full = steps["models/slow.lookahead/dynssm_av21.0"]
+    assert full.vehicle == "vehicles/slow.lookahead.yaml"
+    assert full.vehicle in full.needs
+    assert steps["models/slow.lookahead/ddm_av21.0"].vehicle == "av21_paper"
+    assert steps["models/slow.lookahead/ddm_av21.0"].needs == ("recordings/putnam.parquet",)
+
+
+def test_a_calibrated_car_is_not_calibrated_again_by_the_training():
+    steps = by_key(steps_of(load_plan(), None, {}))
+    assert steps["models/slow.lookahead/dynssm_av21.0"].recipe()["model"]["physics"]["nominal"] == "vehicle"
+    assert steps["models/slow.lookahead/dynssm_av21_mid_range.0"].recipe()["model"]["physics"]["nominal"] == "mid_range"
+
+
+def test_what_is_trained_on_decides_the_identity_of_a_training(plan):
+    (step,) = (step for step in steps_of(plan, None, {}) if step.key == "models/club.topics/ridge_orca.0")
+    changed = plan.model_copy(update={"epochs": 2})
+    (longer,) = (step for step in steps_of(changed, None, {}) if step.key == "models/club.topics/ridge_orca.0")
+    assert step.recipe() != longer.recipe()
+    assert json.loads(json.dumps(step.recipe())) == step.recipe()
+    assert identity(step, dict.fromkeys((*step.needs, *step.uses), _Done("a"))) != identity(
+        step, dict.fromkeys((*step.needs, *step.uses), _Done("b"))
+    )
+
+
+class _Done:
+    def __init__(self, identity):
+        self.identity = identity
+
+
+def test_the_same_files_have_the_same_digest(tmp_path):
+    for folder, content in (("a", "x"), ("b", "x"), ("c", "y")):
+        (tmp_path / folder / "d").mkdir(parents=True)
+        (tmp_path / folder / "d" / "f").write_text(content)
+    assert digest(tmp_path / "a") == digest(tmp_path / "b") != digest(tmp_path / "c")
+
+
+def test_a_log_that_is_not_there_is_unavailable(plan, tmp_path):
+    step = by_key(steps_of(plan, tmp_path, {}))["recordings/away.parquet"]
+    with pytest.raises(UnavailableError, match="nowhere is not in the data folder"):
+        step.recipe()
+
+
+def test_the_small_run_measures_all_that_it_can(small_run):
+    root, _, outcomes, results = small_run
+    track, absent, given = results.comparisons
+    assert track.tests == ("club b", "late")
+    assert track.models == ("persistence", "single_track", "ridge_orca", "dynssm_orca")
+    assert [track.seeds(model) for model in track.models] == [1, 1, 1, 2]
+    assert {score["seed"] for score in track.entries("dynssm_orca")} == {0, 1}
+    assert track.rmse("persistence")[0].mean > 0.0
+    assert outcomes["scores/away.topics.json"].state == "unavailable"
+    assert absent.tests == given.planned == ()
+    assert absent.reasons == ["extract away: nowhere is not in the data folder (--data or DYNSSM_DATA)"]
+    assert results.missing == {"extract away": "nowhere is not in the data folder (--data or DYNSSM_DATA)"}
+    assert set(results.costs) == {"persistence", "single_track", "single_track_ewma", "ridge_orca", "dynssm_orca"}
+    assert (
+        results.costs["ridge_orca"]["parameters"]
+        == open_artifact(root / "models/club.topics/ridge_orca.0").card.parameters
+    )
+    assert not (root / "errors").exists()
+
+
+def test_calibration_starts_mid_range_and_finds_the_simulated_car(small_run):
+    vehicle, truth = load_vehicle(small_run[0] / "vehicles/club.topics.yaml"), load_vehicle("orca")
+    assert vehicle.coefficients["B_f"].nominal == pytest.approx(truth.coefficients["B_f"].nominal, rel=1e-3)
+    assert small_run[3].comparisons[0].rmse("single_track")[0].mean < 1e-6
+
+
+def test_a_test_part_is_scored_and_nothing_else(small_run):
+    track = small_run[3].comparisons[0]
+    recording = Recording.load(small_run[0] / "recordings/club.parquet")
+    late = int(((recording.time - recording.time[0]) / 1e9 >= 6.0).sum())
+    assert track.test("late")["rows"] == late - 15  # windows of 15 rows and the row to predict
+
+
+def test_fine_tuning_goes_on_from_the_model_that_the_split_has_anyway(plan, tmp_path):
+    """A planted mark in the first model's checkpoint comes out of the second's."""
+    study = plan.studies["track"].model_copy(update={"models": ("ddm_orca", "fthd_orca"), "seeds": 1})
+    short = plan.drives["club"].model_copy(update={"duration": 3.0})
+    small = plan.model_copy(update={"studies": {"track": study}, "drives": plan.drives | {"club": short}})
+    steps = by_key(steps_of(small, None, {}))
+    ddm, fthd = (steps[f"models/club.topics/{name}.0"] for name in ("ddm_orca", "fthd_orca"))
+    assert fthd.start == ddm.key
+    steps["recordings/club.parquet"].make(tmp_path, frozenset())
+    ddm.make(tmp_path, frozenset(ddm.needs))
+    checkpoint = tmp_path / f"{ddm.key}.checkpoint.pt"
+    content = torch.load(checkpoint, weights_only=True)
+    content["history"]["train/prediction"] = [123.0]
+    torch.save(content, checkpoint)
+    fthd.make(tmp_path, frozenset((*fthd.needs, ddm.key)))
+    metrics = json.loads((tmp_path / fthd.key / "metrics.json").read_text())
+    assert metrics["start"]["history"]["train/prediction"] == [123.0]

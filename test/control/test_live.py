@@ -1,0 +1,280 @@
+"""The controller on a car that does not wait: each command acts one T_s after the odometry that it answers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dynssm_ros.control.controller import Controller
+from dynssm_ros.control.live import Laps, LiveController
+from dynssm_ros.control.reference import load_reference
+from dynssm_ros.control.remote import RemoteModel
+from dynssm_ros.control.settings import Settings
+from dynssm_ros.runtime.health import Level
+from dynssm_ros.signals.history import Refusal
+from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
+from dynssm_ros.simulation.plant import Pose, make_plant
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, State
+
+T_S = 20_000_000  # ns
+STAMP = 1_700_000_000_000_000_000
+
+
+@pytest.fixture
+def online(orca, club):
+    """Builds the controller on the club track."""
+
+    def build(line="centre", pace=0.7, N=10, **options):
+        reference = load_reference(line, orca, club, pace)
+        return LiveController(orca, reference, club, replace(Settings.of(orca, N=N), deadline=math.inf), **options)
+
+    return build
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    """What the pilot is asked and what it decides, step by step."""
+    recorded = []
+    original = Controller.step
+
+    def step(self, *given):
+        recorded.append((*given, original(self, *given)))
+        return recorded[-1][-1]
+
+    monkeypatch.setattr(Controller, "step", step)
+    return recorded
+
+
+class Car:
+    """The simulated car, rolling at first, that obeys each command one step late."""
+
+    def __init__(self, vehicle, track, v_x=1.5):
+        start = Pose(*(float(v) for v in track.centre.position(0.0)), float(track.centre.heading(0.0)))
+        self.plant = make_plant(vehicle, "euler", start, State(v_x, 0.0, 0.0), lap_length=track.length)
+        self.stamp, self.sent = STAMP, Applied(0.0, 0.0)
+
+    def answered(self, online: LiveController):
+        """One odometry message and its answer, and the car drives on."""
+        pose = self.plant.pose
+        wrapped = pose._replace(theta=math.remainder(pose.theta, 2 * math.pi))
+        outcome = online.step(self.stamp, wrapped, self.plant.measured)
+        self.plant.advance(self.sent)
+        self.stamp += T_S
+        if isinstance(outcome, Applied):
+            self.sent = outcome
+        return outcome
+
+
+def test_laps_from_a_standing_start_stay_between_the_borders(online, orca, club):
+    controller = online("racing", 0.9, N=15)
+    now = [0.0]
+    holder = CommandHolder(orca, 0.2, lambda: now[0])
+    last = Applied(0.0, 0.0)
+    reach = orca.inputs.steering_rate * orca.sampling_time
+    for k, sample in enumerate(drive_by_commands(orca, club, "euler", holder.command)):
+        now[0] = k * orca.sampling_time
+        command = controller.step(STAMP + k * T_S, sample.pose, sample.measured)
+        assert orca.inputs.throttle[0] <= command.r <= orca.inputs.throttle[1]
+        assert orca.inputs.steering[0] <= command.delta <= orca.inputs.steering[1]
+        assert abs(command.delta - last.delta) <= reach * (1 + 1e-9)
+        holder.receive(command)
+        last = command
+        if controller.laps.count == 1 or k > 500:
+            break
+    assert controller.laps.count == 1
+    assert controller.laps.last < 5.5
+    assert controller.laps.worst == 0.0
+    assert controller.counts["solved"] > 0.8 * k
+
+
+def test_it_plans_from_where_the_car_is_when_the_command_acts(online, orca, club, steps):
+    controller, car = online(), Car(orca, club)
+    steps.clear()
+    for _ in range(40):
+        car.answered(controller)
+    reached = car.plant.measured
+    _, pose, seen, feedback, decision = steps[-1]
+    np.testing.assert_allclose(seen, reached, atol=1e-12)
+    assert math.hypot(pose.x - car.plant.pose.x, pose.y - car.plant.pose.y) < 2e-3, "Euler's chord against the arc"
+    assert feedback == steps[-2][-1].command, "the command before is what acts until then"
+    assert decision.command == car.sent
+
+
+def test_what_the_predictor_says_reaches_the_plan_and_is_dropped_when_it_falls_silent(online, orca, club, steps):
+    controller, car = online(max_age=0.1), Car(orca, club)
+    theta = orca.nominal + 0.05 * (orca.upper - orca.nominal)
+    theta[-1] = orca.nominal[-1]
+    for _ in range(5):
+        answered = car.stamp
+        car.answered(controller)
+        controller.remote.adapted(answered + T_S, dict(zip(COEFFICIENTS, theta, strict=True)))
+        controller.remote.predicted(answered + T_S, car.plant.measured)
+    np.testing.assert_array_equal(steps[-1][-1].theta, theta)
+    assert controller.verdict() == (Level.OK, "drives, adapted coefficients")
+    values = controller.values()
+    assert float(values["D_f"]) == pytest.approx(theta[COEFFICIENTS.index("D_f")], rel=1e-5)
+    assert values["coefficients"] == RemoteModel.ADAPTED
+    assert any(float(values[f"added to {name}"]) != 0 for name in State._fields), "the plant is the nominal car"
+
+    for _ in range(8):
+        car.answered(controller)
+    np.testing.assert_array_equal(steps[-1][-1].theta, orca.nominal)
+    level, words = controller.verdict()
+    assert level == Level.WARN
+    assert "nominal car, nothing from the predictor for 0.1 s" in words
+
+
+@pytest.mark.parametrize(("spoilt", "by"), [(0, math.nan), (3, math.inf), (5, 1e300)])
+def test_odometry_that_is_not_finite_is_refused_and_the_drive_goes_on(online, orca, club, spoilt, by):
+    controller, car = online(), Car(orca, club)
+    for _ in range(5):
+        car.answered(controller)
+    row = [*car.plant.pose, *car.plant.measured]
+    row[spoilt] = by
+    assert controller.step(car.stamp, Pose(*row[:3]), State(*row[3:])) is Refusal.NOT_FINITE
+    assert isinstance(car.answered(controller), Applied)
+
+
+@pytest.mark.parametrize(
+    "state",
+    [State(9e5, 0.0, 0.0), State(2.0, -9e5, 0.0), State(2.0, 0.0, 9e5), State(-3.0, 1.0, 5.0), State(0.0, 0.0, 0.0)],
+)
+def test_odometry_that_cannot_be_yields_a_command_that_can(online, orca, club, state):
+    controller, car = online(), Car(orca, club)
+    for _ in range(3):
+        car.answered(controller)
+    command = controller.step(car.stamp, car.plant.pose, state)
+    for value, (low, high) in zip(command, (orca.inputs.throttle, orca.inputs.steering), strict=True):
+        assert low <= value <= high
+
+
+def test_odometry_that_comes_twice_or_late_is_refused(online, orca, club):
+    controller, car = online(), Car(orca, club)
+    car.answered(controller)
+    car.answered(controller)
+    for back in (1, 2):
+        assert controller.step(car.stamp - back * T_S, car.plant.pose, car.plant.measured) is Refusal.REPEATED
+
+
+def test_odometry_at_twice_the_rate_is_answered_every_other_time(online, orca, club):
+    controller, car = online(), Car(orca, club)
+    assert isinstance(car.answered(controller), Applied)
+    half = controller.step(car.stamp - T_S // 2, car.plant.pose, car.plant.measured)
+    assert half is None
+    assert isinstance(car.answered(controller), Applied)
+
+
+def test_time_that_jumps_back_begins_a_new_drive(online, orca, club):
+    controller, car = online(), Car(orca, club)
+    for _ in range(10):
+        car.answered(controller)
+    driven = controller.laps.s
+    car = Car(orca, club)
+    car.stamp -= 10**9
+    car.answered(controller)
+    assert controller.laps.s != driven
+    assert controller.laps.lateral == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_car_that_is_slower_than_the_line_is_brought_up_to_speed(online, orca, club, steps):
+    controller, car = online(), Car(orca, club, v_x=0.0)
+    steps.clear()
+    car.answered(controller)
+    assert controller.verdict()[1].startswith("gets up to speed")
+    assert not steps
+    for _ in range(40):
+        car.answered(controller)
+    assert controller.verdict()[1].startswith("drives")
+    assert controller.counts["solved"] == len(steps) > 10
+
+
+def test_a_gap_ends_the_plan_and_the_car_is_found_wherever_it_is(online, orca, club, steps):
+    controller, car = online(), Car(orca, club)
+    for _ in range(10):
+        car.answered(controller)
+    s = 0.6 * club.length
+    elsewhere = Pose(*(float(v) for v in club.centre.position(s)), float(club.centre.heading(s)))
+    outcome = controller.step(car.stamp + 10**9, elsewhere, State(1.0, 0.0, 0.0))
+    assert isinstance(outcome, Applied)
+    assert controller.laps.s % club.length == pytest.approx(s, abs=1e-6)
+    assert steps[-1][-1].plan.status == "solved"
+
+
+def test_far_off_the_road_it_brakes_and_says_so(online, orca, club):
+    controller, car = online(), Car(orca, club)
+    for _ in range(5):
+        car.answered(controller)
+    steering = car.sent.delta
+    beside = Pose(*(float(v) for v in club.centre.position(0.3, -3 * 0.4)), 0.0)
+    assert controller.step(car.stamp, beside, State(1.0, 0.0, 0.0)) == (orca.inputs.throttle[0], steering)
+    level, words = controller.verdict()
+    assert level == Level.ERROR
+    assert "m outside the borders: brakes" in words
+    car.stamp += T_S
+    car.answered(controller)
+    assert controller.verdict()[0] != Level.ERROR
+
+
+def test_brakes_hold_the_steering(online, orca, club):
+    controller, car = online(), Car(orca, club)
+    for _ in range(20):
+        car.answered(controller)
+    assert controller.brake() == (orca.inputs.throttle[0], car.sent.delta)
+
+
+def test_late_plans_are_counted_and_told(orca, club):
+    reference = load_reference("centre", orca, club, 0.7)
+    controller = LiveController(orca, reference, club, replace(Settings.of(orca, N=10), deadline=0.0))
+    car = Car(orca, club)
+    for _ in range(5):
+        assert isinstance(car.answered(controller), Applied)
+    assert controller.counts["late"] == 4, "the first plan may take its time"
+    level, words = controller.verdict()
+    assert level == Level.WARN
+    assert "4 of 5 plans infeasible or late" in words
+
+
+def test_before_the_first_odometry_there_are_figures_too(online):
+    values = online().values()
+    assert values["laps"] == "0"
+    assert values["plans solved"] == "0", "what warms it up does not count"
+    assert values["step p99 (ms)"] == "nan"
+
+
+@pytest.mark.parametrize("first", [0.0, 2.0, 6.2])
+def test_laps_are_timed_from_where_the_car_was_first_seen(circle, first):
+    track, _ = circle(radius=1.0)
+    laps = Laps(track)
+    speed = 1.3
+    for k in range(600):
+        angle = first + speed * 0.02 * k
+        laps.passed(5.0 + 0.02 * k, math.cos(angle), math.sin(angle))
+    assert laps.count == int(600 * 0.02 * speed / (2 * math.pi))
+    assert laps.last == pytest.approx(2 * math.pi / speed, rel=1e-4)
+    assert laps.worst == 0.0
+
+
+def test_a_lap_with_a_gap_does_not_count(circle):
+    track, _ = circle(radius=1.0)
+    laps = Laps(track)
+    for k in range(150):
+        angle = 2 * math.pi * k / 100
+        laps.passed(0.1 * k, math.cos(angle), math.sin(angle), together=k != 60)
+    assert laps.count == 0
+    for k in range(150, 170):
+        angle = 2 * math.pi * k / 100
+        laps.passed(0.1 * k, math.cos(angle), math.sin(angle))
+    assert laps.count == 1
+    assert laps.last == pytest.approx(10.0)
+
+
+def test_how_far_outside_is_measured_and_kept(circle):
+    track, _ = circle(radius=1.0)
+    laps = Laps(track)
+    for radius, outside in ((1.0, 0.0), (1.25, 0.05), (0.7, 0.1), (1.1, 0.0)):
+        laps.passed(0.0, radius, 0.0)
+        assert laps.outside == pytest.approx(outside, abs=1e-6)
+    assert laps.worst == pytest.approx(0.1, abs=1e-6)

@@ -1,0 +1,117 @@
+"""Models behind the controller."""
+
+import numpy as np
+import pytest
+
+from dynssm_ros.control.nmpc import Plan
+from dynssm_ros.control.prediction_model import Adaptive
+from dynssm_ros.control.race_models import load_prediction_model, true_model
+from dynssm_ros.errors import ArtifactError, ConfigurationError
+from dynssm_ros.runtime.models import Persistence, SingleTrack, WindowPrediction, load_model
+from dynssm_ros.simulation.double_track import DoubleTrack
+from dynssm_ros.vehicle import load_vehicle, save_vehicle
+
+RNG = np.random.default_rng(0)
+ROWS = np.array([1.8, -0.1, 2.0, 0.3, 0.1, 0.1, 0.02]) + 0.01 * RNG.standard_normal((20, 7))
+
+
+class Speaking(SingleTrack):
+    """Says coefficients and a residual that tell which window was read."""
+
+    name = "speaking"
+    H = 4
+    commands = "topics"
+
+    def predict(self, windows):
+        physics = self._following(windows[:, -1, :])
+        theta = np.tile(self._theta, (len(windows), 1)) * (1 + 0.01 * windows[:, :1, 0])
+        return WindowPrediction(physics + windows[:, -1, 3:6], theta, physics)
+
+
+def previous(N=5):
+    return Plan(RNG.standard_normal((N + 1, 8)), RNG.standard_normal((N, 2)))
+
+
+def test_what_the_model_says_of_the_last_window_is_held(orca):
+    adapted = Adaptive(Speaking(orca), orca).read(ROWS, previous())
+    np.testing.assert_allclose(adapted.theta, orca.nominal * (1 + 0.01 * ROWS[-4, 0]), rtol=1e-12)
+    np.testing.assert_allclose(adapted.correction, ROWS[-1, 3:6], rtol=1e-9)
+
+
+def test_the_nominal_car_drives_until_the_window_is_full(orca):
+    adapted = Adaptive(Speaking(orca), orca).read(ROWS[:3], None)
+    np.testing.assert_array_equal(adapted.theta, orca.nominal)
+    np.testing.assert_array_equal(adapted.correction, 0.0)
+
+
+def test_along_the_horizon_the_plan_becomes_history(orca):
+    plan = previous(5)
+    adapted = Adaptive(Speaking(orca), orca, along_horizon=True).read(ROWS, plan)
+    assert (adapted.theta.shape, adapted.correction.shape) == ((5, 17), (5, 3))
+    np.testing.assert_allclose(adapted.correction[0], ROWS[-1, 3:6], rtol=1e-9)
+    rows = np.concatenate([plan.x[1:5, 3:8], plan.u[1:]], axis=1)
+    np.testing.assert_allclose(adapted.correction[1:], rows[:, 3:6], rtol=1e-9)
+    first = np.concatenate([ROWS[-4:], rows])[:5, 0]
+    np.testing.assert_allclose(adapted.theta, orca.nominal * (1 + 0.01 * first[:, None]), rtol=1e-12)
+
+
+def test_a_model_without_commands_sees_none(orca):
+    model = Speaking(orca)
+    model.commands = "none"
+    adapted = Adaptive(model, orca).read(ROWS, previous())
+    np.testing.assert_allclose(adapted.correction, [*ROWS[-1, 3:5], 0.0], atol=1e-12)
+
+
+def test_a_model_without_physics_corrects_the_nominal_car(orca):
+    """Persistence says that nothing changes, so the correction takes off what the nominal step adds."""
+    adapted = Adaptive(Persistence(), orca).read(ROWS, None)
+    stepped = SingleTrack(orca).predict(ROWS[None, -1:]).state[0]
+    np.testing.assert_allclose(stepped + adapted.correction, ROWS[-1, :3], atol=1e-12)
+    np.testing.assert_array_equal(adapted.theta, orca.nominal)
+
+
+def test_what_is_not_finite_is_not_used(orca):
+    rows = ROWS.copy()
+    rows[-1, 3] = np.nan
+    adapted = Adaptive(Speaking(orca), orca).read(rows, None)
+    np.testing.assert_array_equal(adapted.theta, orca.nominal)
+
+
+def test_a_trained_model_says_here_what_it_says_elsewhere(orca, small_model):
+    knowledge = load_prediction_model(str(small_model), orca, orca, "rk4")
+    adapted = knowledge.read(ROWS, None)
+    said = load_model(small_model).predict(ROWS[None, -knowledge.H :])
+    np.testing.assert_array_equal(adapted.theta, said.theta[0])
+    np.testing.assert_array_equal(adapted.correction, (said.state - said.physics)[0])
+
+
+def test_the_true_model_has_what_the_plant_has(orca):
+    driven = orca.with_effect("drag", {"coefficient": 0.001})
+    assert driven.active_effects[0] in true_model(driven, "rk4").car.effects
+    assert any(isinstance(effect, DoubleTrack) for effect in true_model(driven, "double_track").car.effects)
+    assert true_model(driven, "euler").car.integrator == "euler"
+    np.testing.assert_array_equal(
+        load_prediction_model("true", orca, driven, "rk4").read(ROWS, None).theta, orca.nominal
+    )
+
+
+def test_a_vehicle_file_is_the_car_that_the_controller_believes_in(orca, tmp_path):
+    path = tmp_path / "weak.yaml"
+    save_vehicle(orca.with_nominal((orca.lower + orca.upper) / 2), path)
+    knowledge = load_prediction_model(str(path), orca, orca, "rk4")
+    assert knowledge.name == "weak"
+    np.testing.assert_array_equal(knowledge.read(ROWS, None).theta, (orca.lower + orca.upper) / 2)
+
+
+def test_models_of_another_car_or_sampling_time_are_refused(orca, small_model, tmp_path):
+    slow = orca.model_copy(update={"sampling_time": 0.04})
+    with pytest.raises(ArtifactError, match=r"sampling time 0\.02 s; expected that of vehicle orca, 0\.04 s"):
+        load_prediction_model(str(small_model), slow, slow, "rk4")
+    heavy = orca.model_copy(update={"constants": orca.constants.model_copy(update={"m": 0.05})})
+    with pytest.raises(ArtifactError, match=r"another vehicle \(m = 0\.041\); expected that of orca \(m = 0\.05\)"):
+        load_prediction_model(str(small_model), heavy, heavy, "rk4")
+    save_vehicle(load_vehicle("av21").model_copy(update={"sampling_time": 0.02}), tmp_path / "indy.yaml")
+    with pytest.raises(ConfigurationError, match="another vehicle"):
+        load_prediction_model(str(tmp_path / "indy.yaml"), orca, orca, "rk4")
+    with pytest.raises(ConfigurationError, match="neither a model folder nor one of true, "):
+        load_prediction_model("oracle", orca, orca, "rk4")

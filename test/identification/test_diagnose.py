@@ -1,0 +1,174 @@
+"""The diagnosis as a whole: hidden causes are named, none are invented, nothing held out reaches the fit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.hidden_causes.cases import Case, record, size
+from benchmarks.hidden_causes.outcomes import judge
+from dynssm_ros.errors import ConfigurationError, RecordingError
+from dynssm_ros.identification.diagnose import Diagnosis, diagnose
+from dynssm_ros.reporting.diagnosis_report import diagnosis_report, in_words
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.track.tracks import load_track
+from dynssm_ros.vehicle import Vehicle, load_vehicle
+from dynssm_ros.vehicle.effects import EFFECTS
+
+Laps = Callable[..., tuple[Recording, Vehicle]]
+LINE = load_track("road_course").centre
+SEED = 1
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_a_hidden_cause_is_named(name: str, laps: Laps) -> None:
+    # a stretch of the lap has to be driven before it can be judged
+    duration = 120.0 if name == "grip_patch" else 70.0
+    recording, vehicle = laps(name, seed=SEED, duration=duration)
+    found = diagnose(recording, vehicle, integrator="euler", line=LINE)
+    hidden = Case({name: size(name, np.random.default_rng(SEED))}, SEED)
+    outcome = judge(hidden, found.causes)
+    assert found.verdict == "effects"
+    assert outcome.first, outcome.named
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_nothing_is_named_where_nothing_is_hidden(seed: int, laps: Laps) -> None:
+    recording, vehicle = laps(seed=seed)
+    found = diagnose(recording, vehicle, integrator="euler", line=LINE)
+    assert (found.verdict, found.causes) == ("none", ())
+    assert found.vehicle.effects == ()
+    assert "right within the noise" in in_words(found)
+
+
+def test_two_causes_are_both_named(laps: Laps) -> None:
+    recording, vehicle = laps("odometry_lever_arm", "drag", seed=4)
+    found = diagnose(recording, vehicle, integrator="euler", line=LINE)
+    assert {cause.effect for cause in found.causes} == {"odometry_lever_arm", "drag"}
+
+
+def test_a_finely_integrated_plant_is_told_from_euler_steps() -> None:
+    recording, vehicle = record(Case({"yaw_rate_bias": {"bias": 0.02}}, 2, "rk4", 45.0))
+    found = diagnose(recording, vehicle, line=LINE)
+    assert [cause.effect for cause in found.causes] == ["yaw_rate_bias"]
+    assert found.protocol["Integrator"] == "rk4"
+
+
+def test_the_extended_car_errs_less_on_held_out_rows(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
+    _, vehicle, found = lagging
+    (cause,) = found.causes
+    hidden = size("steering_lag", np.random.default_rng(1))["time_constant"]
+    assert cause.values["time_constant"] == pytest.approx(hidden, abs=4 * cause.std["time_constant"])
+    assert cause.heldout_gain > 0.02
+    assert found.gain.reduction[found.gain.horizon, 2] > 0.1
+    low, high = found.gain.interval[:, found.gain.horizon]
+    assert (
+        (low <= found.gain.reduction[found.gain.horizon]) & (found.gain.reduction[found.gain.horizon] <= high)
+    ).all()
+    assert [entry.name for entry in found.vehicle.effects] == ["steering_lag"]
+    assert found.vehicle.name == vehicle.name
+
+
+def test_no_held_out_row_reaches_the_fit(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
+    recording, vehicle, found = lagging
+    cut = int(found.gain.windows.starts.min())
+    assert found.windows.starts.max() + found.windows.steps < cut
+    rng = np.random.default_rng(0)
+    poisoned = {name: values.copy() for name, values in recording.columns.items()}
+    for name in ("v_x", "v_y", "omega", "r_fb", "delta_fb", "r_cmd", "delta_cmd"):
+        poisoned[name][cut:] += rng.uniform(0.0, 0.5, len(recording) - cut)
+    other = diagnose(replace(recording, columns=poisoned), vehicle, integrator="euler", line=LINE)
+    assert other.vehicle == found.vehicle
+    assert [(c.effect, c.values, c.delta_bic) for c in other.causes] == [
+        (c.effect, c.values, c.delta_bic) for c in found.causes
+    ]
+    assert other.gain.rmse["extended"][0, 0] > 2 * found.gain.rmse["extended"][0, 0]
+
+
+def test_the_json_is_that_of_the_contract(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
+    content = json.loads(json.dumps(lagging[2].to_json("out/vehicle.yaml"), allow_nan=False))
+    assert content["verdict"] == "effects"
+    (cause,) = content["causes"]
+    assert set(cause) == {"effect", "parameters", "evidence", "alternatives"}
+    assert set(cause["parameters"]["time_constant"]) == {"value", "std", "unit"}
+    assert cause["parameters"]["time_constant"]["unit"] == "s"
+    assert set(cause["evidence"]) == {"delta_bic", "heldout_gain"}
+    assert {"horizon_s", "before", "after", "reduction"} <= set(content["gain"])
+    for part in ("before", "after", "reduction"):
+        assert list(content["gain"][part]) == ["v_x", "v_y", "omega"]
+    assert content["gain"]["horizon_s"] >= 0.5
+    assert content["vehicle"] == "out/vehicle.yaml"
+
+
+def test_words_and_report_name_cause_size_gain_and_advice(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
+    found = lagging[2]
+    words = in_words(found)
+    for part in (
+        "steering_lag: time_constant = ",
+        "±",
+        " s\n",
+        EFFECTS["steering_lag"].ADVICE,
+        "Error on held-out laps",
+    ):
+        assert part in words
+    page = diagnosis_report(found).html()
+    assert page.count("data:image/svg+xml") >= 8
+    assert EFFECTS["steering_lag"].SUMMARY in page
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"holdout": 0.0}, "holdout 0: expected a share between 0.05 and 0.8"),
+        ({"horizon": 0.04}, "horizon 0.04 s: expected at least two sampling times"),
+        ({"min_speed": 200.0}, "0 stretches of 0.52 s at 200 m/s or more beside the held-out part; expected at least"),
+    ],
+)
+def test_an_impossible_option_is_one_clear_line(
+    options: dict[str, float], words: str, lagging: tuple[Recording, Vehicle, Diagnosis]
+) -> None:
+    recording, vehicle, _ = lagging
+    with pytest.raises((ConfigurationError, RecordingError), match=words):
+        diagnose(recording, vehicle, **options)  # type: ignore[arg-type]
+
+
+def test_a_channel_without_measurement_is_one_clear_line(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
+    recording, vehicle, _ = lagging
+    dead = replace(recording, columns=recording.columns | {"v_y": np.zeros(len(recording))})
+    with pytest.raises(RecordingError, match="v_y is constant at 0; expected a measured channel"):
+        diagnose(dead, vehicle)
+    with pytest.raises(RecordingError, match=r"sampling time 0\.04 s, but vehicle orca has 0\.02 s"):
+        diagnose(recording, load_vehicle("orca"))
+
+
+def test_a_recording_too_short_to_hold_any_out_is_one_clear_line(
+    lagging: tuple[Recording, Vehicle, Diagnosis],
+) -> None:
+    recording, vehicle, _ = lagging
+    with pytest.raises(RecordingError, match="expected at least 24"):
+        diagnose(recording.select(slice(0, 200)), vehicle)
+
+
+def test_straight_driving_says_what_cannot_be_judged(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
+    recording, vehicle, _ = lagging
+    rng, N, T_s = np.random.default_rng(0), len(recording), recording.T_s
+    columns = {name: np.zeros(N) for name in recording.columns}
+    columns["r_fb"] = 0.15 + 0.2 * np.sin(0.7 * np.arange(N) * T_s)
+    v_x = np.empty(N)
+    v_x[0], th = 30.0, {name: c.nominal for name, c in vehicle.coefficients.items()}
+    for k in range(N - 1):
+        force = (th["C_m1"] - th["C_m2"] * v_x[k]) * columns["r_fb"][k] - th["C_r0"] - th["C_r2"] * v_x[k] ** 2
+        v_x[k + 1] = v_x[k] + T_s * force / vehicle.constants.m
+    columns |= {"v_x": v_x + 0.02 * rng.standard_normal(N), "x": np.cumsum(v_x) * T_s}
+    columns |= {"v_y": 0.01 * rng.standard_normal(N), "omega": 0.002 * rng.standard_normal(N)}
+    found = diagnose(replace(recording, columns=columns), vehicle, integrator="euler")
+    notes = " ".join(found.notes)
+    assert "steering is constant" in notes
+    assert "no full lap" in notes
+    (blind,) = [note for note in found.notes if note.startswith("no excitation: ")]
+    for name in ("steering_gain", "steering_lag", "locked_differential"):
+        assert name in blind

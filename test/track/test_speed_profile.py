@@ -1,0 +1,95 @@
+"""Acceleration limits of a vehicle and the forward-backward speed profile."""
+
+import numpy as np
+import pytest
+
+from dynssm_ros.errors import UserError
+from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.speed_profile import Limits, speed_profile, vehicle_limits
+from dynssm_ros.track.tracks import built_in_track
+from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
+
+CONSTANT = Limits(np.linspace(0.1, 100, 50), np.full(50, 8.0), np.full(50, 3.0), np.full(50, 6.0))
+
+
+def slopes(line: ClosedLine, v: np.ndarray) -> np.ndarray:
+    """Longitudinal acceleration from each point to the next."""
+    return (np.roll(v, -1) ** 2 - v**2) / (2 * np.diff(line.s, append=line.length))
+
+
+def test_circle_is_driven_at_the_lateral_limit():
+    angle = np.linspace(0, 2 * np.pi, 300, endpoint=False)
+    circle = ClosedLine(50 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    np.testing.assert_allclose(speed_profile(circle, CONSTANT), np.sqrt(8.0 * 50), rtol=1e-4)
+
+
+@pytest.mark.parametrize("limits", [CONSTANT, vehicle_limits(load_vehicle("av21")).scaled(0.8)])
+@pytest.mark.parametrize("name", ["oval", "road_course"])
+def test_profile_keeps_all_limits(name, limits):
+    line = built_in_track(name).centre
+    v = speed_profile(line, limits)
+    lateral = np.interp(v, limits.speed, limits.lateral)
+    share = np.abs(line.curvature(line.s)) * v**2 / lateral
+    assert np.max(share) <= 1 + 1e-3
+    assert np.max(v) <= limits.top_speed
+    a = slopes(line, v)
+    assert np.all(a <= np.interp(v, limits.speed, limits.drive) + 1e-9)
+    assert np.all(a >= -np.interp(np.roll(v, -1), limits.speed, limits.brake) - 1e-9)
+
+
+def test_straights_are_driven_at_full_throttle_or_full_brake():
+    line = built_in_track("road_course").centre
+    a = slopes(line, speed_profile(line, CONSTANT))
+    straight = np.abs(line.curvature(line.s)) < 1e-6
+    full = np.isclose(a, 3.0, atol=1e-3) | np.isclose(a, -6.0, atol=1e-3)
+    # on each straight one point lies between the two
+    assert np.sum(straight & ~full) <= 12
+    assert np.sum(straight & full) > 150
+
+
+def test_profile_does_not_depend_on_the_first_point():
+    line = built_in_track("club").centre
+    limits = vehicle_limits(load_vehicle("orca"))
+    shifted = ClosedLine(np.roll(line.points, -137, axis=0))
+    np.testing.assert_allclose(speed_profile(shifted, limits), np.roll(speed_profile(line, limits), -137), rtol=1e-6)
+
+
+def test_orca_limits_follow_its_equations():
+    orca = load_vehicle("orca")
+    th = dict(zip(COEFFICIENTS, orca.nominal, strict=True))
+    limits = vehicle_limits(orca)
+    v, m = limits.speed, orca.constants.m
+    net = (th["C_m1"] - th["C_m2"] * v) - th["C_r0"] - th["C_r2"] * v**2
+    np.testing.assert_allclose(limits.drive, net / m, rtol=1e-12)
+    braking = -0.1 * (th["C_m1"] - th["C_m2"] * v) - th["C_r0"] - th["C_r2"] * v**2
+    np.testing.assert_allclose(limits.brake, -braking / m, rtol=1e-12)
+    roots = np.roots([-th["C_r2"], -th["C_m2"], th["C_m1"] - th["C_r0"]])
+    assert 0.98 * max(roots) < limits.top_speed <= max(roots)  # where drag eats the whole drive
+    peak = th["D_f"] * (orca.constants.l_f + orca.constants.l_r) / (m * orca.constants.l_r)
+    assert 0.9 * peak < np.min(limits.lateral) < peak
+
+
+def test_effects_change_what_the_driver_believes_possible():
+    orca = load_vehicle("orca")
+    whole = vehicle_limits(orca)
+    half = vehicle_limits(orca.with_effect("front_grip", {"factor": 0.5}))
+    np.testing.assert_allclose(half.lateral, whole.lateral / 2, rtol=1e-9)  # the front gives way first
+    draggy = vehicle_limits(orca.with_effect("drag", {"coefficient": 0.01}))
+    assert draggy.top_speed < whole.top_speed
+
+
+def test_cornering_speed_inverts_the_lateral_limit():
+    limits = vehicle_limits(load_vehicle("av21"))
+    speed = np.linspace(10, 40, 7)
+    curvature = np.interp(speed, limits.speed, limits.lateral) / speed**2
+    np.testing.assert_allclose(limits.cornering_speed(curvature), speed, rtol=1e-3)
+    np.testing.assert_allclose(limits.cornering_speed(-curvature), speed, rtol=1e-3)
+    assert limits.cornering_speed(np.zeros(1))[0] == limits.top_speed
+
+
+def test_car_that_cannot_move_is_refused():
+    orca = load_vehicle("orca")
+    weak = orca.nominal.copy()
+    weak[COEFFICIENTS.index("C_m1")] = 0.01
+    with pytest.raises(UserError, match="full throttle does not move it"):
+        vehicle_limits(orca.with_nominal(weak))
