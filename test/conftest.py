@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -99,3 +102,78 @@ def small_model(laps_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     recording = extract([laps_bag], load_signal_map("default"), 50.0)
     trained = train(recording, config, load_vehicle("orca"), folder / "checkpoint.pt")
     return save_artifact(trained, folder / "small").path
+
+
+TINY = """
+base: dynssm_orca
+name: tiny
+H: 4
+ssm: {channels: 4, states: 2}
+gru: {hidden: 4}
+fusion: {hidden: 8, latent: 8}
+physics: {nominal: mid_range}
+adaptation: {hidden: 8}
+residual: {hidden: [8]}
+training: {epochs: 4, batch_size: 64}
+"""
+
+
+@pytest.fixture
+def tiny_model(tmp_path: Path) -> Path:
+    """A model file that trains in a second, four epochs."""
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY)
+    return path
+
+
+@pytest.fixture
+def dynssm(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs the command line in this process: ``dynssm(...) -> (status, stdout, stderr)``."""
+    from dynssm_ros.cli import main as cli
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["dynssm", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        out, err = capsys.readouterr()
+        return int(stopped.value.code or 0), out, err
+
+    return run
+
+
+@pytest.fixture
+def drawn() -> Callable[[Any], list[Any]]:
+    """Draws a figure and returns its visible axes."""
+
+    def draw(figure: Any) -> list[Any]:
+        sink = io.BytesIO()
+        figure.savefig(sink, format="png", dpi=40)
+        assert len(sink.getvalue()) > 1000
+        return [axes for axes in figure.axes if axes.axison]
+
+    return draw
+
+
+@pytest.fixture(scope="session")
+def laps() -> Callable[..., tuple[Any, Any]]:
+    """``laps(effect, ..., seed=1)``: a quick drive with hidden effects of random size, and the nominal vehicle."""
+    import numpy as np
+
+    from benchmarks.hidden_causes.cases import Case, record, size
+
+    def drive(*effects: str, seed: int = 1, duration: float = 70.0) -> tuple[Any, Any]:
+        rng = np.random.default_rng(seed)
+        return record(Case({name: size(name, rng) for name in effects}, seed, "euler", duration))
+
+    return drive
+
+
+@pytest.fixture(scope="session")
+def lagging(laps: Callable[..., tuple[Any, Any]]) -> tuple[Any, Any, Any]:
+    """A recording of a car whose steering lags, the vehicle file that does not know it, and the diagnosis."""
+    from dynssm_ros.identification.diagnose import diagnose
+    from dynssm_ros.track.tracks import load_track
+
+    recording, vehicle = laps("steering_lag")
+    line = load_track("road_course").centre
+    return recording, vehicle, diagnose(recording, vehicle, integrator="euler", line=line)

@@ -92,12 +92,15 @@ def _bins(quantity: str, values: Vector, unit: str) -> Iterator[Regime]:
 
 
 def round_edges(low: float, high: float, most: int) -> Vector:
-    """Edges of at most ``most`` bins that cover ``low`` to ``high``; their width is 1, 2, 2.5 or 5 times a power of ten."""
+    """Edges of bins that cover ``low`` to ``high``: the narrowest of 1, 2, 2.5 or 5 times a power of ten, ``most`` in the span.
+
+    The outer edges are multiples of the width too, so that there may be one bin more.
+    """
     span = max(high - low, 1e-12 * max(abs(low), abs(high), 1e-300))
     power = 10.0 ** np.floor(np.log10(span / most))
     for width in (factor * power for factor in (1.0, 2.0, 2.5, 5.0, 10.0, 20.0)):
-        first, last = np.floor(low / width + 1e-9), np.ceil(high / width - 1e-9)
-        if last - first <= most:
+        if width * most >= span * (1 - 1e-9):
+            first, last = np.floor(low / width + 1e-9), np.ceil(high / width - 1e-9)
             return np.asarray(width * np.arange(first, max(last, first + 1) + 1))
     raise AssertionError("one of the widths is wide enough")
 

@@ -21,6 +21,9 @@ from dynssm_ros.vehicle import COEFFICIENTS
 T_s = 0.04
 
 
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
 def make_recording(v_x, omega, segment=None):
     N = len(v_x)
     columns = {name: np.zeros(N) for name in WINDOW_COLUMNS} | {"v_x": v_x, "omega": omega}
