@@ -27,36 +27,6 @@ from dynssm_ros.vehicle.effects import EFFECTS
 
 Hidden = dict[str, dict[str, float]]
 
-SIZES: dict[str, dict[str, tuple[float, float]]] = {
-    "steering_offset": {"offset": (0.004, 0.02)},
-    "steering_gain": {"factor": (0.015, 0.2)},
-    "steering_lag": {"time_constant": (0.015, 0.2)},
-    "throttle_lag": {"time_constant": (0.012, 0.4)},
-    "drag": {"coefficient": (0.12, 0.6)},
-    "rolling_resistance": {"coefficient": (0.005, 0.04)},
-    "drive_gain": {"factor": (0.12, 0.25)},
-    "mass": {"factor": (0.11, 0.2)},
-    "yaw_inertia": {"factor": (0.2, 0.5)},
-    "front_grip": {"factor": (0.1, 0.25)},
-    "rear_grip": {"factor": (0.06, 0.2)},
-    "downforce": {"coefficient": (0.25, 2.0)},
-    "load_transfer": {"factor": (0.12, 2.0)},
-    "tire_relaxation": {"length": (0.35, 1.2)},
-    "combined_slip": {"strength": (0.35, 1.0)},
-    "road_bank": {"angle": (0.015, 0.1)},
-    "road_grade": {"angle": (0.005, 0.05)},
-    "crosswind": {"speed": (0.7, 12.0)},
-    "grip_drift": {"rate": (0.0003, 0.002)},
-    "grip_patch": {"factor": (0.035, 0.4)},
-    "locked_differential": {"stiffness": (2.0, 30.0)},
-    "odometry_lever_arm": {"x": (0.08, 2.0)},
-    "odometry_misalignment": {"angle": (0.003, 0.04)},
-    "odometry_delay": {"delay": (0.008, 0.16)},
-    "yaw_rate_bias": {"bias": (0.003, 0.03)},
-    "yaw_rate_lag": {"time_constant": (0.013, 0.25)},
-}
-"""How far each effect is off neutral, from just noticeable to large, in the units of its parameters."""
-
 NOISE = (0.02, 0.02, 0.003)  # m/s, m/s, rad/s: a good odometry
 OFF = 0.02  # of the nominal values
 TRACKS = {"road_course": 1.0, "club": 140.0, "club_b": 110.0}
@@ -64,7 +34,6 @@ TRACKS = {"road_course": 1.0, "club": 140.0, "club_b": 110.0}
 _RATES = (0.04, 0.04, 0.04, 0.02)  # s: sampling times, drawn with equal chance
 _KNOWN = 0.02  # how well the vehicle file says that they are known
 _SHIFTS = {"S_hf": 0.0007, "S_hr": 0.0007, "S_vf": 40.0, "S_vr": 40.0}  # rad, N: the same for values around 0
-_ONE_WAY = {"rear_grip": -1.0, "grip_drift": -1.0, "grip_patch": -1.0, "load_transfer": 1.0}  # a car that can be driven
 _TRIES = 6
 _ROUND = 13  # cases, of which two have a pair of effects and two none
 _PAIRS, _NONE = (4, 10), (6, 12)
@@ -104,23 +73,8 @@ class Case:
 
 def size(effect: str, rng: np.random.Generator) -> dict[str, float]:
     """Random parameters of an effect, between just noticeable and large."""
-    ((low, high),) = SIZES[effect].values()
-    return sized(effect, float(np.exp(rng.uniform(np.log(low), np.log(high)))), rng)
-
-
-def sized(effect: str, amount: float, rng: np.random.Generator) -> dict[str, float]:
-    """Parameters of an effect that is ``amount`` off neutral, to a random side, direction and place."""
-    (name,) = SIZES[effect]
-    if effect == "crosswind":
-        direction = float(rng.uniform(0, 2 * np.pi))
-        return {"x": amount * float(np.cos(direction)), "y": amount * float(np.sin(direction))}
-    about = EFFECTS[effect].PARAMETERS[name]
-    either = about.lower < about.neutral and effect not in ("downforce", "rolling_resistance", "drag")
-    sign = _ONE_WAY.get(effect, float(rng.choice([-1.0, 1.0])) if either else 1.0)
-    values = {name: about.neutral + sign * amount}
-    if effect == "grip_patch":
-        values |= {"centre": float(rng.uniform(0.1, 0.9)), "length": float(rng.uniform(0.12, 0.3))}
-    return values
+    low, high = EFFECTS[effect].TYPICAL
+    return EFFECTS[effect].drawn(float(np.exp(rng.uniform(np.log(low), np.log(high)))), rng)
 
 
 def cases(seed: int, count: int, effects: Sequence[str] = tuple(EFFECTS)) -> Iterator[Case]:

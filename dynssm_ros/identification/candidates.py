@@ -1,8 +1,7 @@
 """What may be wrong: every effect of the library in every variant, and how well each would explain what is left.
 
 All of them are tried at once on linearised errors, with the nominal values free to move as far as is known of them.
-What an effect does somewhere on the lap is what it does everywhere, weighed with where it is, so that one simulation
-serves for all places.
+A local effect's response is the global response times a window over the lap, so that one simulation serves all positions.
 """
 
 from __future__ import annotations
@@ -17,16 +16,9 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.car import Car, Values
 from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import Fit, Study, unit
-from dynssm_ros.vehicle.effects import EFFECTS
-from dynssm_ros.vehicle.effects.base import LAP, section
+from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
+from dynssm_ros.vehicle.effects.base import section
 
-_SHAPES: dict[str, tuple[float, ...]] = {
-    "centre": tuple(np.linspace(0.0, 1.0, 32, endpoint=False).tolist()),
-    "length": (0.03, 0.06, 0.12, 0.25),
-    "balance": (0.2, 0.45, 0.7),
-    "side": (1.0, 3.0, 10.0),
-    "arm": (-0.4, 0.4),
-}  # tried for the parameters that say where or how an effect acts
 _LADDER = (6.0, 1.5, 0.375, 0.094, 0.023)  # units: sizes at which effects are tried, a factor of 4 apart
 _HERE = 1.5  # unit at which effects are tried that act somewhere on the lap
 _REACH = (0.5, 3.0)  # times a size, for which its response serves
@@ -58,9 +50,9 @@ class Candidate:
         return tuple(p for p in self.parameters if EFFECTS[self.effect].PARAMETERS[p].shape)
 
     @property
-    def somewhere(self) -> bool:
-        """Whether it acts on a part of the lap only."""
-        return "centre" in self.parameters
+    def local(self) -> bool:
+        """Whether it acts on a section of the lap only."""
+        return any(EFFECTS[self.effect].PARAMETERS[p].local for p in self.parameters)
 
     @property
     def free(self) -> tuple[tuple[str, str], ...]:
@@ -131,14 +123,14 @@ class Responses:
         A response to one size alone serves for all.
         """
         effect = candidate.effect
-        place = {k: v for k, v in shape.items() if k in ("centre", "length")}
+        place = {k: v for k, v in shape.items() if k in LOCATION}
         form = {k: v for k, v in shape.items() if k not in place}
         about = EFFECTS[effect].PARAMETERS[parameter]
-        local = bool(place) and about.context == LAP and parameter in ("factor", "section")
+        local = bool(place) and about.local
         key = (effect, parameter, local, tuple(sorted(form.items())))
         if key not in self._known:
             everywhere = {"s": 0.5, "lap_length": 1.0} if local else None
-            if candidate.somewhere:
+            if candidate.local:
                 found = self._simulated(effect, parameter, form, (_HERE, -_HERE), everywhere)
             else:
                 found = self._simulated(effect, parameter, form, (_LADDER[1], _LADDER[3]), everywhere)
@@ -218,7 +210,8 @@ class Scan:
         """The best place, form and size of each candidate that shows at all."""
         for candidate in found:
             best = None
-            for combination in product(*(_SHAPES[p] for p in candidate.shapes)):
+            about = EFFECTS[candidate.effect].PARAMETERS
+            for combination in product(*(about[p].tried for p in candidate.shapes)):
                 prospect = self._try(candidate, dict(zip(candidate.shapes, combination, strict=True)))
                 if prospect is not None and (best is None or prospect.gain > best.gain):
                     best = prospect
@@ -227,7 +220,7 @@ class Scan:
 
     def _try(self, candidate: Candidate, shape: Values) -> Prospect | None:
         responses = [self._responses.of(candidate, p, shape) for p in candidate.amplitudes]
-        bent = np.array([len(known) > 1 for known, _ in responses]) & (not candidate.somewhere)
+        bent = np.array([len(known) > 1 for known, _ in responses]) & (not candidate.local)
         sizes = sorted({abs(r.size) for (known, _), b in zip(responses, bent, strict=True) if b for r in known})
         best: tuple[float, Vector] | None = None
         for size in sizes or [_HERE]:

@@ -13,7 +13,7 @@ from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.identification.car import Car, knowledge
 from dynssm_ros.identification.improvement import Gain, measure
 from dynssm_ros.identification.integrator import Searched, searched
-from dynssm_ros.identification.minimum_effect import noticeable, room
+from dynssm_ros.identification.minimum_effect import noticeable
 from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import per_unit
 from dynssm_ros.identification.residuals import Bunched, Systematic, bunched, systematic
@@ -288,7 +288,7 @@ def _cause(one: Refined, found: Searched, at: _Prepared, std: Vector) -> Cause:
 
 def _hidden(sizes: Mapping[str, float]) -> Iterator[str]:
     """What these laps cannot show at any size that is possible, and how to drive so that they do."""
-    hidden = [effect for effect, size in sizes.items() if size > room(effect)]
+    hidden = [effect for effect, size in sizes.items() if size > EFFECTS[effect].magnitude().span]
     if hidden:
         yield (
             f"no excitation: {', '.join(hidden)} would not be noticed at any possible size, because these laps hardly show "

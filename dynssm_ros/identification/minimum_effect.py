@@ -12,7 +12,7 @@ from dynssm_ros.identification.car import Values
 from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import Fit, Study, unit
 from dynssm_ros.identification.selection import SURE
-from dynssm_ros.vehicle.effects import EFFECTS
+from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 
 _PLACES = np.linspace(0.0, 1.0, 8, endpoint=False)  # of the lap
 _NOTHING = 1e-9  # of a squared error in units of the noise
@@ -42,7 +42,7 @@ def noticeable(study: Study, fit: Fit, found: Iterable[Candidate]) -> dict[str, 
             continue
         about, parameter = EFFECTS[effect].PARAMETERS, candidate.amplitudes[0]
         form = {name: about[name].neutral for name in candidate.shapes}
-        places = [{"centre": float(place)} for place in _PLACES] if "centre" in form else [{}]
+        places = [{LOCATION[0]: float(place)} for place in _PLACES] if candidate.local else [{}]
         left = np.median([_left(_column(study, fit, effect, parameter, form | at), J, H) for at in places])
         out[effect] = float(np.sqrt(needed / left) * unit(effect, parameter)) if left > _NOTHING else float("inf")
     return out
@@ -51,8 +51,8 @@ def noticeable(study: Study, fit: Fit, found: Iterable[Candidate]) -> dict[str, 
 def _column(study: Study, fit: Fit, effect: str, parameter: str, form: Values) -> Vector:
     """What a unit of a parameter does to the whitened errors, shape ``(W * 3 K,)``."""
     about = EFFECTS[effect].PARAMETERS[parameter]
-    sign = 1.0 if about.upper > about.neutral else -1.0
-    values = dict(fit.car.effects.get(effect, {})) | form | {parameter: about.neutral + sign * unit(effect, parameter)}
+    moved = about.neutral + about.direction * unit(effect, parameter)
+    values = dict(fit.car.effects.get(effect, {})) | form | {parameter: moved}
     change = study.errors(fit.car.with_effect(effect, values)) - fit.errors
     return (fit.noise.whiten(change) * _root(fit)[:, None]).ravel()
 
@@ -65,9 +65,3 @@ def _left(column: Vector, J: Vector, H: Vector) -> float:
     """Squared length of what fitted values cannot take up of a column."""
     across = J.T @ column
     return float(column @ column - across @ np.linalg.solve(H, across))
-
-
-def room(effect: str) -> float:
-    """How far off neutral the first parameter that says how much can be."""
-    about = next(p for p in EFFECTS[effect].PARAMETERS.values() if not p.shape)
-    return max(about.upper - about.neutral, about.neutral - about.lower)

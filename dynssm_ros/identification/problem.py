@@ -31,32 +31,26 @@ _CONVERGED = 0.3  # of the squared error
 
 def unit(effect: str, parameter: str) -> float:
     """The unit in which a parameter is fitted."""
-    about = EFFECTS[effect].PARAMETERS[parameter]
-    return _UNIT * max(about.upper - about.neutral, about.neutral - about.lower)
-
-
-def _scales(effect: str, parameter: str) -> bool:
-    """Whether it multiplies, and so is fitted as a logarithm."""
-    about = EFFECTS[effect].PARAMETERS[parameter]
-    return about.neutral == 1.0 and about.lower > 0.0
+    return _UNIT * EFFECTS[effect].PARAMETERS[parameter].span
 
 
 def _in_units(effect: str, parameter: str, value: float) -> float:
     """A parameter's value as a fit has it: 0 where it is neutral."""
-    off = np.log(value) if _scales(effect, parameter) else value - EFFECTS[effect].PARAMETERS[parameter].neutral
+    about = EFFECTS[effect].PARAMETERS[parameter]
+    off = np.log(value) if about.scales else value - about.neutral
     return float(off / unit(effect, parameter))
 
 
 def _value(effect: str, parameter: str, in_units: float) -> float:
     """The inverse of :func:`_in_units`, within the bounds."""
     about, off = EFFECTS[effect].PARAMETERS[parameter], in_units * unit(effect, parameter)
-    value = np.exp(off) if _scales(effect, parameter) else about.neutral + off
+    value = np.exp(off) if about.scales else about.neutral + off
     return float(np.clip(value, about.lower, about.upper))
 
 
 def per_unit(effect: str, parameter: str, value: float) -> float:
     """How much a parameter that has ``value`` changes per unit of a fit."""
-    return unit(effect, parameter) * (value if _scales(effect, parameter) else 1.0)
+    return unit(effect, parameter) * (value if EFFECTS[effect].PARAMETERS[parameter].scales else 1.0)
 
 
 @dataclass(frozen=True)

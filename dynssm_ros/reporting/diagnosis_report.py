@@ -1,4 +1,4 @@
-"""A diagnosis in words, tables and diagnosis_figures."""
+"""A diagnosis in words, tables and figures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from dynssm_ros.identification.diagnose import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
-from dynssm_ros.identification.minimum_effect import room
 from dynssm_ros.identification.residuals import Systematic
 from dynssm_ros.identification.selection import SURE
 from dynssm_ros.reporting import diagnosis_figures
@@ -117,7 +116,7 @@ def gain_in_words(diagnosis: Diagnosis) -> list[str]:
 
 
 def diagnosis_report(diagnosis: Diagnosis) -> Report:
-    """The report with diagnosis_figures."""
+    """The report with figures."""
     return Report(
         f"Diagnosis of {diagnosis.vehicle.name}",
         f"{headline(diagnosis)} {left_in_words(diagnosis)}".strip(),
@@ -285,9 +284,9 @@ def _systematic_table(diagnosis: Diagnosis) -> Table:
 def _noticeable_table(diagnosis: Diagnosis) -> Table:
     columns = (Column("effect"), Column("noticed from"), Column("unit"), Column("judged"))
     rows: list[list[Value]] = []
-    for effect, size in sorted(diagnosis.noticeable.items(), key=lambda item: item[1] / room(item[0])):
-        unit = next(p.unit for p in EFFECTS[effect].PARAMETERS.values() if not p.shape)
-        rows.append([effect, size, "" if unit == "1" else unit, "yes" if size <= room(effect) else "no"])
+    for effect, size in sorted(diagnosis.noticeable.items(), key=lambda item: item[1] / EFFECTS[item[0]].magnitude().span):
+        about = EFFECTS[effect].magnitude()
+        rows.append([effect, size, "" if about.unit == "1" else about.unit, "yes" if size <= about.span else "no"])
     return Table(columns, rows)
 
 

@@ -17,7 +17,6 @@ from dynssm_ros.reporting.page import Report, Section
 from dynssm_ros.reporting.tables import Column, Table, Value
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, motion
-from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDelay
 from dynssm_ros.vehicle.single_track import Motion, lateral_force
 
 _STAMPS = 0.5  # s between the time stamps on the map
@@ -222,7 +221,7 @@ def _motion(race: Race, with_effects: bool = True) -> Motion:
     x, y, theta = race.pose.T
     context = {"t": race.time, "s": race.s, "lap_length": course.track.length, "x": x, "y": y, "theta": theta}
     effects = [
-        effect for effect in course.vehicle.active_effects if not isinstance(effect, (MeasurementEffect, OdometryDelay))
+        effect for effect in course.vehicle.active_effects if not effect.SENSOR
     ]
     nominal = Coefficients(*course.vehicle.nominal)
     state, command = State(*race.state.T), Applied(*race.command.T)

@@ -14,7 +14,7 @@ import pytest
 
 from benchmarks.hidden_causes import __main__ as command
 from benchmarks.hidden_causes import run
-from benchmarks.hidden_causes.cases import NOISE, SIZES, TRACKS, Case, cases, off, size, sized
+from benchmarks.hidden_causes.cases import NOISE, TRACKS, Case, cases, off, size
 from benchmarks.hidden_causes.outcomes import Outcome, judge, matrix, rates
 from benchmarks.hidden_causes.page import page
 from benchmarks.hidden_causes.run import kept, run_case
@@ -36,7 +36,8 @@ def cause(effect: str, values: dict[str, float], *alternatives: str, std: float 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_every_effect_has_sizes_that_the_library_admits(name: str) -> None:
-    assert name in SIZES
+    least, most = EFFECTS[name].TYPICAL
+    assert 0 < least < most <= EFFECTS[name].magnitude().span
     for seed in range(20):
         values = size(name, np.random.default_rng(seed))
         car = load_vehicle("av21").with_effect(name, values)
@@ -181,8 +182,8 @@ def test_the_least_sizes_are_just_noticeable() -> None:
     study = Study(Windows(track, np.arange(8, rows.shape[1] - 14, 13), 13, 8, "euler"), Car.of(car))
     fit = study.fit(Car.of(car), ())
     J = fit.noise.whiten(fit.jacobian).reshape(-1, 18)
-    for name, ((least, _),) in ((name, tuple(sizes.values())) for name, sizes in SIZES.items()):
-        values = sized(name, least, np.random.default_rng(0))
+    for name, effect in EFFECTS.items():
+        values = effect.drawn(effect.TYPICAL[0], np.random.default_rng(0))
         change = fit.noise.whiten(study.errors(fit.car.with_effect(name, values)) - fit.errors).ravel()
         seen = J.T @ change
         evidence = change @ change - seen @ np.linalg.solve(J.T @ J + np.eye(18), seen)

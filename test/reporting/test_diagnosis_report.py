@@ -11,7 +11,7 @@ from dynssm_ros.identification.candidates import Candidate
 from dynssm_ros.identification.car import Car
 from dynssm_ros.identification.diagnose import EXTENDED, GIVEN, RECALIBRATED, Diagnosis
 from dynssm_ros.identification.improvement import Gain, measure
-from dynssm_ros.identification.minimum_effect import noticeable, room
+from dynssm_ros.identification.minimum_effect import noticeable
 from dynssm_ros.identification.problem import Study
 from dynssm_ros.identification.windows import Track, Windows
 from dynssm_ros.reporting.diagnosis_figures import errors_over, gain_by_horizon, simulated_and_measured
@@ -27,6 +27,7 @@ from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle
+from dynssm_ros.vehicle.effects import EFFECTS
 
 AV21 = load_vehicle("av21")
 TRUE = AV21.with_effect("drag", {"coefficient": 0.5}).with_effect("steering_gain", {"factor": 1.1})
@@ -91,7 +92,7 @@ def test_twice_the_noise_hides_effects_about_twice_as_large() -> None:
         sizes.append(noticeable(study, study.fit(Car.of(TRUE), (), rounds=1), found))
     for effect in sizes[0]:
         assert 1.3 < sizes[1][effect] / sizes[0][effect] < 2.7
-        assert sizes[0][effect] < 0.5 * room(effect)
+        assert sizes[0][effect] < 0.5 * EFFECTS[effect].magnitude().span
 
 
 def test_straight_driving_shows_no_steering_error() -> None:

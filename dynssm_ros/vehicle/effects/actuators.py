@@ -18,6 +18,7 @@ class SteeringOffset(Effect):
     ADVICE = "Re-zero the steering sensor with the wheels straight, and check toe and tie rods."
     MANOEUVRE = "driving straight at several speeds"
     PARAMETERS = {"offset": Parameter("rad", -0.05, 0.05, 0.0)}
+    TYPICAL = (0.004, 0.02)
     offset: Array = 0.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
@@ -34,6 +35,7 @@ class SteeringGain(Effect):
     ADVICE = "Measure the road-wheel angle over the sensor's range and correct the steering ratio."
     MANOEUVRE = "corners to both sides at low lateral acceleration"
     PARAMETERS = {"factor": Parameter("1", 0.5, 1.5, 1.0)}
+    TYPICAL = (0.015, 0.2)
     factor: Array = 1.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
@@ -50,6 +52,7 @@ class SteeringLag(Effect):
     ADVICE = "Check the steering actuator, play and compliance, and the stamps of the steering signal."
     MANOEUVRE = "quick steering from side to side at constant speed"
     PARAMETERS = {"time_constant": Parameter("s", 0.0, 0.5, 0.0)}
+    TYPICAL = (0.015, 0.2)
     MEMORY = ("steering_lag.delta",)
     time_constant: Array = 0.0
 
@@ -67,6 +70,7 @@ class ThrottleLag(Effect):
     ADVICE = "Check turbo and engine response, brake pressure build-up, and the stamps of the throttle signal."
     MANOEUVRE = "steps of throttle and brake on a straight"
     PARAMETERS = {"time_constant": Parameter("s", 0.0, 0.5, 0.0)}
+    TYPICAL = (0.012, 0.4)
     MEMORY = ("throttle_lag.r",)
     time_constant: Array = 0.0
 

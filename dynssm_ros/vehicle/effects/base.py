@@ -12,6 +12,8 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar
 
+import numpy as np
+
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle.single_track import Array, Coefficients, Constants, Motion, StageEffect, at_least
 
@@ -90,6 +92,8 @@ class Effect(StageEffect):
         VARIANTS: sets of parameters to be fitted together, the simplest first; empty: all of them.
         MEMORY: names of its own states. :func:`lagged` settles and integrates them.
         SENSOR: it changes what the sensors show; the car moves as without it.
+        TYPICAL: how far it is off neutral in a car that is badly set up: just noticeable in ordinary laps, and large.
+        DIRECTIONS: to which sides of neutral it is met in a car that can be driven; empty: those that its bounds admit.
     """
 
     NAME: ClassVar[str] = ""
@@ -100,6 +104,8 @@ class Effect(StageEffect):
     VARIANTS: ClassVar[tuple[tuple[str, ...], ...]] = ()
     MEMORY: ClassVar[tuple[str, ...]] = ()
     SENSOR: ClassVar[bool] = False
+    TYPICAL: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    DIRECTIONS: ClassVar[tuple[float, ...]] = ()
 
     @classmethod
     def variants(cls) -> tuple[tuple[str, ...], ...]:
@@ -116,6 +122,18 @@ class Effect(StageEffect):
     def magnitude(cls) -> Parameter:
         """The first parameter that says how much."""
         return next(about for about in cls.PARAMETERS.values() if not about.shape)
+
+    @classmethod
+    def drawn(cls, amount: float, rng: np.random.Generator) -> dict[str, float]:
+        """Parameters of an effect that is ``amount`` off neutral, to a random side; for simulated test drives."""
+        name, about = next((name, about) for name, about in cls.PARAMETERS.items() if not about.shape)
+        side = float(rng.choice([-1.0, 1.0])) if about.lower < about.neutral else 1.0
+        if cls.DIRECTIONS and side not in cls.DIRECTIONS:
+            side = cls.DIRECTIONS[0]
+        values = {name: about.neutral + side * amount}
+        if about.local:
+            values |= dict(zip(LOCATION, (float(rng.uniform(0.1, 0.9)), float(rng.uniform(0.12, 0.3))), strict=True))
+        return values
 
     @classmethod
     def unusable(cls, constants: Constants) -> str | None:

@@ -27,6 +27,7 @@ class LockedDifferential(Effect):
         "stiffness": Parameter("1", 0.0, 60.0, 0.0),
         "width": Parameter("1", 0.2, 1.0, TRACK_WIDTH, shape=True),
     }
+    TYPICAL = (2.0, 30.0)
     VARIANTS = (("stiffness",),)  # the width, in wheelbases, shows in the product only
     stiffness: Array = 0.0
     width: Array = TRACK_WIDTH

@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+
 from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, Effect, Parameter, like, section
 from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion
 
@@ -65,6 +67,7 @@ class RoadBank(RoadAngle):
     ADVICE = "Map the banking of the track, or feed the measured roll to the model."
     MANOEUVRE = "the same stretch at different speeds, straight as far as possible"
     PARAMETERS = {**RoadAngle.PARAMETERS, "roll_gain": Parameter("1", -2.0, 2.0, 0.0, context=("roll",))}
+    TYPICAL = (0.015, 0.1)
     VARIANTS = (*RoadAngle.VARIANTS, ("roll_gain",))
     roll_gain: Array = 0.0
 
@@ -85,6 +88,7 @@ class RoadGrade(RoadAngle):
     ADVICE = "Map the height of the track and give the model its slope."
     MANOEUVRE = "the same stretch with and without throttle"
     PARAMETERS = RoadAngle.PARAMETERS
+    TYPICAL = (0.005, 0.05)
 
     def forces(self, xp: Any, q: Motion) -> None:
         """Adds the weight's part along the car."""
@@ -110,6 +114,7 @@ class Crosswind(Effect):
         "side": Parameter("1", 0.0, 100.0, 3.0, shape=True, tried=(1.0, 3.0, 10.0)),
         "arm": Parameter("m", -1.0, 1.0, 0.0, shape=True, tried=(-0.4, 0.4)),
     }
+    TYPICAL = (0.7, 12.0)
     VARIANTS = (("x", "y"), ("x", "y", "side"), ("x", "y", "side", "arm"))
     x: Array = 0.0
     y: Array = 0.0
@@ -129,6 +134,12 @@ class Crosswind(Effect):
         push = self.side * q.theta.C_r2 * xp.sqrt(a_x * a_x + a_y * a_y + _CALM) * w_y
         q.F_y = q.F_y + push
         q.M_z = q.M_z + self.arm * push
+
+    @classmethod
+    def drawn(cls, amount: float, rng: np.random.Generator) -> dict[str, float]:
+        """Wind of that speed (m/s) from a random direction."""
+        direction = float(rng.uniform(0, 2 * math.pi))
+        return {"x": amount * math.cos(direction), "y": amount * math.sin(direction)}
 
     def _wind(self, xp: Any, q: Motion) -> tuple[Array, Array]:
         """The wind in the body frame (m/s)."""

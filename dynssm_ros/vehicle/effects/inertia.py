@@ -18,6 +18,7 @@ class Mass(Effect):
     ADVICE = "Weigh the car as it runs, with fuel, and correct m in the vehicle file."
     MANOEUVRE = "full throttle and coasting at different speeds"
     PARAMETERS = {"factor": Parameter("1", 0.6, 1.6, 1.0)}
+    TYPICAL = (0.11, 0.2)
     factor: Array = 1.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
@@ -34,6 +35,7 @@ class YawInertia(Effect):
     ADVICE = "Measure the yaw inertia (bifilar pendulum) or sum it up from the parts, and correct I_z."
     MANOEUVRE = "quick steering from side to side at constant speed"
     PARAMETERS = {"factor": Parameter("1", 0.4, 2.5, 1.0)}
+    TYPICAL = (0.2, 0.5)
     factor: Array = 1.0
 
     def inputs(self, xp: Any, q: Motion) -> None:

@@ -21,6 +21,8 @@ class Downforce(Effect):
         "coefficient": Parameter("N/(m/s)^2", -0.5, 5.0, 0.0),
         "balance": Parameter("1", 0.0, 1.0, 0.45, shape=True, tried=(0.2, 0.45, 0.7)),
     }
+    TYPICAL = (0.25, 2.0)
+    DIRECTIONS = (1.0,)  # a car that can be driven
     coefficient: Array = 0.0
     balance: Array = 0.45
 
@@ -40,6 +42,8 @@ class LoadTransfer(Effect):
     ADVICE = "Measure the height of the centre of gravity and correct h_cg; check anti-dive and anti-squat."
     MANOEUVRE = "braking into corners and accelerating out of them"
     PARAMETERS = {"factor": Parameter("1", 0.0, 4.0, 1.0)}
+    TYPICAL = (0.12, 2.0)
+    DIRECTIONS = (1.0,)  # a car that can be driven
     factor: Array = 1.0
 
     @classmethod

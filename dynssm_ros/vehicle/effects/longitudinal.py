@@ -18,6 +18,8 @@ class Drag(Effect):
     ADVICE = "Check wings, cooling inlets and bodywork; coast down from top speed to measure the drag."
     MANOEUVRE = "coasting down from top speed"
     PARAMETERS = {"coefficient": Parameter("N/(m/s)^2", -1.0, 2.0, 0.0)}
+    TYPICAL = (0.12, 0.6)
+    DIRECTIONS = (1.0,)  # a car that can be driven
     coefficient: Array = 0.0
 
     def drive(self, xp: Any, q: Motion) -> None:
@@ -34,6 +36,8 @@ class RollingResistance(Effect):
     ADVICE = "Check tyre pressures, bearings and dragging brakes; let the car roll out to measure the resistance."
     MANOEUVRE = "rolling out at low speed"
     PARAMETERS = {"coefficient": Parameter("1", -0.1, 0.2, 0.0)}
+    TYPICAL = (0.005, 0.04)
+    DIRECTIONS = (1.0,)  # a car that can be driven
     coefficient: Array = 0.0
 
     def drive(self, xp: Any, q: Motion) -> None:
@@ -50,6 +54,7 @@ class DriveGain(Effect):
     ADVICE = "Check the engine map and the brake balance, and the scale of the throttle signal."
     MANOEUVRE = "full throttle and hard braking on a straight"
     PARAMETERS = {"factor": Parameter("1", 0.4, 1.6, 1.0)}
+    TYPICAL = (0.12, 0.25)
     factor: Array = 1.0
 
     def drive(self, xp: Any, q: Motion) -> None:

@@ -35,6 +35,7 @@ class OdometryLeverArm(MeasurementEffect):
     ADVICE = "Measure where the antenna or sensor sits and move its velocity to the centre of gravity."
     MANOEUVRE = "tight corners to both sides"
     PARAMETERS = {"x": Parameter("m", -3.0, 3.0, 0.0), "y": Parameter("m", -2.0, 2.0, 0.0)}
+    TYPICAL = (0.08, 2.0)
     VARIANTS = (("x",), ("x", "y"))
     x: Array = 0.0
     y: Array = 0.0
@@ -59,6 +60,7 @@ class OdometryMisalignment(MeasurementEffect):
     ADVICE = "Align the sensor, or correct its heading offset until driving straight shows no sideways speed."
     MANOEUVRE = "driving straight at different speeds"
     PARAMETERS = {"angle": Parameter("rad", -0.2, 0.2, 0.0)}
+    TYPICAL = (0.003, 0.04)
     angle: Array = 0.0
 
     def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
@@ -95,6 +97,7 @@ class OdometryDelay(Effect):
     ADVICE = "Stamp the odometry when it is measured, or take its delay off its stamps."
     MANOEUVRE = "quick changes of steering and throttle"
     PARAMETERS = {"delay": Parameter("s", 0.0, 0.3, 0.0)}
+    TYPICAL = (0.008, 0.16)
     MEMORY = ("odometry_delay.r", "odometry_delay.delta")
     SENSOR = True
     delay: Array = 0.0
@@ -120,6 +123,7 @@ class YawRateBias(MeasurementEffect):
     ADVICE = "Zero the gyroscope at standstill before each run."
     MANOEUVRE = "standing still or driving straight"
     PARAMETERS = {"bias": Parameter("rad/s", -0.3, 0.3, 0.0)}
+    TYPICAL = (0.003, 0.03)
     bias: Array = 0.0
 
     def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
@@ -145,6 +149,7 @@ class YawRateLag(MeasurementEffect):
     ADVICE = "Widen the filter of the yaw rate sensor, or account for it where the signal is used."
     MANOEUVRE = "quick steering from side to side"
     PARAMETERS = {"time_constant": Parameter("s", 0.0, 0.5, 0.0)}
+    TYPICAL = (0.013, 0.25)
     MEMORY = ("yaw_rate_lag.behind",)
     time_constant: Array = 0.0
 

@@ -21,6 +21,7 @@ class FrontGrip(Effect):
     ADVICE = "Check pressure, temperature and wear of the front tyres and the front wing."
     MANOEUVRE = "steady cornering up to the limit"
     PARAMETERS = {"factor": Parameter("1", 0.3, 1.7, 1.0)}
+    TYPICAL = (0.1, 0.25)
     factor: Array = 1.0
 
     def tyres(self, xp: Any, q: Motion) -> None:
@@ -37,6 +38,8 @@ class RearGrip(Effect):
     ADVICE = "Check pressure, temperature and wear of the rear tyres and the rear wing."
     MANOEUVRE = "steady cornering up to the limit"
     PARAMETERS = {"factor": Parameter("1", 0.3, 1.7, 1.0)}
+    TYPICAL = (0.06, 0.2)
+    DIRECTIONS = (-1.0,)  # a car that can be driven
     factor: Array = 1.0
 
     def tyres(self, xp: Any, q: Motion) -> None:
@@ -56,6 +59,7 @@ class TireRelaxation(Effect):
     ADVICE = "Model the relaxation length; higher pressure and stiffer carcasses shorten it."
     MANOEUVRE = "quick steering from side to side at low speed"
     PARAMETERS = {"length": Parameter("m", 0.0, 3.0, 0.0)}
+    TYPICAL = (0.35, 1.2)
     MEMORY = ("tire_relaxation.alpha_f", "tire_relaxation.alpha_r")
     length: Array = 0.0
 
@@ -80,6 +84,7 @@ class CombinedSlip(Effect):
     ADVICE = "Model the friction ellipse; brake and accelerate straighter, or soften the throttle map at corner exit."
     MANOEUVRE = "braking into corners and accelerating out of them"
     PARAMETERS = {"strength": Parameter("1", 0.0, 1.5, 0.0)}
+    TYPICAL = (0.35, 1.0)
     strength: Array = 0.0
 
     def tyres(self, xp: Any, q: Motion) -> None:
@@ -97,6 +102,8 @@ class GripDrift(Effect):
     ADVICE = "Watch tyre temperatures and wear over the stint, and schedule tyre changes accordingly."
     MANOEUVRE = "the same corners at the limit, early and late in the stint"
     PARAMETERS = {"rate": Parameter("1/s", -0.005, 0.005, 0.0, context=("t",))}
+    TYPICAL = (0.0003, 0.002)
+    DIRECTIONS = (-1.0,)  # a car that can be driven
     rate: Array = 0.0
 
     def tyres(self, xp: Any, q: Motion) -> None:
@@ -118,6 +125,8 @@ class GripPatch(Effect):
         "centre": CENTRE,
         "length": LENGTH,
     }
+    TYPICAL = (0.035, 0.4)
+    DIRECTIONS = (-1.0,)  # a car that can be driven
     factor: Array = 1.0
     centre: Array = 0.5
     length: Array = 0.1
