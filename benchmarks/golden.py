@@ -21,13 +21,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as parquet
 import yaml
+from pyarrow import parquet
 from rosbags.highlevel import AnyReader
 
 TOLERANCE = 1e-9
 TIMED = re.compile(r"latency|seconds|_us\b|_ms\b|late\b|step_time|control_step|milliseconds|compute")
 PAIR = ("--effect", "steering_offset:offset=0.02", "--effect", "rear_grip:factor=0.85")
+
+
+# the model files of 0.1.0, as changes of those that are shipped
+MODELS = {
+    "dynssm_av21": {"base": "dynssm", "training": {"validation_block": 10.0}},
+    "dynssm_av21_adaptive": {"base": "dynssm_adaptive", "training": {"validation_block": 10.0}},
+    "dynssm_orca": {
+        "base": "dynssm_paper_orca", "physics": {"nominal": "calibrated"}, "residual": {"inputs": "normalised"},
+        "loss": {"scale": "increment"},
+    },
+    "dynssm_orca_adaptive": {
+        "base": "dynssm_orca", "in_window_estimation": {
+            "spread": {"D_f": 0.05 / 0.8, "D_r": 0.05 / 0.8, "S_hf": 0.02 / 0.04}, "noise": 0.05, "history": 0.2,
+        },
+    },
+    "ridge_av21": {"base": "ridge", "training": {"validation_block": 10.0}},
+    "ridge_orca": {"base": "ridge", "history": 0.3, "training": {"validation_block": 1.0}},
+}  # fmt: skip
 
 
 def commands(folder: Path) -> Iterator[tuple[str, list[str], list[Path]]]:
@@ -64,7 +82,8 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str], list[Path]]]:
             out = folder / model
             yield (
                 f"{car}/train/{model}",
-                ["train", f"{log}", "--model", model, "--vehicle", f"{folder / f'{car}_euler.yaml'}", "--epochs", "1",
+                ["train", f"{log}", "--model", model_file(folder, model), "--vehicle",
+                 f"{folder / f'{car}_euler.yaml'}", "--epochs", "1",
                  "--out", f"{out}"],
                 [out / "metrics.json"],
             )  # fmt: skip
@@ -96,8 +115,8 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str], list[Path]]]:
             out = folder / f"{car}_{plant}_race"
             yield (
                 f"{car}/{plant}/race",
-                ["race", "--vehicle", car, "--track", "club" if car == "orca" else "oval", "--plant", plant, "--model", "true",
-                 "--model", f"{folder / f'dynssm_{car}'}", "--pace", "0.8", "--out", f"{out}"],
+                ["race", "--vehicle", car, "--track", "club" if car == "orca" else "oval", "--plant", plant,
+                 "--model", "true", "--model", f"{folder / f'dynssm_{car}'}", "--pace", "0.8", "--out", f"{out}"],
                 [out / "results.json"],
             )  # fmt: skip
     out = folder / "orca_progress"
@@ -108,6 +127,11 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str], list[Path]]]:
          f"{out}"],
         [out / "results.json"],
     )  # fmt: skip
+
+
+def model_file(folder: Path, model: str) -> str:
+    """The model file of that name: of ``MODELS``, or a shipped one."""
+    return f"{folder / model}.yaml" if model in MODELS else model
 
 
 def numbers(path: Path) -> dict[str, float | str]:
@@ -187,9 +211,11 @@ def record(file: Path) -> None:
     results: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="dynssm-golden-") as name:
         folder = Path(name)
+        for model, content in MODELS.items():
+            (folder / f"{model}.yaml").write_text(yaml.safe_dump(content | {"name": model}), encoding="utf-8")
         for case, arguments, written in commands(folder):
             begin = time.monotonic()
-            run = subprocess.run(
+            run = subprocess.run(  # noqa: S603 - our own command
                 [sys.executable, "-m", "dynssm_ros.cli.main", *arguments], capture_output=True, text=True, check=False
             )
             if run.returncode:

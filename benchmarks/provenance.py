@@ -36,7 +36,7 @@ def reached(module: str, rooms: Collection[str], found: dict[str, str] | None = 
         if isinstance(node, ast.ImportFrom) and node.module:
             for name in (node.module, *(f"{node.module}.{alias.name}" for alias in node.names)):
                 parts = name.split(".")
-                if len(parts) > 1 and (parts[0] == "benchmarks" or parts[0] == _PACKAGE.name and parts[1] in rooms):
+                if len(parts) > 1 and (parts[0] == "benchmarks" or (parts[0] == _PACKAGE.name and parts[1] in rooms)):
                     reached(name, rooms, found)
     return found
 

@@ -70,17 +70,16 @@ def laps_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def small_model(laps_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a small DynSSM, trained for two epochs on ``laps_bag`` (T_s 0.02 s, H 5, commands from topics)."""
-    from dynssm_ros.learning.configuration import ModelConfig
     from dynssm_ros.learning.export import save_artifact
-    from dynssm_ros.learning.training import train
+    from dynssm_ros.learning.stages import train
     from dynssm_ros.signals.extraction import extract
     from dynssm_ros.signals.signal_map import load_signal_map
     from dynssm_ros.vehicle import load_vehicle
 
-    config = ModelConfig.model_validate(
+    config = parse_model_config(
         {
             "name": "small",
-            "H": 5,
+            "history": 0.1,
             "ssm": {"channels": 4, "states": 2},
             "gru": {"hidden": 6},
             "fusion": {"hidden": 8, "latent": 8},
@@ -93,10 +92,10 @@ def small_model(laps_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
                 "batch_size": 64,
                 "learning_rate": 0.001,
                 "patience": 5,
-                "min_speed": 0.0,
                 "validation_block": 1.0,
             },
-        }
+        },
+        "small.yaml",
     )
     folder = tmp_path_factory.mktemp("models")
     recording = extract([laps_bag], load_signal_map("default"), 50.0)
@@ -105,15 +104,16 @@ def small_model(laps_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 TINY = """
-base: dynssm_orca
+base: dynssm_paper_orca
 name: tiny
-H: 4
+history: 0.08
 ssm: {channels: 4, states: 2}
 gru: {hidden: 4}
 fusion: {hidden: 8, latent: 8}
 physics: {nominal: mid_range}
 adaptation: {hidden: 8}
-residual: {hidden: [8]}
+residual: {hidden: [8], inputs: normalised}
+loss: {scale: increment}
 training: {epochs: 4, batch_size: 64}
 """
 

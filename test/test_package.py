@@ -18,7 +18,7 @@ import yaml
 
 import dynssm_ros
 from dynssm_ros.configuration import config_root
-from dynssm_ros.learning.configuration import load_model_config
+from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle.parameters import load_vehicle
 

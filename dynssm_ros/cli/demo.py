@@ -116,9 +116,9 @@ def _calibrate(recording: Recording, car: Vehicle, out: Path) -> Vehicle:
 
 
 def _train(recording: Recording, car: Vehicle, out: Path) -> Path:
-    from dynssm_ros.learning.configuration import load_model_config
     from dynssm_ros.learning.export import save_artifact
-    from dynssm_ros.learning.training import train
+    from dynssm_ros.learning.models.registry import load_model_config
+    from dynssm_ros.learning.stages import train
 
     config = load_model_config(MODEL)
     settings = config.training.model_copy(update={"epochs": EPOCHS, "seed": SEED})

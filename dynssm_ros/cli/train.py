@@ -28,10 +28,11 @@ def train(
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
 ) -> None:
     """Train a model on recordings and write its folder: card, weights, ONNX, metrics, loss picture."""
-    from dynssm_ros.learning.configuration import load_model_config
+    from dynssm_ros.learning.calibration import calibrate
     from dynssm_ros.learning.export import check_replaceable, save_artifact
-    from dynssm_ros.learning.training import check_device, checkpoints
-    from dynssm_ros.learning.training import train as fit
+    from dynssm_ros.learning.models.registry import load_model_config
+    from dynssm_ros.learning.stages import check_device, checkpoints
+    from dynssm_ros.learning.stages import train as fit
     from dynssm_ros.reporting.evaluation_figures import loss_components
 
     check_device(device)
@@ -43,7 +44,10 @@ def train(
     checkpoint = out.with_name(f"{out.name}.checkpoint.pt")
     with progress_bar("training") as progress:
         try:
-            trained = fit(data, config, load_vehicle(vehicle), checkpoint, device, progress)
+            trained = fit(
+                data, config, load_vehicle(vehicle), checkpoint, device, progress,
+                lambda log, car: calibrate(log, car, min_speed=car.minimum_speed).vehicle,
+            )  # fmt: skip
         except KeyboardInterrupt:
             kept = [path for path in checkpoints(config, checkpoint) if path.is_file()] or [checkpoint]
             errors.print(f"interrupted; the same command continues from {kept[-1].name}")

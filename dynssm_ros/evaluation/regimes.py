@@ -92,7 +92,7 @@ def _bins(quantity: str, values: Vector, unit: str) -> Iterator[Regime]:
 
 
 def round_edges(low: float, high: float, most: int) -> Vector:
-    """Edges of bins that cover ``low`` to ``high``: the narrowest of 1, 2, 2.5 or 5 times a power of ten, ``most`` in the span.
+    """Edges of bins that cover ``low`` to ``high``: their width is 1, 2, 2.5 or 5 times a power of ten.
 
     The outer edges are multiples of the width too, so that there may be one bin more.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dynssm_ros.learning.configuration import AugmentationConfig
+from dynssm_ros.learning.models.base import AugmentationConfig
 
 _MIRRORED = (1.0, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0)  # the sign of each window column with left and right exchanged
 

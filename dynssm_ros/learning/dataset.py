@@ -3,17 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
+from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.learning.configuration import TrainingConfig
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.recording import Recording
 
+_BLOCK_SHARE, _BLOCK_RANGE_S = 1 / 40, (1.0, 10.0)  # of the recording; length of validation blocks
 _CONSTANT = 1e-9  # a column that varies less than this is not scaled
+
+
+class SplitConfig(StrictModel):
+    """How validation windows are taken out of the training data."""
+
+    seed: int = 0
+    validation: Literal["blocks", "random"] = Field(
+        default="blocks",
+        description="blocks in time that share no row with the training windows, or single windows drawn at random, as "
+        "the literature does, whose neighbours are trained on",
+    )
+    validation_block: float | None = Field(
+        default=None,
+        gt=0,
+        description="length of the validation blocks (s); null: a fortieth of the recording, 1 to 10 s",
+    )
+    validation_every: int = Field(default=6, ge=2, description="every n-th block (one window in n) is for validation")
+
+    @property
+    def effort(self) -> tuple[int, int]:
+        """Epochs at most, and training windows that are needed: what is fitted in closed form has one round."""
+        return 1, 1
 
 
 @dataclass(frozen=True)
@@ -38,29 +63,41 @@ class Windows:
         return Windows(self.matrix.to(device), self.ends.to(device), self.H)
 
 
-def split_windows(recording: Recording, H: int, config: TrainingConfig) -> tuple[Windows, Windows]:
+def split_windows(
+    recording: Recording, H: int, config: SplitConfig, min_speed: float, least: int
+) -> tuple[Windows, Windows]:
     """Training and validation windows: by alternating blocks in time, so that no row serves both, or at random.
 
     The random split is drawn for the last rows of the windows, so that it is the same one for windows of any length.
 
+    Args:
+        recording: training data.
+        H: rows of a window.
+        config: how to split.
+        min_speed: windows that are slower anywhere are left out (m/s).
+        least: training windows that are needed.
+
     Raises:
         RecordingError: too little motion to train on.
     """
-    ends = recording.window_ends(H, min_speed=config.min_speed)
+    ends = recording.window_ends(H, min_speed=min_speed)
     if config.validation == "random":
         drawn = np.random.default_rng(config.seed).random(len(recording)) * config.validation_every < 1
         training, held = ends[~drawn[ends]], ends[drawn[ends]]
     else:
-        block = max(1, round(config.validation_block / recording.T_s))
+        seconds = config.validation_block
+        if seconds is None:
+            seconds = min(max(_BLOCK_SHARE * len(recording) * recording.T_s, _BLOCK_RANGE_S[0]), _BLOCK_RANGE_S[1])
+        block = max(1, round(seconds / recording.T_s))
         blocks = np.arange(len(recording)) // block
         validation = (blocks % config.validation_every == config.validation_every - 1).astype(np.intp)
         cumulated = np.concatenate([[0], np.cumsum(validation)])
         inside = cumulated[ends + 2] - cumulated[ends - H + 1]
         training, held = ends[inside == 0], ends[inside == H + 1]
-    if len(training) < config.batch_size or len(held) == 0:
+    if len(training) < least or len(held) == 0:
         raise RecordingError(
             f"recording {', '.join(recording.info.source)}: {len(training)} training and {len(held)} validation windows "
-            f"of {H} rows at {config.min_speed:g} m/s or more; expected at least {config.batch_size} and 1 - "
+            f"of {H} rows at {min_speed:g} m/s or more; expected at least {least} and 1 - "
             "more driving is needed"
         )
     matrix = torch.tensor(recording.matrix, dtype=torch.float32)

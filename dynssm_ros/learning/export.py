@@ -20,14 +20,13 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from dynssm_ros import configuration
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import replacing
-from dynssm_ros.learning.configuration import ModelConfig
 from dynssm_ros.learning.dataset import Windows
-from dynssm_ros.learning.models.dynssm.network import DynSSM, Output
-from dynssm_ros.learning.models.registry import build_model
-from dynssm_ros.learning.training import Trained
+from dynssm_ros.learning.losses import Output
+from dynssm_ros.learning.models.base import TrainableModel
+from dynssm_ros.learning.models.registry import build_model, parse_model_config
+from dynssm_ros.learning.stages import Trained
 from dynssm_ros.runtime.artifact import (
     CARD,
     METRICS,
@@ -59,10 +58,10 @@ def deployed_outputs(output: Output) -> dict[str, Tensor]:
 class _Deployed(nn.Module):
     """The outputs that are deployed, as a flat tuple."""
 
-    def __init__(self, model: nn.Module) -> None:
+    def __init__(self, model: TrainableModel) -> None:
         super().__init__()
         model = copy.deepcopy(model).eval()
-        self.model = model.for_deployment() if isinstance(model, DynSSM) else model
+        self.model = model.for_deployment()
 
     def forward(self, window: Tensor) -> tuple[Tensor, ...]:
         return tuple(deployed_outputs(self.model(window)).values())
@@ -72,7 +71,7 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
     """Writes the model folder, atomically; an older one of the same name is replaced.
 
     Args:
-        trained: outcome of :func:`dynssm_ros.learning.training.train`.
+        trained: outcome of :func:`dynssm_ros.learning.stages.train`.
         out: the folder.
         training: what to note about how it was trained.
 
@@ -91,21 +90,21 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
         if trained.start is not None:
             metrics["start"] = _metrics(trained.start)
         (folder / METRICS).write_text(json.dumps(metrics, indent=1), encoding="utf-8")
-        physics = config.physics
+        integrator, substeps = config.stepping
         card = ModelCard(
             name=config.name,
             kind=config.kind,
             architecture=config.model_dump(mode="json"),
             vehicle=trained.vehicle,
             sampling_time=trained.vehicle.sampling_time,
-            window=config.H,
+            window=trained.H,
             commands=trained.recording.info.commands,
-            integrator=physics.integrator if physics else "euler",
-            substeps=physics.substeps if physics else 1,
+            integrator=integrator,
+            substeps=substeps,
             normalisation=trained.normalisation,
             covariance=tuple(value**2 for value in trained.validation_rmse),
             parameters=sum(p.numel() for p in model.parameters()),
-            flops=count_flops(model, config.H),
+            flops=count_flops(model, trained.H),
             training={"recordings": list(trained.recording.info.source), "seed": config.training.seed}
             | (training or {}),
             checksums={name: checksum(folder / name) for name in (WEIGHTS, ONNX, METRICS)},
@@ -133,7 +132,7 @@ def check_replaceable(out: Path) -> None:
         raise ArtifactError(f"{out}: exists and is not a model folder; not replaced")
 
 
-def export_onnx(model: nn.Module, sample: Tensor, file: Path) -> None:
+def export_onnx(model: TrainableModel, sample: Tensor, file: Path) -> None:
     """Writes the deployed graph: input ``window`` (N, H, 7), outputs ``increment``, and what else it has."""
     deployed = _Deployed(model)
     with torch.no_grad():
@@ -164,7 +163,7 @@ def _start_recurrences_from_rest(file: Path) -> None:
     onnx.save(graph, file)
 
 
-def check_export(model: nn.Module, sample: Tensor, file: Path, scale: np.ndarray) -> float:
+def check_export(model: TrainableModel, sample: Tensor, file: Path, scale: np.ndarray) -> float:
     """Compares ONNX Runtime with torch on ``sample``.
 
     Returns:
@@ -185,17 +184,17 @@ def check_export(model: nn.Module, sample: Tensor, file: Path, scale: np.ndarray
     return difference
 
 
-def count_flops(model: nn.Module, H: int) -> int:
+def count_flops(model: TrainableModel, H: int) -> int:
     """Floating-point operations of one prediction's matrix products, counted by torch."""
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         model(torch.zeros(1, H, 7))
     return int(counter.get_total_flops())
 
 
-def load_torch(artifact: Artifact) -> nn.Module:
+def load_torch(artifact: Artifact) -> TrainableModel:
     """The trained model back in torch, for comparison and further training."""
     card = artifact.card
-    config = configuration.validate(ModelConfig, card.architecture, f"{artifact.path / CARD}: architecture")
+    config = parse_model_config(card.architecture, f"{artifact.path / CARD}: architecture")
     model = build_model(config, card.vehicle, card.normalisation)
     try:
         model.load_state_dict(load_file(artifact.weights))
@@ -223,6 +222,6 @@ def eager_prediction(artifact: Artifact) -> Callable[[], None]:
 def _sample_windows(trained: Trained, count: int = 256) -> Tensor:
     """Windows spread over the training data."""
     matrix = torch.tensor(trained.recording.matrix, dtype=torch.float32)
-    ends = trained.recording.window_ends(trained.config.H, min_speed=trained.config.training.min_speed)
+    ends = trained.recording.window_ends(trained.H, min_speed=trained.vehicle.minimum_speed)
     chosen = torch.tensor(ends[np.linspace(0, len(ends) - 1, count).astype(int)])
-    return Windows(matrix, chosen, trained.config.H).batch(slice(None))[0]
+    return Windows(matrix, chosen, trained.H).batch(slice(None))[0]

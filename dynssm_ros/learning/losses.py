@@ -2,13 +2,47 @@
 
 from __future__ import annotations
 
+from typing import Literal, NamedTuple
+
 import torch
+from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from dynssm_ros.learning.configuration import LossConfig
-from dynssm_ros.learning.models.dynssm.network import Output
+from dynssm_ros.configuration import StrictModel
 from dynssm_ros.runtime.artifact import Normalisation
+
+
+class Output(NamedTuple):
+    """What a model computes for ``B`` windows; all increments are ``s_{t+1} - s_t``."""
+
+    increment: Tensor
+    """Final prediction, Eq. (30), as an increment ``(B, 3)``."""
+    physics: Tensor | None
+    """The physics' increment, Eq. (26), ``(B, 3)``."""
+    theta: Tensor | None
+    """Adapted coefficients, Eq. (18), ``(B, 17)``."""
+    deviation: Tensor | None
+    """Normalised parameter deviation, Eq. (20), ``(B, 17)``."""
+    correction: Tensor | None
+    """Normalised output of the residual network, Eq. (28), ``(B, 3)``."""
+    variance: Tensor | None = None
+    """Stated variance of the prediction's error, ``(B, 3)``; ``None``: constant."""
+
+
+class LossConfig(StrictModel):
+    """Weights and switches of the objective, Eq. (24)."""
+
+    scale: Literal["target", "increment", "none"] = Field(
+        default="increment",
+        description="s_y: standard deviation of the target state (paper) or of its increment; none: errors as they are, "
+        "in m/s, m/s and rad/s",
+    )
+    robust: float = Field(default=0.0, ge=0, description="Huber threshold in units of the scale; 0: squared error")
+    parameters: float = Field(ge=0, description="lambda_theta")
+    correction: float = Field(default=0.0, ge=0, description="lambda_corr; 0 switches the residual penalty off")
+    physics: float = Field(default=0.0, ge=0, description="lambda_phy; 0 switches the physics anchor off")
+
 
 COMPONENTS = ("prediction", "parameters", "correction", "physics")
 Scales = tuple[Tensor, Tensor]

@@ -284,7 +284,9 @@ def _systematic_table(diagnosis: Diagnosis) -> Table:
 def _noticeable_table(diagnosis: Diagnosis) -> Table:
     columns = (Column("effect"), Column("noticed from"), Column("unit"), Column("judged"))
     rows: list[list[Value]] = []
-    for effect, size in sorted(diagnosis.noticeable.items(), key=lambda item: item[1] / EFFECTS[item[0]].magnitude().span):
+    for effect, size in sorted(
+        diagnosis.noticeable.items(), key=lambda item: item[1] / EFFECTS[item[0]].magnitude().span
+    ):
         about = EFFECTS[effect].magnitude()
         rows.append([effect, size, "" if about.unit == "1" else about.unit, "yes" if size <= about.span else "no"])
     return Table(columns, rows)

@@ -226,8 +226,8 @@ def _sections(evaluation: Evaluation) -> Iterator[Section]:
     yield Section(
         "Error relative to persistence",
         "Persistence predicts that nothing changes. A bar that passes the dashed line is worse than no model at all; "
-        f"bars are cut at {percent(evaluation_figures.MAX_BAR)}, the number is always the true one. Whiskers are the spread over "
-        "seeds, where there are several.",
+        f"bars are cut at {percent(evaluation_figures.MAX_BAR)}, the number is always the true one. Whiskers are the spread "
+        "over seeds, where there are several.",
         evaluation_figures.relative_errors(
             {name: group.mean(lambda score: score.rmse) for name, group in groups.items()},
             {name: group.std(lambda score: score.rmse) for name, group in groups.items()},

@@ -220,9 +220,7 @@ def _motion(race: Race, with_effects: bool = True) -> Motion:
     course = race.course
     x, y, theta = race.pose.T
     context = {"t": race.time, "s": race.s, "lap_length": course.track.length, "x": x, "y": y, "theta": theta}
-    effects = [
-        effect for effect in course.vehicle.active_effects if not effect.SENSOR
-    ]
+    effects = [effect for effect in course.vehicle.active_effects if not effect.SENSOR]
     nominal = Coefficients(*course.vehicle.nominal)
     state, command = State(*race.state.T), Applied(*race.command.T)
     constants = course.vehicle.constants

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import yaml
@@ -25,7 +25,6 @@ from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle.parameters import Vehicle
 from dynssm_ros.vehicle.single_track import Integrator
 
-ModelKind = Literal["dynssm", "ridge", "ddm", "fthd"]
 FORMAT_VERSION = 1
 CARD, WEIGHTS, ONNX, METRICS = "model.yaml", "weights.safetensors", "model.onnx", "metrics.json"
 
@@ -51,7 +50,7 @@ class ModelCard(StrictModel):
 
     format_version: int = Field(default=FORMAT_VERSION, ge=1)
     name: str
-    kind: ModelKind = Field(description="which model class the weights belong to")
+    kind: str = Field(description="which model class the weights belong to")
     architecture: dict[str, Any] = Field(description="the model configuration it was trained from")
     vehicle: Vehicle
     sampling_time: float = Field(gt=0, description="T_s (s)")

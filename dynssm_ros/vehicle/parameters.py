@@ -108,6 +108,11 @@ class Vehicle(StrictModel):
     description: str = ""
     constants: VehicleConstants
     sampling_time: float = Field(gt=0, le=1, description="T_s (s)")
+    minimum_speed: float = Field(
+        default=0.0,
+        ge=0,
+        description="slower rows are neither calibrated nor trained on (m/s): the car parks or creeps there",
+    )
     inputs: InputLimits
     coefficients: dict[str, Coefficient]
     effects: tuple[EffectEntry, ...] = ()

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from dynssm_ros.cli.bench import open_artifacts
 from dynssm_ros.cli.main import app
-from dynssm_ros.learning.configuration import load_model_config
 from dynssm_ros.learning.export import save_artifact
-from dynssm_ros.learning.training import train
+from dynssm_ros.learning.models.registry import load_model_config
+from dynssm_ros.learning.stages import train
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import load_vehicle

@@ -30,16 +30,16 @@ def arguments(laps_bag: Path, tiny_model: Path, tmp_path: Path) -> list[str]:
 def test_an_interrupted_training_says_how_to_go_on_and_does(
     dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    validate, epochs = training._Optimisation._validate, [0]
+    validate, epochs = training.Optimisation._validate, [0]
 
-    def interrupted(self: training._Optimisation) -> dict[str, float]:
+    def interrupted(self: training.Optimisation) -> dict[str, float]:
         epochs[0] += 1
         if epochs[0] == 4:  # the first is of the untrained model
             raise KeyboardInterrupt
         return validate(self)
 
     with monkeypatch.context() as patched:
-        patched.setattr(training._Optimisation, "_validate", interrupted)
+        patched.setattr(training.Optimisation, "_validate", interrupted)
         status, _, err = dynssm(*arguments)
     assert status == 130
     assert err.split("\n")[-2] == "interrupted; the same command continues from model.checkpoint.pt"
@@ -62,15 +62,15 @@ def test_fine_tuning_takes_one_command_and_goes_on_in_the_stage_where_it_was(
     (tmp_path / "tiny.yaml").write_text(
         "{base: fthd_orca, name: tiny, dense: {layers: 2, width: 8}, fine_tuning: {starts_from: tiny_ddm, frozen: 1}}"
     )
-    train_epoch, epochs = training._Optimisation._epoch, [0]
+    train_epoch, epochs = training.Optimisation._epoch, [0]
 
-    def interrupted(self: training._Optimisation) -> dict[str, float]:
+    def interrupted(self: training.Optimisation) -> dict[str, float]:
         epochs[0] += 1
         if epochs[0] in (2, 5):  # in the first stage, and in the second
             raise KeyboardInterrupt
         return train_epoch(self)
 
-    monkeypatch.setattr(training._Optimisation, "_epoch", interrupted)
+    monkeypatch.setattr(training.Optimisation, "_epoch", interrupted)
     for kept in ("model.checkpoint.start.pt", "model.checkpoint.pt"):
         status, _, err = dynssm(*arguments, "--epochs", 2, "--seed", 7)
         assert status == 130

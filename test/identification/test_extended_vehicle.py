@@ -13,9 +13,9 @@ from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.identification.car import Car
 from dynssm_ros.identification.windows import Track, Windows
-from dynssm_ros.learning.configuration import ModelConfig
 from dynssm_ros.learning.export import save_artifact
-from dynssm_ros.learning.training import train
+from dynssm_ros.learning.models.base import ModelConfig
+from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from dynssm_ros.learning.configuration import ModelConfig
+from dynssm_ros.learning.models.base import ModelConfig
+from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.simulation.plant import SCALAR
@@ -21,7 +22,7 @@ MakeConfig = Callable[..., ModelConfig]
 
 SMALL: dict[str, Any] = {
     "name": "small",
-    "H": 4,
+    "history": 0.08,
     "ssm": {"channels": 4, "states": 2},
     "gru": {"hidden": 4},
     "fusion": {"hidden": 8, "latent": 6},
@@ -34,7 +35,6 @@ SMALL: dict[str, Any] = {
         "batch_size": 64,
         "learning_rate": 0.005,
         "patience": 10,
-        "min_speed": 0.0,
         "validation_block": 1.0,
     },
 }
@@ -42,7 +42,7 @@ SMALL: dict[str, Any] = {
 SMALL_DDM: dict[str, Any] = {
     "name": "small_ddm",
     "kind": "ddm",
-    "H": 4,
+    "history": 0.08,
     "gru": {"hidden": 3, "layers": 2},
     "dense": {"layers": 2, "width": 6},
     "physics": {"load_transfer": False},
@@ -54,7 +54,6 @@ SMALL_DDM: dict[str, Any] = {
         "schedule": "constant",
         "gradient_clip": None,
         "patience": 10,
-        "min_speed": 0.0,
         "validation": "random",
         "validation_every": 5,
     },
@@ -96,9 +95,8 @@ def make_fthd() -> MakeConfig:
         ddm = _changed(SMALL_DDM, **start or {}).model_dump()
         settings = {"starts_from": ddm, "frozen": 2, "physics": 0.1} | changes
         training = ddm["training"] | {"epochs": 2, "learning_rate": 0.002}
-        return ModelConfig.model_validate(
-            ddm | {"name": "small_fthd", "kind": "fthd", "training": training, "fine_tuning": settings}
-        )
+        content = ddm | {"name": "small_fthd", "kind": "fthd", "training": training, "fine_tuning": settings}
+        return parse_model_config(content, "test")
 
     return make
 
@@ -108,7 +106,7 @@ def _changed(base: dict[str, Any], **changes: Any) -> ModelConfig:
     for key, value in changes.items():
         both = isinstance(value, dict) and isinstance(content.get(key), dict)
         content[key] = content[key] | value if both else value
-    return ModelConfig.model_validate(content)
+    return parse_model_config(content, "test")
 
 
 def smooth(rng: np.random.Generator, N: int, mean: float, std: float, over: int) -> np.ndarray:

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 
 from dynssm_ros.learning.augmentation import Augmentation
-from dynssm_ros.learning.configuration import AugmentationConfig, PhysicsConfig
+from dynssm_ros.learning.models.base import AugmentationConfig
 from dynssm_ros.learning.models.dynssm.network import PhysicsLayer
+from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 

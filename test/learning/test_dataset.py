@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.learning.configuration import ModelConfig, TrainingConfig
 from dynssm_ros.learning.dataset import Windows, normalisation, split_windows
+from dynssm_ros.learning.models.base import ModelConfig, TrainingConfig
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 
@@ -108,7 +108,7 @@ def test_a_batch_is_windows_in_order_with_the_increment_that_follows() -> None:
 
 def test_scales_are_those_of_the_training_windows(laps: Recording, make_config: Callable[..., ModelConfig]) -> None:
     config = make_config()
-    train, _ = split_windows(laps, config.H, config.training)
+    train, _ = split_windows(laps, config.rows(0.02), config.training, 0.0, config.training.batch_size)
     found = normalisation(laps, train)
     now = laps.matrix[train.ends.numpy()]
     target = laps.matrix[train.ends.numpy() + 1, :3]
@@ -121,7 +121,9 @@ def test_scales_are_those_of_the_training_windows(laps: Recording, make_config: 
 def test_a_constant_input_is_not_scaled(laps: Recording, make_config: Callable[..., ModelConfig]) -> None:
     quiet = laps.with_commands("none")
     config = make_config()
-    found = normalisation(quiet, split_windows(quiet, config.H, config.training)[0])
+    found = normalisation(
+        quiet, split_windows(quiet, config.rows(0.02), config.training, 0.0, config.training.batch_size)[0]
+    )
     assert found.input_std[5:] == (1.0, 1.0)
     assert found.input_mean[5:] == (0.0, 0.0)
 

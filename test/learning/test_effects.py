@@ -11,8 +11,8 @@ import torch
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.calibration import PredictionErrors
-from dynssm_ros.learning.configuration import PhysicsConfig
 from dynssm_ros.learning.models.dynssm.network import PhysicsLayer
+from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.runtime.models import SingleTrack
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.simulation.laps import simulate

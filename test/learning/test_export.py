@@ -17,10 +17,10 @@ import yaml
 
 from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.learning import export as export_module
-from dynssm_ros.learning.configuration import ModelConfig
 from dynssm_ros.learning.dataset import Windows
 from dynssm_ros.learning.export import TOLERANCE, check_export, check_replaceable, load_torch, save_artifact
-from dynssm_ros.learning.training import Trained, train
+from dynssm_ros.learning.models.base import ModelConfig
+from dynssm_ros.learning.stages import Trained, train
 from dynssm_ros.runtime.artifact import Artifact, checksum, open_artifact
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.signals.recording import Recording

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from dynssm_ros.learning.configuration import ModelConfig
 from dynssm_ros.learning.dataset import all_windows
-from dynssm_ros.learning.training import checkpoints, train
+from dynssm_ros.learning.models.base import ModelConfig
+from dynssm_ros.learning.stages import checkpoints, train
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 
 MakeConfig = Callable[..., ModelConfig]
 
 WITH_PARTS = {
-    "H": 6,
-    "memory": {"taps": 2},
-    "hindcast": {"steps": 2, "folds": 2},
+    "history": 0.12,
+    "innovation": {"history": 0.04},
+    "in_window_errors": {"history": 0.04, "folds": 2},
     "training": {"epochs": 4, "batch_size": 16},
 }
 
@@ -35,22 +35,24 @@ def test_the_variance_is_fitted_to_the_errors_on_parts_that_the_model_did_not_kn
     errors = []
     for part in (~second, second):
         other = with_parts.with_training(epochs=1).model_copy(
-            update={"hindcast": with_parts.hindcast.model_copy(update={"folds": 1})}
+            update={"in_window_errors": with_parts.in_window_errors.model_copy(update={"folds": 1})}
         )
         without = train(recording.select(~part), other, orca, tmp_path / f"{part[0]}.pt")
-        left_out = all_windows(recording.select(part), with_parts.H, with_parts.training.min_speed)
-        errors.append(without.model.errors(*left_out.batch(slice(None))))
-    fitted = trained.model.hindcast.variance.clone()
+        left_out = all_windows(recording.select(part), with_parts.rows(0.02), 0.0)
+        errors.append(without.model.held_out_errors(*left_out.batch(slice(None))))
+    fitted = trained.model.in_window.variance.clone()
     trained.model.fit_variance(*(torch.cat(each) for each in zip(*errors, strict=True)))
-    assert torch.equal(trained.model.hindcast.variance, fitted)
+    assert torch.equal(trained.model.in_window.variance, fitted)
     # the prediction itself knows nothing of it
-    plain = train(recording, make_config(**WITH_PARTS | {"hindcast": {"steps": 2}}), orca, tmp_path / "b.pt")
+    plain = train(
+        recording, make_config(**WITH_PARTS | {"in_window_errors": {"history": 0.04}}), orca, tmp_path / "b.pt"
+    )
     different = {
         name
         for name, value in plain.model.state_dict().items()
         if not torch.equal(value, trained.model.state_dict()[name])
     }
-    assert different == {"hindcast.variance"}
+    assert different == {"in_window.variance"}
 
 
 @pytest.mark.parametrize("epoch", [3, 5, 6])
@@ -80,7 +82,9 @@ def test_too_little_to_leave_any_out_is_trained_on_all_the_same(
     blocks = {"validation_block": 2.0, "validation_every": 4}
     config = make_config(**WITH_PARTS | {"training": WITH_PARTS["training"] | blocks})
     trained = train(recording, config, orca, tmp_path / "a.pt")
-    plain = make_config(**WITH_PARTS | {"training": config.training.model_dump(), "hindcast": {"steps": 2}})
+    plain = make_config(
+        **WITH_PARTS | {"training": config.training.model_dump(), "in_window_errors": {"history": 0.04}}
+    )
     alone = train(recording, plain, orca, tmp_path / "b.pt")
-    assert torch.equal(trained.model.hindcast.variance, alone.model.hindcast.variance)
+    assert torch.equal(trained.model.in_window.variance, alone.model.in_window.variance)
     assert [path.name for path in checkpoints(config, tmp_path / "a.pt") if path.is_file()] == ["a.pt"]

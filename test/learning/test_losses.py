@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dynssm_ros.learning.configuration import LossConfig
-from dynssm_ros.learning.losses import COMPONENTS, objective, scales
+from dynssm_ros.learning.losses import COMPONENTS, LossConfig, objective, scales
 from dynssm_ros.learning.models.dynssm.network import Output
 from dynssm_ros.runtime.artifact import Normalisation
 

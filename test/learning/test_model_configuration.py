@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from dynssm_ros.configuration import config_root
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.learning.configuration import load_model_config
+from dynssm_ros.learning.models.registry import load_model_config
 
 SHIPPED = sorted(path.stem for path in (config_root() / "models").glob("*.yaml"))
 LACKS = {
@@ -44,10 +44,10 @@ def write(folder: Path, name: str, content: dict[str, Any]) -> Path:
 
 
 def test_base_gives_what_a_file_leaves_out_block_by_block(tmp_path: Path) -> None:
-    write(tmp_path, "middle", {"base": "dynssm_av21", "H": 40, "training": {"epochs": 7}})
+    write(tmp_path, "middle", {"base": "dynssm_av21", "history": 0.8, "training": {"epochs": 7}})
     config = load_model_config(write(tmp_path, "leaf", {"base": "middle", "name": "leaf", "ssm": None}))
     shipped = load_model_config("dynssm_av21")
-    assert (config.name, config.H, config.ssm) == ("leaf", 40, None)
+    assert (config.name, config.rows(0.02), config.ssm) == ("leaf", 40, None)
     assert config.training == shipped.training.model_copy(update={"epochs": 7})
     assert config.gru == shipped.gru
 
@@ -72,12 +72,12 @@ def test_a_base_that_does_not_exist_is_named(tmp_path: Path) -> None:
         ({"physics": None}, "adaptation needs physics to adapt"),
         ({"physics": None, "adaptation": None}, "inputs.physics_errors and memory need physics"),
         (
-            {"physics": None, "adaptation": None, "residual": None, "memory": None, "hindcast": None},
+            {"physics": None, "adaptation": None, "residual": None, "innovation": None, "in_window_errors": None},
             "without physics there must be a residual network",
         ),
         ({"adaptation": None, "residual": None}, "nothing to learn"),
         ({"adaptation": {"alpha": 1.5}}, "adaptation.alpha: Input should be less than or equal to 1 (got 1.5)"),
-        ({"H": 0}, "H: Input should be greater than or equal to 1 (got 0)"),
+        ({"history": 0}, "H: Input should be greater than or equal to 1 (got 0)"),
         ({"gru": {"width": 3}}, "gru.width: Extra inputs are not permitted (got 3)"),
         ({"residual": {"hidden": []}}, "residual.hidden"),
         ({"training": {"validation_every": 1}}, "training.validation_every"),
@@ -101,7 +101,7 @@ def test_what_does_not_fit_is_refused_with_field_and_value(
     [
         ("ddm_av21", {"dense": None}, "kind ddm needs the blocks gru and dense and physics and loss"),
         ("ddm_av21", {"residual": {"hidden": [8], "scale": 1.0}}, "kind ddm has no residual"),
-        ("ddm_av21", {"memory": {"taps": 3}}, "kind ddm has no memory"),
+        ("ddm_av21", {"innovation": {"history": 0.06}}, "kind ddm has no memory"),
         ("ddm_av21", {"fine_tuning": {"starts_from": "ddm_av21", "frozen": 1, "physics": 0.1}}, "has no fine_tuning"),
         ("ddm_av21", {"training": {"validation": "none"}}, "training.validation: Input should be 'blocks' or 'random'"),
         ("fthd_av21", {"fine_tuning": None}, "kind fthd needs the blocks gru and dense and physics and loss and fine_"),
@@ -142,4 +142,4 @@ def test_other_training_settings_hold_in_all_stages() -> None:
 def test_a_configuration_cannot_be_changed_behind_a_model(make_config: Any) -> None:
     config = make_config()
     with pytest.raises(ValidationError, match="frozen"):
-        config.H = 3
+        config.rows(0.02) = 3

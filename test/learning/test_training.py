@@ -18,11 +18,11 @@ import pytest
 import torch
 
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.learning import training as training_module
-from dynssm_ros.learning.configuration import ModelConfig
+from dynssm_ros.learning import optimisation as training_module
 from dynssm_ros.learning.dataset import split_windows
+from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.dynssm.network import DynSSM
-from dynssm_ros.learning.training import Trained, check_device, train
+from dynssm_ros.learning.stages import Trained, check_device, train
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
@@ -92,7 +92,9 @@ def test_the_best_epoch_is_kept_and_measured(
     trained = train(short, config, orca, checkpoint)
     validation = trained.history["validation/prediction"]
     assert validation[-1] > min(validation)
-    window, target = split_windows(short, config.H, config.training)[1].batch(slice(None))
+    window, target = split_windows(short, config.rows(0.02), config.training, 0.0, config.training.batch_size)[1].batch(
+        slice(None)
+    )
     with torch.no_grad():
         error = trained.model(window).increment - target
     scaled = (error / torch.tensor(trained.normalisation.increment_scale)).square().mean().item()
@@ -179,9 +181,9 @@ def test_a_finished_training_is_not_trained_on(
 KILLED = """
 import sys
 from pathlib import Path
-from dynssm_ros.learning.configuration import ModelConfig
+from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.export import save_artifact
-from dynssm_ros.learning.training import train
+from dynssm_ros.learning.stages import train
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import load_vehicle
 
@@ -266,7 +268,7 @@ def test_the_checkpoint_of_another_training_is_ignored(
     base = make_config(training={"epochs": 1})
     cases = [
         (short, make_config(training={"epochs": 1, "seed": 5}), orca),
-        (short, make_config(training={"epochs": 1}, H=3), orca),
+        (short, make_config(training={"epochs": 1}, history=0.06), orca),
         (short, base, orca.with_nominal((orca.nominal + orca.lower) / 2)),
         (drive(orca, 400, seed=9), base, orca),
     ]
@@ -330,13 +332,13 @@ def test_a_training_that_diverges_later_keeps_the_best_it_had(
     checkpoint: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    validate = training_module._Optimisation._validate
+    validate = training_module.Optimisation._validate
 
     def diverging(self: Any) -> dict[str, float]:
         terms = validate(self)
         return terms if self.state.epoch < 2 else dict.fromkeys(terms, float("nan"))
 
-    monkeypatch.setattr(training_module._Optimisation, "_validate", diverging)
+    monkeypatch.setattr(training_module.Optimisation, "_validate", diverging)
     trained = train(short, make_config(training={"epochs": 9}), orca, checkpoint)
     assert len(trained.history["validation/prediction"]) == 2
     assert np.isfinite(trained.validation_rmse).all()
@@ -361,7 +363,9 @@ def test_a_device_that_is_not_there_is_refused() -> None:
 
 def persistence(recording: Recording, config: ModelConfig) -> np.ndarray:
     """RMSE of predicting no change, on the validation windows."""
-    _, increment = split_windows(recording, config.H, config.training)[1].batch(slice(None))
+    _, increment = split_windows(recording, config.rows(0.02), config.training, 0.0, config.training.batch_size)[
+        1
+    ].batch(slice(None))
     return increment.square().mean(0).sqrt().numpy()
 
 
@@ -390,7 +394,7 @@ def test_ridge_regression_recovers_a_linear_car(make_config: MakeConfig, orca: V
     columns = {name: matrix[:, k] for k, name in enumerate(WINDOW_COLUMNS)}
     time = np.arange(N, dtype=np.int64) * 20_000_000
     recording = Recording(info, time, np.zeros(N, np.int32), columns)
-    config = make_config(kind="ridge", H=H, ridge_penalty=1e-6, training={"min_speed": 0.0})
+    config = make_config(kind="ridge", history=0.02 * H, penalty=1e-6, training={"min_speed": 0.0})
     config = config.model_copy(update={"training": config.training.model_copy(update={"min_speed": 0.0})})
     recording.columns["v_x"] += 5.0  # the car drives forwards
     trained = train(recording, config, orca, checkpoint)
@@ -407,7 +411,7 @@ def test_a_strong_penalty_leaves_the_mean_increment(
 ) -> None:
     config = make_config(kind="ridge", ridge_penalty=1e12)
     trained = train(laps, config, orca, checkpoint)
-    windows, _ = split_windows(laps, config.H, config.training)
+    windows, _ = split_windows(laps, config.rows(0.02), config.training, 0.0, config.training.batch_size)
     window, target = windows.batch(slice(None))
     with torch.no_grad():
         predicted = trained.model(window).increment

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynssm_ros.learning.configuration import load_model_config
 from dynssm_ros.learning.export import save_artifact
-from dynssm_ros.learning.training import train
+from dynssm_ros.learning.models.registry import load_model_config
+from dynssm_ros.learning.stages import train
 from dynssm_ros.nodes.live import run_live
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.signals.extraction import extract

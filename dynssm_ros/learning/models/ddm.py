@@ -9,35 +9,72 @@ transfer and no residual, and the state advances by one Euler step; both are the
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import ClassVar, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
-from dynssm_ros.learning.configuration import ModelConfig
-from dynssm_ros.learning.models.dynssm.network import INPUTS, Output, PhysicsLayer
+from dynssm_ros.configuration import StrictModel
+from dynssm_ros.learning.losses import LossConfig, Output
+from dynssm_ros.learning.models.base import GruConfig, ModelConfig, TrainableModel, TrainingConfig
+from dynssm_ros.learning.models.physics import INPUTS, PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
+from dynssm_ros.vehicle.single_track import Integrator
 
 
-class DDM(nn.Module):
+class DenseConfig(StrictModel):
+    """Hidden dense layers, all of the same width."""
+
+    layers: int = Field(ge=1)
+    width: int = Field(ge=1)
+
+
+class DdmConfig(ModelConfig):
+    """Model file of a DDM."""
+
+    kind: Literal["ddm", "fthd"] = "ddm"
+    gru: GruConfig
+    dense: DenseConfig
+    physics: PhysicsConfig
+    loss: LossConfig
+    training: TrainingConfig
+
+    @property
+    def calibrates(self) -> bool:
+        """As the physics says."""
+        return self.physics.nominal == "calibrated"
+
+    @property
+    def stepping(self) -> tuple[Integrator, int]:
+        """Those of the physics."""
+        return self.physics.integrator, self.physics.substeps
+
+    def modelled_vehicle(self, vehicle: Vehicle) -> Vehicle:
+        """Without load transfer, if the physics has none."""
+        return self.physics.modelled(vehicle)
+
+
+class DDM(TrainableModel):
     """``theta = theta_min + sigmoid(network(window)) * (theta_max - theta_min)``, and a step of the physics with it."""
 
+    KIND = "ddm"
+    CONFIG: ClassVar[type[ModelConfig]] = DdmConfig
     mean: Tensor
     std: Tensor
     lower: Tensor
     admissible: Tensor
 
-    def __init__(self, config: ModelConfig, vehicle: Vehicle, normalisation: Normalisation) -> None:
-        super().__init__()
-        assert config.gru is not None
-        assert config.dense is not None
-        assert config.physics is not None
+    def __init__(self, config: DdmConfig, vehicle: Vehicle, normalisation: Normalisation) -> None:
+        super().__init__(config, vehicle, normalisation)
         self.register_buffer("mean", torch.tensor(normalisation.input_mean))
         self.register_buffer("std", torch.tensor(normalisation.input_std))
         self.register_buffer("lower", torch.tensor(vehicle.lower, dtype=torch.float32))
         self.register_buffer("admissible", torch.tensor(vehicle.upper - vehicle.lower, dtype=torch.float32))
         self.gru = nn.GRU(INPUTS, config.gru.hidden, config.gru.layers, batch_first=True)
-        sizes = (config.H * config.gru.hidden, *[config.dense.width] * config.dense.layers)
+        H = config.rows(vehicle.sampling_time)
+        sizes = (H * config.gru.hidden, *[config.dense.width] * config.dense.layers)
         hidden = [nn.Sequential(nn.Linear(a, b), nn.Mish()) for a, b in pairwise(sizes)]
         self.dense = nn.Sequential(*hidden, nn.Linear(config.dense.width, len(COEFFICIENTS)))
         self.physics = PhysicsLayer(vehicle, config.physics)

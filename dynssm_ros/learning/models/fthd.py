@@ -26,17 +26,90 @@ training, is not built.
 
 from __future__ import annotations
 
+from typing import Any, ClassVar, Literal
+
 import torch
+from pydantic import Field, model_validator
 from torch import Tensor
+from typing_extensions import Self
 
-from dynssm_ros.learning.models.ddm import DDM
-from dynssm_ros.learning.models.dynssm.network import Output
+from dynssm_ros.configuration import StrictModel
+from dynssm_ros.learning.losses import LossConfig, Output, Scales, objective
+from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
+from dynssm_ros.learning.models.ddm import DDM, DdmConfig
+from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.vehicle import Vehicle
+
+# what fine-tuning takes over: the network, and the split, without which it would validate on windows of the first stage
+_NETWORK = ("history", "gru", "dense", "physics")
+_SPLIT = ("seed", "validation", "validation_block", "validation_every")
 
 
-def freeze(model: DDM, count: int) -> None:
-    """Keeps the first ``count`` layers as they are; see :attr:`DDM.layers`."""
-    for layer in model.layers[:count]:
-        layer.requires_grad_(False)
+class FineTuningConfig(StrictModel):
+    """Second stage of FTHD: a trained DDM is trained on."""
+
+    starts_from: DdmConfig = Field(description="the DDM; in a file the name of its model file")
+    frozen: int = Field(
+        ge=0, description="layers that stay as the DDM has them, from the input on; the GRU is the first"
+    )
+    physics: float = Field(ge=0, description="weight of the unsupervised physics loss; the supervised loss has 1")
+
+
+class FthdConfig(DdmConfig):
+    """Model file of an FTHD."""
+
+    kind: Literal["fthd"] = "fthd"
+    fine_tuning: FineTuningConfig
+
+    @model_validator(mode="after")
+    def _fits_its_start(self) -> FthdConfig:
+        start = self.fine_tuning.starts_from
+        if start.kind != "ddm":
+            raise ValueError(f"fine_tuning.starts_from: {start.name} is of kind {start.kind}; expected ddm")
+        for ours, its, names in ((self, start, _NETWORK), (self.training, start.training, _SPLIT)):
+            for name in names:
+                if getattr(ours, name) != getattr(its, name):
+                    raise ValueError(f"{name}: differs from that of {start.name}, which fine_tuning starts from")
+        if self.fine_tuning.frozen > self.dense.layers + 1:
+            raise ValueError(
+                f"fine_tuning.frozen: {self.fine_tuning.frozen} leaves nothing to train of GRU, {self.dense.layers} dense "
+                "layers and the output layer"
+            )
+        return self
+
+    @property
+    def start(self) -> DdmConfig:
+        """The DDM."""
+        return self.fine_tuning.starts_from
+
+    def with_training(self, **changes: Any) -> Self:
+        """The same model with other training settings, which hold for the DDM that it starts from too."""
+        fine_tuning = self.fine_tuning.model_copy(update={"starts_from": self.start.with_training(**changes)})
+        return super().with_training(**changes).model_copy(update={"fine_tuning": fine_tuning})
+
+
+class FTHD(DDM):
+    """The DDM's network in its second stage."""
+
+    KIND = "fthd"
+    CONFIG: ClassVar[type[ModelConfig]] = FthdConfig
+    EXTRA_ROWS = 1  # the predictions of neighbouring windows are compared
+
+    def __init__(self, config: FthdConfig, vehicle: Vehicle, normalisation: Normalisation) -> None:
+        super().__init__(config, vehicle, normalisation)
+        self.fine_tuning = config.fine_tuning
+
+    def take_over(self, start: TrainableModel) -> None:
+        """Takes the weights of the trained DDM and freezes its first layers."""
+        self.load_state_dict(start.state_dict())
+        for layer in self.layers[: self.fine_tuning.frozen]:
+            layer.requires_grad_(False)
+
+    def terms(self, window: Tensor, target: Tensor, loss: LossConfig, scales: Scales) -> dict[str, Tensor]:
+        """The supervised terms, and the physics loss."""
+        output = self(window[:, 1:])
+        disagreement = physics_loss(self, window, output, scales[0])
+        return objective(output, target, loss, scales) | {"physics": self.fine_tuning.physics * disagreement}
 
 
 def physics_loss(model: DDM, windows: Tensor, output: Output, unit: Tensor) -> Tensor:

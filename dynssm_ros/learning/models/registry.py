@@ -1,33 +1,100 @@
-"""Which class a model file's ``kind`` is."""
+"""Models by kind: the built-in ones, those that a user registers, and their files (``config/models/*.yaml``)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-from torch import nn
-
-from dynssm_ros.learning.configuration import ModelConfig
+from dynssm_ros import configuration
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.learning.models.ddm import DDM
 from dynssm_ros.learning.models.dynssm.network import DynSSM
+from dynssm_ros.learning.models.fthd import FTHD
 from dynssm_ros.learning.models.ridge import Ridge
-from dynssm_ros.runtime.artifact import ModelKind, Normalisation
+from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
 
-_CLASSES: dict[ModelKind, Callable[[ModelConfig, Vehicle, Normalisation], nn.Module]] = {
-    "dynssm": DynSSM,
-    "ridge": lambda config, _, normalisation: Ridge(config.H, normalisation),
-    "ddm": DDM,
-    "fthd": DDM,  # the same network, trained on
-}
+MODELS: dict[str, type[TrainableModel]] = {}
+"""Model classes by kind."""
 
 
-def build_model(config: ModelConfig, vehicle: Vehicle, normalisation: Normalisation) -> nn.Module:
-    """An untrained model, which maps raw windows ``(B, H, 7)`` to an :class:`~dynssm_ros.learning.models.dynssm.network.Output`."""
-    return _CLASSES[config.kind](config, vehicle, normalisation)
+def register_model(model: type[TrainableModel]) -> type[TrainableModel]:
+    """Makes a model known by its kind to model files, training and export. Use it as a decorator.
+
+    Raises:
+        ValueError: without a kind, or one that is taken.
+    """
+    if not model.KIND:
+        raise ValueError(f"model {model.__name__}: expected KIND")
+    if MODELS.get(model.KIND, model) is not model:
+        raise ValueError(f"model kind {model.KIND}: taken by {MODELS[model.KIND].__name__}")
+    MODELS[model.KIND] = model
+    return model
 
 
-def modelled_vehicle(config: ModelConfig, vehicle: Vehicle) -> Vehicle:
-    """The car as the model's physics has it, which is the one that the model's coefficients are for."""
-    if config.physics is None or config.physics.load_transfer:
-        return vehicle
-    return vehicle.model_copy(update={"constants": vehicle.constants.model_copy(update={"load_transfer": False})})
+for _model in (DynSSM, Ridge, DDM, FTHD):
+    register_model(_model)
+
+
+def build_model(config: ModelConfig, vehicle: Vehicle, normalisation: Normalisation) -> TrainableModel:
+    """An untrained model.
+
+    Raises:
+        ConfigurationError: a block of it does not fit the vehicle's sampling time.
+    """
+    return MODELS[config.kind](config, vehicle, normalisation)
+
+
+def load_model_config(name_or_path: str | Path, overrides: dict[str, Any] | None = None) -> ModelConfig:
+    """Reads a model file by shipped name or path.
+
+    Args:
+        name_or_path: ``base: NAME`` in the file takes another file's fields where it has none.
+        overrides: fields that replace those of the file, block by block.
+
+    Raises:
+        ConfigurationError: not found, malformed or inconsistent.
+    """
+    path = configuration.find_config("models", name_or_path)
+    return parse_model_config(_merge(_with_base(path), overrides or {}), path)
+
+
+def parse_model_config(content: dict[str, Any], source: str | Path) -> ModelConfig:
+    """The configuration from the fields of a model file; a model's name in ``fine_tuning.starts_from`` is read as a file.
+
+    Raises:
+        ConfigurationError: an unknown kind, or fields that do not fit it.
+    """
+    kind = content.get("kind", DynSSM.KIND)
+    if kind not in MODELS:
+        raise ConfigurationError(f"{source}: kind: '{kind}'; expected one of {', '.join(sorted(MODELS))}")
+    fine_tuning = content.get("fine_tuning")
+    if isinstance(fine_tuning, dict) and isinstance(fine_tuning.get("starts_from"), str):
+        start = _with_base(_referred(Path(source), fine_tuning["starts_from"]))
+        content = content | {"fine_tuning": fine_tuning | {"starts_from": start}}
+    return configuration.validate(MODELS[kind].CONFIG, content, source)
+
+
+def _with_base(path: Path, depth: int = 0) -> dict[str, Any]:
+    content = configuration.read_yaml(path)
+    base = content.pop("base", None)
+    if base is None:
+        return content
+    if depth > 4:
+        raise ConfigurationError(f"{path}: base: files refer to each other in a circle")
+    return _merge(_with_base(_referred(path, base), depth + 1), content)
+
+
+def _referred(path: Path, name: str) -> Path:
+    """The model file that ``path`` calls ``name``: one beside it, else as on the command line."""
+    sibling = path.parent / f"{name}.yaml"
+    return sibling if sibling.is_file() else configuration.find_config("models", name)
+
+
+def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = _merge(merged[key], value) if both else value
+    return merged

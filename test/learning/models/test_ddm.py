@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from dynssm_ros.learning.configuration import ModelConfig, load_model_config
 from dynssm_ros.learning.dataset import Windows, split_windows
 from dynssm_ros.learning.export import save_artifact
+from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.ddm import DDM
-from dynssm_ros.learning.models.registry import build_model, modelled_vehicle
-from dynssm_ros.learning.training import train
+from dynssm_ros.learning.models.registry import build_model, load_model_config, modelled_vehicle
+from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.artifact import ModelKind, Normalisation
 from dynssm_ros.runtime.models import OnnxModel, SingleTrack
 from dynssm_ros.signals.recording import Recording
@@ -49,7 +49,7 @@ def test_every_kind_can_be_built(make_config: MakeConfig, make_ddm: MakeConfig, 
     configs = [make_config(), make_config(kind="ridge"), make_ddm(), make_fthd()]
     assert {config.kind for config in configs} == set(get_args(ModelKind))
     for config in configs:
-        output = build_model(config, load_vehicle("orca"), UNIT)(torch.ones(2, config.H, 7))
+        output = build_model(config, load_vehicle("orca"), UNIT)(torch.ones(2, config.rows(0.02), 7))
         assert output.increment.shape == (2, 3)
 
 

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dynssm_ros.configuration import config_root
-from dynssm_ros.learning.configuration import ModelConfig, load_model_config
 from dynssm_ros.learning.dataset import Windows, normalisation
+from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.dynssm.network import DynSSM, GatedResidual, Output, PhysicsLayer, nominal_parameters
+from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.models import SingleTrack
 from dynssm_ros.signals.recording import Recording

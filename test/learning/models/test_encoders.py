@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import cont2discrete, lfilter
 
-from dynssm_ros.learning.configuration import FusionConfig, GruConfig, SsmConfig
+from dynssm_ros.learning.models.base import GruConfig
+from dynssm_ros.learning.models.dynssm.config import FusionConfig, SsmConfig
 from dynssm_ros.learning.models.dynssm.encoders import DiagonalSsm, Fusion, GruEncoder, SsmEncoder
 
 TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-12}

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from dynssm_ros.learning.configuration import ModelConfig
 from dynssm_ros.learning.export import save_artifact
+from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.ddm import DDM
 from dynssm_ros.learning.models.fthd import physics_loss
-from dynssm_ros.learning.training import Trained, checkpoints, train
+from dynssm_ros.learning.stages import Trained, checkpoints, train
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.models import SingleTrack
 from dynssm_ros.signals.recording import Recording

@@ -12,11 +12,11 @@ import torch
 from pydantic import ValidationError
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.learning.configuration import load_model_config
 from dynssm_ros.learning.export import save_artifact
-from dynssm_ros.learning.models.dynssm.in_window import Identification, solved
+from dynssm_ros.learning.models.dynssm.in_window import solved
 from dynssm_ros.learning.models.dynssm.network import DynSSM
-from dynssm_ros.learning.training import train
+from dynssm_ros.learning.models.registry import load_model_config
+from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.signals.recording import Recording
@@ -26,11 +26,11 @@ SCALES = Normalisation(
     input_mean=(0.0,) * 7, input_std=(1.0,) * 7, state_scale=(1.0,) * 3, increment_scale=(0.02, 0.02, 0.5)
 )
 IDENTIFIED: dict[str, Any] = {
-    "H": 12,
+    "history": 0.24,
     "physics": {"nominal": "vehicle"},
-    "identification": {"spread": {"D_f": 0.05, "D_r": 0.05, "S_hf": 0.02}, "noise": 0.03, "steps": 10},
+    "in_window_estimation": {"spread": {"D_f": 0.05, "D_r": 0.05, "S_hf": 0.02}, "noise": 0.03, "history": 0.2},
 }
-NAMES = tuple(IDENTIFIED["identification"]["spread"])
+NAMES = tuple(IDENTIFIED["in_window_estimation"]["spread"])
 CHOSEN = [COEFFICIENTS.index(name) for name in NAMES]
 
 Drive = Callable[..., Recording]
@@ -69,16 +69,16 @@ def test_small_systems_are_solved() -> None:
 
 def test_the_estimate_is_the_regularised_least_squares_solution(model: DynSSM) -> None:
     """Of a physics that is linear in the coefficients, whatever the rounds."""
-    assert isinstance(model.identification, Identification)
+    assert isinstance(model.estimation, Identification)
     generator = torch.Generator().manual_seed(1)
     errors, slopes = torch.randn(8, 10, 3, generator=generator), torch.randn(8, 10, 3, 3, generator=generator)
-    spread = torch.tensor(list(IDENTIFIED["identification"]["spread"].values()))
+    spread = torch.tensor(list(IDENTIFIED["in_window_estimation"]["spread"].values()))
 
     def physics(cars: torch.Tensor) -> torch.Tensor:
         changes = (cars - model.nominal)[..., CHOSEN] / spread
         return torch.einsum("bsck,bnk->bsnc", slopes, changes.expand(8, -1, -1))
 
-    found = (model.identification(0.01 * errors, physics, model.nominal) - model.nominal).numpy()
+    found = (model.estimation(0.01 * errors, physics, model.nominal) - model.nominal).numpy()
     for k in range(8):
         J = slopes[k].reshape(30, 3).numpy() / 0.03
         expected, *_ = np.linalg.lstsq(
@@ -107,7 +107,9 @@ def test_further_rounds_tell_large_changes_that_come_together(
     given = windows(drive(wide.with_nominal(truth), 300, steering=0.12))
     errors = []
     for rounds in (1, 2, 3):
-        config = make_config(**(IDENTIFIED | {"identification": IDENTIFIED["identification"] | {"rounds": rounds}}))
+        config = make_config(
+            **(IDENTIFIED | {"in_window_estimation": IDENTIFIED["in_window_estimation"] | {"rounds": rounds}})
+        )
         found = identified(DynSSM(config, wide, SCALES).eval(), given)
         errors.append(np.median(np.abs(found - truth[CHOSEN]), axis=0) / truth[CHOSEN])
     assert errors[0][2] > 0.1
@@ -124,7 +126,7 @@ def test_errors_that_mean_nothing_move_little(model: DynSSM, drive: Drive, wide:
     """Random pushes of the stated size leave the estimate within the spread, where the window is excited well within."""
     noise = tuple(0.03 * scale for scale in SCALES.increment_scale)
     found = identified(model, windows(drive(wide, 600, steering=0.12, noise=noise))) - wide.nominal[CHOSEN]
-    assert np.all(np.std(found, axis=0) < 0.3 * np.array(list(IDENTIFIED["identification"]["spread"].values())))
+    assert np.all(np.std(found, axis=0) < 0.3 * np.array(list(IDENTIFIED["in_window_estimation"]["spread"].values())))
 
 
 def test_straight_ahead_nothing_is_told_of_the_grip(make_config: MakeConfig, orca: Vehicle) -> None:
@@ -132,7 +134,9 @@ def test_straight_ahead_nothing_is_told_of_the_grip(make_config: MakeConfig, orc
     theta = orca.nominal.copy()
     theta[[COEFFICIENTS.index(name) for name in ("S_hf", "S_hr", "S_vf", "S_vr")]] = 0.0
     straight = orca.with_nominal(theta)
-    config = make_config(**(IDENTIFIED | {"identification": {"spread": {"D_f": 0.05, "D_r": 0.05}, "steps": 10}}))
+    config = make_config(
+        **(IDENTIFIED | {"in_window_estimation": {"spread": {"D_f": 0.05, "D_r": 0.05}, "history": 0.2}})
+    )
     given = torch.zeros(1, 12, 7)
     given[..., 0] = torch.linspace(1.5, 2.5, 12)  # faster than the throttle of zero explains
     found = identified(DynSSM(config, straight, SCALES).eval(), given)
@@ -160,7 +164,7 @@ def test_the_deployed_graph_identifies_too(
         expected = trained.model(given)
     assert said.theta is not None
     # rounding matters where a window tells little
-    spread = np.array(list(IDENTIFIED["identification"]["spread"].values()))
+    spread = np.array(list(IDENTIFIED["in_window_estimation"]["spread"].values()))
     assert np.max(np.abs(said.theta - expected.theta.numpy())[:, CHOSEN] / spread) < 0.01
     np.testing.assert_allclose(np.median(said.theta[:, CHOSEN[0]]), truth[CHOSEN[0]], rtol=0.03)
 
@@ -168,15 +172,15 @@ def test_the_deployed_graph_identifies_too(
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"identification": {"spread": {"D_x": 0.1}, "steps": 3}}, "unknown D_x; expected some of B_f"),
-        ({"identification": {"spread": {}, "steps": 3}}, "at least 1 item"),
+        ({"in_window_estimation": {"spread": {"D_x": 0.1}, "history": 0.06}}, "unknown D_x; expected some of B_f"),
+        ({"in_window_estimation": {"spread": {}, "history": 0.06}}, "at least 1 item"),
         (
-            {"identification": {"spread": {"D_f": 0.1}, "steps": 12}},
+            {"in_window_estimation": {"spread": {"D_f": 0.1}, "history": 0.24}},
             "identification.steps: 12; a window of 12 rows has 11",
         ),
-        ({"identification": {"spread": {"D_f": -0.1}, "steps": 3}}, "greater than 0"),
+        ({"in_window_estimation": {"spread": {"D_f": -0.1}, "history": 0.06}}, "greater than 0"),
         (
-            {"identification": {"spread": {"D_f": 0.1}, "steps": 3}, "adaptation": None},
+            {"in_window_estimation": {"spread": {"D_f": 0.1}, "history": 0.06}, "adaptation": None},
             "identification needs adaptation",
         ),
     ],
@@ -188,8 +192,8 @@ def test_what_cannot_be_identified_is_refused(make_config: MakeConfig, changes: 
 
 def test_the_shipped_model_file(tmp_path: Path) -> None:
     config = load_model_config("dynssm_orca_adaptive")
-    assert config.identification is not None
-    assert set(config.identification.spread) == {"D_f", "D_r", "S_hf"}
+    assert config.in_window_estimation is not None
+    assert set(config.in_window_estimation.spread) == {"D_f", "D_r", "S_hf"}
     file = tmp_path / "wrong.yaml"
     file.write_text("base: dynssm_orca_adaptive\nidentification: {steps: 100}\n")
     with pytest.raises(ConfigurationError, match=r"identification\.steps: 100"):

@@ -11,11 +11,12 @@ import pytest
 import torch
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.learning.configuration import HindcastConfig, MemoryConfig, load_model_config
 from dynssm_ros.learning.export import save_artifact
-from dynssm_ros.learning.models.dynssm.innovation import ErrorMemory, Hindcast
+from dynssm_ros.learning.models.dynssm.config import InnovationConfig, InWindowConfig
+from dynssm_ros.learning.models.dynssm.innovation import InnovationFilter, InWindowErrors
 from dynssm_ros.learning.models.dynssm.network import DynSSM
-from dynssm_ros.learning.training import train
+from dynssm_ros.learning.models.registry import load_model_config
+from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.models import SingleTrackEwma
 from dynssm_ros.signals.recording import Recording
@@ -26,11 +27,11 @@ SCALES = Normalisation(
 )
 S_DELTA = torch.tensor(SCALES.increment_scale)
 BEYOND: dict[str, Any] = {
-    "H": 10,
+    "history": 0.2,
     "physics": {"nominal": "vehicle"},
     "inputs": {"features": "increments", "rows": 4, "physics_errors": True},
-    "memory": {"taps": 4},
-    "hindcast": {"steps": 5},
+    "innovation": {"history": 0.08},
+    "in_window_errors": {"history": 0.1},
 }
 
 
@@ -49,13 +50,13 @@ def test_past_errors_show_what_was_added(
     drive: Callable[..., Recording], make_config: Callable[..., Any], orca: Vehicle
 ) -> None:
     model = DynSSM(make_config(physics={"nominal": "vehicle"}, inputs={"physics_errors": True}), orca, SCALES)
-    given = windows(drive(orca, 100), model.config.H)
+    given = windows(drive(orca, 100), model.config.rows(0.02))
     seen = model._seen(given, model.changes.states(given))
     np.testing.assert_allclose(seen[..., 7:].detach(), 0.0, atol=2e-5)
     added = torch.tensor([0.01, -0.02, 0.04])
     given[:, -1, :3] += added
     errors = model._seen(given, model.changes.states(given))[..., 7:].detach()
-    assert errors.shape[1] == model.config.H - 1
+    assert errors.shape[1] == model.config.rows(0.02) - 1
     about_the_mean = torch.tensor([-1.0, -1.0, 2.0])[:, None] / 3 * added / S_DELTA  # of the three steps in the window
     np.testing.assert_allclose(errors, about_the_mean.expand(20, 3, 3), atol=2e-5)
 
@@ -64,7 +65,7 @@ def test_increments_do_not_depend_on_the_absolute_state(
     drive: Callable[..., Recording], make_config: Callable[..., Any], orca: Vehicle
 ) -> None:
     model = DynSSM(make_config(inputs={"features": "increments"}), orca, SCALES)
-    given = windows(drive(orca, 100), model.config.H)
+    given = windows(drive(orca, 100), model.config.rows(0.02))
     shifted = given + torch.tensor([3.0, 1.0, -2.0, 0.2, 0.1, 0.0, 0.0])
     there, here = (model._seen(each, model.changes.states(each)) for each in (shifted, given))
     np.testing.assert_allclose(there.detach(), here.detach(), atol=1e-4)
@@ -76,9 +77,9 @@ def test_untrained_memory_is_the_physics_less_its_average_error(
 ) -> None:
     baseline = SingleTrackEwma(orca)
     config = make_config(
-        H=31,
+        history=0.62,
         physics={"nominal": "vehicle"},
-        memory={"taps": 30, "decay": 0.9},
+        innovation={"history": 0.6, "decay": 0.9},
         residual=None,
         adaptation={"hidden": 4, "alpha": 1e-9},
     )
@@ -89,7 +90,7 @@ def test_untrained_memory_is_the_physics_less_its_average_error(
 
 
 def test_a_constant_error_of_the_physics_vanishes(orca: Vehicle) -> None:
-    memory = ErrorMemory(MemoryConfig(taps=6))
+    memory = InnovationFilter(InnovationConfig(history=1.0), 6)
     physics = torch.randn(5, 12, 3)
     constant = torch.tensor([3.0, -50.0, 0.5])
     increments = physics[:, :-1] + constant
@@ -99,7 +100,7 @@ def test_a_constant_error_of_the_physics_vanishes(orca: Vehicle) -> None:
 
 
 def test_hindcasts_are_the_predictions_of_earlier_windows() -> None:
-    memory = ErrorMemory(MemoryConfig(taps=4))
+    memory = InnovationFilter(InnovationConfig(history=1.0), 4)
     torch.nn.init.normal_(memory.filter)
     torch.nn.init.normal_(memory.A)
     increments, physics = torch.randn(5, 11, 3), torch.randn(5, 12, 3)
@@ -114,14 +115,14 @@ def test_hindcasts_are_the_predictions_of_earlier_windows() -> None:
 
 
 def test_trust_follows_what_could_be_predicted() -> None:
-    hindcast = Hindcast(HindcastConfig(steps=14, prior=1.0))
+    hindcast = InWindowErrors(InWindowConfig(history=1.0, shrinkage_weight=1.0), 14)
     predicted = torch.randn(2000, 14, 3)
-    np.testing.assert_allclose(hindcast.trust(predicted, predicted), 1.0)
-    np.testing.assert_allclose(hindcast.trust(predicted, 0.5 * predicted).mean(), 0.5, atol=0.06)
-    assert hindcast.trust(predicted, torch.randn(2000, 14, 3)).mean() < 0.2
-    assert hindcast.trust(predicted, -predicted).max() < 0.4  # what is wrong is at most ignored, not inverted
+    np.testing.assert_allclose(hindcast.shrinkage(predicted, predicted), 1.0)
+    np.testing.assert_allclose(hindcast.shrinkage(predicted, 0.5 * predicted).mean(), 0.5, atol=0.06)
+    assert hindcast.shrinkage(predicted, torch.randn(2000, 14, 3)).mean() < 0.2
+    assert hindcast.shrinkage(predicted, -predicted).max() < 0.4  # what is wrong is at most ignored, not inverted
     # without evidence the prior holds
-    np.testing.assert_allclose(hindcast.trust(1e-4 * predicted, torch.zeros(2000, 14, 3)), 1.0, atol=1e-4)
+    np.testing.assert_allclose(hindcast.shrinkage(1e-4 * predicted, torch.zeros(2000, 14, 3)), 1.0, atol=1e-4)
 
 
 def test_the_prior_of_trust_is_the_weakest_that_costs_nothing() -> None:
@@ -131,9 +132,9 @@ def test_the_prior_of_trust_is_the_weakest_that_costs_nothing() -> None:
     can = torch.ones(20_000, 1, 3)
     can[::2, :, 1] = can[:, :, 2] = 0.0
     happened = can * drawn + torch.randn(20_000, 15, 3, generator=generator)
-    hindcast = Hindcast(HindcastConfig(steps=14, prior=1.0))
-    hindcast.fit_trust(drawn[:, :14], happened[:, :14], drawn[:, 14], happened[:, 14])
-    always, half, never = hindcast.prior.tolist()
+    hindcast = InWindowErrors(InWindowConfig(history=1.0, shrinkage_weight=1.0), 14)
+    hindcast.fit_shrinkage(drawn[:, :14], happened[:, :14], drawn[:, 14], happened[:, 14])
+    always, half, never = hindcast.weight.tolist()
     assert always > 20
     assert never == 1.0
     assert half < 10
@@ -141,7 +142,7 @@ def test_the_prior_of_trust_is_the_weakest_that_costs_nothing() -> None:
 
 def test_stated_variance_follows_the_recent_errors_and_covers_nine_in_ten() -> None:
     generator = torch.Generator().manual_seed(0)
-    hindcast = Hindcast(HindcastConfig(steps=14))
+    hindcast = InWindowErrors(InWindowConfig(history=1.0), 14)
     level = torch.tensor([0.5, 2.0]).repeat(20_000)[:, None, None]  # a calm and a rough stretch
     errors = level * torch.randn(40_000, 15, 3, generator=generator)
     past, now = errors[:, :14], errors[:, 14]
@@ -157,7 +158,7 @@ def test_stated_variance_follows_the_recent_errors_and_covers_nine_in_ten() -> N
 
 
 def test_constant_errors_get_a_constant_variance() -> None:
-    hindcast = Hindcast(HindcastConfig(steps=14))
+    hindcast = InWindowErrors(InWindowConfig(history=1.0), 14)
     generator = torch.Generator().manual_seed(0)
     errors = torch.randn(20_000, 15, 3, generator=generator)
     hindcast.fit_variance(errors[:, :14], errors[:, 14])
@@ -170,7 +171,7 @@ def test_the_deployed_graph_has_it_all(
 ) -> None:
     trained = train(drive(orca, 1500), make_config(**BEYOND), orca, tmp_path / "checkpoint.pt")
     artifact = save_artifact(trained, tmp_path / "model")  # refuses a graph that differs from torch
-    assert artifact.card.architecture["memory"]["taps"] == 4
+    assert artifact.card.architecture["innovation"]["history"] == 0.08
 
 
 def test_training_does_without_trust(
@@ -207,7 +208,7 @@ def test_a_residual_is_not_believed_beyond_the_errors_that_it_is_there_to_correc
     generator = torch.Generator().manual_seed(0)
     happened = torch.randn(2000, 14, 3, generator=generator)
     residual = torch.randn(2000, 3, generator=generator)
-    hindcast = Hindcast(HindcastConfig(steps=14, limit=1.0))
+    hindcast = InWindowErrors(InWindowConfig(history=1.0, limit=1.0), 14)
     small = hindcast.limited(residual, happened + 0.01 * torch.randn(2000, 14, 3, generator=generator), happened)
     assert small.abs().max() < 0.02
     large = hindcast.limited(residual, happened + 100.0, happened)
@@ -215,4 +216,4 @@ def test_a_residual_is_not_believed_beyond_the_errors_that_it_is_there_to_correc
     assert torch.equal(
         hindcast.limited(residual, happened, happened).abs() < 1e-10, torch.ones(2000, 3, dtype=torch.bool)
     )
-    assert Hindcast(HindcastConfig(steps=14)).limited(residual, happened, happened) is residual
+    assert InWindowErrors(InWindowConfig(history=1.0), 14).limited(residual, happened, happened) is residual

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dynssm_ros.learning.configuration import FusionConfig, GruConfig, SsmConfig
+from dynssm_ros.learning.models.base import GruConfig
+from dynssm_ros.learning.models.dynssm.config import FusionConfig, SsmConfig
 
 
 class DiagonalSsm(nn.Module):

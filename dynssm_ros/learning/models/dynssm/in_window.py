@@ -11,11 +11,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from dynssm_ros.learning.configuration import IdentificationConfig
+from dynssm_ros.learning.models.dynssm.config import EstimationConfig
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 
 
-class Identification(nn.Module):
+class InWindowEstimation(nn.Module):
     """Maximum a posteriori estimate of a few coefficients over the last steps of the window.
 
     With the physics' errors ``e_k`` of the ``steps`` last steps, their slopes ``J_k`` by the coefficients, errors of
@@ -32,12 +32,14 @@ class Identification(nn.Module):
     lower: Tensor
     upper: Tensor
 
-    def __init__(self, config: IdentificationConfig, vehicle: Vehicle) -> None:
+    def __init__(self, config: EstimationConfig, steps: int, vehicle: Vehicle) -> None:
         super().__init__()
         self.config = config
+        self.steps = steps
         directions = torch.zeros(len(config.spread), len(COEFFICIENTS))
-        for direction, (name, spread) in zip(directions, config.spread.items(), strict=True):
-            direction[COEFFICIENTS.index(name)] = spread
+        for direction, (name, share) in zip(directions, config.spread.items(), strict=True):
+            k = COEFFICIENTS.index(name)
+            direction[k] = share * (vehicle.upper - vehicle.lower)[k]
         self.register_buffer("directions", directions)
         self.register_buffer("lower", torch.tensor(vehicle.lower, dtype=torch.float32))
         self.register_buffer("upper", torch.tensor(vehicle.upper, dtype=torch.float32))

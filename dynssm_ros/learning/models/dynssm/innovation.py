@@ -1,9 +1,8 @@
-"""What the window tells beyond the paper: how the car changed, how the physics erred, and how far to trust a prediction.
+"""Beyond the paper: what the window tells of the present error of the physics, and of the error of a prediction.
 
-On another track, with another set-up, speeds and forces leave the range of the training laps, and the physics errs in a
-new way: a banked turn, an offset of the steering. Two things stay as they were: increments have the same size, and an
-error that the physics just made, it makes again. The modules here are built on them. All increments are in units of
-``s_delta``.
+On another track or with another set-up, speeds and forces leave the range of the training laps, and the physics errs in a new
+way: a banked turn, an offset of the steering. Two things stay as they were. Increments have the same size, and an error
+that the physics just made, it makes again. The modules here are built on them. All increments are in units of ``s_delta``.
 """
 
 from __future__ import annotations
@@ -12,20 +11,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dynssm_ros.learning.configuration import HindcastConfig, MemoryConfig
+from dynssm_ros.learning.models.dynssm.config import InnovationConfig, InWindowConfig
 from dynssm_ros.runtime.artifact import Normalisation
 
 CHANNELS = 3
-_LIMIT = 4.0  # in units of s_delta; beyond it the encoders learn nothing more from the size
-_INPUT_CHANGE = 0.1  # what an input changes in a step, as a share of its standard deviation
-_LARGEST_TRUST = 1.2
-_PRIORS = 8  # candidates, each three times the one before
-_FULL_TRUST = 1e12  # a prior that no evidence moves
-_PREMIUM = 0.01  # what trust may cost at home
+_INCREMENT_LIMIT = 4.0  # in units of s_delta; beyond it the encoders learn nothing more from the size
+_INPUT_CHANGE_SHARE = 0.1  # what an input changes in a step, as a share of its standard deviation
+_LARGEST_FACTOR = 1.2
+_WEIGHTS = 8  # shrinkage weights to choose from, each three times the one before
+_NO_SHRINKAGE = 1e12  # a weight that no evidence moves
+_VALIDATION_RMSE_TOLERANCE = 0.01  # relative; what shrinkage may cost on data like the training data
 _COVERED, _QUANTILE = 0.9, 1.6448536  # the share of errors within this many standard deviations
 
 
-def limited(value: Tensor, limit: Tensor | float = _LIMIT) -> Tensor:
+def limited(value: Tensor, limit: Tensor | float = _INCREMENT_LIMIT) -> Tensor:
     """``value`` squeezed smoothly to less than ``limit``, by default the range that the training laps have seen."""
     return limit * torch.tanh(value / limit)
 
@@ -58,11 +57,11 @@ class Increments(nn.Module):
         """
         feedback = window[:, 1:, CHANNELS : CHANNELS + 2] - window[:, :-1, CHANNELS : CHANNELS + 2]
         asked = window[:, 1:, CHANNELS + 2 :]
-        inputs = torch.cat([feedback / self.std[:2], asked / self.std[:2]], dim=-1) / _INPUT_CHANGE
+        inputs = torch.cat([feedback / self.std[:2], asked / self.std[:2]], dim=-1) / _INPUT_CHANGE_SHARE
         return limited(torch.cat([increments, centred(increments), inputs], dim=-1))
 
 
-class ErrorMemory(nn.Module):
+class InnovationFilter(nn.Module):
     """The physics with its own recent one-step errors carried forward: its prediction in innovation form.
 
     With the physics' increment ``p_k`` from row ``k``, the measured one ``d_k`` that led to it and the error
@@ -75,12 +74,12 @@ class ErrorMemory(nn.Module):
     term is constant, and none is a function of the absolute state: the filter means the same on any track.
     """
 
-    def __init__(self, config: MemoryConfig) -> None:
+    def __init__(self, config: InnovationConfig, taps: int) -> None:
         super().__init__()
-        self.taps = config.taps
+        self.taps = taps
         self.log_odds = nn.Parameter(torch.full((CHANNELS,), config.decay).logit())
         self.A = nn.Parameter(torch.zeros(CHANNELS, CHANNELS))
-        self.filter = nn.Parameter(torch.zeros(CHANNELS, 2 * CHANNELS, config.taps))
+        self.filter = nn.Parameter(torch.zeros(CHANNELS, 2 * CHANNELS, taps))
         self.frozen: tuple[Tensor, Tensor, Tensor] | None = None
 
     def kernels(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -100,61 +99,61 @@ class ErrorMemory(nn.Module):
         """Computes the kernels once and for all, for deployment."""
         self.frozen = self.kernels()
 
-    def forward(self, increments: Tensor, physics: Tensor, hindcasts: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Predictions from the last row and, in hindsight, from the ``hindcasts`` rows before it.
+    def forward(self, increments: Tensor, physics: Tensor, retrospective: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Predictions from the last row and, retrospectively, from the ``retrospective`` rows before it.
 
         Args:
             increments: measured ``d``, ``(B, H - 1, 3)``.
             physics: ``p`` from every row, ``(B, H, 3)``.
-            hindcasts: rows before the last one to predict from as well.
+            retrospective: rows before the last one to predict from as well.
 
         Returns:
-            ``q`` ``(B, hindcasts + 1, 3)``, the last error ``e`` ``(B, 3)`` and its mean ``m`` ``(B, 3)``.
+            ``q`` ``(B, retrospective + 1, 3)``, the last error ``e`` ``(B, 3)`` and its mean ``m`` ``(B, 3)``.
         """
         direct, g, kernel = self.kernels()
         errors = increments - physics[:, :-1]
-        recent = torch.cat([increments, errors], dim=-1)[:, -(self.taps + hindcasts) :]
+        recent = torch.cat([increments, errors], dim=-1)[:, -(self.taps + retrospective) :]
         remembered = functional.conv1d(recent.transpose(1, 2), kernel).transpose(1, 2)
-        q = physics[:, -(hindcasts + 1) :] @ direct.T + remembered
+        q = physics[:, -(retrospective + 1) :] @ direct.T + remembered
         return q, errors[:, -1], (errors[:, -self.taps :] * g).sum(dim=1)
 
 
-class Hindcast(nn.Module):
-    """Judges the model by what it would have predicted over the last steps of the window, where the truth is known.
+class InWindowErrors(nn.Module):
+    """Judges a prediction by the one-step errors that the model would have made over the last steps of the window.
 
-    *Trust* scales the prediction of each channel by the regression of what happened on what was predicted, with a prior
-    of one: where recent increments could be predicted it stays, where they could not it shrinks towards "no change".
-    *Limit*: a residual that is larger than the errors that it is there to correct is not believed.
-    *Uncertainty* is a constant and a share of the recent squared errors. The weight of the prior is fitted on validation
-    data, so that trust costs next to nothing at home, and the variance on data that the model knows as little as the next
-    lap, so that 90 % intervals cover 90 % there.
+    *Shrinkage* scales each channel's increment by the regression of what happened on what was predicted, drawn towards one:
+    an increment that could not be predicted lately shrinks towards "no change". *Limit*: the residual is limited to the
+    size of the errors that it is to correct. *Variance*: a constant and a share of the recent squared errors. The
+    shrinkage weight is fitted on validation data such that shrinkage costs at most 1 % there. The variance is fitted on
+    data that the model knows as little as the next lap, so that 90 % intervals cover 90 % there.
     """
 
-    prior: Tensor
+    weight: Tensor
     variance: Tensor
 
-    def __init__(self, config: HindcastConfig) -> None:
+    def __init__(self, config: InWindowConfig, steps: int) -> None:
         super().__init__()
         self.config = config
+        self.steps = steps
         # in squared increments of size s_delta, for each channel
-        self.register_buffer("prior", torch.full((CHANNELS,), config.prior))
-        # variance = constant + share * mean squared error of the hindcasts, for each channel
+        self.register_buffer("weight", torch.full((CHANNELS,), config.shrinkage_weight))
+        # variance = constant + share * mean squared error of the in-window errors, for each channel
         self.register_buffer("variance", torch.stack([torch.ones(CHANNELS), torch.zeros(CHANNELS)]))
 
-    def trust(self, predicted: Tensor, happened: Tensor) -> Tensor:
-        """Factor of the prediction ``(B, 3)`` from hindcasts and what happened, each ``(B, steps, 3)``."""
-        return _regression(predicted, happened, self.prior)
+    def shrinkage(self, predicted: Tensor, happened: Tensor) -> Tensor:
+        """Factor of the prediction ``(B, 3)`` from retrospective predictions and what happened, each ``(B, steps, 3)``."""
+        return _regression(predicted, happened, self.weight)
 
     def limited(self, residual: Tensor, predicted: Tensor, happened: Tensor) -> Tensor:
-        """``residual`` ``(B, 3)`` squeezed smoothly below the errors in hindsight, all in units of ``s_delta``."""
+        """``residual`` ``(B, 3)`` squeezed smoothly below the in-window errors, all in units of ``s_delta``."""
         if self.config.limit is None:
             return residual
         errors = torch.sqrt(_mean_square(predicted - happened) + torch.finfo(residual.dtype).tiny)
         return limited(residual, self.config.limit * errors)
 
-    def trust_fully(self) -> None:
-        """Lets no evidence speak against the predictions."""
-        self.prior.fill_(_FULL_TRUST)
+    def no_shrinkage(self) -> None:
+        """Leaves the predictions as they are."""
+        self.weight.fill_(_NO_SHRINKAGE)
 
     def spread(self, predicted: Tensor, happened: Tensor) -> Tensor:
         """Variance of the prediction's error ``(B, 3)``, in units of ``s_delta`` squared."""
@@ -162,32 +161,32 @@ class Hindcast(nn.Module):
         return spread
 
     @torch.no_grad()
-    def fit_trust(self, hindcasts: Tensor, happened: Tensor, predicted: Tensor, target: Tensor) -> None:
-        """Picks for each channel the weakest prior that costs next to nothing on data like the training data.
+    def fit_shrinkage(self, retrospective: Tensor, happened: Tensor, predicted: Tensor, target: Tensor) -> None:
+        """Picks for each channel the least shrinkage weight that costs next to nothing on data like the training data.
 
-        The best there would be the strongest; the weaker, the more of a wrong prediction elsewhere is taken back.
+        The lower the weight, the more of a wrong prediction elsewhere is taken back.
 
         Args:
-            hindcasts: predictions in hindsight ``(N, steps, 3)``.
+            retrospective: predictions of the last steps, ``(N, steps, 3)``.
             happened: the measured increments that they are of.
-            predicted: the predictions that trust is to scale, ``(N, 3)``.
+            predicted: the predictions that shrinkage is to scale, ``(N, 3)``.
             target: the measured increments that they are of.
         """
-        candidates = [self.config.prior * 3.0**power for power in range(_PRIORS)]
+        candidates = [self.config.shrinkage_weight * 3.0**power for power in range(_WEIGHTS)]
         errors = []
-        for prior in candidates:
-            factor = _regression(hindcasts, happened, torch.full_like(self.prior, prior))
+        for weight in candidates:
+            factor = _regression(retrospective, happened, torch.full_like(self.weight, weight))
             errors.append((factor * predicted - target).square().mean(dim=0).sqrt())
         rmse = torch.stack(errors)
-        affordable = rmse <= (1 + _PREMIUM) * rmse.min(dim=0).values
-        self.prior.copy_(torch.tensor(candidates)[affordable.int().argmax(dim=0)])
+        affordable = rmse <= (1 + _VALIDATION_RMSE_TOLERANCE) * rmse.min(dim=0).values
+        self.weight.copy_(torch.tensor(candidates)[affordable.int().argmax(dim=0)])
 
     @torch.no_grad()
     def fit_variance(self, past: Tensor, errors: Tensor) -> None:
         """Fits the variance: the most likely mixture of a constant and the recent errors, scaled to cover 90 %.
 
         Args:
-            past: errors of the predictions in hindsight ``(N, steps, 3)``.
+            past: in-window errors ``(N, steps, 3)``.
             errors: of the predictions themselves, ``(N, 3)``.
         """
         square, recent = errors.square(), _mean_square(past)
@@ -203,11 +202,11 @@ class Hindcast(nn.Module):
         self.variance.copy_(mixture * scale)
 
 
-def _regression(predicted: Tensor, happened: Tensor, prior: Tensor) -> Tensor:
-    """Slope of ``happened`` on ``predicted`` over ``(B, steps, 3)``, drawn towards one by ``prior`` ``(3,)``."""
-    agreed = (predicted * happened).sum(dim=1) + prior
-    full = (predicted * predicted).sum(dim=1) + prior
-    return torch.clamp(agreed / full, 0.0, _LARGEST_TRUST)
+def _regression(predicted: Tensor, happened: Tensor, weight: Tensor) -> Tensor:
+    """Slope of ``happened`` on ``predicted`` over ``(B, steps, 3)``, drawn towards one by ``weight`` ``(3,)``."""
+    agreed = (predicted * happened).sum(dim=1) + weight
+    full = (predicted * predicted).sum(dim=1) + weight
+    return torch.clamp(agreed / full, 0.0, _LARGEST_FACTOR)
 
 
 def _mean_square(errors: Tensor) -> Tensor:

@@ -1,0 +1,166 @@
+"""The contract of a trainable model: its configuration, what it computes, and what training asks of it.
+
+A model is one file or folder: a subclass of :class:`ModelConfig` with its own blocks, and a subclass of
+:class:`TrainableModel` that names it. :func:`dynssm_ros.learning.models.registry.register_model` makes it known by its
+``kind``; everything else (train, export, evaluate, predict) works with the contract alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from typing_extensions import Self
+
+from dynssm_ros.configuration import StrictModel
+from dynssm_ros.learning.dataset import SplitConfig, Windows
+from dynssm_ros.learning.losses import LossConfig, Output, Scales, objective
+from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.single_track import Integrator
+
+
+class AugmentationConfig(StrictModel):
+    """Beyond the paper: training windows changed at random, so that the model does not rely on what another track changes."""
+
+    mirror: bool = Field(default=False, description="half of the windows with left and right exchanged")
+    bank: float = Field(
+        default=0.0, ge=0, description="constant disturbance of each state's increments: its spread in units of s_delta"
+    )
+    offset: float = Field(default=0.0, ge=0, description="spread of a constant offset of the steering (rad)")
+    grip: float = Field(
+        default=0.0,
+        ge=0,
+        description="spread of a change of the lateral forces, as a share of the lateral acceleration",
+    )
+
+
+class TrainingConfig(SplitConfig):
+    """Optimisation by AdamW over shuffled batches."""
+
+    epochs: int = Field(ge=1)
+    batch_size: int = Field(ge=1)
+    learning_rate: float = Field(gt=0)
+    schedule: Literal["cosine", "constant"] = Field(default="cosine", description="course of the learning rate")
+    weight_decay: float = Field(default=0.0, ge=0)
+    gradient_clip: float | None = Field(default=1.0, gt=0, description="largest norm of a gradient; null: any")
+    patience: int = Field(ge=1, description="epochs without a better validation loss before it stops")
+    augmentation: AugmentationConfig = Field(default_factory=AugmentationConfig)
+
+    @property
+    def effort(self) -> tuple[int, int]:
+        """Epochs at most, and training windows that are needed."""
+        return self.epochs, self.batch_size
+
+
+class GruConfig(StrictModel):
+    """Recurrent encoder."""
+
+    hidden: int = Field(ge=1)
+    layers: int = Field(default=1, ge=1)
+
+
+class ModelConfig(StrictModel):
+    """What every model file has. A model's own configuration adds its blocks; a block that it does not have is refused."""
+
+    name: str
+    kind: str = Field(description="which model it is")
+    history: float = Field(gt=0, description="length of the history window (s)")
+    training: SplitConfig
+
+    def rows(self, T_s: float) -> int:
+        """H, rows of the history window at the sampling time ``T_s`` (s)."""
+        return steps_of(self.history, T_s)
+
+    @property
+    def calibrates(self) -> bool:
+        """Whether the vehicle is to be calibrated on the training data first."""
+        return False
+
+    @property
+    def stepping(self) -> tuple[Integrator, int]:
+        """Integrator and substeps of the model's physics."""
+        return "euler", 1
+
+    @property
+    def start(self) -> ModelConfig | None:
+        """The model that is trained first and that this one starts from."""
+        return None
+
+    @property
+    def parts(self) -> int:
+        """Parts of the recording that further models are trained without, to fit the stated variance; 0: none."""
+        return 0
+
+    def with_training(self, **changes: Any) -> Self:
+        """The same model with other training settings; those that it does not have are left out."""
+        known = {name: value for name, value in changes.items() if name in type(self.training).model_fields}
+        return self.model_copy(update={"training": self.training.model_copy(update=known)})
+
+    def modelled_vehicle(self, vehicle: Vehicle) -> Vehicle:
+        """The car as the model's physics has it, which is the one that its coefficients are for."""
+        return vehicle
+
+
+class TrainableModel(nn.Module):
+    """Maps raw windows ``(B, H, 7)`` to an :class:`~dynssm_ros.learning.losses.Output`.
+
+    Subclasses take ``(config, vehicle, normalisation)`` and register their buffers and parameters.
+
+    Attributes:
+        KIND: by which model files and cards name it.
+        CONFIG: its configuration.
+        EXTRA_ROWS: rows before the window that its loss reads as well.
+    """
+
+    KIND: ClassVar[str] = ""
+    CONFIG: ClassVar[type[ModelConfig]] = ModelConfig
+    EXTRA_ROWS: ClassVar[int] = 0
+
+    def __init__(self, config: Any, vehicle: Vehicle, normalisation: Normalisation) -> None:
+        super().__init__()
+
+    def forward(self, window: Tensor) -> Output:
+        """Raw windows ``(B, H, 7)`` to predictions."""
+        raise NotImplementedError
+
+    def terms(self, window: Tensor, target: Tensor, loss: LossConfig, scales: Scales) -> dict[str, Tensor]:
+        """The weighted terms of the loss on windows ``(B, H + EXTRA_ROWS, 7)`` and increments ``(B, 3)``."""
+        return objective(self(window), target, loss, scales)
+
+    def fit(self, training: Windows) -> bool:
+        """Fits in closed form; returns whether that is all the training there is."""
+        return False
+
+    def take_over(self, start: TrainableModel) -> None:
+        """Starts from a trained model; see :attr:`ModelConfig.start`."""
+        raise NotImplementedError
+
+    def post_fit(self, validation: Windows) -> None:
+        """Fits what is fitted on validation windows once the weights are found."""
+
+    def held_out_errors(self, window: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """In-window errors ``(N, steps, 3)`` and errors of the predictions ``(N, 3)`` on windows that are held out."""
+        raise NotImplementedError
+
+    def fit_variance(self, past: Tensor, errors: Tensor) -> None:
+        """Fits the stated variance to what :meth:`held_out_errors` gives; see :attr:`ModelConfig.parts`."""
+        raise NotImplementedError
+
+    def for_deployment(self) -> Self:
+        """Prepares a copy of the model for export; returns itself."""
+        return self.eval()
+
+
+def steps_of(seconds: float, T_s: float) -> int:
+    """Number of sampling times in a stretch of ``seconds``, at least one."""
+    return max(1, round(seconds / T_s))
+
+
+def scale_buffers(model: nn.Module, normalisation: Normalisation) -> None:
+    """Registers mean and standard deviation of the inputs and s_delta as buffers ``mean``, ``std``, ``increment_scale``."""
+    model.register_buffer("mean", torch.tensor(normalisation.input_mean))
+    model.register_buffer("std", torch.tensor(normalisation.input_std))
+    model.register_buffer("increment_scale", torch.tensor(normalisation.increment_scale))

@@ -1,0 +1,208 @@
+"""The optimisation loop: AdamW over shuffled batches, early stopping on validation windows, resumes after a kill."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from dynssm_ros import __version__
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.files import replacing
+from dynssm_ros.learning.augmentation import Augmentation
+from dynssm_ros.learning.dataset import Windows
+from dynssm_ros.learning.losses import COMPONENTS, LossConfig, Scales, scales
+from dynssm_ros.learning.models.base import ModelConfig, TrainableModel, TrainingConfig
+from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.vehicle import Vehicle
+
+History = dict[str, list[float]]
+Progress = Callable[[int, int, str], None]
+"""Called after each epoch with epochs done, epochs at most, and a line about them."""
+
+_LEARNING_RATE_FLOOR = 0.02  # the cosine schedule ends at this fraction of the learning rate
+
+
+@dataclass
+class OptimisationResult:
+    """The best model of an optimisation.
+
+    Attributes:
+        model: with the weights of the best epoch.
+        history: mean loss per epoch: ``train/TERM`` and ``validation/TERM`` for each of ``COMPONENTS``.
+        best_epoch: the one with the lowest validation loss; 0: the untrained model.
+        resumed_from: epochs that were done before.
+    """
+
+    model: TrainableModel
+    history: History
+    best_epoch: int = 0
+    resumed_from: int = 0
+
+
+@dataclass
+class _State:
+    """All that changes while training, and so all that a checkpoint holds."""
+
+    epoch: int = 0
+    best_epoch: int = 0
+    best_loss: float = float("inf")
+    best: dict[str, Tensor] = field(default_factory=dict)
+    history: History = field(default_factory=dict)
+
+
+class Optimisation:
+    """Adam over shuffled batches."""
+
+    def __init__(
+        self,
+        config: Any,
+        vehicle: Vehicle,
+        model: TrainableModel,
+        scale: Normalisation,
+        training: Windows,
+        validation: Windows,
+        checkpoint: Path,
+        device: torch.device,
+    ) -> None:
+        self.config = config
+        self.loss: LossConfig = config.loss
+        self.settings = config.training
+        self.model = model.to(device)
+        s_y, s_delta = scales(config.loss, scale)
+        self.scales: Scales = (s_y.to(device), s_delta.to(device))
+        self.training, self.validation = training.to(device), validation.to(device)
+        self.trained = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
+        self.optimiser = torch.optim.AdamW(
+            self.trained, lr=config.training.learning_rate, weight_decay=config.training.weight_decay
+        )
+        self.schedule = _schedule(config.training, self.optimiser)
+        self.shuffle = torch.Generator().manual_seed(config.training.seed)
+        self.augmentation = Augmentation(
+            config.training.augmentation, vehicle.sampling_time, self.scales[1], self.shuffle
+        )
+        self.checkpoint = checkpoint
+        self.identity = _identity(config, vehicle, training)
+        self.state = _State(history={f"{part}/{term}": [] for part in ("train", "validation") for term in COMPONENTS})
+
+    def run(self, progress: Progress | None) -> OptimisationResult:
+        """Trains until the validation loss stops falling; returns the best model.
+
+        Raises:
+            ConfigurationError: it diverges before there is a best one.
+        """
+        resumed_from = self._resume()
+        state, settings = self.state, self.settings
+        if state.epoch == 0:  # the calibrated car itself is the first candidate
+            self._keep_if_better(self._validate()["prediction"])
+        while state.epoch < settings.epochs and state.epoch - state.best_epoch < settings.patience:
+            trained = self._epoch()
+            validated = self._validate()
+            if not math.isfinite(validated["prediction"]):  # what has diverged stays so
+                break
+            state.epoch += 1
+            for part, terms in (("train", trained), ("validation", validated)):
+                for term, value in terms.items():
+                    state.history[f"{part}/{term}"].append(value)
+            self._keep_if_better(validated["prediction"])
+            self.schedule.step()
+            self._save()
+            if progress is not None:
+                progress(
+                    state.epoch,
+                    settings.epochs,
+                    f"validation {validated['prediction']:.4g}, best {state.best_loss:.4g}",
+                )
+        if state.epoch == 0:
+            raise ConfigurationError(
+                f"model {self.config.name}: diverged in the first epoch; expected a smaller learning_rate than "
+                f"{settings.learning_rate:g}"
+            )
+        self.model.load_state_dict(state.best)
+        return OptimisationResult(self.model, state.history, state.best_epoch, resumed_from)
+
+    def _keep_if_better(self, loss: float) -> None:
+        if loss < self.state.best_loss:
+            self.state.best_loss, self.state.best_epoch = loss, self.state.epoch
+            self.state.best = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
+
+    def _epoch(self) -> dict[str, float]:
+        self.model.train()
+        order = torch.randperm(len(self.training), generator=self.shuffle).to(self.training.ends.device)
+        batches = torch.split(order, self.settings.batch_size)
+        totals = dict.fromkeys(COMPONENTS, 0.0)
+        for index in batches:
+            window, target = self.augmentation(*self.training.batch(index))
+            terms = self._terms(window, target)
+            loss = torch.stack(list(terms.values())).sum()
+            self.optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            if self.settings.gradient_clip is not None:
+                nn.utils.clip_grad_norm_(self.trained, self.settings.gradient_clip)
+            self.optimiser.step()
+            for term, value in terms.items():
+                totals[term] += value.item() * len(index) / len(order)
+        return totals
+
+    @torch.no_grad()
+    def _validate(self) -> dict[str, float]:
+        self.model.eval()
+        window, target = self.validation.batch(slice(None))
+        return {term: value.item() for term, value in self._terms(window, target).items()}
+
+    def _terms(self, window: Tensor, target: Tensor) -> dict[str, Tensor]:
+        return self.model.terms(window, target, self.loss, self.scales)
+
+    def _save(self) -> None:
+        content: dict[str, Any] = vars(self.state) | {
+            "identity": self.identity,
+            "model": self.model.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "schedule": self.schedule.state_dict(),
+            "shuffle": self.shuffle.get_state(),
+        }
+        with replacing(self.checkpoint) as aside:
+            torch.save(content, aside)
+
+    def _resume(self) -> int:
+        """Continues from the checkpoint if it is of this very training; returns its epoch, 0 for a fresh start."""
+        if not self.checkpoint.is_file():
+            return 0
+        try:
+            with zipfile.ZipFile(self.checkpoint) as archive:
+                damaged = archive.testzip()  # torch does not compare the checksums that it writes
+            content = torch.load(self.checkpoint, map_location=self.training.ends.device, weights_only=True)
+        except Exception:  # whatever a foreign or damaged file raises: it is not ours to continue
+            return 0
+        if damaged or not isinstance(content, dict) or content.get("identity") != self.identity:
+            return 0
+        self.model.load_state_dict(content["model"])
+        self.optimiser.load_state_dict(content["optimiser"])
+        self.schedule.load_state_dict(content["schedule"])
+        self.shuffle.set_state(content["shuffle"].cpu())
+        self.state = _State(**{name: content[name] for name in vars(self.state)})
+        return self.state.epoch
+
+
+def _schedule(settings: TrainingConfig, optimiser: torch.optim.Optimizer) -> torch.optim.lr_scheduler.LRScheduler:
+    if settings.schedule == "constant":
+        return torch.optim.lr_scheduler.ConstantLR(optimiser, factor=1.0)
+    floor = settings.learning_rate * _LEARNING_RATE_FLOOR
+    return torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs, floor)
+
+
+def _identity(config: ModelConfig, vehicle: Vehicle, training: Windows) -> str:
+    """Names a training by code, data, car and configuration, so that a checkpoint is never continued for another."""
+    digest = hashlib.sha256(f"{__version__} {torch.__version__} {config.model_dump_json()}".encode())
+    digest.update(vehicle.model_dump_json().encode())
+    digest.update(np.ascontiguousarray(training.matrix.numpy()).tobytes())
+    digest.update(training.ends.numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,194 @@
+"""Training in stages: what a model starts from, the model itself, further models that tell how large its errors are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dynssm_ros.errors import ConfigurationError, RecordingError
+from dynssm_ros.learning.dataset import Windows, all_windows, normalisation, split_windows
+from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
+from dynssm_ros.learning.models.registry import build_model
+from dynssm_ros.learning.optimisation import History, Optimisation, OptimisationResult, Progress
+from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import Vehicle
+
+Calibrate = Callable[[Recording, Vehicle], Vehicle]
+"""Fits the nominal values of a vehicle to a recording."""
+
+_SHORTER = 4  # how many times fewer epochs the models have that only tell how large errors are on unknown laps
+
+
+@dataclass(frozen=True)
+class Trained:
+    """The outcome of a training."""
+
+    config: ModelConfig
+    vehicle: Vehicle
+    """The car as the model has it; see :meth:`ModelConfig.modelled_vehicle`."""
+    recording: Recording
+    model: TrainableModel
+    normalisation: Normalisation
+    history: History
+    """Mean loss per epoch: ``train/TERM`` and ``validation/TERM`` for each of ``COMPONENTS``."""
+    best_epoch: int
+    validation_rmse: tuple[float, float, float]
+    windows: tuple[int, int]
+    """Number of training and validation windows."""
+    resumed_from: int = 0
+    """Epochs that were already done, of all stages together."""
+    start: Trained | None = None
+    """The model that fine-tuning started from."""
+
+    @property
+    def H(self) -> int:
+        """Rows of the model's window."""
+        return self.config.rows(self.vehicle.sampling_time)
+
+
+def train(
+    recording: Recording,
+    config: ModelConfig,
+    vehicle: Vehicle,
+    checkpoint: Path,
+    device: str = "cpu",
+    progress: Progress | None = None,
+    calibrate: Calibrate | None = None,
+) -> Trained:
+    """Trains a model; ``checkpoint`` is kept up to date and continued from if it belongs to the same training.
+
+    Some trainings have several stages with a checkpoint each, see :func:`checkpoints`: fine-tuning, and the models whose
+    errors on a part that they do not know say how far the prediction can be trusted. A stage that is done is not repeated.
+
+    Args:
+        recording: training data; validation windows are taken out of it.
+        config: the model file.
+        vehicle: the car whose coefficients are adapted.
+        checkpoint: file beside the result; the caller removes it once the result is saved.
+        device: ``cpu`` or ``cuda``.
+        progress: called after each epoch.
+        calibrate: from the data of a stage and the vehicle to the calibrated one, for models whose physics asks for it;
+            ``None``: the vehicle is taken as calibrated.
+
+    Raises:
+        RecordingError: another sampling time than the vehicle's, or too little data.
+        ConfigurationError: the training diverges at once.
+    """
+    files = checkpoints(config, checkpoint)
+
+    def run(
+        data: Recording, of: ModelConfig, file: Path, progress: Progress | None, start: Trained | None = None
+    ) -> Trained:
+        car = calibrate(data, vehicle) if calibrate is not None and of.calibrates else vehicle
+        return _train(data, of, car, file, device, progress, start)
+
+    if config.start is not None:
+        stages: tuple[int, ...] = (config.start.training.effort[0], config.training.effort[0])
+        first = run(recording, config.start, files[0], _stage(progress, config.start.name, 0, stages))
+        return run(recording, config, files[1], _stage(progress, config.name, 1, stages), first)
+    parts = [np.arange(len(recording)) * config.parts // len(recording) == k for k in range(config.parts)]
+    rests = [recording.select(~part) for part in parts]
+    if not rests or not all(_can_be_trained_on(rest, config, vehicle) for rest in rests):
+        return run(recording, config, checkpoint, progress)
+    shorter = config.with_training(epochs=max(1, config.training.effort[0] // _SHORTER))
+    stages = (config.training.effort[0], *[shorter.training.effort[0]] * len(parts))
+    trained = run(recording, config, checkpoint, _stage(progress, config.name, 0, stages))
+    errors = []
+    for k, (part, rest, file) in enumerate(zip(parts, rests, files[1:], strict=True), 1):
+        report = _stage(progress, f"{config.name} without part {k} of {len(parts)}", k, stages)
+        without = run(rest, shorter, file, report).model
+        unknown = all_windows(recording.select(part), trained.H, vehicle.minimum_speed)
+        errors.append(without.held_out_errors(*unknown.batch(slice(None))))
+    trained.model.fit_variance(*(torch.cat(each) for each in zip(*errors, strict=True)))
+    return trained
+
+
+def checkpoints(config: ModelConfig, checkpoint: Path) -> list[Path]:
+    """The files that a training with ``checkpoint`` keeps, in the order of its stages."""
+    if config.start is not None:
+        return [checkpoint.with_suffix(".start.pt"), checkpoint]
+    return [checkpoint, *[checkpoint.with_suffix(f".part{k + 1}.pt") for k in range(config.parts)]]
+
+
+def check_device(device: str) -> None:
+    """Checks that torch can compute on ``device``.
+
+    Raises:
+        ConfigurationError: it cannot; names what there is.
+    """
+    available = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    if device not in available:
+        raise ConfigurationError(f"--device {device}: not available here; expected {' or '.join(available)}")
+
+
+@torch.no_grad()
+def validation_rmse(model: TrainableModel, windows: Windows) -> tuple[float, float, float]:
+    """One-step RMSE of each state over ``windows`` (m/s, m/s, rad/s)."""
+    batch, target = windows.batch(slice(None))
+    rmse = (model(batch).increment - target).square().mean(0).sqrt().tolist()
+    return rmse[0], rmse[1], rmse[2]
+
+
+def _split(recording: Recording, config: ModelConfig, vehicle: Vehicle, extra_rows: int = 0) -> tuple[Windows, Windows]:
+    """Training and validation windows of ``extra_rows`` more rows than the model's."""
+    rows, least = config.rows(vehicle.sampling_time) + extra_rows, config.training.effort[1]
+    return split_windows(recording, rows, config.training, vehicle.minimum_speed, least)
+
+
+def _can_be_trained_on(recording: Recording, config: ModelConfig, vehicle: Vehicle) -> bool:
+    """Whether ``recording`` has windows enough for training and validation."""
+    try:
+        _split(recording, config, vehicle)
+    except RecordingError:
+        return False
+    return True
+
+
+def _stage(progress: Progress | None, name: str, stage: int, epochs: tuple[int, ...]) -> Progress | None:
+    """Progress of one of several stages, in epochs of all."""
+    if progress is None:
+        return None
+    before = sum(epochs[:stage])
+    return lambda done, _, words: progress(before + done, sum(epochs), f"{name}: {words}")
+
+
+def _train(
+    recording: Recording,
+    config: ModelConfig,
+    vehicle: Vehicle,
+    checkpoint: Path,
+    device: str,
+    progress: Progress | None,
+    start: Trained | None = None,
+) -> Trained:
+    """One stage; ``start`` is the outcome of the stage before."""
+    recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
+    torch.set_num_threads(1)  # batches are small: more threads wait for each other longer than they compute
+    torch.manual_seed(config.training.seed)
+    vehicle = config.modelled_vehicle(vehicle)
+    H = config.rows(vehicle.sampling_time)
+    plain, _ = _split(recording, config, vehicle)
+    scale = normalisation(recording, plain) if start is None else start.normalisation
+    model = build_model(config, vehicle, scale)
+    training, validation = _split(recording, config, vehicle, model.EXTRA_ROWS)
+    if start is not None:
+        model.take_over(start.model)
+    if model.fit(training):
+        run = OptimisationResult(model, {})
+    else:
+        optimisation = Optimisation(
+            config, vehicle, model, scale, training, validation, checkpoint, torch.device(device)
+        )
+        run = optimisation.run(progress)
+    model = run.model.cpu().eval()
+    held = replace(validation, H=H)
+    model.post_fit(held)
+    return Trained(
+        config, vehicle, recording, model, scale, run.history, run.best_epoch, validation_rmse(model, held),
+        (len(training), len(validation)), run.resumed_from + (start.resumed_from if start else 0), start,
+    )  # fmt: skip
