@@ -30,7 +30,7 @@ def counting(N: int, segments: list[int], slow: list[int] = ()) -> Recording:  #
 
 
 def training(**changes: float | str) -> TrainingConfig:
-    fields = {"epochs": 1, "batch_size": 1, "learning_rate": 0.1, "patience": 1, "min_speed": 5.0}
+    fields = {"epochs": 1, "batch_size": 1, "learning_rate": 0.1, "patience": 1}
     return TrainingConfig.model_validate(fields | {"validation_block": 20 * T_s, "validation_every": 3} | changes)
 
 
@@ -53,7 +53,7 @@ def test_no_row_serves_both_and_no_window_crosses_a_gap_or_a_slow_stretch(
 ) -> None:
     recording = counting(N, segments, slow)
     try:
-        both = split_windows(recording, H, training(validation_block=block * T_s, validation_every=every))
+        both = split_windows(recording, H, training(validation_block=block * T_s, validation_every=every), 5.0, 1)
     except RecordingError:
         return
     assert not rows(both[0]) & rows(both[1])
@@ -70,17 +70,17 @@ def test_a_random_split_has_every_window_once_and_is_the_same_for_windows_of_any
     seed: int, every: int, segments: list[int]
 ) -> None:
     recording, how = counting(400, segments), training(validation="random", validation_every=every, seed=seed)
-    (train, held), (longer_train, longer_held) = (split_windows(recording, H, how) for H in (3, 4))
+    (train, held), (longer_train, longer_held) = (split_windows(recording, H, how, 5.0, 1) for H in (3, 4))
     assert sorted([*train.ends.tolist(), *held.ends.tolist()]) == recording.window_ends(3, min_speed=5.0).tolist()
     assert set(longer_train.ends.tolist()) <= set(train.ends.tolist())
     assert set(longer_held.ends.tolist()) <= set(held.ends.tolist())
-    assert torch.equal(split_windows(recording, 3, how)[1].ends, held.ends)
+    assert torch.equal(split_windows(recording, 3, how, 5.0, 1)[1].ends, held.ends)
 
 
 def test_a_random_split_holds_out_one_window_in_n_as_the_seed_says() -> None:
     recording = counting(5000, [])
     by_seed = [
-        split_windows(recording, 5, training(validation="random", validation_every=5, seed=seed))[1].ends.tolist()
+        split_windows(recording, 5, training(validation="random", validation_every=5, seed=seed), 5.0, 1)[1].ends.tolist()
         for seed in (0, 1)
     ]
     for held in by_seed:
@@ -90,7 +90,7 @@ def test_a_random_split_holds_out_one_window_in_n_as_the_seed_says() -> None:
 
 def test_without_gaps_only_windows_on_a_border_are_lost() -> None:
     H, recording = 5, counting(300, [])
-    train, validation = split_windows(recording, H, training(validation_block=20 * T_s, validation_every=3))
+    train, validation = split_windows(recording, H, training(validation_block=20 * T_s, validation_every=3), 5.0, 1)
     # 15 blocks of 20 rows: 5 for validation, 5 stretches of 40 for training, each good for rows - H windows
     assert len(train) == 5 * (40 - H)
     assert len(validation) == 5 * (20 - H)
@@ -98,7 +98,7 @@ def test_without_gaps_only_windows_on_a_border_are_lost() -> None:
 
 def test_a_batch_is_windows_in_order_with_the_increment_that_follows() -> None:
     recording = counting(100, [])
-    train, _ = split_windows(recording, 4, training())
+    train, _ = split_windows(recording, 4, training(), 5.0, 1)
     window, increment = train.batch(torch.tensor([0, 3]))
     assert window.shape == (2, 4, 7)
     np.testing.assert_array_equal(window[0].numpy(), recording.matrix[0:4])
@@ -141,10 +141,12 @@ def test_a_state_that_never_changes_is_refused_by_name(laps: Recording) -> None:
     [
         (3, {}, r"0 training and 0 validation windows of 4 rows at 5 m/s or more"),
         (30, {}, r"16 training and 6 validation windows .*; expected at least 100 and 1"),
-        (300, {"min_speed": 1e6}, "0 training and 0 validation windows of 4 rows at 1e\\+06 m/s or more"),
+        (300, {"slowest": 1e6}, "0 training and 0 validation windows of 4 rows at 1e\\+06 m/s or more"),
         (300, {"validation_block": 1e6}, "0 validation windows"),
     ],
 )
 def test_too_little_driving_is_refused_with_what_was_found(N: int, changes: dict[str, float], expected: str) -> None:
+    changes = dict(changes)
+    slowest = changes.pop("slowest", 5.0)
     with pytest.raises(RecordingError, match=expected):
-        split_windows(counting(N, []), 4, training(batch_size=100, validation_every=2, **changes))
+        split_windows(counting(N, []), 4, training(validation_every=2, **changes), slowest, 100)

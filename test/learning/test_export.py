@@ -20,6 +20,7 @@ from dynssm_ros.learning import export as export_module
 from dynssm_ros.learning.dataset import Windows
 from dynssm_ros.learning.export import TOLERANCE, check_export, check_replaceable, load_torch, save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
+from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import Trained, train
 from dynssm_ros.runtime.artifact import Artifact, checksum, open_artifact
 from dynssm_ros.runtime.models import OnnxModel
@@ -143,7 +144,7 @@ def test_the_card_says_what_the_model_is(artifact: Artifact, trained: Callable[[
     assert card.normalisation == model.normalisation
     np.testing.assert_allclose(card.covariance, np.square(model.validation_rmse))
     assert card.parameters == sum(parameter.numel() for parameter in model.model.parameters())
-    assert ModelConfig.model_validate(card.architecture) == model.config
+    assert parse_model_config(card.architecture, "card") == model.config
     assert card.training == {"recordings": ["drive 0"], "seed": 0, "holdout": 0.2}
     assert {name: checksum(artifact.path / name) for name in card.checksums} == card.checksums
 

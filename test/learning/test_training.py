@@ -20,8 +20,10 @@ import torch
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.learning import optimisation as training_module
 from dynssm_ros.learning.dataset import split_windows
+from dynssm_ros.learning.models import base
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.dynssm.network import DynSSM
+from dynssm_ros.learning.models.ridge import RidgeConfig
 from dynssm_ros.learning.stages import Trained, check_device, train
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
@@ -152,7 +154,7 @@ def test_an_interruption_in_the_middle_of_an_epoch_costs_that_epoch_alone(
 ) -> None:
     config = make_config(training={"epochs": 4})
     whole = train(short, config, orca, tmp_path / "whole.pt")
-    calls, objective = [0], training_module.objective
+    calls, objective = [0], base.objective
 
     def failing(*args: Any) -> Any:
         calls[0] += 1
@@ -161,7 +163,7 @@ def test_an_interruption_in_the_middle_of_an_epoch_costs_that_epoch_alone(
         return objective(*args)
 
     with monkeypatch.context() as patched:
-        patched.setattr(training_module, "objective", failing)
+        patched.setattr(base, "objective", failing)
         with pytest.raises(KeyboardInterrupt):
             train(short, config, orca, tmp_path / "cut.pt")
     resumed = train(short, config, orca, tmp_path / "cut.pt")
@@ -181,14 +183,15 @@ def test_a_finished_training_is_not_trained_on(
 KILLED = """
 import sys
 from pathlib import Path
-from dynssm_ros.learning.models.base import ModelConfig
+import json
+from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.stages import train
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import load_vehicle
 
 folder = Path(sys.argv[1])
-config = ModelConfig.model_validate_json((folder / "config.json").read_text())
+config = parse_model_config(json.loads((folder / "config.json").read_text()), "config")
 show = lambda done, total, words: print(done, flush=True)
 trained = train(Recording.load(folder / "r.parquet"), config, load_vehicle("orca"), folder / "checkpoint.pt", "cpu", show)
 save_artifact(trained, folder / "model")
@@ -394,8 +397,7 @@ def test_ridge_regression_recovers_a_linear_car(make_config: MakeConfig, orca: V
     columns = {name: matrix[:, k] for k, name in enumerate(WINDOW_COLUMNS)}
     time = np.arange(N, dtype=np.int64) * 20_000_000
     recording = Recording(info, time, np.zeros(N, np.int32), columns)
-    config = make_config(kind="ridge", history=0.02 * H, penalty=1e-6, training={"min_speed": 0.0})
-    config = config.model_copy(update={"training": config.training.model_copy(update={"min_speed": 0.0})})
+    config = RidgeConfig(name="linear", history=0.02 * H, penalty=1e-6)
     recording.columns["v_x"] += 5.0  # the car drives forwards
     trained = train(recording, config, orca, checkpoint)
     assert (np.array(trained.validation_rmse) < 1e-5 * np.array(trained.normalisation.state_scale)).all()
@@ -409,9 +411,9 @@ def test_ridge_regression_recovers_a_linear_car(make_config: MakeConfig, orca: V
 def test_a_strong_penalty_leaves_the_mean_increment(
     laps: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
 ) -> None:
-    config = make_config(kind="ridge", ridge_penalty=1e12)
+    config = RidgeConfig(name="flat", history=0.08, penalty=1e12)
     trained = train(laps, config, orca, checkpoint)
-    windows, _ = split_windows(laps, config.rows(0.02), config.training, 0.0, config.training.batch_size)
+    windows, _ = split_windows(laps, config.rows(0.02), config.training, 0.0, 1)
     window, target = windows.batch(slice(None))
     with torch.no_grad():
         predicted = trained.model(window).increment

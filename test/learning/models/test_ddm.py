@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,9 +13,9 @@ from dynssm_ros.learning.dataset import Windows, split_windows
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.ddm import DDM
-from dynssm_ros.learning.models.registry import build_model, load_model_config, modelled_vehicle
+from dynssm_ros.learning.models.registry import MODELS, build_model, load_model_config
 from dynssm_ros.learning.stages import train
-from dynssm_ros.runtime.artifact import ModelKind, Normalisation
+from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.models import OnnxModel, SingleTrack
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle, load_vehicle
@@ -47,7 +46,7 @@ def test_the_shipped_models_have_the_published_number_of_parameters(name: str, v
 
 def test_every_kind_can_be_built(make_config: MakeConfig, make_ddm: MakeConfig, make_fthd: MakeConfig) -> None:
     configs = [make_config(), make_config(kind="ridge"), make_ddm(), make_fthd()]
-    assert {config.kind for config in configs} == set(get_args(ModelKind))
+    assert {config.kind for config in configs} == set(MODELS)
     for config in configs:
         output = build_model(config, load_vehicle("orca"), UNIT)(torch.ones(2, config.rows(0.02), 7))
         assert output.increment.shape == (2, 3)
@@ -120,8 +119,8 @@ def test_the_prediction_is_a_step_of_the_single_track_model_without_load_transfe
 
 def test_a_model_with_load_transfer_leaves_the_vehicle_as_it_is(make_config: MakeConfig) -> None:
     car = load_vehicle("av21")
-    assert modelled_vehicle(make_config(), car) is car
-    assert modelled_vehicle(make_config(physics=None, adaptation=None), car) is car
+    assert make_config().modelled_vehicle(car) is car
+    assert make_config(physics=None, adaptation=None).modelled_vehicle(car) is car
 
 
 def test_it_learns_a_car_from_its_laps(make_ddm: MakeConfig, laps: Recording, orca: Vehicle, tmp_path: Path) -> None:
@@ -129,7 +128,7 @@ def test_it_learns_a_car_from_its_laps(make_ddm: MakeConfig, laps: Recording, or
     trained = train(laps, config, orca, tmp_path / "checkpoint.pt")
     prediction = trained.history["validation/prediction"]
     assert min(prediction) < 0.2 * prediction[0]
-    held: Windows = split_windows(laps, 4, config.training)[1]
+    held: Windows = split_windows(laps, 4, config.training, 0.0, 1)[1]
     window, increment = held.batch(slice(None))
     with torch.no_grad():
         error = trained.model(window).increment - increment

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 
 from dynssm_ros.configuration import config_root
 from dynssm_ros.learning.dataset import Windows, normalisation
+from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import ModelConfig
-from dynssm_ros.learning.models.dynssm.network import DynSSM, GatedResidual, Output, PhysicsLayer, nominal_parameters
+from dynssm_ros.learning.models.dynssm.network import DynSSM, GatedResidual
+from dynssm_ros.learning.models.physics import PhysicsLayer
 from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.models import SingleTrack
@@ -152,7 +154,7 @@ def test_theta_0_is_the_vehicles_or_the_middle_of_the_bounds(make_config: MakeCo
     for name, expected in (("vehicle", orca.nominal), ("mid_range", (orca.lower + orca.upper) / 2)):
         physics = make_config(physics={"nominal": name}).physics
         assert physics is not None
-        np.testing.assert_allclose(nominal_parameters(physics, orca).numpy(), expected, rtol=1e-6)
+        np.testing.assert_allclose(physics.theta_0(orca).numpy(), expected, rtol=1e-6)
 
 
 @given(seed=st.integers(0, 1000), factor=st.floats(0.1, 3.0))
@@ -244,7 +246,7 @@ def test_an_ablation_trains_all_that_it_has(
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_models_stay_below_the_papers_size(name: str, orca: Vehicle, scale: Normalisation) -> None:
-    model = build(load_model_config(name), load_vehicle(name.split("_")[1]), scale)
+    model = build(load_model_config(name), load_vehicle("orca" if name.endswith("orca") else "av21"), scale)
     parameters = sum(parameter.numel() for parameter in model.parameters())
     assert parameters <= (81_000 if "av21" in name else 420_000)
 

@@ -15,6 +15,7 @@ from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.ddm import DDM
 from dynssm_ros.learning.models.fthd import physics_loss
+from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import Trained, checkpoints, train
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.models import SingleTrack
@@ -176,4 +177,4 @@ def test_the_metrics_tell_of_both_stages(whole: Trained, tmp_path: Path) -> None
     assert metrics["history"] == whole.history
     assert metrics["start"]["history"] == whole.start.history
     assert metrics["start"]["best_epoch"] == whole.start.best_epoch
-    assert ModelConfig.model_validate(artifact.card.architecture) == whole.config
+    assert parse_model_config(artifact.card.architecture, "card") == whole.config

@@ -29,7 +29,7 @@ S_DELTA = torch.tensor(SCALES.increment_scale)
 BEYOND: dict[str, Any] = {
     "history": 0.2,
     "physics": {"nominal": "vehicle"},
-    "inputs": {"features": "increments", "rows": 4, "physics_errors": True},
+    "inputs": {"features": "increments", "history": 0.08, "physics_errors": True},
     "innovation": {"history": 0.08},
     "in_window_errors": {"history": 0.1},
 }
@@ -185,23 +185,26 @@ def test_training_does_without_trust(
     assert (learning - running).abs().max() > 1e-4
 
 
+NEURAL = "base: dynssm_paper_orca\nphysics: null\nadaptation: null\nresidual: {scale: 3.0}\n"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("base: dynssm_orca_neural_only\ninputs: {physics_errors: true}", "need physics"),
-        ("base: dynssm_av21\nresidual: {inputs: raw}", "residual.inputs: raw goes with inputs as in the paper"),
-        ("base: dynssm_av21_paper\nmemory: {taps: 15}", "H: 15 rows; memory and hindcast reach back over 16"),
-        ("base: dynssm_av21_paper\nhindcast: {steps: 3}", "hindcast needs memory"),
+        (f"{NEURAL}inputs: {{physics_errors: true}}", "need physics"),
+        ("base: dynssm\nresidual: {inputs: raw}", "residual.inputs: raw goes with inputs as in the paper"),
+        ("base: dynssm_paper_orca\ninnovation: {history: 0.3}", "reach back over 16 rows; a window of 0.3 s at T_s = 0.02 s has 15"),
+        ("base: dynssm_paper_orca\nin_window_errors: {history: 0.1}", "in_window_errors needs innovation"),
         (
-            "base: dynssm_av21_paper\nresidual: {inputs: normalised}\ninputs: {features: increments, rows: 15}",
-            "a window of 15 rows has 14 of them",
+            "base: dynssm_paper_orca\nresidual: {inputs: normalised}\ninputs: {features: increments, history: 0.3}",
+            "inputs.history: 15 rows; a window of 0.3 s at T_s = 0.02 s has 14",
         ),
     ],
 )
-def test_what_cannot_be_is_refused(text: str, message: str, tmp_path: Path) -> None:
+def test_what_cannot_be_is_refused(text: str, message: str, tmp_path: Path, orca: Vehicle) -> None:
     (tmp_path / "m.yaml").write_text(f"{text}\nname: m\n")
     with pytest.raises(ConfigurationError, match=message):
-        load_model_config(tmp_path / "m.yaml")
+        DynSSM(load_model_config(tmp_path / "m.yaml"), orca, SCALES)
 
 
 def test_a_residual_is_not_believed_beyond_the_errors_that_it_is_there_to_correct() -> None:
