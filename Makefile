@@ -25,7 +25,7 @@ help: ## this list
 	@echo "make TARGET, where TARGET is one of"
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
 	@echo "Variables: OUT=$(OUT) (folder of the demo; of paper out/paper), JOBS=$(JOBS) (processes),"
-	@echo "  DYNSSM_DATA=$(DYNSSM_DATA) (measured logs and tracks), ARGS=... (options of dynssm paper), PYTHON=... (interpreter, 3.10 to 3.12)"
+	@echo "  DYNSSM_DATA=$(DYNSSM_DATA) (measured logs and tracks), ARGS=... (variables of make paper: quick=1, test=NAME=R.parquet), PYTHON=... (interpreter, 3.10 to 3.12)"
 
 setup: $(STAMP) ## the virtual environment alone
 
@@ -34,7 +34,9 @@ demo: $(STAMP) ## from simulated laps to a live prediction and its report
 
 paper: OUT = out/paper
 paper: $(STAMP) ## docs/results.md and results_race.md measured anew, about two hours on two cores; continues after a kill
-	@$(BIN)/dynssm paper --out "$(OUT)" --results docs/results.md --data "$(DYNSSM_DATA)" --jobs $(JOBS) $(ARGS)
+	@doit() { $(BIN)/python -m doit "$$@"; }
+	doit run -f benchmarks/paper/dodo.py -n $(JOBS) out="$(OUT)" data="$(DYNSSM_DATA)" results=docs/results.md $(ARGS) step || true
+	doit run -f benchmarks/paper/dodo.py out="$(OUT)" data="$(DYNSSM_DATA)" results=docs/results.md $(ARGS) document
 
 test: $(STAMP) ## style, types and all tests
 	@set -x

@@ -31,7 +31,7 @@ PAIR = ("--effect", "steering_offset:offset=0.02", "--effect", "rear_grip:factor
 
 
 # the model files of 0.1.0, as changes of those that are shipped
-MODELS = {
+MODELS: dict[str, dict[str, Any]] = {
     "dynssm_av21": {"base": "dynssm", "training": {"validation_block": 10.0}},
     "dynssm_av21_adaptive": {"base": "dynssm_adaptive", "training": {"validation_block": 10.0}},
     "dynssm_orca": {

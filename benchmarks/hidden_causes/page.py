@@ -1,4 +1,4 @@
-"""The results of the battery as a page."""
+"""The results of the hidden-cause benchmark as a page."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from benchmarks.hidden_causes.cases import Case, Hidden
 from benchmarks.hidden_causes.outcomes import Outcome, rates
 
-PAGE, FIGURE = "diagnose_battery.md", "diagnose_battery_confusion.png"
+PAGE, FIGURE = "hidden_causes.md", "hidden_causes_confusion.png"
 GOALS = {"named_first": 0.95, "right_size": 0.95, "both_found": 0.85, "false_alarms": 0.05}
 _IN_WORDS = {
     "named_first": "the hidden effect, or an alternative reported with it, is named first",
@@ -35,10 +35,10 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
     yield "# Hidden causes"
     yield ""
     yield (
-        f"Made by `python -m benchmarks.hidden_causes --seed {seed}`: {len(outcomes)} simulated drives with hidden "
-        f"effects, seeds {seed} to {seed + len(of) - 1}"
+        f"Made by `python -m doit -f benchmarks/hidden_causes/dodo.py seed={seed}`: {len(outcomes)} simulated drives "
+        f"with hidden effects, seeds {seed} to {seed + len(of) - 1}"
         + (f", without {undriven} whose car could not be driven" if undriven else "")
-        + ". How they are drawn and what counts as just noticeable: the command's `--help`."
+        + ". How they are drawn and what counts as just noticeable: `benchmarks/hidden_causes/cases.py`."
     )
     yield ""
     yield f"| rate | cases | share | 95 % interval | goal | {' | '.join(_PLANTS.values())} |"

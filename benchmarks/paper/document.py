@@ -84,11 +84,6 @@ def _introduction(results: Results) -> Iterator[str]:
             f"> **Not results:** a quick run to try everything out, with {results.plan.epochs} epochs in each stage, "
             "one seed, short drives, and only the first split of each study."
         )
-    if made.stale[0]:
-        yield (
-            f"> **Out of date:** {made.stale[0]} of {made.stale[1]} steps were done by other code than the present. Remove "
-            "the run's folder and run again."
-        )
     if results.missing:
         lines = [f"> - {title}: {reason}" for title, reason in results.missing.items()]
         yield "\n".join(["> **Incomplete.** These steps could not be done:", ">", *lines])
@@ -106,7 +101,7 @@ def _introduction(results: Results) -> Iterator[str]:
         "Several tests of a study are taken together by the root of the mean square of their RMSE, the largest maximum "
         "error, and the mean of all else. Bold is the best of a column.",
         "To repeat it: `make paper`, with the logs and tracks in `DYNSSM_DATA`; it continues after a kill. "
-        '`benchmarks/paper/plan.yaml` is the plan. `ARGS="--test NAME=R.parquet"` adds a recording to be predicted.',
+        '`benchmarks/paper/plan.yaml` is the plan. `ARGS="test=NAME=R.parquet"` adds a recording to be predicted.',
     ]
     yield "\n".join(f"- {line}" for line in lines)
 
@@ -117,7 +112,7 @@ def _missing(results: Results, data: str) -> Iterator[str]:
         if comparison.car.reference != data:
             continue
         if not comparison.planned:
-            yield f"*{comparison.label}*: not measured, no recording was given with `--test NAME=R.parquet`."
+            yield f"*{comparison.label}*: not measured, no recording was given with `test=NAME=R.parquet`."
         elif comparison.reasons:
             what = "not measured" if not comparison.tests else "measured in part"
             yield f"*{comparison.label}*: {what}; {'; '.join(dict.fromkeys(comparison.reasons))}."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -13,6 +13,8 @@ from dynssm_ros.configuration import StrictModel
 from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.control.settings import Objective
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.learning.models.base import ModelConfig
+from dynssm_ros.learning.models.registry import load_model_config, merge
 from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.simulation.plant import PlantKind
@@ -107,8 +109,12 @@ class Car(StrictModel):
 
 
 class Model(StrictModel):
-    """How a model is trained."""
+    """A model: a shipped model file, or changes of one or of another model of the plan; and how it is trained."""
 
+    base: str | None = Field(
+        default=None, description="model of the plan, else shipped file; null: the file of its name"
+    )
+    change: dict[str, Any] = Field(default_factory=dict, description="fields instead of the base's, block by block")
     variant: str = Field(default="", description="of an ablation: what it is, as the table shows it; empty: its name")
     vehicle: str | None = Field(default=None, description="vehicle file as it is; null: the calibrated car")
     seeds: int | None = Field(default=None, ge=1, description="at most so many, also where a study wants more")
@@ -205,6 +211,25 @@ class Plan(StrictModel):
             _check(f"races.{name}.models", race.models, [*FIXED, *trained])
         return self
 
+    def configured(self, name: str) -> ModelConfig:
+        """Configuration of a model of the plan.
+
+        Raises:
+            ConfigurationError: no such file, or the changes do not fit it.
+        """
+        change: dict[str, Any] = {}
+        base, seen = name, {name}
+        while base in self.models:
+            model = self.models[base]
+            change = merge(model.change, change)
+            if model.base is None or model.base == base:
+                break
+            base = model.base
+            if base in seen and base in self.models:
+                raise ConfigurationError(f"models.{name}: base: refers to itself")
+            seen.add(base)
+        return load_model_config(base, change | {"name": name})
+
     def car(self, study: Study) -> Car:
         """The car of a study."""
         return self.cars[self.splits[study.splits[0]].car]
@@ -263,7 +288,7 @@ def load_plan(path: Path | None = None) -> Plan:
     vehicles |= {race.vehicle for race in plan.races.values()}
     try:
         for name in plan.models:
-            configuration.find_config("models", name)
+            plan.configured(name)
         for vehicle in sorted(vehicles):
             configuration.find_config("vehicles", vehicle)
         for log in plan.logs.values():

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, ClassVar, get_args
 
 from benchmarks.paper.plan import MID_RANGE, Race
 from benchmarks.paper.steps import Step, digest, in_data, named_track
@@ -36,6 +36,8 @@ class DriveLaps(Step):
         calibrated: key of the calibrated car.
         data: folder with tracks and lines.
     """
+
+    marker: ClassVar[str] = NUMBERS
 
     race: Race
     trained: Mapping[str, str]

@@ -13,12 +13,14 @@ import numpy as np
 from benchmarks.paper.plan import Car, Plan, Study
 from benchmarks.paper.racing import NUMBERS
 from benchmarks.paper.reference import Reference
-from benchmarks.paper.runner import Outcome
 from benchmarks.paper.schedule import COSTS, race_key, score_key
 from benchmarks.paper.steps import Step
+from benchmarks.tasks import output, split_available
 from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.spread import Spread, spreads
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
+
+_NOT_MADE = "not made; `make paper` says why"
 
 Entry = Mapping[str, Any]
 """Scores of one training of a model on one test, as :meth:`~dynssm_ros.evaluation.score.Score.to_json` writes them."""
@@ -31,12 +33,10 @@ class Made:
     Attributes:
         protocol: by name: machine, versions, date ...
         quick: whether the plan was shortened to try things out.
-        stale: number of steps that were done by other code than the present, of how many.
     """
 
     protocol: Mapping[str, str] = field(default_factory=dict)
     quick: bool = False
-    stale: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -177,13 +177,12 @@ class Comparison:
         return spreads([pool(np.stack([measure(entry) for entry in run])) for run in self._runs[model]])
 
 
-def read_results(
-    plan: Plan, reference: Reference, root: Path, steps: Sequence[Step], outcomes: Mapping[str, Outcome], made: Made
-) -> Results:
+def read_results(plan: Plan, reference: Reference, root: Path, steps: Sequence[Step], made: Made) -> Results:
     """Reads what the steps of ``plan`` left in ``root``."""
-    done = {key for key, outcome in outcomes.items() if outcome.state == "done"}
+    done = {step.key for step in steps if output(step, root).exists()}
+    _, reasons, causes = split_available(steps)
     titles = {step.key: step.title for step in steps}
-    lost = {key: outcome for key, outcome in outcomes.items() if key not in done}
+    failed = {step.key: _NOT_MADE for step in steps if step.key not in done and step.key not in reasons}
     scores = {key: _read(root / key) for key in done if key.startswith("scores/")}
     return Results(
         plan=plan,
@@ -191,8 +190,9 @@ def read_results(
         scores=scores,
         races={name: _read(root / race_key(name) / NUMBERS) for name in plan.races if race_key(name) in done},
         costs=_read(root / COSTS)["models"] if COSTS in done else {},
-        missing={titles[key]: outcome.reason for key, outcome in lost.items() if outcome.cause == key},
-        reasons={key: f"{titles[outcome.cause]}: {outcome.reason}" for key, outcome in lost.items()},
+        missing={titles[key]: reasons[key] for key, cause in causes.items() if cause == key}
+        | {titles[key]: reason for key, reason in failed.items()},
+        reasons={key: f"{titles[causes[key]]}: {reason}" for key, reason in reasons.items()} | failed,
         made=made,
     )
 

@@ -17,7 +17,6 @@ from benchmarks.paper.steps import (
     Take,
     TimeModels,
     Train,
-    model_config,
     recording_key,
 )
 from dynssm_ros.signals.signal_map import Commands
@@ -42,11 +41,12 @@ def steps_of(plan: Plan, data: Path | None, given: Mapping[str, Path]) -> list[S
     for step in steps:
         if isinstance(step, Train):
             trained[step.model] = (*trained.get(step.model, ()), step.key)
-    timing = TimeModels(
+    steps += [_race_step(name, race, data) for name, race in plan.races.items()]
+    timing = TimeModels(  # last, while nothing else computes
         key=COSTS, title="time the models", uses=tuple(step.key for step in steps), trained=trained, calls=plan.calls,
         vehicle=next(iter(plan.cars.values())).vehicle,
     )  # fmt: skip
-    return [*steps, timing, *(_race_step(name, race, data) for name, race in plan.races.items())]
+    return [*steps, timing]
 
 
 COSTS = "costs.json"
@@ -153,8 +153,8 @@ class _Site:
     def _training(self, name: str, seed: int, others: Mapping[str, range]) -> Train:
         """A training; one that fine-tunes goes on from a training of ``others`` where that is the same."""
         own_vehicle = self.plan.models[name].vehicle
-        fine_tuning = model_config(name).fine_tuning
-        first = fine_tuning.starts_from.name if fine_tuning else ""
+        config = self.plan.configured(name)
+        first = config.start.name if config.start else ""
         same = seed in others.get(first, ()) and self.plan.models[first].vehicle == own_vehicle
         start = self.model(first, seed) if same else None
         return Train(
@@ -163,6 +163,7 @@ class _Site:
             needs=(recording_key(self.split.train.recording), *(() if own_vehicle else (self.vehicle,))),
             uses=(start,) if start else (),
             model=name,
+            config=config,
             seed=seed,
             epochs=self.plan.epochs,
             part=self.split.train,

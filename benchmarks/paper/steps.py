@@ -12,9 +12,8 @@ import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from dynssm_ros.evaluation.metrics import by_channel, latency_us
 from dynssm_ros.evaluation.open_loop import Evaluation, evaluate
 from dynssm_ros.files import write_json
 from dynssm_ros.learning.calibration import calibrate
-from dynssm_ros.learning.configuration import ModelConfig, load_model_config
+from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.runtime.models import OnnxModel, WindowModel, load_model
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
@@ -39,7 +38,6 @@ from dynssm_ros.track.racing_line import line_of
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 
-model_config = cache(load_model_config)  # hundreds of steps are of a few models
 _ROUNDS = 5  # of timing all models in turn, because machines are noisy
 _WINDOWS = 50  # different ones, so that no model answers from its caches
 
@@ -57,12 +55,14 @@ class Step(ABC):
         title: what is done, for people.
         needs: keys of steps whose outputs must be there.
         uses: keys of steps whose outputs are taken as far as they are there.
+        marker: file of an output folder that is written last.
     """
 
     key: str
     title: str
     needs: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
+    marker: ClassVar[str] = ""
 
     @abstractmethod
     def recipe(self) -> dict[str, Any]:
@@ -180,7 +180,8 @@ class Train(Step):
     """A model on the training part of a split.
 
     Attributes:
-        model: name of the model file.
+        model: name in the plan.
+        config: its configuration.
         seed: of the training.
         epochs: in each stage, instead of the file's.
         part: rows to train on.
@@ -189,7 +190,10 @@ class Train(Step):
         start: key of the step that trains what fine-tuning starts from, if there is one.
     """
 
+    marker: ClassVar[str] = "model.yaml"
+
     model: str
+    config: ModelConfig
     seed: int
     epochs: int | None
     part: Part
@@ -207,7 +211,7 @@ class Train(Step):
     def make(self, root: Path, there: frozenset[str]) -> None:
         """Trains it; after a kill from where it was. The checkpoint stays, for what starts from this model."""
         from dynssm_ros.learning.export import save_artifact
-        from dynssm_ros.learning.training import checkpoints, train
+        from dynssm_ros.learning.stages import checkpoints, train
 
         config, target = self._config(), root / self.key
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -218,12 +222,9 @@ class Train(Step):
         save_artifact(train(_load(root, self.part, self.commands), config, vehicle, checkpoint), target)
 
     def _config(self) -> ModelConfig:
-        """The model file; a step before has calibrated the car, as the training would do again."""
+        """The configuration of this training; a step before has calibrated the car."""
         epochs = {} if self.epochs is None else {"epochs": self.epochs}
-        config = model_config(self.model).with_training(seed=self.seed, **epochs)
-        if config.physics is None or config.physics.nominal != "calibrated" or self.vehicle not in self.needs:
-            return config
-        return config.model_copy(update={"physics": config.physics.model_copy(update={"nominal": "vehicle"})})
+        return self.config.with_training(seed=self.seed, **epochs)
 
 
 @dataclass(frozen=True, kw_only=True)

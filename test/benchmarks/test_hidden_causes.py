@@ -12,12 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.hidden_causes import __main__ as command
-from benchmarks.hidden_causes import run
 from benchmarks.hidden_causes.cases import NOISE, TRACKS, Case, cases, off, size
 from benchmarks.hidden_causes.outcomes import Outcome, judge, matrix, rates
 from benchmarks.hidden_causes.page import page
-from benchmarks.hidden_causes.run import kept, run_case
+from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
 from dynssm_ros.files import write_json
 from dynssm_ros.identification.car import Car
 from dynssm_ros.identification.diagnose import Cause
@@ -28,6 +26,8 @@ from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def cause(effect: str, values: dict[str, float], *alternatives: str, std: float = 0.0) -> Cause:
@@ -132,41 +132,36 @@ def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
     assert "| `a` |" not in text
 
 
-def test_the_command_writes_rates_figure_and_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ran = iter([*OUTCOMES, None])
-    monkeypatch.setattr(command, "run_case", lambda case, folder: next(ran))
-    command.main(["--out", str(tmp_path), "--page", str(tmp_path / "docs"), "--count", "5", "--seed", "7"])
-    assert (tmp_path / "docs" / "diagnose_battery_confusion.png").read_bytes()[1:4] == b"PNG"
-    assert (tmp_path / "docs" / "diagnose_battery.md").read_text() == page(OF, 7)
-    written = json.loads((tmp_path / "battery.json").read_text())
-    assert written["named_first"]["share"] == 0.5
-    assert (written["seed"], written["undriven"], len(written["outcomes"])) == (7, 1, 4)
-
-
-def test_what_is_done_is_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_case_is_driven_diagnosed_and_read_back(tmp_path: Path) -> None:
     case = Case({"steering_offset": {"offset": 0.02}}, 3, "euler", 40.0)
-    first = run_case(case, tmp_path)
-    assert first is not None
-    assert first.values == case.hidden
-
-    def no_more(*arguments: object, **options: object) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr(run, "diagnose", no_more)
-    monkeypatch.setattr(run, "record", no_more)
-    assert run_case(case, tmp_path) == first
+    assert read_outcome(case, tmp_path) is None
+    run_case(case, tmp_path)
+    found = read_outcome(case, tmp_path)
+    assert found is not None
+    assert found.values == case.hidden
+    assert (tmp_path / "drives" / f"{outcome_file(case, tmp_path).stem}.parquet").is_file()
 
 
-def test_the_command_continues_with_what_is_done_in_several_processes(tmp_path: Path) -> None:
+def test_doit_goes_on_with_what_is_done_and_writes_the_page(tmp_path: Path) -> None:
     for case, named in zip(cases(0, 2), (("steering_offset",), ()), strict=True):
         outcome = Outcome(case.name, tuple(case.hidden), named, bool(named), bool(named), True if named else None)
-        write_json(kept(case, tmp_path), {"outcome": asdict(outcome)})
-    module = "benchmarks.hidden_causes"
-    subprocess.run(
-        [sys.executable, "-m", module, "--out", str(tmp_path), "--count", "2", "--jobs", "2"], check=True, timeout=300
-    )
-    assert not [*tmp_path.glob("drives-*")]
-    assert json.loads((tmp_path / "battery.json").read_text())["named_first"]["share"] == 0.5
+        write_json(outcome_file(case, tmp_path), {"outcome": asdict(outcome)})
+    command = [
+        sys.executable,
+        "-m",
+        "doit",
+        "run",
+        "-f",
+        "benchmarks/hidden_causes/dodo.py",
+        f"out={tmp_path}",
+        "count=2",
+    ]
+    done = subprocess.run([*command, "page"], capture_output=True, text=True, check=False, cwd=REPOSITORY)
+    assert done.returncode == 0, done.stderr
+    assert "named_first" in done.stdout
+    assert (tmp_path / "hidden_causes_confusion.png").read_bytes()[1:4] == b"PNG"
+    assert "2 simulated drives with hidden effects" in (tmp_path / "hidden_causes.md").read_text()
+    assert json.loads((tmp_path / "outcomes.json").read_text())["cases"] == 2
 
 
 def test_the_least_sizes_are_just_noticeable() -> None:

@@ -80,7 +80,9 @@ def test_a_random_split_has_every_window_once_and_is_the_same_for_windows_of_any
 def test_a_random_split_holds_out_one_window_in_n_as_the_seed_says() -> None:
     recording = counting(5000, [])
     by_seed = [
-        split_windows(recording, 5, training(validation="random", validation_every=5, seed=seed), 5.0, 1)[1].ends.tolist()
+        split_windows(recording, 5, training(validation="random", validation_every=5, seed=seed), 5.0, 1)[
+            1
+        ].ends.tolist()
         for seed in (0, 1)
     ]
     for held in by_seed:

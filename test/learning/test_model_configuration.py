@@ -16,6 +16,7 @@ from dynssm_ros.learning.models.registry import load_model_config
 
 SHIPPED = sorted(path.stem for path in (config_root() / "models").glob("*.yaml"))
 
+
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_shipped_file_is_valid_and_carries_its_own_name(name: str) -> None:
     assert load_model_config(name).name == name
@@ -86,10 +87,18 @@ def test_what_does_not_fit_is_refused_with_field_and_value(
         ("ddm_av21", {"dense": None}, "dense: Input should be"),
         ("ddm_av21", {"residual": {"hidden": [8], "scale": 1.0}}, "residual: Extra inputs are not permitted"),
         ("ddm_av21", {"innovation": {"history": 0.06}}, "innovation: Extra inputs are not permitted"),
-        ("ddm_av21", {"fine_tuning": {"starts_from": "ddm_av21", "frozen": 1, "physics": 0.1}}, "fine_tuning: Extra inputs are not permitted"),
+        (
+            "ddm_av21",
+            {"fine_tuning": {"starts_from": "ddm_av21", "frozen": 1, "physics": 0.1}},
+            "fine_tuning: Extra inputs are not permitted",
+        ),
         ("ddm_av21", {"training": {"validation": "none"}}, "training.validation: Input should be 'blocks' or 'random'"),
         ("fthd_av21", {"fine_tuning": None}, "fine_tuning: Input should be"),
-        ("fthd_av21", {"fine_tuning": {"starts_from": "ridge"}}, "fine_tuning.starts_from.kind: Input should be 'ddm' or 'fthd' (got 'ridge')"),
+        (
+            "fthd_av21",
+            {"fine_tuning": {"starts_from": "ridge"}},
+            "fine_tuning.starts_from.kind: Input should be 'ddm' or 'fthd' (got 'ridge')",
+        ),
         ("fthd_av21", {"fine_tuning": {"starts_from": "ddm_mars"}}, "'ddm_mars' is neither a file nor a shipped name"),
         ("fthd_av21", {"fine_tuning": {"starts_from": "fthd_av21"}}, "fine_tuning.starts_from"),
         ("fthd_av21", {"fine_tuning": {"frozen": 4}}, "frozen: 4 leaves nothing to train of GRU, 2 dense layers"),

@@ -57,7 +57,7 @@ def load_model_config(name_or_path: str | Path, overrides: dict[str, Any] | None
         ConfigurationError: not found, malformed or inconsistent.
     """
     path = configuration.find_config("models", name_or_path)
-    return parse_model_config(_merge(_with_base(path), overrides or {}), path)
+    return parse_model_config(merge(_with_base(path), overrides or {}), path)
 
 
 def parse_model_config(content: dict[str, Any], source: str | Path) -> ModelConfig:
@@ -83,7 +83,7 @@ def _with_base(path: Path, depth: int = 0) -> dict[str, Any]:
         return content
     if depth > 4:
         raise ConfigurationError(f"{path}: base: files refer to each other in a circle")
-    return _merge(_with_base(_referred(path, base), depth + 1), content)
+    return merge(_with_base(_referred(path, base), depth + 1), content)
 
 
 def _referred(path: Path, name: str) -> Path:
@@ -92,9 +92,10 @@ def _referred(path: Path, name: str) -> Path:
     return sibling if sibling.is_file() else configuration.find_config("models", name)
 
 
-def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """The fields of ``base`` with those of ``over`` instead, block by block."""
     merged = dict(base)
     for key, value in over.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = _merge(merged[key], value) if both else value
+        merged[key] = merge(merged[key], value) if both else value
     return merged

@@ -193,7 +193,10 @@ NEURAL = "base: dynssm_paper_orca\nphysics: null\nadaptation: null\nresidual: {s
     [
         (f"{NEURAL}inputs: {{physics_errors: true}}", "need physics"),
         ("base: dynssm\nresidual: {inputs: raw}", "residual.inputs: raw goes with inputs as in the paper"),
-        ("base: dynssm_paper_orca\ninnovation: {history: 0.3}", "reach back over 16 rows; a window of 0.3 s at T_s = 0.02 s has 15"),
+        (
+            "base: dynssm_paper_orca\ninnovation: {history: 0.3}",
+            "reach back over 16 rows; a window of 0.3 s at T_s = 0.02 s has 15",
+        ),
         ("base: dynssm_paper_orca\nin_window_errors: {history: 0.1}", "in_window_errors needs innovation"),
         (
             "base: dynssm_paper_orca\nresidual: {inputs: normalised}\ninputs: {features: increments, history: 0.3}",

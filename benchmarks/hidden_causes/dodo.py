@@ -1,0 +1,63 @@
+"""The benchmark of hidden causes as doit's tasks: ``python -m doit -n 2 -f benchmarks/hidden_causes/dodo.py seed=1000``.
+
+Variables: ``out`` (folder for drives and outcomes), ``page`` (folder for the page and its figure), ``seed`` (of the
+first case), ``count`` (of cases). What is done is kept; after a change of the engine ``doit forget`` has it diagnosed again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from doit import get_var
+from doit.tools import config_changed
+
+from benchmarks.hidden_causes.cases import cases
+from benchmarks.hidden_causes.outcomes import matrix, rates
+from benchmarks.hidden_causes.page import FIGURE, PAGE, page
+from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
+from benchmarks.tasks import doit_config
+from dynssm_ros.errors import UserError
+from dynssm_ros.files import replacing, write_json
+from dynssm_ros.reporting.diagnosis_figures import confusion
+
+SEED, COUNT = int(get_var("seed", "0")), int(get_var("count", "130"))
+OUT = Path(get_var("out", "out/hidden_causes"))
+PAGE_FOLDER = Path(get_var("page", str(OUT)))
+CASES = list(cases(SEED, COUNT))
+DOIT_CONFIG = doit_config(OUT / "doit.json")
+_DPI = 130
+
+
+def task_case() -> Iterator[dict[str, Any]]:
+    """Drives and diagnoses each case."""
+    for case in CASES:
+        yield {
+            "name": case.name,
+            "actions": [(run_case, [case, OUT])],
+            "targets": [str(outcome_file(case, OUT))],
+            "uptodate": [config_changed(repr(case))],
+        }
+
+
+def task_page() -> dict[str, Any]:
+    """Writes rates, confusion matrix and page of what is there."""
+    return {"actions": [write_page], "uptodate": [False], "verbosity": 2}
+
+
+def write_page() -> None:
+    """The rates as JSON, the figure, and the page."""
+    of = [(case, read_outcome(case, OUT)) for case in CASES]
+    outcomes = [outcome for _, outcome in of if outcome is not None]
+    if not outcomes:
+        raise UserError(f"count={COUNT}: no case could be driven")
+    about = {"seed": SEED, "undriven": len(of) - len(outcomes), **rates(outcomes)}
+    write_json(OUT / "outcomes.json", about | {"outcomes": [asdict(outcome) for outcome in outcomes]})
+    with replacing(PAGE_FOLDER / FIGURE) as aside:
+        confusion(*matrix(outcomes)).savefig(aside, format="png", dpi=_DPI, metadata={"Software": None})
+    with replacing(PAGE_FOLDER / PAGE) as aside:
+        aside.write_text(page(of, SEED), encoding="utf-8")
+    for name, value in about.items():
+        print(f"{name}: {value}")

@@ -1,0 +1,122 @@
+"""Benchmarks as tasks of doit, the workflow tool: what is done is kept, and made again when what it is made of changes.
+
+doit, Snakemake and DVC were compared. Snakemake has a language of its own and some forty dependencies. DVC ties every stage to
+a shell command and the data to git. doit is one small package, and its tasks are Python: they call our functions with our
+values. It notes its state only at its end, so that a kill would lose hours; :class:`NotingDB` notes it task by task.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from doit.dependency import JsonDB
+from doit.exceptions import TaskFailed
+from doit.tools import config_changed
+
+from dynssm_ros.errors import UserError
+from dynssm_ros.files import replacing
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # several processes share the cores
+
+
+class NotingDB(JsonDB):  # type: ignore[misc]
+    """doit's JSON state, written after every task; a kill costs the task under way."""
+
+    def set(self, task_id: str, dependency: str, value: Any) -> None:
+        """Notes a value of a task."""
+        super().set(task_id, dependency, value)
+        self.dump()
+
+    def dump(self) -> None:
+        """Writes the file aside and renames it."""
+        with replacing(self.name) as aside:
+            aside.write_text(self.codec.encode(self._db), encoding="utf-8")
+
+
+class Step(Protocol):
+    """A piece of work with one output; see :class:`benchmarks.paper.steps.Step`."""
+
+    @property
+    def key(self) -> str:
+        """Path of the output below the run's folder; its name."""
+
+    @property
+    def title(self) -> str:
+        """What is done, for people."""
+
+    @property
+    def marker(self) -> str:
+        """File of the output that is written last, relative to :attr:`key`; empty: the output itself."""
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Keys of steps whose outputs must be there."""
+
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """Keys of steps whose outputs are taken as far as they are there."""
+
+    def recipe(self) -> dict[str, Any]:
+        """All that decides the outcome beside the steps that this one builds on, as JSON has it."""
+
+    def make(self, root: Path, there: frozenset[str]) -> None:
+        """Makes the output below ``root``; ``there``: which of the other steps' outputs are."""
+
+
+def output(step: Step, root: Path) -> Path:
+    """The file by which a step is known to be done."""
+    return root / step.key / step.marker
+
+
+def split_available(steps: Sequence[Step]) -> tuple[list[Step], dict[str, str], dict[str, str]]:
+    """Steps that can be made with what the user provides.
+
+    Returns:
+        Those steps; why others cannot be made, by their keys; and the keys of the steps that are the cause.
+    """
+    reasons: dict[str, str] = {}
+    causes: dict[str, str] = {}
+    for step in steps:
+        lost = [key for key in step.needs if key in reasons]
+        if lost:
+            reasons[step.key], causes[step.key] = reasons[lost[0]], causes[lost[0]]
+            continue
+        try:
+            step.recipe()
+        except UserError as error:
+            reasons[step.key], causes[step.key] = str(error), step.key
+    return [step for step in steps if step.key not in reasons], reasons, causes
+
+
+def tasks(steps: Sequence[Step], root: Path) -> Iterator[dict[str, Any]]:
+    """doit's tasks of ``steps``, all of which are available."""
+    by_key = {step.key: step for step in steps}
+    for step in steps:
+        before = [by_key[key] for key in (*step.needs, *step.uses) if key in by_key]
+        yield {
+            "name": step.key,
+            "doc": step.title,
+            "actions": [(perform, [step, root, [other.key for other in before]])],
+            "targets": [str(output(step, root))],
+            "file_dep": [str(output(other, root)) for other in before],
+            "uptodate": [config_changed(json.dumps(step.recipe(), sort_keys=True))],
+        }
+
+
+def perform(step: Step, root: Path, before: Iterable[str]) -> TaskFailed | None:
+    """Makes a step; what is wrong with the user's input is one line."""
+    try:
+        step.make(root, frozenset(before))
+    except UserError as error:
+        return TaskFailed(f"{step.title}: {error}")
+    return None
+
+
+def doit_config(state: Path) -> dict[str, Any]:
+    """doit's settings: where its state is, and to go on with what does not need a task that failed."""
+    state.parent.mkdir(parents=True, exist_ok=True)
+    return {"dep_file": str(state), "backend": "noting", "continue": True, "verbosity": 1}
