@@ -1,8 +1,8 @@
 """Benchmarks as tasks of doit, the workflow tool: what is done is kept, and made again when what it is made of changes.
 
-doit, Snakemake and DVC were compared. Snakemake has a language of its own and some forty dependencies. DVC ties every stage to
-a shell command and the data to git. doit is one small package, and its tasks are Python: they call our functions with our
-values. It notes its state only at its end, so that a kill would lose hours; :class:`NotingDB` notes it task by task.
+doit, Snakemake and DVC were compared. Snakemake has a language of its own and some forty dependencies. DVC ties every
+stage to a shell command and the data to git. doit is one small package, and its tasks are Python: they call our functions
+with our values. It notes its state only at its end, so that a kill would lose hours; :class:`NotingDB` notes it task by task.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def split_available(steps: Sequence[Step]) -> tuple[list[Step], dict[str, str], 
 
 
 def tasks(steps: Sequence[Step], root: Path) -> Iterator[dict[str, Any]]:
-    """doit's tasks of ``steps``, all of which are available."""
+    """Tasks of ``steps`` for doit, all of which are available."""
     by_key = {step.key: step for step in steps}
     for step in steps:
         before = [by_key[key] for key in (*step.needs, *step.uses) if key in by_key]
@@ -117,6 +117,6 @@ def perform(step: Step, root: Path, before: Iterable[str]) -> TaskFailed | None:
 
 
 def doit_config(state: Path) -> dict[str, Any]:
-    """doit's settings: where its state is, and to go on with what does not need a task that failed."""
+    """Settings of doit: where its state is, and to go on with what does not need a task that failed."""
     state.parent.mkdir(parents=True, exist_ok=True)
     return {"dep_file": str(state), "backend": "noting", "continue": True, "verbosity": 1}

@@ -1,8 +1,75 @@
 """Vehicle dynamics for autonomous racing: learned from rosbags, deployed on ROS 2, explained in physical terms.
 
-The rooms, lowest first: ``vehicle`` (physics), ``signals`` (bags, messages, time grids), ``learning`` (models and
-training), ``runtime`` (the deployed predictor), ``simulation`` (cars on tracks), ``evaluation`` (tables, figures),
-``nodes`` (ROS 2), ``cli`` (the ``dynssm`` command). Imports run downwards only.
+    from dynssm_ros import Recording, load_vehicle, load_model, extract, calibrate, train, evaluate, diagnose, race
+
+The functions are those of the ``dynssm`` command; see :mod:`dynssm_ros.api`. Importing this package loads none of the heavy
+libraries: they come in with the function that needs them.
 """
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.2.0"
+
+if TYPE_CHECKING:
+    from dynssm_ros.api import (
+        calibrate,
+        diagnose,
+        evaluate,
+        extract,
+        load_model,
+        race,
+        recorded,
+        replay,
+        simulate,
+        train,
+    )
+    from dynssm_ros.learning.models.registry import register_model
+    from dynssm_ros.signals.recording import Recording
+    from dynssm_ros.simulation.plant import register_plant
+    from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
+    from dynssm_ros.vehicle.effects import register_effect
+
+_HOMES = {
+    **dict.fromkeys(
+        ("calibrate", "diagnose", "evaluate", "extract", "load_model", "race", "recorded", "replay", "simulate", "train"),
+        "api",
+    ),
+    "Recording": "signals.recording",
+    **dict.fromkeys(("Vehicle", "load_vehicle", "save_vehicle"), "vehicle"),
+    "register_effect": "vehicle.effects",
+    "register_model": "learning.models.registry",
+    "register_plant": "simulation.plant",
+}  # fmt: skip
+__all__ = [
+    "Recording",
+    "Vehicle",
+    "calibrate",
+    "diagnose",
+    "evaluate",
+    "extract",
+    "load_model",
+    "load_vehicle",
+    "race",
+    "recorded",
+    "register_effect",
+    "register_model",
+    "register_plant",
+    "replay",
+    "save_vehicle",
+    "simulate",
+    "train",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """The public names, from where they are defined, when they are first asked for."""
+    if name in _HOMES:
+        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -157,8 +158,6 @@ def drawn() -> Callable[[Any], list[Any]]:
 @pytest.fixture(scope="session")
 def laps() -> Callable[..., tuple[Any, Any]]:
     """``laps(effect, ..., seed=1)``: a quick drive with hidden effects of random size, and the nominal vehicle."""
-    import numpy as np
-
     from benchmarks.hidden_causes.cases import Case, record, size
 
     def drive(*effects: str, seed: int = 1, duration: float = 70.0) -> tuple[Any, Any]:
@@ -177,3 +176,58 @@ def lagging(laps: Callable[..., tuple[Any, Any]]) -> tuple[Any, Any, Any]:
     recording, vehicle = laps("steering_lag")
     line = load_track("road_course").centre
     return recording, vehicle, diagnose(recording, vehicle, integrator="euler", line=line)
+
+
+@pytest.fixture(scope="session")
+def orca() -> Any:
+    """The small car."""
+    from dynssm_ros.vehicle import load_vehicle
+
+    return load_vehicle("orca")
+
+
+def smooth(rng: np.random.Generator, N: int, mean: float, std: float, over: int) -> np.ndarray:
+    """Coloured noise that changes over about ``over`` rows."""
+    kernel = np.exp(-0.5 * (np.arange(-3 * over, 3 * over + 1) / over) ** 2)
+    noise = np.convolve(rng.standard_normal(N + len(kernel) - 1), kernel / np.sqrt((kernel**2).sum()), "valid")
+    return mean + std * noise
+
+
+@pytest.fixture(scope="session")
+def drive() -> Callable[..., Any]:
+    """Drives the single-track car under smooth random inputs; the recording holds its states and commands.
+
+    ``noise`` is the standard deviation of a random push per step (m/s, m/s, rad/s): errors of a one-step prediction
+    with the true coefficients are exactly these.
+    """
+    from dynssm_ros.signals.inputs import WINDOW_COLUMNS
+    from dynssm_ros.signals.recording import Recording, RecordingInfo
+    from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step
+    from dynssm_ros.vehicle.kinematics import SCALAR
+
+    def make(
+        vehicle: Vehicle,
+        N: int = 1500,
+        seed: int = 0,
+        throttle: tuple[float, float] = (0.32, 0.05),
+        steering: float = 0.06,
+        noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        segments: int = 1,
+    ) -> Recording:
+        rng = np.random.default_rng(seed)
+        r, delta = smooth(rng, N + 1, *throttle, 40), smooth(rng, N + 1, 0.0, steering, 15)
+        pushes = rng.standard_normal((N, 3)) * noise
+        theta, effects = Coefficients(*vehicle.nominal.tolist()), vehicle.active_effects
+        state, states = State(1.8, 0.0, 0.0), np.empty((N, 3))
+        for k in range(N):
+            states[k] = state
+            applied = Applied(float(r[k + 1]), float(delta[k + 1]))
+            following = step(SCALAR, state, applied, theta, vehicle.constants, vehicle.sampling_time, effects)
+            state = State(*(value + push for value, push in zip(following, pushes[k].tolist(), strict=True)))
+        matrix = np.column_stack([states, r[:-1], delta[:-1], np.diff(r), np.diff(delta)])
+        info = RecordingInfo(sampling_time=vehicle.sampling_time, commands="topics", source=(f"drive {seed}",))
+        time = 10**18 + np.round(np.arange(N) * vehicle.sampling_time * 1e9).astype(np.int64)
+        segment = (np.arange(N) * segments // N).astype(np.int32)
+        return Recording(info, time, segment, {name: matrix[:, k] for k, name in enumerate(WINDOW_COLUMNS)})
+
+    return make

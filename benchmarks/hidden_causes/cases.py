@@ -13,12 +13,12 @@ least of them are harder than that.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dynssm_ros.signals.recording import Recording, RecordingInfo
-from dynssm_ros.simulation.laps import SimulationError, simulate
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.simulation.laps import SimulationError, as_recording, simulate
 from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import Track, load_track
@@ -119,15 +119,8 @@ def record(case: Case) -> tuple[Recording, Vehicle]:
         except SimulationError:
             if attempt == _TRIES - 1:
                 raise
-    columns = dict(
-        zip(
-            ("v_x", "v_y", "omega", "r_fb", "delta_fb", "r_cmd", "delta_cmd", "x", "y", "theta"),
-            (*run.measured.T, *run.feedback.T, *(run.command - run.feedback).T, *run.pose.T),
-            strict=True,
-        )
-    )
-    info = RecordingInfo(sampling_time=case.sampling_time, commands="topics", source=(case.name,))
-    return Recording(info, run.time, np.zeros(len(run.time), dtype=np.int32), columns), nominal
+    recording = as_recording(run)
+    return replace(recording, info=recording.info.model_copy(update={"source": (case.name,)})), nominal
 
 
 def cars(case: Case) -> tuple[Vehicle, Vehicle]:

@@ -1,9 +1,8 @@
 """The paper's evaluation as doit's tasks: ``make paper``, or ``python -m doit -f benchmarks/paper/dodo.py out=DIR``.
 
 Variables: ``out`` (folder of the run), ``data`` (measured logs and tracks), ``results`` (document to write), ``test``
-(``NAME=R.parquet``, several apart by commas: recordings to predict after training on the whole log), ``quick=1`` (a few epochs,
-one seed: tries everything out), ``plan`` (another plan than ``plan.yaml``). ``doit list``, ``doit forget`` and ``doit -n 2`` work as
-always.
+(``NAME=R.parquet``, several apart by commas: recordings to predict after training on the whole log), ``quick=1`` (a few
+epochs, one seed: tries everything out), ``plan`` (another plan than ``plan.yaml``).
 """
 
 from __future__ import annotations

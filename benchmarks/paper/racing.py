@@ -81,9 +81,7 @@ class DriveLaps(Step):
             given = str(root / self.trained[name]) if name in self.trained else name
             if name == MID_RANGE:
                 given = str(Path(folder) / f"{MID_RANGE}.yaml")
-                save_vehicle(
-                    known.with_nominal((known.lower + known.upper) / 2), Path(given), "The middle of all bounds."
-                )
+                save_vehicle(known.unmeasured(), Path(given), "The middle of all bounds.")
             knowledge = load_prediction_model(given, known, driven, self.race.plant)
         knowledge.name = name
         return knowledge

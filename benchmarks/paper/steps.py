@@ -24,7 +24,7 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.metrics import by_channel, latency_us
 from dynssm_ros.evaluation.open_loop import Evaluation, evaluate
 from dynssm_ros.files import write_json
-from dynssm_ros.learning.calibration import calibrate
+from dynssm_ros.identification.calibration import calibrate
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.runtime.models import OnnxModel, WindowModel, load_model
 from dynssm_ros.signals.extraction import extract
@@ -172,7 +172,7 @@ class Calibrate(Step):
 
     def _start(self) -> Vehicle:
         vehicle = load_vehicle(self.car.vehicle)
-        return vehicle if self.car.start == "vehicle" else vehicle.with_nominal((vehicle.lower + vehicle.upper) / 2)
+        return vehicle if self.car.start == "vehicle" else vehicle.unmeasured()
 
 
 @dataclass(frozen=True, kw_only=True)

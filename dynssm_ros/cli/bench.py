@@ -14,8 +14,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from dynssm_ros.api import disambiguated
 from dynssm_ros.arrays import Vector
-from dynssm_ros.cli.console import JsonOption, console, progress_bar, told_apart
+from dynssm_ros.cli.console import JsonOption, console, progress_bar
 from dynssm_ros.files import write_json
 from dynssm_ros.reporting.tables import Column, Table
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
@@ -69,7 +70,10 @@ def bench(
 
 def open_artifacts(folders: list[Path]) -> dict[str, Artifact]:
     """The models by name; where two folders hold models of the same name, the folders tell them apart."""
-    return told_apart({str(folder): open_artifact(folder) for folder in folders}, attrgetter("card.name"))
+    opened: dict[str, Artifact] = disambiguated(
+        {str(folder): open_artifact(folder) for folder in folders}, attrgetter("card.name")
+    )
+    return opened
 
 
 def comparison(results: dict[str, dict[str, Any]]) -> Table:

@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
+from dynssm_ros import api
 from dynssm_ros.cli.console import CommandsOption, JsonOption, VehicleOption, console, progress_bar
 from dynssm_ros.files import write_json
-from dynssm_ros.learning.calibration import Calibration
-from dynssm_ros.learning.calibration import calibrate as fit
-from dynssm_ros.learning.least_squares import Loss
-from dynssm_ros.signals.recording import Recording, concatenate
-from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, load_vehicle, save_vehicle
+from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, save_vehicle
+from dynssm_ros.vehicle.single_track import Integrator
+
+if TYPE_CHECKING:
+    from dynssm_ros.identification.calibration import Calibration
 
 
 def calibrate(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings of one car.", metavar="R.parquet...")],
     vehicle: VehicleOption,
     out: Annotated[Path, typer.Option(help="Vehicle file to write.", dir_okay=False)],
-    steps: Annotated[
-        int, typer.Option(help="Steps ahead that are predicted; more weigh slow errors higher.", min=1)
-    ] = 1,
-    loss: Annotated[Loss, typer.Option(help="Robust loss of the errors.")] = "soft_l1",
-    min_speed: Annotated[float, typer.Option(help="Leave out slower rows (m/s).", min=0.0)] = 0.0,
+    horizon: Annotated[
+        float, typer.Option(help="Length of the simulations that are compared with the laps (s).", min=0.0)
+    ] = 0.5,
+    integrator: Annotated[
+        Integrator, typer.Option(help="Steps of the model: T_s as in the paper, or finer.")
+    ] = "euler",
+    min_speed: Annotated[
+        float | None,
+        typer.Option(help="Leave out slower rows (m/s).", min=0.0, show_default="the vehicle file's minimum_speed"),
+    ] = None,
     holdout: Annotated[
         float, typer.Option(help="Leave the last fraction of each recording out.", min=0.0, max=0.9)
     ] = 0.0,
@@ -35,16 +41,15 @@ def calibrate(
     json: JsonOption = None,
 ) -> None:
     """Fit the nominal parameters of a vehicle to measured laps, within their bounds."""
-    car = load_vehicle(vehicle)
-    data = concatenate([Recording.load(path).with_commands(commands).split_last(holdout)[0] for path in recordings])
     with progress_bar("calibrating") as progress:
-        result = fit(data, car, steps, loss, min_speed, starts, seed, progress)
-    source = ", ".join(data.info.source)
+        result = api.calibrate(
+            list(recordings), vehicle, horizon, min_speed, holdout, integrator, starts, seed, commands, progress
+        )
+    source = ", ".join(str(path) for path in recordings)
     save_vehicle(
         result.vehicle,
         out,
-        f"Calibrated on {source} (commands {data.info.commands}, {result.steps} steps ahead, loss {loss}, "
-        f"{result.rows} rows, seed {seed}).",
+        f"Calibrated on {source} (simulations of {result.horizon:g} s, {integrator}, {result.rows} rows, seed {seed}).",
     )
     if json is not None:
         write_json(json, as_json(result))
@@ -59,7 +64,7 @@ def calibrate(
         )
     for combination in result.unidentified:
         terms = " ".join(f"{weight:+g} {name}" for name, weight in combination.items())
-        console.print(f"not determined by these data: {terms} (in units of their ranges)", soft_wrap=True)
+        console.print(f"not determined by these data: {terms} (in units of what was known before)", soft_wrap=True)
     console.print(f"{out} written", soft_wrap=True)
 
 
@@ -92,5 +97,5 @@ def as_json(result: Calibration) -> dict[str, Any]:
         "rmse_before": dict(zip(channels, result.rmse_before.tolist(), strict=True)),
         "rmse_after": dict(zip(channels, result.rmse_after.tolist(), strict=True)),
         "rows": result.rows,
-        "steps": result.steps,
+        "horizon_s": result.horizon,
     }

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Protocol, TypeVar
+from typing import Annotated, Any, Protocol
 
 import typer
 from rich.console import Console
@@ -13,11 +13,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from dynssm_ros.files import write_json
 from dynssm_ros.signals.signal_map import Commands
+from dynssm_ros.vehicle.effects import parse_effect
 
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
-
-Opened = TypeVar("Opened")
 
 VehicleOption = Annotated[
     str, typer.Option("--vehicle", help="Vehicle: name of a shipped one (orca, av21, ...) or a file.")
@@ -35,18 +34,18 @@ MinSpeedOption = Annotated[
         show_default="5 if the recording exceeds 10 m/s as full-size cars do, else 0",
     ),
 ]
+PlantOption = Annotated[
+    str,
+    typer.Option(
+        "--plant",
+        help="euler: one step per T_s, as in the published data; rk4: steps of 1 ms; double_track: four wheels.",
+    ),
+]
+EffectOption = Annotated[
+    list[str] | None,
+    typer.Option("--effect", help="Physics that no model knows of; repeatable.", metavar="NAME[:k=v,...]"),
+]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the result as JSON.", dir_okay=False)]
-
-
-def told_apart(opened: Mapping[str, Opened], name: Callable[[Opened], str]) -> dict[str, Opened]:
-    """What was opened, by name; where several have the same one, what was given tells them apart.
-
-    Args:
-        opened: by what was given on the command line.
-        name: of one of them.
-    """
-    called = [name(each) for each in opened.values()]
-    return {given if called.count(name(each)) > 1 else name(each): each for given, each in opened.items()}
 
 
 def write_results(content: dict[str, Any], out: Path, also: Path | None) -> None:
@@ -56,16 +55,21 @@ def write_results(content: dict[str, Any], out: Path, also: Path | None) -> None
             write_json(path, content)
 
 
+def as_effects(texts: list[str] | None) -> dict[str, dict[str, float]]:
+    """``NAME[:k=v,...]`` of ``--effect`` as names and parameters."""
+    return dict(map(parse_effect, texts or []))
+
+
 class Update(Protocol):
-    """Tells a progress bar how much is done, of how much, and a few words about it."""
+    """Moves a progress bar."""
 
     def __call__(self, done: int, total: int, words: str = "") -> None:
-        """Shows it."""
+        """Shows how much is done, of how much, and a few words about it."""
 
 
 @contextmanager
 def progress_bar(description: str) -> Iterator[Update]:
-    """Shows a progress bar on stderr if that is a terminal; yields the function that is told of progress."""
+    """Shows a progress bar on stderr if that is a terminal; yields the function that moves it."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

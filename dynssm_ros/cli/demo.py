@@ -8,39 +8,31 @@ The simulated car is not the model's: it integrates finely, its sensors are nois
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
+from dynssm_ros import api
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.open_loop import Evaluation
-from dynssm_ros.evaluation.open_loop import evaluate as evaluate_models
 from dynssm_ros.reporting import evaluation_figures as figures
 from dynssm_ros.reporting.evaluation_report import open_loop_report, summary_table, verdict
 from dynssm_ros.reporting.page import Report, Section
-from dynssm_ros.runtime.models import Persistence, SingleTrack, load_model
-from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.signals.signal_map import STATE_SIGNALS, load_signal_map
-from dynssm_ros.simulation.laps import simulate, write_run
-from dynssm_ros.track.driver import Style
-from dynssm_ros.track.tracks import load_track
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 
-VEHICLE, MODEL, SIGNALS = "av21", "dynssm_av21", "default"
+VEHICLE, MODEL, SIGNALS = "av21", "dynssm", "default"
 TRAINING_TRACK, TEST_TRACK = "road_course", "oval"
 TRAINING_TIME, TEST_TIME, LIVE_TIME = 600.0, 120.0, 15.0  # s
 NOISE = (0.02, 0.01, 0.002)  # m/s, m/s, rad/s
-HIDDEN = ("steering_offset", {"offset": 0.004})
+HIDDEN = {"steering_offset": {"offset": 0.004}}
 EPOCHS = 40
 SEED = 0
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -88,14 +80,16 @@ def demo(
 def _drive(car: Vehicle, track: str, duration: float, seed: int, out: Path) -> Recording:
     """Simulates laps into a bag and extracts that."""
     bag = out / f"{track}_bag"
+    from dynssm_ros.simulation.laps import write_run
+
     with progress_bar(f"1 simulate {track}") as progress:
-        run = simulate(
-            car.with_effect(*HIDDEN), load_track(track), duration, plant="rk4", seed=seed, style=Style(0.85, 0.6),
-            noise=NOISE, progress=progress,
+        run = api.simulate(
+            car, track, duration, plant="rk4", seed=seed, aggressiveness=0.85, variation=0.6, noise=NOISE,
+            effects=HIDDEN, on_progress=progress,
         )  # fmt: skip
         write_run(run, bag)
     with progress_bar(f"2 extract {track}") as progress:
-        recording = extract([bag], load_signal_map(SIGNALS), 1 / car.sampling_time, progress=progress)
+        recording = api.extract(bag, SIGNALS, 1 / car.sampling_time, on_progress=progress)
     recording.save(out / f"{track}.parquet")
     console.print(
         f"{track}: {run.laps:.1f} laps, {len(recording)} rows, top speed {run.state[:, 0].max():.2f} m/s, seed {seed}"
@@ -104,11 +98,9 @@ def _drive(car: Vehicle, track: str, duration: float, seed: int, out: Path) -> R
 
 
 def _calibrate(recording: Recording, car: Vehicle, out: Path) -> Vehicle:
-    from dynssm_ros.learning.calibration import calibrate
-
-    guess = car.with_nominal((car.lower + car.upper) / 2)  # the demo does not start from the simulator's own values
+    guess = car.unmeasured()  # the demo does not start from the simulator's own values
     with progress_bar("3 calibrate") as progress:
-        result = calibrate(recording, guess, min_speed=5.0, starts=2, seed=SEED, progress=progress)
+        result = api.calibrate(recording, guess, seed=SEED, on_progress=progress)
     save_vehicle(result.vehicle, out / "vehicle.yaml", f"Calibrated by the demo on {TRAINING_TRACK}.")
     before, after = (", ".join(f"{v:.3g}" for v in rmse) for rmse in (result.rmse_before, result.rmse_after))
     console.print(f"calibrated single-track: one-step RMSE (v_x, v_y, omega) {before} -> {after}", soft_wrap=True)
@@ -116,33 +108,21 @@ def _calibrate(recording: Recording, car: Vehicle, out: Path) -> Vehicle:
 
 
 def _train(recording: Recording, car: Vehicle, out: Path) -> Path:
-    from dynssm_ros.learning.export import save_artifact
-    from dynssm_ros.learning.models.registry import load_model_config
-    from dynssm_ros.learning.stages import train
-
-    config = load_model_config(MODEL)
-    settings = config.training.model_copy(update={"epochs": EPOCHS, "seed": SEED})
-    model, checkpoint = out / "model", out / "model.checkpoint.pt"
     with progress_bar("4 train") as progress:
-        trained = train(
-            recording, config.model_copy(update={"training": settings}), car, checkpoint,
-            progress=progress,
-        )  # fmt: skip
-    artifact = save_artifact(trained, model)
+        trained, artifact = api.train(
+            recording, MODEL, car, out / "model", seed=SEED, epochs=EPOCHS, on_progress=progress
+        )
     figures.loss_components(trained.history, trained.best_epoch).savefig(out / "losses.png", dpi=150)
-    checkpoint.unlink(missing_ok=True)
     console.print(
         f"DynSSM: {artifact.card.parameters} parameters, best epoch {trained.best_epoch} of {EPOCHS}, seed {SEED}"
     )
-    return model
+    return artifact.path
 
 
 def _evaluate(recording: Recording, car: Vehicle, model: Path) -> Evaluation:
-    candidates = (load_model(model), SingleTrack(car), Persistence())
     with progress_bar(f"5 evaluate on {TEST_TRACK}") as progress:
-        return evaluate_models(
-            recording, {m.name: m for m in candidates}, f"{TEST_TRACK} (trained on {TRAINING_TRACK})", progress=progress
-        )
+        evaluation = api.evaluate(recording, [model, "single_track", "persistence"], car, on_progress=progress)
+    return replace(evaluation, name=f"{TEST_TRACK} (trained on {TRAINING_TRACK})")
 
 
 def _run_live(model: Path, bag: Path, recording: Recording) -> _Live:
@@ -196,7 +176,7 @@ def _report(evaluation: Evaluation, live: _Live) -> Report:
     ]
     protocol = dict(base.protocol) | {
         "Simulated car": f"{VEHICLE}, Runge-Kutta at 1 ms, noise {NOISE} on v_x, v_y, ω; hidden from the model: "
-        f"{HIDDEN[0]} {HIDDEN[1]['offset']:g} rad",
+        f"steering_offset {HIDDEN['steering_offset']['offset']:g} rad",
     }
     return Report(
         "From a race log to a live prediction", f"{base.summary} {_live_words(live)}.", sections, protocol, base.table

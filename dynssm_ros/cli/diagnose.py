@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from dynssm_ros import api
 from dynssm_ros.cli.console import (
     CommandsOption,
     JsonOption,
@@ -16,11 +18,8 @@ from dynssm_ros.cli.console import (
     progress_bar,
     write_results,
 )
-from dynssm_ros.identification.diagnose import diagnose as find_causes
-from dynssm_ros.reporting.diagnosis_report import diagnosis_report, in_words
-from dynssm_ros.signals.recording import Recording, concatenate
-from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import load_vehicle, save_vehicle
+from dynssm_ros.extras import require
+from dynssm_ros.vehicle import save_vehicle
 from dynssm_ros.vehicle.single_track import Integrator
 
 
@@ -49,22 +48,18 @@ def diagnose(
     json: JsonOption = None,
 ) -> None:
     """Find out what the simulation gets wrong about measured laps, and why; write the vehicle file that has it."""
-    car = load_vehicle(vehicle)
-    data = concatenate([Recording.load(path).with_commands(commands) for path in recordings])
-    line = None if track is None else load_track(track).centre
+    require("diagnose", "train", "report")
+    from dynssm_ros.reporting.diagnosis_report import diagnosis_report, in_words
+
     with progress_bar("diagnosing") as progress:
-        steps = 0
-
-        def say(words: str) -> None:
-            nonlocal steps
-            steps += 1
-            progress(min(steps, 39), 40, words)
-
-        result = find_causes(data, car, horizon, holdout, min_speed, integrator, line, say)
+        steps = itertools.count(1)
+        result = api.diagnose(
+            list(recordings), vehicle, horizon, holdout, min_speed, integrator, track, commands,
+            lambda words: progress(min(next(steps), 39), 40, words),
+        )  # fmt: skip
     path = out / "vehicle.yaml"
-    save_vehicle(
-        result.vehicle, path, f"{car.name}, extended by a diagnosis of {', '.join(data.info.source)}: {result.verdict}."
-    )
+    about = f"{result.car.vehicle.name}, extended by a diagnosis of {result.protocol['Recording']}: {result.verdict}."
+    save_vehicle(result.vehicle, path, about)
     diagnosis_report(result).save(out / "report.html")
     write_results(result.to_json(str(path)), out, json)
     console.print(in_words(result), markup=False, soft_wrap=True)

@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
+from dynssm_ros import api
 from dynssm_ros.cli.console import CommandsOption, SignalsOption, console, progress_bar
-from dynssm_ros.signals.extraction import extract as extract_bags
-from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.signals.standard import recording_to_bag
 
 
@@ -34,9 +33,8 @@ def extract(
     ] = False,
 ) -> None:
     """Turn race logs into a recording: named SI signals on a uniform time grid."""
-    signal_map = load_signal_map(signals).with_commands(commands)
     with progress_bar("reading") as progress:
-        recording = extract_bags(bags, signal_map, rate, drop_bad, progress)
+        recording = api.extract(list(bags), signals, rate, commands, drop_bad, progress)
     if bag is not None:
         recording_to_bag(recording, bag)
     recording.save(out)

@@ -7,12 +7,8 @@ from typing import Annotated
 
 import typer
 
+from dynssm_ros import api
 from dynssm_ros.cli.console import console, progress_bar
-from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.models import OnnxModel
-from dynssm_ros.runtime.predictor import Predictor
-from dynssm_ros.runtime.replay import replay_to_bag
-from dynssm_ros.signals.signal_map import load_signal_map
 
 
 def replay(
@@ -28,9 +24,8 @@ def replay(
     ] = 0.2,
 ) -> None:
     """Predict offline what the node would have published for a bag."""
-    predictor = Predictor(OnnxModel(open_artifact(model)), load_signal_map(signals), max_age)
     with progress_bar("replaying") as progress:
-        count, refusals, notes = replay_to_bag(bag, predictor, out, with_inputs, progress)
+        count, refusals, notes = api.replay(bag, model, out, signals, with_inputs, max_age, progress)
     for note in notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     reasons = ", ".join(f"{number} x {refusal.value}" for refusal, number in refusals.items())

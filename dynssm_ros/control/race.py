@@ -23,7 +23,7 @@ from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.simulation.laps import SimulationError
-from dynssm_ros.simulation.plant import PlantKind, make_plant, plant_step
+from dynssm_ros.simulation.plant import PlantKind, make_plant, plant_type
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Applied, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
@@ -189,9 +189,11 @@ class _Drive:
         pose, state = course.starting()
         vehicle, track = course.vehicle, course.track
         # the processor's time, so that what else runs on the machine changes no simulated lap
-        settings = replace(course.settings, travel="start" if course.plant == "euler" else "middle")
+        settings = replace(
+            course.settings, travel="start" if plant_type(course.plant).integrator == "euler" else "middle"
+        )
         self.pilot = Controller(model, vehicle.inputs, course.reference, track, settings, time.thread_time)
-        rolling = LowSpeedRolling(vehicle, plant_step(vehicle, course.plant))
+        rolling = LowSpeedRolling(vehicle, plant_type(course.plant).step(vehicle))
         self._car = make_plant(vehicle, course.plant, pose, state, (rolling,), track.length)
         self._course = course
         self._feedback = Applied(0.0, 0.0)

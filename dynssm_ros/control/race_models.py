@@ -8,8 +8,7 @@ from dynssm_ros.control.horizon_model import Car
 from dynssm_ros.control.prediction_model import Adaptive, Fixed, PredictionModel
 from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.runtime.models import OnnxModel, Persistence, SingleTrack, SingleTrackEwma, WindowModel, load_model
-from dynssm_ros.simulation.double_track import DoubleTrack
-from dynssm_ros.simulation.plant import PlantKind
+from dynssm_ros.simulation.plant import PlantKind, plant_type
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 
 TRUE = "true"
@@ -19,9 +18,8 @@ SHARED = ("m", "l_f", "l_r")  # what makes it the same car
 
 def true_model(vehicle: Vehicle, plant: PlantKind) -> Fixed:
     """The plant's own model: its coefficients, effects and wheels. Steps of 1 ms become two of Runge and Kutta."""
-    first = (DoubleTrack.of(vehicle.constants),) if plant == "double_track" else ()
-    car = Car.of(vehicle) if plant == "euler" else Car.of(vehicle, "rk4", 2, first)
-    return Fixed(TRUE, car, vehicle.nominal)
+    of = plant_type(plant)
+    return Fixed(TRUE, Car.of(vehicle, of.integrator, of.substeps, of.first(vehicle)), vehicle.nominal)
 
 
 def load_prediction_model(

@@ -31,16 +31,31 @@ class Car:
         moved: how far each of the 17 coefficients, and then the mass, is off its nominal value, in standard
             deviations of what is known of it; shape ``(18,)``. Those that are positive move as logarithms.
         effects: values by effect and parameter, in the order in which they act.
+        mass_std: standard deviation of the mass, as a share of it; 0: the mass is known.
     """
 
     vehicle: Vehicle
     moved: Vector
     effects: Mapping[str, Values]
+    mass_std: float = MASS_STD
 
     @classmethod
-    def of(cls, vehicle: Vehicle) -> Car:
+    def of(cls, vehicle: Vehicle, mass_std: float = MASS_STD) -> Car:
         """The car as the vehicle file has it."""
-        return cls(vehicle, np.zeros(len(COEFFICIENTS) + 1), {})
+        return cls(vehicle, np.zeros(len(COEFFICIENTS) + 1), {}, mass_std)
+
+    def at(self, theta: Vector) -> Car:
+        """The same car with coefficients ``theta`` ``(17,)``."""
+        known, scales, nominal = knowledge(self.vehicle), _scaling(self.vehicle), self.vehicle.nominal
+        base = np.where(scales, nominal, 1.0)
+        grown = base * np.log(np.where(scales, theta, 1.0) / base)
+        return replace(self, moved=np.append(np.where(scales, grown, theta - nominal) / known, self.moved[-1]))
+
+    def in_units(self, relative: Vector) -> Vector:
+        """Standard deviations of the coefficients from those of :attr:`moved`, ``(17,)``."""
+        nominal, scales = self.vehicle.nominal, _scaling(self.vehicle)
+        grown = np.where(scales, np.array(self.theta) / np.where(scales, nominal, 1.0), 1.0)
+        return np.asarray(relative * knowledge(self.vehicle) * grown)
 
     @property
     def limits(self) -> tuple[Vector, Vector]:
@@ -52,7 +67,7 @@ class Car:
             np.where(scales, nominal * np.log(np.where(scales, b, 1.0) / nominal), b - vehicle.nominal) / known
             for b in (vehicle.lower + margin, vehicle.upper - margin)
         ]
-        mass = np.log([_LIGHTEST, 1.0 / _LIGHTEST]) / MASS_STD
+        mass = np.log([_LIGHTEST, 1.0 / _LIGHTEST]) / self.mass_std if self.mass_std else np.array([-1.0, 1.0])
         return np.append(bounds[0], mass[0]), np.append(bounds[1], mass[1])
 
     @property
@@ -66,7 +81,7 @@ class Car:
     @property
     def constants(self) -> VehicleConstants:
         """Mass and geometry."""
-        factor = float(np.exp(MASS_STD * np.clip(self.moved, *self.limits)[-1]))
+        factor = float(np.exp(self.mass_std * np.clip(self.moved, *self.limits)[-1]))
         return self.vehicle.constants.model_copy(update={"m": self.vehicle.constants.m * factor})
 
     @property

@@ -18,7 +18,7 @@ from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import per_unit
 from dynssm_ros.identification.residuals import Bunched, Systematic, bunched, systematic
 from dynssm_ros.identification.selection import Refined, Selection
-from dynssm_ros.identification.windows import WARM_UP, Track, Windows
+from dynssm_ros.identification.windows import Windows, compared_every, fit_windows, held_out_windows, recorded_rows
 from dynssm_ros.signals.recording import Recording, default_min_speed
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
@@ -32,10 +32,6 @@ Say = Callable[[str], None]
 
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
-_COMPARED = 13  # rows of each simulation, at most: more hang together
-_MOST = 500  # windows in the fit, evenly spread: more would cost time and tell little
-_MEASURED = 3000  # in the held-out rows
-_LEAST = 24  # windows with which a fit can begin
 _LEAST_LAPS = 3  # with which whole laps are held out
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
@@ -198,7 +194,7 @@ def diagnose(
     return Diagnosis(
         "effects" if causes else "unexplained" if left.is_there or together.is_there else "none",
         causes,
-        fit.car.extended(np.minimum(std[:17], 1.0) * knowledge(vehicle)),
+        fit.car.extended(fit.car.in_units(np.minimum(std[:17], 1.0))),
         gain,
         left,
         together,
@@ -241,7 +237,7 @@ def _prepare(
             f"horizon {horizon:g} s: expected at least two sampling times ({2 * recording.T_s:g} s)"
         )
     asked = steps
-    every = -(-steps // _COMPARED)
+    every = compared_every(steps)
     steps = every * -(-steps // every)
     notes = _check_signals(recording)
     speed = default_min_speed(recording) if min_speed is None else min_speed
@@ -252,8 +248,9 @@ def _prepare(
     context = lap_context(recording, line)
     source = ", ".join(recording.info.source)
     require_context(vehicle.active_effects, context, f"recording {source}")
-    track = Track(recording.matrix.T, context, recording.T_s, (recording.time - recording.time[0]) / 1e9)
-    fitted, unseen = _windows(recording, track, steps, 2 * asked, speed, cut)
+    data = recorded_rows(recording, context)
+    fitted = fit_windows(recording, data, steps * recording.T_s, speed, cut)
+    unseen = held_out_windows(recording, data, steps, 2 * asked, speed, cut)
     protocol = {
         "Recording": source,
         "Commands": recording.info.commands,
@@ -262,7 +259,7 @@ def _prepare(
         "Fit": f"{len(fitted)} simulations of {steps * recording.T_s:g} s, from {speed:g} m/s",
         "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * recording.T_s:g} s",
     }
-    return _Prepared(replace(fitted, every=every), asked, unseen, Car.of(vehicle), notes, protocol)
+    return _Prepared(fitted, asked, unseen, Car.of(vehicle), notes, protocol)
 
 
 def _cause(one: Refined, found: Searched, at: _Prepared, std: Vector) -> Cause:
@@ -334,41 +331,3 @@ def _cut(recording: Recording, holdout: float) -> tuple[int, str]:
                 return cut, f"the last {held} of {total} laps and what follows"
     cut = N - max(1, round(holdout * N))
     return cut, f"the last {100 * holdout:.0f} % as one block (fewer than {_LEAST_LAPS} laps)"
-
-
-def _windows(
-    recording: Recording, track: Track, steps: int, long: int, min_speed: float, cut: int
-) -> tuple[Windows, Windows]:
-    """Simulations for the fit, end to end before ``cut``, and for measuring, overlapping behind it.
-
-    Args:
-        recording: what was measured.
-        track: the same, as simulations read it.
-        steps: of each simulation for the fit.
-        long: of each one for measuring.
-        min_speed: of all rows (m/s).
-        cut: first held-out row.
-    """
-    warm = round(WARM_UP / recording.T_s)
-    ends = recording.window_ends(warm + 1, horizon=steps, min_speed=min_speed)
-    usable = ends[ends + steps < cut]
-    starts: list[int] = []
-    for row in usable:
-        if not starts or row >= starts[-1] + steps:
-            starts.append(int(row))
-    if len(starts) < _LEAST:
-        raise RecordingError(
-            f"recording {', '.join(recording.info.source)}: {len(starts)} stretches of {steps * recording.T_s:g} s at "
-            f"{min_speed:g} m/s or more beside the held-out part; expected at least {_LEAST}"
-        )
-    spread = np.linspace(0, len(starts) - 1, min(len(starts), _MOST)).round().astype(int)
-    chosen = np.array(starts)[spread]
-    ends = recording.window_ends(warm + 1, horizon=long, min_speed=min_speed)
-    later = ends[ends - warm >= cut]
-    if len(later) < _LEAST:
-        raise RecordingError(
-            f"recording {', '.join(recording.info.source)}: {len(later)} rows in the held-out part from which "
-            f"{long * recording.T_s:g} s can be simulated; expected at least {_LEAST}: record longer or hold out more"
-        )
-    every = max(1, steps // 4, len(later) // _MEASURED)
-    return Windows(track, chosen, steps, warm, filtered=True), Windows(track, later[::every], long, warm)

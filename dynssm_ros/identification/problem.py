@@ -23,6 +23,7 @@ BLOCK = 3.0  # s; errors farther apart count as independent
 _UNIT = 0.1  # of the way from neutral to the upper bound: in this unit effects are fitted
 _FREE = 10.0  # of these units an effect's parameter may be, as one standard deviation
 _ROUNDS = 30
+_NOMINAL_STEP, _EFFECT_STEP = 1e-3, 0.02  # of the derivatives: standard deviations known before, units of an effect
 _KEPT = 0.5  # of what a quadratic promises: derivatives that keep less are too old
 _LOUD, _LEAST = 1e-2, 1e-12  # of the variance of a channel: more than any noise, and less
 _DAMPING = (0.0, 0.03, 0.3, 3.0, 30.0)
@@ -140,7 +141,7 @@ class Study:
         upper = limits(car, free)[1]
         cars, done = [], np.empty(len(at) - first)
         for k in range(first, len(at)):
-            step = 0.05 if k < n else 0.02
+            step = _NOMINAL_STEP if k < n else _EFFECT_STEP
             moved = at.copy()
             moved[k] += step if at[k] + step <= upper[k] else -step
             done[k - first] = moved[k] - at[k]
@@ -254,6 +255,10 @@ class Study:
         known = np.diag(self.known_before(fit.position))
         bread = np.linalg.inv(information + known)
         return np.asarray(bread @ (self.inflation(fit) * information + known) @ bread)
+
+    def information(self, fit: Fit) -> Vector:
+        """What the data alone say of the fitted values, ``(P, P)``: the inverse of their covariance."""
+        return self._scores(fit)[0]
 
     def inflation(self, fit: Fit, last: int = 0) -> float:
         """How many times larger the variance of the scores is than independent errors would make it, at least 1.

@@ -13,14 +13,20 @@ import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.errors import RecordingError
 from dynssm_ros.identification.car import Car, Fleet
 from dynssm_ros.signals.inputs import applied_inputs
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.single_track import Integrator, settled_memory, settling_rate, step_with_memory
 
 _FINEST = 16  # integration steps per sampling time, at most
 WARM_UP = 0.64  # s of measured rows along which a simulation is led before it runs free
 _FOLLOWING = 0.16  # s, time constant with which a simulation that is led follows the measured rows
+_COMPARED = 13  # rows of each simulation, at most: more hang together
+_MOST = 500  # windows in a fit, evenly spread: more would cost time and tell little
+_MEASURED = 3000  # windows in held-out rows
+_LEAST = 24  # windows with which a fit can begin
 _WILD = 1e3  # a prediction farther off than this many spreads of its channel counts as that far
 
 
@@ -184,3 +190,63 @@ class Windows:
             self.substeps,
             self.context(k) | dict(context or {}),
         )
+
+
+def recorded_rows(recording: Recording, context: dict[str, Vector]) -> Track:
+    """The rows of a recording with other signals by name."""
+    return Track(recording.matrix.T, context, recording.T_s, (recording.time - recording.time[0]) / 1e9)
+
+
+def compared_every(steps: int) -> int:
+    """Of how many rows one is compared in a simulation of ``steps``."""
+    return -(-steps // _COMPARED)
+
+
+def fit_windows(recording: Recording, data: Track, horizon: float, min_speed: float, cut: int) -> Windows:
+    """Simulations for a fit, end to end before the row ``cut``.
+
+    Args:
+        recording: what was measured.
+        data: the same, as simulations read it.
+        horizon: of each simulation (s), rounded up to rows that are compared.
+        min_speed: of all rows (m/s).
+        cut: rows from here on are left out.
+
+    Raises:
+        RecordingError: too few stretches.
+    """
+    steps = max(1, int(np.ceil(horizon / recording.T_s - 1e-9)))
+    every = compared_every(steps)
+    steps = every * -(-steps // every)
+    warm = round(WARM_UP / recording.T_s)
+    ends = recording.window_ends(warm + 1, horizon=steps, min_speed=min_speed)
+    starts: list[int] = []
+    for row in ends[ends + steps < cut]:
+        if not starts or row >= starts[-1] + steps:
+            starts.append(int(row))
+    if len(starts) < _LEAST:
+        beside = " beside the held-out part" if cut < len(recording) else ""
+        raise RecordingError(
+            f"recording {', '.join(recording.info.source)}: {len(starts)} stretches of {steps * recording.T_s:g} s at "
+            f"{min_speed:g} m/s or more{beside}; expected at least {_LEAST}"
+        )
+    chosen = np.array(starts)[np.linspace(0, len(starts) - 1, min(len(starts), _MOST)).round().astype(int)]
+    return Windows(data, chosen, steps, warm, every=every, filtered=True)
+
+
+def held_out_windows(recording: Recording, data: Track, steps: int, long: int, min_speed: float, cut: int) -> Windows:
+    """Overlapping simulations of ``long`` steps for measuring, behind the row ``cut``; ``steps``: of those of the fit.
+
+    Raises:
+        RecordingError: too few rows.
+    """
+    warm = round(WARM_UP / recording.T_s)
+    ends = recording.window_ends(warm + 1, horizon=long, min_speed=min_speed)
+    later = ends[ends - warm >= cut]
+    if len(later) < _LEAST:
+        raise RecordingError(
+            f"recording {', '.join(recording.info.source)}: {len(later)} rows in the held-out part from which "
+            f"{long * recording.T_s:g} s can be simulated; expected at least {_LEAST}: record longer or hold out more"
+        )
+    every = max(1, steps // 4, len(later) // _MEASURED)
+    return Windows(data, later[::every], long, warm)

@@ -25,7 +25,7 @@ from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
 from dynssm_ros.simulation.laps import Sample, drive
-from dynssm_ros.simulation.plant import PlantKind
+from dynssm_ros.simulation.plant import PLANTS, PlantKind
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.racing_line import LineKind, line_of
 from dynssm_ros.track.tracks import load_track
@@ -47,7 +47,7 @@ class SimulatorNode(Node):
         )
         track = describe(self, "track", "club", "Track: built-in name or CSV file.", read_only=True)
         scale = describe(self, "scale", 1.0, "Size of the track.", (1e-4, 1e4), read_only=True)
-        self._plant: PlantKind = choose(self, "plant", "euler", get_args(PlantKind), "How the car is modelled.")
+        self._plant: PlantKind = choose(self, "plant", "euler", tuple(PLANTS), "How the car is modelled.")
         self._line: LineKind = choose(self, "line", "centre", get_args(LineKind), "What the own driver follows.")
         self._driver: DriverKind = choose(
             self, "driver", "pure_pursuit", get_args(DriverKind), f"The own one, or whoever sends {COMMAND_TOPIC}."

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 
 from dynssm_ros.simulation.laps import Sample, SimulationError
-from dynssm_ros.simulation.plant import PlantKind, make_plant, plant_step
+from dynssm_ros.simulation.plant import PlantKind, make_plant, plant_type
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Applied, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
@@ -68,7 +68,11 @@ def drive_by_commands(
     (x, y), theta = track.centre.position(0.0), float(track.centre.heading(0.0))
     start = Pose(float(x), float(y), theta), State(0.0, 0.0, 0.0)
     car = make_plant(
-        vehicle, plant, *start, last=(LowSpeedRolling(vehicle, plant_step(vehicle, plant)),), lap_length=track.length
+        vehicle,
+        plant,
+        *start,
+        last=(LowSpeedRolling(vehicle, plant_type(plant).step(vehicle)),),
+        lap_length=track.length,
     )
     feedback, s = Applied(0.0, 0.0), 0.0
     for k in itertools.count():

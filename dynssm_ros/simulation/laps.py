@@ -14,6 +14,9 @@ import numpy.typing as npt
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS
+from dynssm_ros.signals.recording import Recording, RecordingInfo
+from dynssm_ros.signals.signal_map import POSE_SIGNALS
 from dynssm_ros.signals.standard import write_standard_bag
 from dynssm_ros.simulation.plant import PlantKind, make_plant
 from dynssm_ros.track.driver import Driver, Style
@@ -192,6 +195,22 @@ def simulate(
         s=np.array([sample.s for sample in samples]),
         lateral=np.array([sample.lateral for sample in samples]),
     )
+
+
+def as_recording(run: Run) -> Recording:
+    """The drive as it would be extracted from its bag."""
+    increments = run.command - run.feedback
+    columns = dict(
+        zip(
+            (*WINDOW_COLUMNS, *POSE_SIGNALS),
+            (*run.measured.T, *run.feedback.T, *increments.T, *run.pose.T),
+            strict=True,
+        )
+    )
+    info = RecordingInfo(
+        sampling_time=run.vehicle.sampling_time, commands="topics", source=(f"{run.vehicle.name} on {run.track.name}",)
+    )
+    return Recording(info, run.time, np.zeros(len(run.time), dtype=np.int32), columns)
 
 
 def write_run(run: Run, path: str | Path) -> None:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.double_track import DoubleTrack
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step_with_memory
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose, world_velocity
 from dynssm_ros.vehicle.single_track import Integrator, Motion, StageEffect, measured_state, settled_memory
 
-PlantKind = Literal["euler", "rk4", "double_track"]
-"""``euler``: one forward Euler step per T_s for state and pose, as in the published data; ``rk4``: steps of 1 ms;
-``double_track``: four wheels with load transfer, in steps of 1 ms."""
+PlantKind = str
+"""Name of a plant, see :data:`PLANTS`."""
 
 RK4_STEP = 1e-3  # s, at most
 
@@ -164,9 +164,90 @@ class _Late:
         return State(*(a + share * (b - a) for a, b in zip(old, new, strict=True)))
 
 
-def plant_step(vehicle: Vehicle, kind: PlantKind) -> float:
-    """Longest integration step (s) of a plant."""
-    return vehicle.sampling_time if kind == "euler" else RK4_STEP
+class PlantType(Protocol):
+    """How cars of a kind of plant are made. Register one of your own by :func:`register_plant`."""
+
+    integrator: Integrator
+    """Of a model that steps like it: ``euler`` carries the pose by the velocity at the start of a step."""
+    substeps: int
+    """Of such a model."""
+
+    def step(self, vehicle: Vehicle) -> float:
+        """Longest integration step (s)."""
+
+    def first(self, vehicle: Vehicle) -> tuple[StageEffect, ...]:
+        """Physics that it has beyond the single-track equations."""
+
+    def make(
+        self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], lap_length: float | None
+    ) -> Plant:
+        """A car of that kind; see :class:`SingleTrackPlant` for the arguments and errors."""
+
+
+class EulerPlant:
+    """One forward Euler step per T_s for state and pose, as in the published data."""
+
+    integrator: Integrator = "euler"
+    substeps = 1
+
+    def step(self, vehicle: Vehicle) -> float:
+        """T_s."""
+        return vehicle.sampling_time
+
+    def first(self, vehicle: Vehicle) -> tuple[StageEffect, ...]:
+        """Nothing."""
+        return ()
+
+    def make(
+        self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], lap_length: float | None
+    ) -> Plant:
+        """The single-track car."""
+        return SingleTrackPlant(vehicle, self.integrator, pose, state, self.first(vehicle), last, lap_length)
+
+
+class Rk4Plant(EulerPlant):
+    """Runge-Kutta steps of 1 ms at most."""
+
+    integrator: Integrator = "rk4"
+    substeps = 2
+
+    def step(self, vehicle: Vehicle) -> float:
+        """1 ms."""
+        return RK4_STEP
+
+
+class DoubleTrackPlant(Rk4Plant):
+    """Four wheels with load transfer and load-sensitive tyres, in steps of 1 ms."""
+
+    def first(self, vehicle: Vehicle) -> tuple[StageEffect, ...]:
+        """Left and right wheels."""
+        return (DoubleTrack.of(vehicle.constants),)
+
+
+PLANTS: dict[str, PlantType] = {"euler": EulerPlant(), "rk4": Rk4Plant(), "double_track": DoubleTrackPlant()}
+"""Plants by name."""
+
+
+def register_plant(name: str, plant: PlantType) -> None:
+    """Makes a plant known by its name to ``simulate``, ``race`` and the simulator node.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    if PLANTS.get(name, plant) is not plant:
+        raise ValueError(f"plant {name}: the name is taken by {type(PLANTS[name]).__name__}")
+    PLANTS[name] = plant
+
+
+def plant_type(kind: PlantKind) -> PlantType:
+    """The plant of that name.
+
+    Raises:
+        ConfigurationError: there is none.
+    """
+    if kind not in PLANTS:
+        raise ConfigurationError(f"plant '{kind}'; expected one of {', '.join(PLANTS)}")
+    return PLANTS[kind]
 
 
 def make_plant(
@@ -177,8 +258,5 @@ def make_plant(
     last: Sequence[StageEffect] = (),
     lap_length: float | None = None,
 ) -> Plant:
-    """The plant of that kind; see :class:`SingleTrackPlant` for the arguments and errors."""
-    if kind == "double_track":
-        first = (DoubleTrack.of(vehicle.constants),)
-        return SingleTrackPlant(vehicle, "rk4", pose, state, first, last, lap_length)
-    return SingleTrackPlant(vehicle, kind, pose, state, (), last, lap_length)
+    """A car of that kind of plant; see :class:`SingleTrackPlant` for the arguments and errors."""
+    return plant_type(kind).make(vehicle, pose, state, last, lap_length)

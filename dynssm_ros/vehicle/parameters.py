@@ -175,6 +175,14 @@ class Vehicle(StrictModel):
         }
         return self.model_copy(update={"coefficients": coefficients})
 
+    def unmeasured(self) -> Vehicle:
+        """The same car of which nothing but the bounds is known: values in their middle, no standard deviations."""
+        coefficients = {
+            name: c.model_copy(update={"nominal": sum(c.bounds) / 2, "std": None})
+            for name, c in self.coefficients.items()
+        }
+        return self.model_copy(update={"coefficients": coefficients})
+
     def with_effect(self, name: str, parameters: dict[str, float]) -> Vehicle:
         """The same car with one more effect.
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from dynssm_ros.identification import diagnose as diagnosis
+from dynssm_ros.identification import windows
+from dynssm_ros.identification.calibration import calibrate
 from dynssm_ros.identification.diagnose import RECALIBRATED, diagnose
-from dynssm_ros.learning.calibration import calibrate
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import load_vehicle
@@ -21,10 +21,10 @@ def test_yaw_is_found_to_come_late_and_the_extended_car_errs_less(
     putnam: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # half the simulations of a diagnosis proper tell the same, in half the time
-    monkeypatch.setattr(diagnosis, "_MOST", 250)
+    monkeypatch.setattr(windows, "_MOST", 250)
     recording = extract([putnam], load_signal_map("av21"), 25.0)
     seen = recording.split_last(0.25)[0]
-    car = calibrate(seen, load_vehicle("av21"), min_speed=5.0, starts=1).vehicle
+    car = calibrate(seen, load_vehicle("av21").unmeasured(), starts=1).vehicle
     found = diagnose(recording, car, horizon=0.6, integrator="rk4")
     assert found.verdict == "effects"
     # a yaw rate that is measured late and a steering that answers late are hard to tell apart in this log

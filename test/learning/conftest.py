@@ -6,16 +6,13 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.registry import parse_model_config
-from dynssm_ros.signals.inputs import WINDOW_COLUMNS
-from dynssm_ros.signals.recording import Recording, RecordingInfo
-from dynssm_ros.simulation.plant import SCALAR
-from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, load_vehicle, step
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import Vehicle
 
 Drive = Callable[..., Recording]
 MakeConfig = Callable[..., ModelConfig]
@@ -70,11 +67,6 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def orca() -> Vehicle:
-    return load_vehicle("orca")
-
-
-@pytest.fixture(scope="session")
 def make_config() -> MakeConfig:
     """The small model with other blocks; ``None`` leaves a block out, a mapping changes fields of it."""
 
@@ -110,49 +102,6 @@ def _changed(base: dict[str, Any], **changes: Any) -> ModelConfig:
         content = {name: content[name] for name in ("name", "kind", "history", "penalty") if name in content}
         content["training"] = {"validation_block": 1.0}
     return parse_model_config(content, "test")
-
-
-def smooth(rng: np.random.Generator, N: int, mean: float, std: float, over: int) -> np.ndarray:
-    """Coloured noise that changes over about ``over`` rows."""
-    kernel = np.exp(-0.5 * (np.arange(-3 * over, 3 * over + 1) / over) ** 2)
-    noise = np.convolve(rng.standard_normal(N + len(kernel) - 1), kernel / np.sqrt((kernel**2).sum()), "valid")
-    return mean + std * noise
-
-
-@pytest.fixture(scope="session")
-def drive() -> Drive:
-    """Drives the single-track car under smooth random inputs; the recording holds its states and commands.
-
-    ``noise`` is the standard deviation of a random push per step (m/s, m/s, rad/s): errors of a one-step prediction
-    with the true coefficients are exactly these.
-    """
-
-    def make(
-        vehicle: Vehicle,
-        N: int = 1500,
-        seed: int = 0,
-        throttle: tuple[float, float] = (0.32, 0.05),
-        steering: float = 0.06,
-        noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        segments: int = 1,
-    ) -> Recording:
-        rng = np.random.default_rng(seed)
-        r, delta = smooth(rng, N + 1, *throttle, 40), smooth(rng, N + 1, 0.0, steering, 15)
-        pushes = rng.standard_normal((N, 3)) * noise
-        theta, effects = Coefficients(*vehicle.nominal.tolist()), vehicle.active_effects
-        state, states = State(1.8, 0.0, 0.0), np.empty((N, 3))
-        for k in range(N):
-            states[k] = state
-            applied = Applied(float(r[k + 1]), float(delta[k + 1]))
-            following = step(SCALAR, state, applied, theta, vehicle.constants, vehicle.sampling_time, effects)
-            state = State(*(value + push for value, push in zip(following, pushes[k].tolist(), strict=True)))
-        matrix = np.column_stack([states, r[:-1], delta[:-1], np.diff(r), np.diff(delta)])
-        info = RecordingInfo(sampling_time=vehicle.sampling_time, commands="topics", source=(f"drive {seed}",))
-        time = 10**18 + np.round(np.arange(N) * vehicle.sampling_time * 1e9).astype(np.int64)
-        segment = (np.arange(N) * segments // N).astype(np.int32)
-        return Recording(info, time, segment, {name: matrix[:, k] for k, name in enumerate(WINDOW_COLUMNS)})
-
-    return make
 
 
 @pytest.fixture(scope="session")

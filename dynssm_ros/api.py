@@ -1,0 +1,510 @@
+"""The Python API: one function for each command, from data to data. The command line calls these and prints.
+
+All functions take vehicles, models, signal maps and tracks by shipped name, by path, or as the object itself. Nothing is
+printed; ``on_progress`` is called with what is done and what there is to do. What is wrong with the input raises a
+:class:`~dynssm_ros.errors.UserError` whose message is one line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.extras import require
+from dynssm_ros.signals.recording import Recording, concatenate
+from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
+from dynssm_ros.vehicle import Vehicle, load_vehicle
+from dynssm_ros.vehicle.single_track import Integrator
+
+if TYPE_CHECKING:
+    from dynssm_ros.control.race import Race
+    from dynssm_ros.control.settings import Objective
+    from dynssm_ros.evaluation.open_loop import Evaluation
+    from dynssm_ros.identification.calibration import Calibration
+    from dynssm_ros.identification.diagnose import Diagnosis
+    from dynssm_ros.learning.models.base import ModelConfig
+    from dynssm_ros.learning.stages import Trained
+    from dynssm_ros.runtime.artifact import Artifact
+    from dynssm_ros.runtime.models import WindowModel
+    from dynssm_ros.simulation.laps import Run
+    from dynssm_ros.simulation.plant import PlantKind
+    from dynssm_ros.track.racing_line import LineKind
+    from dynssm_ros.track.tracks import Track
+
+Progress = Callable[[int, int], None]
+PathLike = str | Path
+Log = Recording | PathLike
+"""A recording, or the Parquet file of one."""
+
+
+def load_model(name_or_dir: PathLike, vehicle: Vehicle | PathLike | None = None) -> WindowModel:
+    """Opens a trained model's folder, or a baseline: ``persistence``, ``single_track``, ``single_track_ewma``.
+
+    Example:
+        >>> model = load_model("single_track", "orca")
+        >>> model.H, model.T_s
+        (1, 0.02)
+    """
+    from dynssm_ros.runtime.models import load_model
+
+    return load_model(name_or_dir, None if vehicle is None else _vehicle(vehicle))
+
+
+def simulate(
+    vehicle: Vehicle | PathLike,
+    track: Track | PathLike,
+    duration: float | None = None,
+    laps: float | None = None,
+    plant: PlantKind = "euler",
+    line: LineKind = "centre",
+    seed: int = 0,
+    aggressiveness: float = 0.95,
+    variation: float = 0.5,
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    effects: Mapping[str, Mapping[str, float]] | None = None,
+    scale: float = 1.0,
+    on_progress: Progress | None = None,
+) -> Run:
+    """Drives a simulated car around a track.
+
+    Args:
+        vehicle: the car.
+        track: ``oval``, ``road_course``, ``club``, ``club_b``, or a file ``x_m,y_m,w_tr_right_m,w_tr_left_m``.
+        duration: time to drive (s); 60 if neither this nor ``laps``.
+        laps: laps to drive, instead of a duration.
+        plant: ``euler``, ``rk4`` or ``double_track``.
+        line: what the driver follows: ``centre`` or ``racing``.
+        seed: of the driver's variation and the noise.
+        aggressiveness: share of the car's limits in use.
+        variation: how much speed and line vary, 0 to 1.
+        noise: standard deviations of the measured ``v_x, v_y, omega`` (m/s, m/s, rad/s).
+        effects: physics that the vehicle file does not have, by name, with parameters.
+        scale: of the track.
+        on_progress: called with simulated milliseconds or metres.
+
+    Example:
+        >>> run = simulate("orca", "club", duration=2.0, effects={"front_grip": {"factor": 0.9}})
+        >>> run.state.shape
+        (101, 3)
+    """
+    require("simulate", "race")
+    from dynssm_ros.simulation.laps import simulate
+    from dynssm_ros.track.driver import Style
+    from dynssm_ros.track.racing_line import line_of
+
+    car = _vehicle(vehicle).with_effects((name, dict(values)) for name, values in (effects or {}).items())
+    course = _track(track).scaled(scale)
+    if duration is None and laps is None:
+        duration = 60.0
+    style = Style(aggressiveness, variation)
+    return simulate(
+        car, course, duration, laps, plant, seed, style, line_of(line, car, course), noise=noise, progress=on_progress
+    )
+
+
+def extract(
+    bags: PathLike | Sequence[PathLike],
+    signals: SignalMap | PathLike = "default",
+    rate: float = 50.0,
+    commands: Commands | None = None,
+    drop_bad: bool = False,
+    on_progress: Progress | None = None,
+) -> Recording:
+    """Turns race logs into a recording: named SI signals on a uniform time grid.
+
+    Args:
+        bags: rosbag2 folders or ``.mcap``/``.db3`` files, in the order of driving.
+        signals: signal map: which topic and field is which signal.
+        rate: of the grid (Hz).
+        commands: source of the command inputs; the signal map's if not given.
+        drop_bad: leave out samples that are not finite or out of order instead of raising.
+        on_progress: called with messages read.
+
+    Example:
+        >>> recording = extract("laps_bag", rate=50.0)  # doctest: +SKIP
+        >>> recording["v_x"].mean()  # doctest: +SKIP
+        1.93
+    """
+    from dynssm_ros.signals.extraction import extract
+
+    several = [bags] if isinstance(bags, (str, Path)) else list(bags)
+    signal_map = signals if isinstance(signals, SignalMap) else load_signal_map(signals)
+    return extract(several, signal_map.with_commands(commands), rate, drop_bad, on_progress)
+
+
+def calibrate(
+    recordings: Log | Sequence[Log],
+    vehicle: Vehicle | PathLike,
+    horizon: float = 0.5,
+    min_speed: float | None = None,
+    holdout: float = 0.0,
+    integrator: Integrator = "euler",
+    starts: int = 3,
+    seed: int = 0,
+    commands: Commands | None = None,
+    on_progress: Progress | None = None,
+) -> Calibration:
+    """Fits the nominal parameters of a vehicle to measured laps, within their bounds, with standard deviations.
+
+    Args:
+        recordings: of one car.
+        vehicle: start values, bounds, and what is known before.
+        horizon: length of the simulations that are compared with the laps (s).
+        min_speed: slower rows are left out (m/s); the vehicle file's if not given.
+        holdout: last fraction of each recording that is left out.
+        integrator: of the model.
+        starts: starting points of the search.
+        seed: of the random ones.
+        commands: source of the command inputs; the recording's own if not given.
+        on_progress: called after each starting point.
+
+    Example:
+        >>> laps = recorded(simulate("orca", "club", duration=20.0))
+        >>> found = calibrate(laps, "orca")
+        >>> round(found.vehicle.coefficients["D_f"].nominal, 4)
+        0.192
+    """
+    require("calibrate", "train")
+    from dynssm_ros.identification.calibration import calibrate
+
+    data = _joined(recordings, commands, holdout)
+    return calibrate(data, _vehicle(vehicle), horizon, min_speed, integrator, starts, seed, on_progress)
+
+
+class TrainingResult(NamedTuple):
+    """A trained model and where it was written."""
+
+    trained: Trained
+    artifact: Artifact
+
+
+def train(
+    recordings: Log | Sequence[Log],
+    model: ModelConfig | PathLike,
+    vehicle: Vehicle | PathLike,
+    out: PathLike,
+    holdout: float = 0.0,
+    commands: Commands | None = None,
+    seed: int | None = None,
+    epochs: int | None = None,
+    device: str = "cpu",
+    on_progress: Callable[[int, int, str], None] | None = None,
+) -> TrainingResult:
+    """Trains a model and writes its folder: card, weights, ONNX graph, metrics. Continues after a kill.
+
+    Args:
+        recordings: of one car.
+        model: model file: shipped name or path.
+        vehicle: the car; calibrated on the recordings first if the model asks for it.
+        out: folder to write. ``OUT.checkpoint.pt`` beside it is removed when the model is there.
+        holdout: last fraction of each recording that is left out.
+        commands: source of the command inputs; the recording's own if not given.
+        seed: instead of the model file's.
+        epochs: instead of the model file's, in each stage.
+        device: ``cpu`` or ``cuda``.
+        on_progress: called after each epoch with epochs done, epochs at most and a line about them.
+
+    Example:
+        >>> laps = recorded(simulate("orca", "club", duration=20.0))
+        >>> result = train(laps, "ridge", "orca", "ridge_model")
+        >>> result.artifact.card.window
+        30
+    """
+    require("train", "train")
+    from dynssm_ros.identification.calibration import calibrate
+    from dynssm_ros.learning.export import check_replaceable, save_artifact
+    from dynssm_ros.learning.stages import check_device, checkpoints, train
+
+    check_device(device)
+    folder = Path(out) if Path(out).name else Path(out).absolute()  # "." has no name to put the checkpoint beside
+    check_replaceable(folder)
+    config = model_config(model, seed, epochs)
+    checkpoint = checkpoint_of(folder)
+    trained = train(
+        _joined(recordings, commands, holdout), config, _vehicle(vehicle), checkpoint, device, on_progress,
+        lambda data, car: calibrate(data, car, integrator=config.stepping[0]).vehicle,
+    )  # fmt: skip
+    artifact = save_artifact(trained, folder, {"holdout": holdout, "device": device})
+    for path in checkpoints(config, checkpoint):
+        path.unlink(missing_ok=True)
+    return TrainingResult(trained, artifact)
+
+
+def model_config(model: ModelConfig | PathLike, seed: int | None = None, epochs: int | None = None) -> ModelConfig:
+    """A model file with other training settings, where given."""
+    from dynssm_ros.learning.models.registry import load_model_config
+
+    given = {key: value for key, value in (("seed", seed), ("epochs", epochs)) if value is not None}
+    config = load_model_config(model) if isinstance(model, (str, Path)) else model
+    return config.with_training(**given)
+
+
+def checkpoint_of(out: Path) -> Path:
+    """Where a training that writes ``out`` keeps its state."""
+    return out.with_name(f"{out.name}.checkpoint.pt")
+
+
+def evaluate(
+    recording: Log,
+    models: Sequence[WindowModel | PathLike] | Mapping[str, WindowModel],
+    vehicle: Vehicle | PathLike | None = None,
+    holdout: float | None = None,
+    commands: Commands | None = None,
+    min_speed: float | None = None,
+    horizon: float | None = None,
+    stride: int = 1,
+    track: Track | PathLike | None = None,
+    on_progress: Progress | None = None,
+) -> Evaluation:
+    """Scores models on a recording: one-step errors, rollouts, displacement, coverage, latency.
+
+    Args:
+        recording: to score on.
+        models: folders, names of baselines, or models.
+        vehicle: of the single-track baselines.
+        holdout: score only this last fraction of the recording.
+        commands: protocol; if not given, that of the models' training.
+        min_speed: stretches below are left out (m/s); if not given, 5 for full-size cars, else 0.
+        horizon: length of the rollouts (s); if not given, 0.3 up to T_s = 0.02 s, else 0.6.
+        stride: a rollout starts at every ``stride``-th row.
+        track: on which errors are placed; if not given, the first full lap of the recording.
+        on_progress: called with predictions made.
+
+    Example:
+        >>> laps = recorded(simulate("orca", "club", duration=10.0))
+        >>> scores = evaluate(laps, ["persistence", "single_track"], "orca").scores
+        >>> bool(scores["single_track"].rmse[0] < 1e-9)
+        True
+    """
+    require("evaluate", "race")
+    from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
+    from dynssm_ros.track.lap_position import first_lap
+
+    log = _recording(recording)
+    opened = models if isinstance(models, Mapping) else open_models(models, vehicle)
+    line = first_lap(log) if track is None else _centre_line(track, log)
+    log = log.with_commands(commands or shared_commands(opened))
+    split = "whole recording"
+    if holdout is not None:
+        if holdout <= 0:
+            raise ConfigurationError(f"--holdout {holdout:g}: expected a fraction above 0 and up to 1")
+        log, split = log.split_last(holdout)[1], f"last {100 * holdout:.3g} % of the recording, as one block"
+    name = Path(recording).name if isinstance(recording, (str, Path)) else ""
+    return evaluate(log, opened, name, split, min_speed, horizon, stride, line=line, progress=on_progress)
+
+
+def open_models(
+    models: Sequence[WindowModel | PathLike], vehicle: Vehicle | PathLike | None = None
+) -> dict[str, WindowModel]:
+    """Models by their names; where two have the same one, what was given disambiguates."""
+    opened = {str(m): load_model(m, vehicle) if isinstance(m, (str, Path)) else m for m in models}
+    return disambiguated(opened, lambda model: model.name)
+
+
+def disambiguated(opened: Mapping[str, Any], name: Callable[[Any], str]) -> dict[str, Any]:
+    """What was opened, by name; where several have the same one, by what was given."""
+    called = [name(each) for each in opened.values()]
+    return {given if called.count(name(each)) > 1 else name(each): each for given, each in opened.items()}
+
+
+def replay(
+    bag: PathLike,
+    model: PathLike,
+    out: PathLike,
+    signals: SignalMap | PathLike = "default",
+    with_inputs: bool = False,
+    max_age: float = 0.2,
+    on_progress: Progress | None = None,
+) -> Any:
+    """Predicts offline what the node would have published for a bag, into a new bag.
+
+    Returns:
+        The number of predictions, the refusals by reason, and notes on a bag that had to be recovered.
+
+    Example:
+        >>> replay("laps_bag", "model", "predictions")  # doctest: +SKIP
+        (995, Counter({<Refusal.FILLING: ...>: 5}), [])
+    """
+    from dynssm_ros.runtime.artifact import open_artifact
+    from dynssm_ros.runtime.models import OnnxModel
+    from dynssm_ros.runtime.predictor import Predictor
+    from dynssm_ros.runtime.replay import replay_to_bag
+
+    signal_map = signals if isinstance(signals, SignalMap) else load_signal_map(signals)
+    predictor = Predictor(OnnxModel(open_artifact(model)), signal_map, max_age)
+    return replay_to_bag(Path(bag), predictor, Path(out), with_inputs, on_progress)
+
+
+def diagnose(
+    recordings: Log | Sequence[Log],
+    vehicle: Vehicle | PathLike,
+    horizon: float = 0.5,
+    holdout: float = 0.25,
+    min_speed: float | None = None,
+    integrator: Integrator | None = None,
+    track: Track | PathLike | None = None,
+    commands: Commands | None = None,
+    on_progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Finds out what the simulation gets wrong about measured laps, and why.
+
+    Args:
+        recordings: of one car.
+        vehicle: the simulated car; how well it is known decides whether a coefficient that has to move is a cause.
+        horizon: time that is simulated from a measured state on (s).
+        holdout: share at the end that only measures the improvement; whole laps if there are three.
+        min_speed: stretches below are left out (m/s); if not given, 5 for full-size cars, else 0.
+        integrator: of the simulation; if not given, Runge-Kutta unless Euler is clearly closer to the data.
+        track: from whose start positions on the lap are counted; if not given, the first full lap.
+        commands: source of the command inputs; the recording's own if not given.
+        on_progress: called with what is being done.
+
+    Example:
+        >>> hidden = {"steering_offset": {"offset": 0.03}}
+        >>> laps = recorded(simulate("orca", "club", duration=40.0, plant="rk4", effects=hidden))
+        >>> [cause.effect for cause in diagnose(laps, "orca", integrator="rk4").causes]
+        ['steering_offset']
+    """
+    require("diagnose", "train")
+    from dynssm_ros.identification.diagnose import diagnose
+
+    line = None if track is None else _track(track).centre
+    say = on_progress or (lambda words: None)
+    data = _joined(recordings, commands, 0.0)
+    return diagnose(data, _vehicle(vehicle), horizon, holdout, min_speed, integrator, line, say)
+
+
+def race(
+    vehicle: Vehicle | PathLike,
+    track: Track | PathLike,
+    models: Sequence[str],
+    plant: PlantKind = "rk4",
+    objective: Objective = "tracking",
+    laps: int = 1,
+    line: str = "racing",
+    speed_scale: float = 1.0,
+    horizon: int | None = None,
+    along_horizon: bool = False,
+    offset_free: bool = False,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
+    scale: float | None = None,
+    lap_length: float | None = None,
+    start: float = 0.0,
+    start_offset: float = 0.0,
+    start_speed: float | None = None,
+    on_progress: Callable[[int, int, str], None] | None = None,
+) -> list[Race]:
+    """Drives laps in closed loop: a predictive controller with each model in turn, on a simulated car.
+
+    Args:
+        vehicle: the car.
+        track: where.
+        models: ``true`` (the plant's own), vehicle files, model folders, or names of baselines.
+        plant: ``euler``, ``rk4`` or ``double_track``.
+        objective: ``tracking`` follows the line at its own speed; ``progress`` goes as far as the borders allow.
+        laps: to drive.
+        line: ``centre``, ``racing``, or a file ``s_m,x_m,y_m,v_mps`` with its own speed.
+        speed_scale: share of the car's limits in the line's speed; of a file, factor on it.
+        horizon: steps of T_s that are planned ahead; as the car needs if not given.
+        along_horizon: read the models anew at every step of the horizon.
+        offset_free: follow what each model mispredicts, and add it.
+        effects: physics that the plant has and no model but ``true`` knows, by name, with parameters.
+        scale: of the track.
+        lap_length: or the length that it is scaled to (m).
+        start: where the car starts on the centre line (m).
+        start_offset: how far left of the line it starts (m).
+        start_speed: how fast (m/s), 0 from standstill; the line's own speed if not given.
+        on_progress: called with millimetres driven and the model's name.
+
+    Example:
+        >>> (lap,) = race("orca", "club", ["true"], speed_scale=0.8)
+        >>> lap.completed, lap.outside
+        (True, 0.0)
+    """
+    require("race", "race")
+    from dynssm_ros.control.race import Course, Start, race
+    from dynssm_ros.control.race_models import load_prediction_model
+    from dynssm_ros.control.reference import load_reference
+    from dynssm_ros.control.settings import Settings
+
+    car = _vehicle(vehicle)
+    driven = car.with_effects((name, dict(values)) for name, values in (effects or {}).items())
+    road = _sized(_track(track), scale, lap_length)
+    for text in models:
+        if list(models).count(text) > 1:
+            raise ConfigurationError(f"--model {text}: given twice; expected different models")
+    opened = {text: load_prediction_model(text, car, driven, plant, along_horizon) for text in models}
+    for name, model in disambiguated(opened, lambda model: model.name).items():
+        model.name = name
+    reference = load_reference(line, car, road, speed_scale)
+    settings = Settings.of(car, objective, horizon, offset_free)
+    course = Course(driven, road, plant, reference, settings, laps, Start(start, start_offset, start_speed))
+    races = []
+    for k, model in enumerate(opened.values()):
+
+        def report(done: int, total: int, words: str, k: int = k) -> None:
+            if on_progress is not None:
+                on_progress(k * total + done, len(opened) * total, words)
+
+        races.append(race(course, model, report))
+    return races
+
+
+def recorded(run: Run) -> Recording:
+    """A simulated drive as a recording, as if it had been written to a bag and extracted.
+
+    Example:
+        >>> len(recorded(simulate("orca", "club", duration=1.0)))
+        51
+    """
+    from dynssm_ros.simulation.laps import as_recording
+
+    return as_recording(run)
+
+
+def _vehicle(vehicle: Vehicle | PathLike) -> Vehicle:
+    return vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+
+
+def _recording(log: Log) -> Recording:
+    return log if isinstance(log, Recording) else Recording.load(log)
+
+
+def _joined(logs: Log | Sequence[Log], commands: Commands | None, holdout: float) -> Recording:
+    """Recordings one after the other, each without its last fraction ``holdout``."""
+    several = [logs] if isinstance(logs, (Recording, str, Path)) else list(logs)
+    return concatenate([_recording(log).with_commands(commands).split_last(holdout)[0] for log in several])
+
+
+def _track(track: Track | PathLike) -> Track:
+    from dynssm_ros.track.tracks import Track, load_track
+
+    return track if isinstance(track, Track) else load_track(track)
+
+
+def _sized(track: Track, scale: float | None, lap_length: float | None) -> Track:
+    """The track at the size asked for."""
+    if scale is not None and lap_length is not None:
+        raise ConfigurationError(f"--scale {scale:g} and --lap-length {lap_length:g}; expected one of them")
+    if lap_length is not None:
+        scale = lap_length / track.length
+    return track if scale is None else track.scaled(scale)
+
+
+def _centre_line(track: Track | PathLike, log: Recording) -> Any:
+    """The centre line of a track on which the recording was driven."""
+    import numpy as np
+
+    road = _track(track)
+    if not log.has_pose:
+        raise ConfigurationError(f"--track {track}: the recording holds no positions (x, y) to place on it")
+    _, lateral = road.project(np.stack([log["x"], log["y"]], axis=1))
+    away, width = float(np.median(np.abs(lateral))), float(np.mean(road.width_left + road.width_right))
+    if away > width:
+        raise ConfigurationError(
+            f"--track {track}: the recording lies {away:.3g} m (median) from its centre line; expected the same "
+            f"coordinates, so at most the track's width of {width:.3g} m"
+        )
+    return road.centre

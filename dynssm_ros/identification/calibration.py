@@ -1,0 +1,172 @@
+"""Calibration: the nominal coefficients of a vehicle from measured laps, with their uncertainty.
+
+It is a diagnosis without candidates: the same prediction errors, noise model and covariance. Simulations of half a second
+start all along the recording. Their errors are whitened by the noise of measurement, start and disturbances that is
+estimated with them. What the vehicle file knows of a coefficient (its standard deviation, else its bounds) is its prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.identification.car import Car
+from dynssm_ros.identification.problem import Fit, Study
+from dynssm_ros.identification.windows import Windows, fit_windows, recorded_rows
+from dynssm_ros.signals.context import recording_context
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
+from dynssm_ros.vehicle.effects import require_context
+from dynssm_ros.vehicle.single_track import Integrator
+
+Progress = Callable[[int, int], None]
+
+HORIZON_S = 0.5
+_SEARCHED = 4000  # rows with which a starting point is judged
+_SEARCH_PRIOR, _POLISHED = 0.1, 3  # weight of what is known before, at first; rounds that find it
+_INSIDE = 1e-6  # of the range, that a starting point keeps from its bounds
+_WEIGHT_SHOWN = 0.25  # least weight of a coefficient in a direction that the data do not determine
+_ON_BOUND = 1e-6  # of the range in units of a fit
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the data say of the coefficients.
+
+    Attributes:
+        vehicle: the vehicle with calibrated nominal values and their standard deviations.
+        theta: coefficients ``(17,)``; ``std`` their standard deviations, at most those known before.
+        on_bound: names of coefficients that the data push against a bound.
+        unidentified: combinations that the data determine less well than was known before, as ``{coefficient: weight}`` in
+            units of what was known.
+        rmse_before: one-step RMSE ``(3,)`` with the former nominal values; ``rmse_after`` with the calibrated ones.
+        rows: number of prediction errors used per channel.
+        horizon: length of the simulations (s).
+    """
+
+    vehicle: Vehicle
+    theta: Vector
+    std: Vector
+    on_bound: tuple[str, ...]
+    unidentified: tuple[dict[str, float], ...]
+    rmse_before: Vector
+    rmse_after: Vector
+    rows: int
+    horizon: float
+
+
+def calibrate(
+    recording: Recording,
+    vehicle: Vehicle,
+    horizon: float = HORIZON_S,
+    min_speed: float | None = None,
+    integrator: Integrator = "euler",
+    starts: int = 3,
+    seed: int = 0,
+    on_progress: Progress | None = None,
+) -> Calibration:
+    """Fits the nominal coefficients within their bounds; mass and geometry stay.
+
+    Args:
+        recording: measured or simulated laps.
+        vehicle: start values, bounds and what is known before; its effects are part of the model.
+        horizon: length of the simulations that are compared with the laps (s).
+        min_speed: rows that are slower are left out (m/s); ``None``: the vehicle file's.
+        integrator: of the model: ``euler`` steps of T_s as in the paper, or ``rk4``.
+        starts: starting points: the nominal values, the middle of the bounds, then seeded random ones.
+        seed: of the random starting points.
+        on_progress: called after each starting point.
+
+    Raises:
+        RecordingError: another sampling time than the vehicle's, or too few rows.
+        ConfigurationError: an effect of the vehicle needs a signal that the recording does not have.
+    """
+    recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
+    context = recording_context(recording)
+    require_context(vehicle.active_effects, context, f"recording {', '.join(recording.info.source)}")
+    speed = vehicle.minimum_speed if min_speed is None else min_speed
+    data = recorded_rows(recording, context)
+    windows = fit_windows(recording, data, horizon, speed, len(recording))
+    given = Car.of(vehicle, mass_std=0.0)
+    single = recording.window_ends(1, horizon=1, min_speed=speed)
+    one_step = Windows(data, single, 1, 0).stepping(integrator, vehicle)
+    near = _nearest_start(one_step, given, _starting_points(vehicle, starts, seed), on_progress)
+    study = Study(windows.stepping(integrator, vehicle.with_nominal(np.array(near.theta))), near)
+    # what is known before counts from here on, so the nominal values are a starting point again
+    fit = min((study.fit(car, ()) for car in (near, given)), key=lambda fit: fit.objective)
+    if on_progress is not None:
+        on_progress(starts + 1, starts + 1)
+    theta = np.array(fit.car.theta)
+    relative = np.minimum(np.sqrt(np.diag(study.covariance(fit)))[: len(COEFFICIENTS)], 1.0)
+    std = fit.car.in_units(relative)
+    lower, upper = (limit[: len(COEFFICIENTS)] for limit in given.limits)
+    held = (fit.position[: len(COEFFICIENTS)] <= lower + _ON_BOUND) | (
+        fit.position[: len(COEFFICIENTS)] >= upper - _ON_BOUND
+    )
+    before, after = (np.sqrt((one_step.errors(car)[:, 0] ** 2).mean(axis=0)) for car in (given, fit.car))
+    return Calibration(
+        vehicle.with_nominal(theta, std),
+        theta,
+        std,
+        tuple(name for name, on in zip(COEFFICIENTS, held, strict=True) if on),
+        _unidentified(study, fit),
+        before,
+        after,
+        windows.target.shape[0] * windows.target.shape[1],
+        windows.steps * recording.T_s,
+    )
+
+
+def _nearest_start(one_step: Windows, given: Car, points: list[Vector], on_progress: Progress | None) -> Car:
+    """The car from which the fit is to begin: the best of robust fits of one-step errors from each of the points.
+
+    Far from the truth the noise model would take a wrong car for a disturbed one. Here errors are in units of the
+    increments. What is known before is weighed with the errors that are left, found by a few rounds.
+    """
+    some = one_step.select(np.arange(0, len(one_step), max(1, len(one_step) // _SEARCHED)))
+    rows = some.data.rows
+    scale = np.maximum((rows[:3, some.starts + 1] - rows[:3, some.starts]).std(axis=1), 1e-12)
+    lower, width = given.vehicle.lower, given.vehicle.upper - given.vehicle.lower
+
+    def fitted(start: Vector, prior: float, tolerance: float, evaluations: int) -> optimize.OptimizeResult:
+        def residuals(p: Vector) -> Vector:
+            car = given.at(lower + p * width)
+            return np.concatenate([(some.errors(car)[:, 0] / scale).ravel(), prior * car.moved])
+
+        inside = np.clip(start, _INSIDE, 1.0 - _INSIDE)
+        return optimize.least_squares(
+            residuals, inside, bounds=(0.0, 1.0), loss="soft_l1", x_scale="jac", ftol=tolerance, xtol=tolerance,
+            gtol=tolerance, max_nfev=evaluations,
+        )  # fmt: skip
+
+    found = []
+    for number, theta in enumerate(points, 1):
+        found.append(fitted((theta - lower) / width, _SEARCH_PRIOR, 1e-5, 60))
+        if on_progress is not None:
+            on_progress(number, len(points) + 1)
+    best = min(found, key=lambda fit: float(fit.cost))
+    for _ in range(_POLISHED):
+        left = float(np.median(np.abs(best.fun[: 3 * len(some)])))
+        best = fitted(best.x, left, 1e-12, 300)
+    return given.at(lower + best.x * width)
+
+
+def _starting_points(vehicle: Vehicle, count: int, seed: int) -> list[Vector]:
+    """The nominal values, the middle of the bounds, then random points well inside them."""
+    random, width = np.random.default_rng(seed), vehicle.upper - vehicle.lower
+    drawn = (vehicle.lower + random.uniform(0.1, 0.9, len(width)) * width for _ in range(count - 2))
+    return [vehicle.nominal, (vehicle.lower + vehicle.upper) / 2, *drawn][:count]
+
+
+def _unidentified(study: Study, fit: Fit) -> tuple[dict[str, float], ...]:
+    """Eigenvectors of the information with less of it than was known before."""
+    information = study.information(fit)[: len(COEFFICIENTS), : len(COEFFICIENTS)]
+    values, vectors = np.linalg.eigh(information)
+    return tuple(
+        {COEFFICIENTS[k]: round(float(v), 2) for k, v in enumerate(vectors[:, d]) if abs(v) > _WEIGHT_SHOWN}
+        for d in np.flatnonzero(values < 1.0)
+    )

@@ -1,0 +1,47 @@
+"""Calibration with effects that read signals beside state and inputs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.identification.calibration import calibrate
+from dynssm_ros.identification.car import Car
+from dynssm_ros.identification.windows import Windows, recorded_rows
+from dynssm_ros.signals.context import recording_context
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.simulation.laps import as_recording, simulate
+from dynssm_ros.track.tracks import load_track
+from dynssm_ros.vehicle import Vehicle, load_vehicle
+
+AV21 = load_vehicle("av21")
+WIND, FADE = ("crosswind", {"x": 2.0, "y": 8.0}), ("grip_drift", {"rate": -0.003})
+
+
+@pytest.fixture(scope="module")
+def windy() -> Recording:
+    """A car in wind whose grip fades, with its pose; the signals of the track are not recorded."""
+    car = AV21.with_effect(*WIND).with_effect(*FADE)
+    return as_recording(simulate(car, load_track("road_course"), duration=30.0))
+
+
+def errors(recording: Recording, car: Vehicle) -> np.ndarray:
+    data = recorded_rows(recording, recording_context(recording))
+    return Windows(data, recording.window_ends(1, horizon=3), 3, 0, "euler").errors(Car.of(car))
+
+
+def test_time_and_heading_are_known(windy: Recording) -> None:
+    assert np.abs(errors(windy, AV21.with_effect(*WIND).with_effect(*FADE))).max() < 1e-9
+    assert np.abs(errors(windy, AV21)).max() > 1e-3
+
+
+def test_the_signal_that_the_recording_has_not_is_named(windy: Recording) -> None:
+    patchy = AV21.with_effect("grip_patch", {"factor": 0.7})
+    with pytest.raises(ConfigurationError, match=r"effect grip_patch needs the signal s \(m\)"):
+        calibrate(windy, patchy)
+    lap = {"s": np.linspace(0, 300, len(windy)), "lap_length": np.full(len(windy), 1000.0)}
+    placed = replace(windy, columns=windy.columns | lap)
+    assert np.isfinite(calibrate(placed, patchy, starts=1).theta).all()
