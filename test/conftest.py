@@ -77,6 +77,8 @@ def small_model(laps_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     from dynssm_ros.signals.signal_map import load_signal_map
     from dynssm_ros.vehicle import load_vehicle
 
+    from dynssm_ros.learning.models.registry import parse_model_config
+
     config = parse_model_config(
         {
             "name": "small",

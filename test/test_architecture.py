@@ -25,7 +25,7 @@ FLOORS = (  # lowest first; a room imports itself and the floors below, never an
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
-GROUND = {"arrays", "configuration", "errors", "files"}  # for all rooms, so they import none
+GROUND = {"arrays", "configuration", "errors", "extras", "files"}  # for all rooms, so they import none
 TOP = {"__init__", "api"}  # the Python API: over all rooms but those that call it
 
 ROS = {
@@ -53,7 +53,7 @@ def imports(source: str, module: str, is_package: bool = False) -> Iterator[tupl
 
 def floor_of(module: str) -> int:
     """The floor of a module; those beside the rooms are below all, the API below the nodes and the command line."""
-    room = (module.split(".") + [""])[1]
+    room = [*module.split("."), ""][1]
     if room in TOP:
         return FLOOR["nodes"]
     return FLOOR.get(room, -1)

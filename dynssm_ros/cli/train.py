@@ -48,8 +48,8 @@ def train(
         console.print(f"continued from epoch {trained.resumed_from}")
     v_x, v_y, omega = trained.validation_rmse
     console.print(
-        f"{artifact.path}: {artifact.card.parameters} parameters, best epoch {trained.best_epoch}, seed {trained.config.training.seed}; "
-        f"one-step RMSE on {trained.windows[1]} validation windows: v_x {v_x:.4g} m/s, v_y {v_y:.4g} m/s, "
-        f"omega {omega:.3g} rad/s (commands: {artifact.card.commands})",
+        f"{artifact.path}: {artifact.card.parameters} parameters, best epoch {trained.best_epoch}, "
+        f"seed {trained.config.training.seed}; one-step RMSE on {trained.windows[1]} validation windows: v_x {v_x:.4g} m/s, "
+        f"v_y {v_y:.4g} m/s, omega {omega:.3g} rad/s (commands: {artifact.card.commands})",
         soft_wrap=True,
     )

@@ -20,6 +20,7 @@ from dynssm_ros.signals.bags import BagMessage, open_bag
 
 MATCH_TIMEOUT = 10.0  # s
 _SETTLE = 0.3  # s; the listener's side of a match comes a moment after ours
+_LINGER = 1.0  # s after the last message; best-effort delivery tells no publisher when it is done
 _SPIN_BELOW = 1e-3  # s; shorter waits are not worth a sleep
 
 
@@ -121,7 +122,14 @@ class PlayerNode(Node):
                 if not rclpy.ok():
                     return
             if not self.loop:
+                self._linger()
                 return
+
+    def _linger(self) -> None:
+        """Stays until listeners have taken the last messages: what this process shares with them goes when it ends."""
+        end = time.monotonic() + _LINGER
+        while rclpy.ok() and time.monotonic() < end:
+            rclpy.spin_once(self, timeout_sec=0.1)
 
 
 def main(args: list[str] | None = None) -> None:

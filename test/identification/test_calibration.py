@@ -186,7 +186,7 @@ def test_too_few_rows_are_refused(drive: Drive, orca: Vehicle) -> None:
         RecordingError, match=r"drive 0: 14 stretches of 0\.52 s at 0 m/s or more; expected at least 24"
     ):
         calibrate(drive(orca, 400), orca)
-    with pytest.raises(RecordingError, match="0 stretches of 0.52 s at 50 m/s or more"):
+    with pytest.raises(RecordingError, match=r"0 stretches of 0\.52 s at 50 m/s or more"):
         calibrate(drive(orca, 1500), orca, min_speed=50.0)
 
 
