@@ -90,7 +90,7 @@ class Controller:
         self._model = model
         self._track = track
         self._clock = clock
-        horizon = HorizonModel(model.car, settings.N, settings.travel)
+        horizon = HorizonModel(model.car, settings.N, settings.travel, settings.scale.length / settings.scale.time)
         self._nmpc = Nmpc(horizon, limits, reference, track, settings, clock)
         self._disturbance = Disturbance.of(settings, model.car.T_s)
         self._history: deque[Vector] = deque(maxlen=max(model.H, 1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,15 @@ from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehic
 from dynssm_ros.vehicle.effects.base import SLOWEST
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose
 from dynssm_ros.vehicle.low_speed import LowSpeedRolling
-from dynssm_ros.vehicle.single_track import Constants, Integrator, StageEffect, at_least, step_with_memory
+from dynssm_ros.vehicle.single_track import (
+    Constants,
+    Integrator,
+    StageEffect,
+    at_least,
+    motion,
+    step_with_memory,
+    true_state,
+)
 
 STATES = ("x", "y", "theta", "v_x", "v_y", "omega", "r", "delta")
 """Pose (m, m, rad), velocities (m/s, m/s, rad/s), what the actuators do (fraction, rad). The effects' own follow."""
@@ -67,6 +75,18 @@ class Car:
         return tuple(name for effect in self.effects for name in effect.carries)
 
 
+class _Symbols(NamedTuple):
+    """State and parameters of a step as casadi symbols."""
+
+    pose: Pose
+    state: State
+    applied: Applied
+    memory: dict[str, Any]
+    theta: Coefficients
+    correction: State
+    context: dict[str, Any]
+
+
 class HorizonModel:
     """One step of ``car`` and its Jacobians, for all steps of a horizon at once.
 
@@ -77,9 +97,10 @@ class HorizonModel:
         car: what is stepped.
         N: steps of the horizon.
         travel: what carries the pose; a matter of the world, and not of what a model knows of the car.
+        slowest: speed (m/s) up to which slip angles are those of this speed; slower wheels roll.
     """
 
-    def __init__(self, car: Car, N: int, travel: Travel = "middle") -> None:
+    def __init__(self, car: Car, N: int, travel: Travel = "middle", slowest: float = SLOWEST) -> None:
         self.car = car
         self.N = N
         self._travel = travel
@@ -91,6 +112,8 @@ class HorizonModel:
         outputs = [following, ca.jacobian(following, x), ca.jacobian(following, u)]
         self._step = ca.Function("step", [x, u, p], [following])
         self._stages = ca.Function("stage", [x, u, p], [ca.densify(each) for each in outputs]).map(N)
+        slips = self._slip_angles(x, p, slowest)
+        self._slips = ca.Function("slip", [x, p], [slips, ca.densify(ca.jacobian(slips, x))]).map(N)
 
     def step(self, x: Vector, u: Vector, p: Vector) -> Vector:
         """The state one step on, shape ``(size,)``.
@@ -120,29 +143,63 @@ class HorizonModel:
             by_u.reshape(self.size, self.N, len(INPUTS)).transpose(1, 0, 2),
         )
 
+    def slip_angles(self, x: Vector, p: Vector) -> tuple[Vector, Vector]:
+        """Slip angles of front and rear axle (rad) as the model has them, effects and shifts included.
+
+        Args:
+            x: states, shape ``(N, size)``.
+            p: parameters, shape ``(N, PARAMETERS)``.
+
+        Returns:
+            Shapes ``(N, 2)``, and ``(N, 2, size)`` of the Jacobian by the state.
+        """
+        slips, by_x = (np.asarray(each) for each in self._slips(x.T, p.T))
+        return slips.T, by_x.reshape(2, self.N, self.size).transpose(1, 0, 2)
+
+    def _slip_angles(self, x: Any, p: Any, slowest: float) -> Any:
+        import casadi as ca
+
+        car, at = self.car, self._split(x, p, slowest)
+        state = true_state(ca, at.state, car.effects, at.memory)
+        q = motion(ca, state, at.applied, at.theta, car.constants, car.effects, at.memory, at.context, car.T_s)
+        return ca.vertcat(q.alpha_f, q.alpha_r)
+
+    def _split(self, x: Any, p: Any, slowest: float) -> _Symbols:
+        """State and parameters as the equations take them, with at least ``slowest`` (m/s) of speed."""
+        import casadi as ca
+
+        x_pos, y_pos, heading, *moving = ca.vertsplit(x)
+        parameters = iter(ca.vertsplit(p))
+        theta, correction, context = (list(islice(parameters, n)) for n in (len(COEFFICIENTS), 3, len(CONTEXT)))
+        return _Symbols(
+            Pose(x_pos, y_pos, heading),
+            State(at_least(moving[0], slowest), *moving[1:3]),
+            Applied(*moving[3:5]),
+            dict(zip(self.car.memory, moving[5:], strict=True)),
+            Coefficients(*theta),
+            State(*correction),
+            {"x": x_pos, "y": y_pos, "theta": heading, **dict(zip(CONTEXT, context, strict=True))},
+        )
+
     def _following(self, x: Any, u: Any, p: Any) -> Any:
         import casadi as ca
 
-        car = self.car
-        x_pos, y_pos, heading, *motion = ca.vertsplit(x)
-        # standing still the slip angles have no derivative
-        now, applied = State(at_least(motion[0], SLOWEST), *motion[1:3]), Applied(motion[3] + u[0], motion[4] + u[1])
-        parameters = iter(ca.vertsplit(p))
-        theta, correction, context = (list(islice(parameters, n)) for n in (len(COEFFICIENTS), 3, len(CONTEXT)))
+        car, at = self.car, self._split(x, p, SLOWEST)  # standing still the slip angles have no derivative
+        now, applied = at.state, Applied(at.applied.r + u[0], at.applied.delta + u[1])
         state, memory = step_with_memory(
             ca,
             now,
-            dict(zip(car.memory, motion[5:], strict=True)),
+            at.memory,
             applied,
-            Coefficients(*theta),
+            at.theta,
             car.constants,
             car.T_s,
             car.effects,
             car.integrator,
             car.substeps,
-            {"x": x_pos, "y": y_pos, "theta": heading, **dict(zip(CONTEXT, context, strict=True))},
+            at.context,
         )
-        state = State(*(value + by for value, by in zip(state, correction, strict=True)))
+        state = State(*(value + by for value, by in zip(state, at.correction, strict=True)))
         share = 0.5 if self._travel == "middle" else 0.0
-        pose = advance_pose(ca, Pose(x_pos, y_pos, heading), now, state, car.T_s, share)
+        pose = advance_pose(ca, at.pose, now, state, car.T_s, share)
         return ca.vertcat(*pose, *state, *applied, *(memory[name] for name in car.memory))

@@ -199,11 +199,12 @@ class Nmpc:
     def _improved(self, now: Vector, guess: Plan, adapted: Adapted, t: float) -> Plan | None:
         """The solution of the program around ``guess``; ``None`` if there is none."""
         x = np.concatenate([now[None], guess.x[1:]])
-        following, by_x, by_u = self.model.linearised(x[:-1], guess.u, self._parameters(adapted, t))
+        p = self._parameters(adapted, t)
+        following, by_x, by_u = self.model.linearised(x[:-1], guess.u, p)
         if not all(np.all(np.isfinite(each)) for each in (following, by_x, by_u)):
             return None
         offset, slope = _condensed(x, guess.u, following, by_x, by_u)
-        program = self._program(now, x, offset, slope)
+        program = self._program(now, x, offset, slope, p)
         if not all(np.all(np.isfinite(each)) for each in program[:3]):
             return None
         solution = self._solver(
@@ -216,7 +217,7 @@ class Nmpc:
             return None
         return Plan(states, u.reshape(-1, len(INPUTS)))
 
-    def _program(self, now: Vector, guess: Vector, offset: Vector, slope: Vector) -> _Program:
+    def _program(self, now: Vector, guess: Vector, offset: Vector, slope: Vector, p: Vector) -> _Program:
         """The program in increments and slacks; states are ``offset + slope @ increments``."""
         N, w = self.settings.N, self.settings.weights
         positions, moves = offset[1:, :2], slope[1:, :2]
@@ -245,7 +246,7 @@ class Nmpc:
             A[rows, k : 2 * N : 2] = np.tri(N)
             low[rows], high[rows] = bounds[0] - held, bounds[1] - held
         self._add_borders(A[2 * N : 4 * N], low[2 * N : 4 * N], high[2 * N : 4 * N], guess, positions, moves)
-        self._add_slip(A[4 * N : 8 * N], high[4 * N : 8 * N], offset[1:], slope[1:])
+        self._add_slip(A[4 * N : 8 * N], high[4 * N : 8 * N], guess[1:], offset[1:], slope[1:], p)
         if w.ending > 0:
             A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -length / self.settings.scale.time
             high[-1] = float(self._reference.speed_at(at[-1])) - offset[-1, V_X]
@@ -256,21 +257,20 @@ class Nmpc:
         z_high = np.concatenate([np.tile([span, reach], N), np.full(N + 1, np.inf)])
         return _Program(H, g, A, low, high, z_low, z_high)
 
-    def _add_slip(self, A: Vector, high: Vector, x: Vector, slope: Vector) -> None:
-        """The slip angles (rad) of both axles at the states ``x``, shape ``(N, size)``, within their bounds on both sides."""
-        N, car, scale = self.settings.N, self.model.car.constants, self.settings.scale
-        v_x, v_y, omega = x[:, V_X : V_X + 3].T
-        along = np.maximum(v_x, scale.length / scale.time)  # slower wheels roll, and no line is close to their angle
-        for k, (place, steered) in enumerate(((car.l_f, 1.0), (-car.l_r, 0.0))):
-            across = v_y + place * omega
-            slip = steered * x[:, DELTA] - np.arctan2(across, along)
-            by_along, by_across = (part[:, None] / (along**2 + across**2)[:, None] for part in (across, -along))
-            by_u = by_along * slope[:, V_X] + by_across * (slope[:, V_X + 1] + place * slope[:, V_X + 2])
-            by_u += steered * slope[:, DELTA]
-            rows, bound = slice(2 * k * N, 2 * (k + 1) * N), self.settings.slip[k]
+    def _add_slip(self, A: Vector, high: Vector, guess: Vector, offset: Vector, slope: Vector, p: Vector) -> None:
+        """The slip angles (rad) of both axles after each step, within their bounds on both sides.
+
+        They are the model's own, linearised at the guessed states ``(N, size)``.
+        """
+        N = self.settings.N
+        slips, by_x = self.model.slip_angles(guess, p)
+        slips = slips + np.einsum("kas,ks->ka", by_x, offset - guess)
+        for axle, bound in enumerate(self.settings.slip):
+            by_u = np.einsum("ks,ksj->kj", by_x[:, axle], slope)
+            rows = slice(2 * axle * N, 2 * (axle + 1) * N)
             A[rows, : 2 * N] = np.concatenate([by_u, -by_u])
             A[rows, 2 * N : 3 * N] = -np.tile(np.eye(N), (2, 1))
-            high[rows] = np.concatenate([bound - slip, bound + slip])
+            high[rows] = np.concatenate([bound - slips[:, axle], bound + slips[:, axle]])
 
     def _reference_points(self, guess: Vector) -> Vector:
         """Where on the line the steps of the horizon are compared with it (m), shape ``(N,)``."""

@@ -83,3 +83,22 @@ def test_every_effect_acts_and_can_be_differentiated(orca, acting, name):
     assert np.all(np.isfinite(by_x))
     if name != "odometry_delay":
         assert not np.allclose(following[0, :8], plain, rtol=1e-9, atol=0)
+
+
+def test_slip_angles_are_those_of_the_physics_with_shifts_and_effects(orca):
+    """Closed form, and what an effect on the steering changes; the Jacobian by differences."""
+    car = orca.with_effect("steering_offset", {"offset": 0.02})
+    model = HorizonModel(Car.of(car), 2)
+    x = np.zeros((2, model.size))
+    x[:, 3:8] = [[1.9, 0.03, 1.5, 0.3, 0.1], [2.4, -0.1, -2.0, 0.2, -0.05]]
+    p = np.tile(parameters(car), (2, 1)) if parameters(car).ndim == 1 else parameters(car)[:2]
+    slips, by_x = model.slip_angles(x, p)
+    theta, c = Coefficients(*car.nominal), car.constants
+    v_x, v_y, omega, delta = x[:, 3], x[:, 4], x[:, 5], x[:, 7]
+    front = delta + 0.02 - np.arctan2(v_y + c.l_f * omega, v_x) + theta.S_hf
+    rear = np.arctan2(c.l_r * omega - v_y, v_x) + theta.S_hr
+    np.testing.assert_allclose(slips, np.stack([front, rear], axis=1), atol=1e-12)
+    for k in range(model.size):
+        moved = x.copy()
+        moved[:, k] += 1e-6
+        np.testing.assert_allclose((model.slip_angles(moved, p)[0] - slips) / 1e-6, by_x[:, :, k], atol=1e-5)
