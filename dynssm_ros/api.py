@@ -371,9 +371,9 @@ def diagnose(
     from dynssm_ros.identification.diagnose import diagnose
 
     line = None if track is None else _track(track).centre
-    say = on_progress or (lambda words: None)
+    report = on_progress or (lambda words: None)
     data = _joined(recordings, commands, 0.0)
-    return diagnose(data, _vehicle(vehicle), horizon, holdout, min_speed, integrator, line, say)
+    return diagnose(data, _vehicle(vehicle), horizon, holdout, min_speed, integrator, line, report)
 
 
 def race(

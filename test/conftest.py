@@ -72,12 +72,11 @@ def laps_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def small_model(laps_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a small DynSSM, trained for two epochs on ``laps_bag`` (T_s 0.02 s, H 5, commands from topics)."""
     from dynssm_ros.learning.export import save_artifact
+    from dynssm_ros.learning.models.registry import parse_model_config
     from dynssm_ros.learning.stages import train
     from dynssm_ros.signals.extraction import extract
     from dynssm_ros.signals.signal_map import load_signal_map
     from dynssm_ros.vehicle import load_vehicle
-
-    from dynssm_ros.learning.models.registry import parse_model_config
 
     config = parse_model_config(
         {

@@ -38,7 +38,7 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
         f"Made by `python -m doit -f benchmarks/hidden_causes/dodo.py seed={seed}`: {len(outcomes)} simulated drives "
         f"with hidden effects, seeds {seed} to {seed + len(of) - 1}"
         + (f", without {undriven} whose car could not be driven" if undriven else "")
-        + ". How they are drawn and what counts as just noticeable: `benchmarks/hidden_causes/cases.py`."
+        + ". How they are drawn and what counts as just minimum_detectable: `benchmarks/hidden_causes/cases.py`."
     )
     yield ""
     yield f"| rate | cases | share | 95 % interval | goal | {' | '.join(_PLANTS.values())} |"

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.evaluation.spread import Spread
+from dynssm_ros.evaluation.spread import SeedSpread
 from dynssm_ros.reporting.evaluation_figures import NO_MODEL, PALETTE, STYLE, SYMBOLS, WIDTH
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
@@ -46,7 +46,7 @@ def against_persistence(relative: Mapping[str, Mapping[str, Vector]]) -> Figure:
     return figure
 
 
-def against_the_full_model(full: Sequence[Spread], ablations: Mapping[str, Sequence[Spread]]) -> Figure:
+def against_the_full_model(full: Sequence[SeedSpread], ablations: Mapping[str, Sequence[SeedSpread]]) -> Figure:
     """One-step RMSE of each ablation as a multiple of the full model's, with the spread over seeds.
 
     Args:

@@ -144,7 +144,7 @@ class Race(StrictModel):
     plant: PlantKind = "euler"
     objective: Objective = "tracking"
     line: str = Field(default="racing", description="centre, racing, or file relative to the data folder")
-    pace: float = Field(default=1.0, gt=0)
+    speed_scale: float = Field(default=1.0, gt=0)
     horizon: int | None = Field(default=None, ge=2, description="null: as the car needs")
     offset_free: bool = Field(default=False, description="whether what a model mispredicts is added to it")
     laps: int = Field(default=1, ge=1)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.paper.document import MADE_BY
 from benchmarks.paper.plan import MID_RANGE, Race
-from benchmarks.paper.race_figures import lap_over_pace
+from benchmarks.paper.race_figures import lap_over_speed_scale
 from benchmarks.paper.reference import ClosedLoop
 from benchmarks.paper.results import Entry, Results
 from benchmarks.paper.schedule import race_key
@@ -31,9 +31,9 @@ _CAPTIONS = {
     "profiles": "State and commands over the lap",
     "forces": "Forces over the lap",
     "coefficients": "What each model told the controller over the lap",
-    "pace": "Lap time over the factor on the line's speed; hollow at the top: not completed",
+    "speed_scale": "Lap time over the factor on the line's speed; hollow at the top: not completed",
 }
-_SWEEP = 3  # races that differ in nothing but their pace and make a figure together
+_SWEEP = 3  # races that differ in nothing but their speed_scale and make a figure together
 _DPI = 130
 
 
@@ -47,18 +47,18 @@ def write_races(results: Results, root: Path, path: Path) -> None:
             with replacing(path.with_name(pictures[name][figure])) as aside:
                 shutil.copyfile(root / race_key(name) / f"{figure}.png", aside)
     for names in _sweeps(results):
-        pictures[names[-1]]["pace"] = f"{path.stem}_{names[0]}_pace.png"
-        with replacing(path.with_name(pictures[names[-1]]["pace"])) as aside:
+        pictures[names[-1]]["speed_scale"] = f"{path.stem}_{names[0]}_pace.png"
+        with replacing(path.with_name(pictures[names[-1]]["speed_scale"])) as aside:
             _over_pace(results, names).savefig(aside, format="png", dpi=_DPI, metadata={"Software": None})
     with replacing(path) as aside:
         aside.write_text(races_markdown(results, pictures), encoding="utf-8")
 
 
 def _sweeps(results: Results) -> list[list[str]]:
-    """Names of measured races that differ in nothing but their pace, in the plan's order."""
+    """Names of measured races that differ in nothing but their speed_scale, in the plan's order."""
     alike: dict[str, list[str]] = {}
     for name in results.races:
-        told_apart = {"title", "text", "paper", "pace", "figures"}
+        told_apart = {"title", "text", "paper", "speed_scale", "figures"}
         alike.setdefault(results.plan.races[name].model_dump_json(exclude=told_apart), []).append(name)
     return [names for names in alike.values() if len(names) >= _SWEEP]
 
@@ -67,19 +67,21 @@ def _over_pace(results: Results, names: list[str]) -> Figure:
     """Their lap times, what the line allows, and the paper's."""
     races, driven = [results.plan.races[name] for name in names], [results.races[name] for name in names]
     models = [model for model in races[0].models if model in driven[0]["models"]]
-    over = list(zip((race.pace for race in races), driven, strict=True))
+    over = list(zip((race.speed_scale for race in races), driven, strict=True))
     laps = {
-        _NAMES.get(model, model): {pace: entry["models"][model]["lap_time_s"] for pace, entry in over}
+        _NAMES.get(model, model): {speed_scale: entry["models"][model]["lap_time_s"] for speed_scale, entry in over}
         for model in models
     }
     bounds = {
-        "the line at its own speed": {pace: entry["line_lap_time_s"] for pace, entry in over},
-        "the same with no more than full throttle": {pace: entry["line_full_throttle_s"] for pace, entry in over},
+        "the line at its own speed": {speed_scale: entry["line_lap_time_s"] for speed_scale, entry in over},
+        "the same with no more than full throttle": {
+            speed_scale: entry["line_full_throttle_s"] for speed_scale, entry in over
+        },
     }
     published = {
         f"{name}, the paper's": row.lap_time for race in races for name, row in _published(results, race).items()
     }
-    return lap_over_pace(laps, bounds, {name: lap for name, lap in published.items() if lap is not None})
+    return lap_over_speed_scale(laps, bounds, {name: lap for name, lap in published.items() if lap is not None})
 
 
 def races_markdown(results: Results, pictures: Mapping[str, Mapping[str, str]]) -> str:
@@ -129,7 +131,7 @@ def _course(race: Race, driven: Entry) -> str:
         f"{driven['track']}, {driven['track_length_m']:.4g} m",
         f"plant {driven['plant']}" + (f" with {_effects(race)}" if race.effects else ""),
         f"{driven['objective']} of the {driven['line']} line, which takes {driven['line_lap_time_s']:.3f} s at its own speed"
-        + (f" ({race.pace:g} of it)" if race.pace != 1 else ""),
+        + (f" ({race.speed_scale:g} of it)" if race.speed_scale != 1 else ""),
         f"{driven['horizon']} steps ahead",
     ]
     return "; ".join(parts) + "."

@@ -16,7 +16,7 @@ _CLOSE = 0.3  # s between level lines of which the lower one has its words below
 
 
 @styled
-def lap_over_pace(
+def lap_over_speed_scale(
     laps: Mapping[str, Mapping[float, float | None]],
     bounds: Mapping[str, Mapping[float, float]],
     published: Mapping[str, float],
@@ -42,13 +42,15 @@ def lap_over_pace(
             "markersize": 4 + 2 * (len(laps) - 1 - k),
         }
         paces = sorted(by_pace)
-        values = [by_pace[pace] for pace in paces]
+        values = [by_pace[speed_scale] for speed_scale in paces]
         axes.plot(paces, [np.nan if lap is None else lap for lap in values], label=name, zorder=3 + k / 10, **look)
-        lost = [pace + shift[k] for pace, lap in zip(paces, values, strict=True) if lap is None]
+        lost = [speed_scale + shift[k] for speed_scale, lap in zip(paces, values, strict=True) if lap is None]
         axes.plot(lost, [top] * len(lost), linestyle="", markerfacecolor="none", clip_on=False, **look)
     for style, (words, by_pace) in zip(_STYLES, bounds.items(), strict=False):
         axes.plot(*zip(*sorted(by_pace.items()), strict=True), color=MEASURED, linestyle=style, label=words)
-    left = min(pace for by_pace in laps.values() for pace in by_pace)  # where all are slower than what is published
+    left = min(
+        speed_scale for by_pace in laps.values() for speed_scale in by_pace
+    )  # where all are slower than what is published
     for words, lap in published.items():
         axes.axhline(lap, color=NO_MODEL, linewidth=0.9, zorder=1)
         above = not any(0 < other - lap < _CLOSE for other in published.values())

@@ -60,7 +60,7 @@ class DriveLaps(Step):
         track = load_track(named_track(self.data, race.track))
         if race.lap_length is not None:
             track = track.scaled(race.lap_length / track.length)
-        reference = load_reference(str(self._line()), vehicle, track, race.pace)
+        reference = load_reference(str(self._line()), vehicle, track, race.speed_scale)
         settings = Settings.of(vehicle, race.objective, race.horizon, race.offset_free)
         course = Course(driven, track, race.plant, reference, settings, race.laps, Start(speed=race.speed))
         models = [name for name in race.models if self.trained.get(name) in there or name not in self.trained]

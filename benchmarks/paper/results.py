@@ -17,7 +17,7 @@ from benchmarks.paper.schedule import COSTS, race_key, score_key
 from benchmarks.paper.steps import Step
 from benchmarks.tasks import output, split_available
 from dynssm_ros.arrays import Vector
-from dynssm_ros.evaluation.spread import Spread, spreads
+from dynssm_ros.evaluation.spread import SeedSpread, spreads
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _NOT_MADE = "not made; `make paper` says why"
@@ -133,19 +133,19 @@ class Comparison:
         """Those of all trainings and tests."""
         return [entry for run in self._runs[model] for entry in run]
 
-    def rmse(self, model: str) -> list[Spread]:
+    def rmse(self, model: str) -> list[SeedSpread]:
         """One-step RMSE of each state."""
         return self._pooled(model, lambda entry: by_name(entry["rmse"]), lambda each: np.sqrt((each**2).mean(axis=0)))
 
-    def max_error(self, model: str) -> list[Spread]:
+    def max_error(self, model: str) -> list[SeedSpread]:
         """Largest one-step error of each state."""
         return self._pooled(model, lambda entry: by_name(entry["max_error"]), lambda each: each.max(axis=0))
 
-    def displacement(self, model: str) -> list[Spread]:
+    def displacement(self, model: str) -> list[SeedSpread]:
         """ADE and FDE (m)."""
         return self._pooled(model, lambda entry: _numbers([entry["ade"], entry["fde"]]), _mean)
 
-    def coverage(self, model: str) -> list[Spread] | None:
+    def coverage(self, model: str) -> list[SeedSpread] | None:
         """Share of errors inside the 90 % interval, for each state; ``None`` for a model that states none."""
         if any(entry["coverage_90"] is None for entry in self.entries(model)):
             return None
@@ -173,7 +173,9 @@ class Comparison:
                 runs.append(found)
         return runs
 
-    def _pooled(self, model: str, measure: Callable[[Entry], Vector], pool: Callable[[Vector], Vector]) -> list[Spread]:
+    def _pooled(
+        self, model: str, measure: Callable[[Entry], Vector], pool: Callable[[Vector], Vector]
+    ) -> list[SeedSpread]:
         return spreads([pool(np.stack([measure(entry) for entry in run])) for run in self._runs[model]])
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.paper.reference import Channels, OpenLoop, Reference
 from benchmarks.paper.results import Comparison, Entry, Results
 from dynssm_ros.evaluation.coefficients import coefficient_unit
-from dynssm_ros.evaluation.spread import Spread
+from dynssm_ros.evaluation.spread import SeedSpread
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.tables import Column, Table, Value, text
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
@@ -193,7 +193,7 @@ def coverage_table(comparisons: Sequence[Comparison]) -> Table:
             covered = comparison.coverage(model) if model in comparison.models else None
             if covered is not None:
                 rows.append(
-                    [comparison.label, f"`{model}`", *(Spread(100 * s.mean, 100 * s.std, s.n) for s in covered)]
+                    [comparison.label, f"`{model}`", *(SeedSpread(100 * s.mean, 100 * s.std, s.n) for s in covered)]
                 )
     return Table(columns, rows)
 

@@ -49,7 +49,7 @@ def diagnose(
 ) -> None:
     """Find out what the simulation gets wrong about measured laps, and why; write the vehicle file that has it."""
     require("diagnose", "train", "report")
-    from dynssm_ros.reporting.diagnosis_report import diagnosis_report, in_words
+    from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report
 
     with progress_bar("diagnosing") as progress:
         steps = itertools.count(1)
@@ -62,5 +62,5 @@ def diagnose(
     save_vehicle(result.vehicle, path, about)
     diagnosis_report(result).save(out / "report.html")
     write_results(result.to_json(str(path)), out, json)
-    console.print(in_words(result), markup=False, soft_wrap=True)
+    console.print(as_text(result), markup=False, soft_wrap=True)
     console.print(f"{path} written; {out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)

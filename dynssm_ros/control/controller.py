@@ -24,7 +24,7 @@ from dynssm_ros.vehicle import Applied, Coefficients, State
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose
 from dynssm_ros.vehicle.parameters import InputLimits
-from dynssm_ros.vehicle.single_track import settled_memory
+from dynssm_ros.vehicle.single_track import settled_effect_states
 
 LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
 _VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
@@ -119,8 +119,10 @@ class Controller:
         self._history.append(np.array([*seen, *feedback, *increments]))
         self._disturbance.measured(np.array(seen))
         adapted = self._disturbance.added(self._model.read(np.array(self._history), previous))
-        memory = self._settled(t, pose, seen, feedback, adapted) if previous is None else previous.x[0, len(STATES) :]
-        plan = self._nmpc.plan(np.array([*pose, *seen, *feedback, *memory]), adapted, t, began)
+        effect_states = (
+            self._settled(t, pose, seen, feedback, adapted) if previous is None else previous.x[0, len(STATES) :]
+        )
+        plan = self._nmpc.plan(np.array([*pose, *seen, *feedback, *effect_states]), adapted, t, began)
         command = self._nmpc.command(plan)
         measured = plan.x[0, _MEASURED]
         increments = np.subtract(command, measured[-2:])
@@ -131,15 +133,15 @@ class Controller:
         return Decision(command, plan, adapted, self._clock() - began)
 
     def _settled(self, t: float, pose: Pose, seen: State, feedback: Applied, adapted: Adapted) -> Vector:
-        """The memory of the model's effects at the start; zeros while that is not known."""
+        """The effect states of the model's effects at the start; zeros while that is not known."""
         car = self._model.car
-        if not (car.memory and np.all(np.isfinite([*pose, *seen, *feedback]))):
-            return np.zeros(len(car.memory))
+        if not (car.effect_states and np.all(np.isfinite([*pose, *seen, *feedback]))):
+            return np.zeros(len(car.effect_states))
         s = float(self._track.project(pose[:2])[0])
         context = {"t": t, "s": s, "lap_length": self._track.length, **pose._asdict()}
         theta = Coefficients(*(float(value) for value in _first(adapted.theta)))
-        memory = settled_memory(SCALAR, seen, feedback, theta, car.constants, car.effects, None, context)
-        return np.array([memory[name] for name in car.memory])
+        effect_states = settled_effect_states(SCALAR, seen, feedback, theta, car.constants, car.effects, None, context)
+        return np.array([effect_states[name] for name in car.effect_states])
 
 
 def _first(values: Vector) -> Vector:

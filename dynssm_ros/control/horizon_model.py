@@ -20,7 +20,7 @@ from dynssm_ros.vehicle.single_track import (
     StageEffect,
     at_least,
     motion,
-    step_with_memory,
+    step_with_effect_states,
     true_state,
 )
 
@@ -37,7 +37,7 @@ PARAMETERS = len(COEFFICIENTS) + 3 + len(CONTEXT)
 
 
 @dataclass(frozen=True)
-class Car:
+class SteppedCar:
     """The physics that a model steps by.
 
     Attributes:
@@ -57,7 +57,7 @@ class Car:
     @classmethod
     def of(
         cls, vehicle: Vehicle, integrator: Integrator = "euler", substeps: int = 1, first: Sequence[StageEffect] = ()
-    ) -> Car:
+    ) -> SteppedCar:
         """The car of a vehicle file, also at low speed, where a step of T_s is too long for the tyres.
 
         Args:
@@ -70,7 +70,7 @@ class Car:
         return cls(vehicle.constants, vehicle.sampling_time, effects, integrator, substeps)
 
     @property
-    def memory(self) -> tuple[str, ...]:
+    def effect_states(self) -> tuple[str, ...]:
         """Names of the effects' own states."""
         return tuple(name for effect in self.effects for name in effect.carries)
 
@@ -81,7 +81,7 @@ class _Symbols(NamedTuple):
     pose: Pose
     state: State
     applied: Applied
-    memory: dict[str, Any]
+    effect_states: dict[str, Any]
     theta: Coefficients
     correction: State
     context: dict[str, Any]
@@ -100,11 +100,11 @@ class HorizonModel:
         slowest: speed (m/s) up to which slip angles are those of this speed; slower wheels roll.
     """
 
-    def __init__(self, car: Car, N: int, travel: Travel = "middle", slowest: float = SLOWEST) -> None:
+    def __init__(self, car: SteppedCar, N: int, travel: Travel = "middle", slowest: float = SLOWEST) -> None:
         self.car = car
         self.N = N
         self._travel = travel
-        self.size = len(STATES) + len(car.memory)
+        self.size = len(STATES) + len(car.effect_states)
         import casadi as ca  # takes a while, and most of the command line does without
 
         x, u, p = ca.SX.sym("x", self.size), ca.SX.sym("u", len(INPUTS)), ca.SX.sym("p", PARAMETERS)
@@ -119,7 +119,7 @@ class HorizonModel:
         """The state one step on, shape ``(size,)``.
 
         Args:
-            x: state in the order of ``STATES`` and the car's memory, shape ``(size,)``.
+            x: state in the order of ``STATES`` and the car's effect states, shape ``(size,)``.
             u: increments of throttle and steering, shape ``(2,)``.
             p: coefficients, correction and context, shape ``(PARAMETERS,)``.
         """
@@ -160,8 +160,8 @@ class HorizonModel:
         import casadi as ca
 
         car, at = self.car, self._split(x, p, slowest)
-        state = true_state(ca, at.state, car.effects, at.memory)
-        q = motion(ca, state, at.applied, at.theta, car.constants, car.effects, at.memory, at.context, car.T_s)
+        state = true_state(ca, at.state, car.effects, at.effect_states)
+        q = motion(ca, state, at.applied, at.theta, car.constants, car.effects, at.effect_states, at.context, car.T_s)
         return ca.vertcat(q.alpha_f, q.alpha_r)
 
     def _split(self, x: Any, p: Any, slowest: float) -> _Symbols:
@@ -175,7 +175,7 @@ class HorizonModel:
             Pose(x_pos, y_pos, heading),
             State(at_least(moving[0], slowest), *moving[1:3]),
             Applied(*moving[3:5]),
-            dict(zip(self.car.memory, moving[5:], strict=True)),
+            dict(zip(self.car.effect_states, moving[5:], strict=True)),
             Coefficients(*theta),
             State(*correction),
             {"x": x_pos, "y": y_pos, "theta": heading, **dict(zip(CONTEXT, context, strict=True))},
@@ -186,10 +186,10 @@ class HorizonModel:
 
         car, at = self.car, self._split(x, p, SLOWEST)  # standing still the slip angles have no derivative
         now, applied = at.state, Applied(at.applied.r + u[0], at.applied.delta + u[1])
-        state, memory = step_with_memory(
+        state, effect_states = step_with_effect_states(
             ca,
             now,
-            at.memory,
+            at.effect_states,
             applied,
             at.theta,
             car.constants,
@@ -202,4 +202,4 @@ class HorizonModel:
         state = State(*(value + by for value, by in zip(state, at.correction, strict=True)))
         share = 0.5 if self._travel == "middle" else 0.0
         pose = advance_pose(ca, at.pose, now, state, car.T_s, share)
-        return ca.vertcat(*pose, *state, *applied, *(memory[name] for name in car.memory))
+        return ca.vertcat(*pose, *state, *applied, *(effect_states[name] for name in car.effect_states))

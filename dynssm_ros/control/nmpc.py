@@ -7,8 +7,9 @@ shooting: its gaps are closed by the program). The states are then eliminated, s
 Actuator limits are hard; the borders, the slip of both axles, and the speed at the end of the horizon where the objective
 asks for it are soft with a linear penalty, so that a program is feasible wherever the car is.
 
-Tracking follows a schedule: the place where a car that keeps the line's own time would be now. One that is behind or ahead is
-asked to catch up, or to wait; but the schedule is never further away than a leash, so what cannot be made up for is forgiven.
+Tracking follows a reference time: the place where a car that keeps the line's own time would be now. One that is behind is
+asked to catch up, one that is ahead to wait. The reference is at most ``lag_bound`` away (MPCC: a bound on the lag error),
+so that time that cannot be made up for is given up.
 
 Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control", 2005.
 """
@@ -50,7 +51,7 @@ class Plan:
     """A horizon.
 
     Attributes:
-        x: states in the order of ``STATES`` and the car's memory, shape ``(N + 1, size)``.
+        x: states in the order of ``STATES`` and the car's effect states, shape ``(N + 1, size)``.
         u: increments of throttle (fraction) and steering (rad), shape ``(N, 2)``.
         status: whether it was solved, or why it is the plan of the step before, moved on.
     """
@@ -129,7 +130,7 @@ class Nmpc:
         """Plans from ``now`` on.
 
         Args:
-            now: present state in the order of ``STATES`` and the car's memory, shape ``(size,)``.
+            now: present state in the order of ``STATES`` and the car's effect states, shape ``(size,)``.
             adapted: what the model says; see :class:`Adapted`.
             t: time since the start of the drive (s), for effects that read it.
             began: when the control step began, by the clock, to which the deadline counts; now if not given.
@@ -169,7 +170,9 @@ class Nmpc:
         self._on_track = float(self._track.project(now[:2], self._on_track if near else None)[0])
         self._on_line = float(self._reference.project(now[:2], self._on_line if near else None))
         due = float(self._reference.ahead(self._scheduled, self._times(0)[1:2])[0]) if near else self._on_line
-        self._scheduled = self._on_line + float(np.clip(due - self._on_line, -self.settings.leash, self.settings.leash))
+        self._scheduled = self._on_line + float(
+            np.clip(due - self._on_line, -self.settings.lag_bound, self.settings.lag_bound)
+        )
 
     def _first_guess(self, now: Vector) -> Plan:
         """Along the reference at its own speed."""

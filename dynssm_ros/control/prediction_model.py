@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.control.horizon_model import INPUTS, STATES, Car
+from dynssm_ros.control.horizon_model import INPUTS, STATES, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Plan
 from dynssm_ros.runtime.models import OnnxModel, WindowModel
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
@@ -20,7 +20,7 @@ class PredictionModel(Protocol):
     """What the controller asks of a model."""
 
     name: str
-    car: Car
+    car: SteppedCar
     """The physics that its coefficients are for."""
     H: int
     """Rows of history that it reads; 0: none."""
@@ -40,7 +40,7 @@ class Fixed:
 
     H = 0
 
-    def __init__(self, name: str, car: Car, theta: Vector) -> None:
+    def __init__(self, name: str, car: SteppedCar, theta: Vector) -> None:
         self.name = name
         self.car = car
         self._adapted = Adapted(theta, np.zeros(3))
@@ -67,7 +67,7 @@ class Adaptive:
         card = model.artifact.card if isinstance(model, OnnxModel) else None
         self.name = model.name
         self.H = model.H
-        self.car = Car.of(own) if card is None else Car.of(own, card.integrator, card.substeps)
+        self.car = SteppedCar.of(own) if card is None else SteppedCar.of(own, card.integrator, card.substeps)
         self._model = model
         self._along_horizon = along_horizon
         self._nominal = Adapted(own.nominal, np.zeros(3))
@@ -97,7 +97,7 @@ class Adaptive:
         return Adapted(theta, correction)
 
 
-def stepped(car: Car, rows: Vector, theta: Vector) -> Vector:
+def stepped(car: SteppedCar, rows: Vector, theta: Vector) -> Vector:
     """Next states of ``car`` (m/s, m/s, rad/s), shape ``(k, 3)``.
 
     Args:

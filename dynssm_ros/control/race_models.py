@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynssm_ros.control.horizon_model import Car
+from dynssm_ros.control.horizon_model import SteppedCar
 from dynssm_ros.control.prediction_model import Adaptive, Fixed, PredictionModel
 from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.runtime.models import OnnxModel, Persistence, SingleTrack, SingleTrackEwma, WindowModel, load_model
@@ -19,7 +19,7 @@ SHARED = ("m", "l_f", "l_r")  # what makes it the same car
 def true_model(vehicle: Vehicle, plant: PlantKind) -> Fixed:
     """The plant's own model: its coefficients, effects and wheels. Steps of 1 ms become two of Runge and Kutta."""
     of = plant_type(plant)
-    return Fixed(TRUE, Car.of(vehicle, of.integrator, of.substeps, of.first(vehicle)), vehicle.nominal)
+    return Fixed(TRUE, SteppedCar.of(vehicle, of.integrator, of.substeps, of.first(vehicle)), vehicle.nominal)
 
 
 def load_prediction_model(

@@ -125,7 +125,7 @@ class Reference:
         return np.concatenate([[0.0], np.cumsum(2 * np.diff(self._grid) / (speed[1:] + speed[:-1]))])
 
 
-def load_reference(name_or_path: str, vehicle: Vehicle, track: Track, pace: float = 1.0) -> Reference:
+def load_reference(name_or_path: str, vehicle: Vehicle, track: Track, speed_scale: float = 1.0) -> Reference:
     """The line to follow.
 
     Args:
@@ -133,21 +133,21 @@ def load_reference(name_or_path: str, vehicle: Vehicle, track: Track, pace: floa
             at its own speed.
         vehicle: whose limits and size count.
         track: where.
-        pace: share of the car's accelerations that the profile asks for; of a file, factor on its speed.
+        speed_scale: share of the car's accelerations that the profile asks for; of a file, factor on its speed.
 
     Raises:
         TrackError: neither of the names nor a file; a file that is no line; a road that is too narrow for the car.
     """
     path, limits = Path(name_or_path), vehicle_limits(vehicle)
     if path.is_file():
-        return _read(path, pace, limits)
+        return _read(path, speed_scale, limits)
     if name_or_path not in ("centre", "racing"):
         raise TrackError(f"line '{name_or_path}' is neither centre, racing nor a file {','.join(COLUMNS)}")
     line = line_of("centre" if name_or_path == "centre" else "racing", vehicle, track)
-    return Reference(name_or_path, line, speed_profile(line, limits.scaled(pace)), limits)
+    return Reference(name_or_path, line, speed_profile(line, limits.scaled(speed_scale)), limits)
 
 
-def _read(path: Path, pace: float, limits: Limits) -> Reference:
+def _read(path: Path, speed_scale: float, limits: Limits) -> Reference:
     """A line from a file; a last row that closes the loop is left out."""
     try:
         table = np.loadtxt(path, delimiter=",", comments="#", ndmin=2)
@@ -158,7 +158,7 @@ def _read(path: Path, pace: float, limits: Limits) -> Reference:
             f"{path}: {len(table)} rows of {table.shape[1]} values; expected at least {MIN_POINTS} rows of finite "
             f"{','.join(COLUMNS)}"
         )
-    points, speed = table[:, 1:3], table[:, 3] * pace
+    points, speed = table[:, 1:3], table[:, 3] * speed_scale
     steps = np.hypot(*np.diff(points, axis=0).T)
     if np.hypot(*(points[-1] - points[0])) < np.min(steps) / 2:
         points, speed, steps = points[:-1], speed[:-1], steps[:-1]

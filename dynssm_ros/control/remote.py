@@ -9,11 +9,11 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.disturbance import Disturbance
-from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, STATES, Car, HorizonModel
+from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, STATES, HorizonModel, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Plan
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose
-from dynssm_ros.vehicle.single_track import settled_memory
+from dynssm_ros.vehicle.single_track import settled_effect_states
 
 Context = tuple[float, float, float]
 """Time (s), place on the track (m) and length of the lap (m): what effects may read beside the pose."""
@@ -57,7 +57,7 @@ class RemoteModel:
     CORRECTED = "nominal car, corrected"
 
     def __init__(self, vehicle: Vehicle, max_age: float, disturbance: Disturbance | None = None) -> None:
-        self.car = Car.of(vehicle)
+        self.car = SteppedCar.of(vehicle)
         self._model = HorizonModel(self.car, 1)
         self._period = round(vehicle.sampling_time * 1e9)
         self._max_age = max_age * 1e9
@@ -101,7 +101,9 @@ class RemoteModel:
         self._theta[stamp] = values
         return ""
 
-    def start(self, pose: Pose, seen: State, applied: Applied, context: Context, memory: Vector | None) -> Vector:
+    def start(
+        self, pose: Pose, seen: State, applied: Applied, context: Context, effect_states: Vector | None
+    ) -> Vector:
         """The controller's state, shape ``(size,)``.
 
         Args:
@@ -109,14 +111,14 @@ class RemoteModel:
             seen: its measured velocities.
             applied: what its actuators do from now on.
             context: now.
-            memory: states of the car's effects; settled if not given.
+            effect_states: states of the car's effects; settled if not given.
         """
-        if memory is None:
+        if effect_states is None:
             car, theta = self.car, Coefficients(*self.output.adapted.theta.tolist())
             around = dict(zip(CONTEXT, context, strict=True)) | pose._asdict()
-            settled = settled_memory(SCALAR, seen, applied, theta, car.constants, car.effects, None, around)
-            memory = np.array([settled[name] for name in car.memory])
-        return np.array([*pose, *seen, *applied, *memory])
+            settled = settled_effect_states(SCALAR, seen, applied, theta, car.constants, car.effects, None, around)
+            effect_states = np.array([settled[name] for name in car.effect_states])
+        return np.array([*pose, *seen, *applied, *effect_states])
 
     def measured(self, stamp: int, x: Vector, context: Context) -> None:
         """Notes where the prediction from the odometry at ``stamp`` (ns) starts.

@@ -25,7 +25,9 @@ HORIZON = 3.5  # in units of the car's time: 15 steps of 20 ms for the 1:43 car,
 # shares of what the tyres can give up to which an axle is used: beyond its peak the front gives less for more steering, and
 # from a slide of the rear there is no way back
 _FRONT_USED, _REAR_USED = 1.0, 0.95
-_LEASH = 0.3  # wheelbases that a car may be behind the line's own time and still be asked to make up for it
+_LAG_BOUND_WHEELBASES = (
+    0.3  # wheelbases that a car may be behind the line's own time and still be asked to make up for it
+)
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class Settings:
         deadline: time (s) after which a plan comes too late and is not used.
         margin: distance to keep between the car's centre and the borders (m).
         slip: slip angles of front and rear axle that no step is to exceed (rad).
-        leash: how far the place where a car that keeps the line's time would be is from this one (m) at most.
+        lag_bound: how far the place where a car that keeps the line's time would be is from this one (m) at most.
         offset_free: whether what the model mispredicts is added to it; see :mod:`dynssm_ros.control.disturbance`.
         travel: what carries the pose over a step.
     """
@@ -106,7 +108,7 @@ class Settings:
     deadline: float = math.inf
     margin: float = 0.0
     slip: tuple[float, float] = (math.inf, math.inf)
-    leash: float = 0.0
+    lag_bound: float = 0.0
     offset_free: bool = False
     travel: Travel = "middle"
 
@@ -130,8 +132,8 @@ class Settings:
         half_width = CAR_WIDTH * scale.length / 2
         th = Coefficients(*vehicle.nominal)
         slip = _slip(_FRONT_USED, th.B_f, th.C_f, th.E_f), _slip(_REAR_USED, th.B_r, th.C_r, th.E_r)
-        leash = _LEASH * scale.length
-        return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip, leash, offset_free)
+        lag_bound = _LAG_BOUND_WHEELBASES * scale.length
+        return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip, lag_bound, offset_free)
 
     @property
     def weights(self) -> Weights:

@@ -14,7 +14,7 @@ from dynssm_ros.evaluation.coefficients import CoefficientStatistics
 from dynssm_ros.evaluation.metrics import by_channel, finite
 from dynssm_ros.evaluation.regimes import Regime
 from dynssm_ros.evaluation.rollout import Rollout
-from dynssm_ros.evaluation.spread import Spread, mean_and_std, spreads
+from dynssm_ros.evaluation.spread import SeedSpread, mean_and_std, spreads
 from dynssm_ros.runtime.models import OnnxModel, WindowModel
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
@@ -124,7 +124,7 @@ class Group:
         """Standard deviation of ``measure`` over the seeds."""
         return mean_and_std([measure(score) for score in self.scores])[1]
 
-    def spreads(self, measure: Callable[[Score], Vector | Sequence[float]]) -> list[Spread]:
+    def spreads(self, measure: Callable[[Score], Vector | Sequence[float]]) -> list[SeedSpread]:
         """Mean and standard deviation of each entry of ``measure`` over the seeds."""
         return spreads([np.asarray(measure(score), dtype=np.float64) for score in self.scores])
 

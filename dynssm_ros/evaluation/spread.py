@@ -11,7 +11,7 @@ from dynssm_ros.arrays import Vector
 
 
 @dataclass(frozen=True)
-class Spread:
+class SeedSpread:
     """Mean and spread of a number that was measured with several seeds.
 
     Attributes:
@@ -33,7 +33,7 @@ def mean_and_std(values: Sequence[Vector]) -> tuple[Vector, Vector]:
         return stacked.mean(axis=0), spread
 
 
-def spreads(values: Sequence[Vector]) -> list[Spread]:
-    """A :class:`Spread` for each entry of the arrays ``values``, one array per seed."""
+def spreads(values: Sequence[Vector]) -> list[SeedSpread]:
+    """A :class:`SeedSpread` for each entry of the arrays ``values``, one array per seed."""
     mean, std = mean_and_std(values)
-    return [Spread(float(m), float(s), len(values)) for m, s in zip(mean.ravel(), std.ravel(), strict=True)]
+    return [SeedSpread(float(m), float(s), len(values)) for m, s in zip(mean.ravel(), std.ravel(), strict=True)]

@@ -14,9 +14,9 @@ import numpy as np
 from scipy import optimize
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.car import Car
-from dynssm_ros.identification.problem import Fit, Study
-from dynssm_ros.identification.windows import Windows, fit_windows, recorded_rows
+from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.problem import Fit, IdentificationProblem
+from dynssm_ros.identification.windows import SimulationWindows, fit_windows, recorded_rows
 from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
@@ -91,17 +91,19 @@ def calibrate(
     speed = vehicle.minimum_speed if min_speed is None else min_speed
     data = recorded_rows(recording, context)
     windows = fit_windows(recording, data, horizon, speed, len(recording))
-    given = Car.of(vehicle, mass_std=0.0)
+    given = CarEstimate.of(vehicle, mass_std=0.0)
     single = recording.window_ends(1, horizon=1, min_speed=speed)
-    one_step = Windows(data, single, 1, 0).stepping(integrator, vehicle)
+    one_step = SimulationWindows(data, single, 1, 0).with_integrator(integrator, vehicle)
     near = _nearest_start(one_step, given, _starting_points(vehicle, starts, seed), on_progress)
-    study = Study(windows.stepping(integrator, vehicle.with_nominal(np.array(near.theta))), near)
+    problem = IdentificationProblem(
+        windows.with_integrator(integrator, vehicle.with_nominal(np.array(near.theta))), near
+    )
     # what is known before counts from here on, so the nominal values are a starting point again
-    fit = min((study.fit(car, ()) for car in (near, given)), key=lambda fit: fit.objective)
+    fit = min((problem.fit(car, ()) for car in (near, given)), key=lambda fit: fit.objective)
     if on_progress is not None:
         on_progress(starts + 1, starts + 1)
     theta = np.array(fit.car.theta)
-    relative = np.minimum(np.sqrt(np.diag(study.covariance(fit)))[: len(COEFFICIENTS)], 1.0)
+    relative = np.minimum(np.sqrt(np.diag(problem.covariance(fit)))[: len(COEFFICIENTS)], 1.0)
     std = fit.car.in_units(relative)
     lower, upper = (limit[: len(COEFFICIENTS)] for limit in given.limits)
     held = (fit.position[: len(COEFFICIENTS)] <= lower + _ON_BOUND) | (
@@ -113,7 +115,7 @@ def calibrate(
         theta,
         std,
         tuple(name for name, on in zip(COEFFICIENTS, held, strict=True) if on),
-        _unidentified(study, fit),
+        _unidentified(problem, fit),
         before,
         after,
         windows.target.shape[0] * windows.target.shape[1],
@@ -121,7 +123,9 @@ def calibrate(
     )
 
 
-def _nearest_start(one_step: Windows, given: Car, points: list[Vector], on_progress: Progress | None) -> Car:
+def _nearest_start(
+    one_step: SimulationWindows, given: CarEstimate, points: list[Vector], on_progress: Progress | None
+) -> CarEstimate:
     """The car from which the fit is to begin: the best of robust fits of one-step errors from each of the points.
 
     Far from the truth the noise model would take a wrong car for a disturbed one. Here errors are in units of the
@@ -162,9 +166,9 @@ def _starting_points(vehicle: Vehicle, count: int, seed: int) -> list[Vector]:
     return [vehicle.nominal, (vehicle.lower + vehicle.upper) / 2, *drawn][:count]
 
 
-def _unidentified(study: Study, fit: Fit) -> tuple[dict[str, float], ...]:
+def _unidentified(problem: IdentificationProblem, fit: Fit) -> tuple[dict[str, float], ...]:
     """Eigenvectors of the information with less of it than was known before."""
-    information = study.information(fit)[: len(COEFFICIENTS), : len(COEFFICIENTS)]
+    information = problem.information(fit)[: len(COEFFICIENTS), : len(COEFFICIENTS)]
     values, vectors = np.linalg.eigh(information)
     return tuple(
         {COEFFICIENTS[k]: round(float(v), 2) for k, v in enumerate(vectors[:, d]) if abs(v) > _WEIGHT_SHOWN}

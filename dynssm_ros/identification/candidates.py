@@ -13,17 +13,19 @@ from itertools import product
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.car import Car, Values
+from dynssm_ros.identification.car import CarEstimate, Values
 from dynssm_ros.identification.noise import weights
-from dynssm_ros.identification.problem import Fit, Study, unit
+from dynssm_ros.identification.problem import Fit, IdentificationProblem, unit
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 from dynssm_ros.vehicle.effects.base import section
 
-_LADDER = (6.0, 1.5, 0.375, 0.094, 0.023)  # units: sizes at which effects are tried, a factor of 4 apart
-_HERE = 1.5  # unit at which effects are tried that act somewhere on the lap
-_REACH = (0.5, 3.0)  # times a size, for which its response serves
-_BENT = 0.1  # relative difference of responses to a small and a large size, beyond which an effect is not linear
-_SHOWS = 0.3  # of the noise, that a unit of an effect has to change
+_SIZE_GRID_UNITS = (6.0, 1.5, 0.375, 0.094, 0.023)  # units: sizes at which effects are tried, a factor of 4 apart
+_LOCAL_SIZE_UNITS = 1.5  # unit at which effects are tried that act somewhere on the lap
+_SIZE_REACH = (0.5, 3.0)  # times a size, for which its response serves
+_NONLINEARITY = (
+    0.1  # relative difference of responses to a small and a large size, beyond which an effect is not linear
+)
+_VISIBLE_NOISE_SHARE = 0.3  # of the noise, that a unit of an effect has to change
 _LEAST = 1e-5  # share of a column that the nominal values must leave for the effect to be seen
 
 
@@ -61,30 +63,30 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Prospect:
-    """How much a candidate would gain, by linearised errors.
+class ScoredCandidate:
+    """How much a candidate would improvement, by linearised errors.
 
     Attributes:
         candidate: what was tried.
         values: with which parameters.
-        gain: decrease of the squared error in units of the noise.
+        improvement: decrease of the squared error in units of the noise.
     """
 
     candidate: Candidate
     values: Values
-    gain: float
+    improvement: float
 
 
-def candidates(study: Study, car: Car) -> tuple[list[Candidate], dict[str, str]]:
+def candidates(problem: IdentificationProblem, car: CarEstimate) -> tuple[list[Candidate], dict[str, str]]:
     """The effects that can be tried, and for those that cannot, why."""
     found, left = [], {}
-    have = set(study.windows.data.context)
+    have = set(problem.windows.data.context)
     for name, effect in EFFECTS.items():
         reason = effect.unusable(car.vehicle.constants)
         if reason is not None:
             left[name] = reason
             continue
-        if effect.MEMORY and any(entry.name == name for entry in car.vehicle.effects):
+        if effect.EFFECT_STATES and any(entry.name == name for entry in car.vehicle.effects):
             left[name] = "the vehicle file has it already"
             continue
         usable = [v for v in effect.variants() if set(effect.signals(v)) <= have]
@@ -109,10 +111,10 @@ class Responses:
     to several sizes.
     """
 
-    def __init__(self, study: Study, car: Car, errors: Vector) -> None:
-        self._study, self._car, self._errors = study, car, errors
+    def __init__(self, problem: IdentificationProblem, car: CarEstimate, errors: Vector) -> None:
+        self._study, self._car, self._errors = problem, car, errors
         self._known: dict[tuple[str, str, bool, tuple[tuple[str, float], ...]], list[Response]] = {}
-        windows = study.windows
+        windows = problem.windows
         if "s" in windows.data.context:
             lap = np.stack([windows.context(k)["s"] for k in range(windows.steps)])
             self._lap = lap / windows.context(0)["lap_length"]
@@ -131,11 +133,11 @@ class Responses:
         if key not in self._known:
             everywhere = {"s": 0.5, "lap_length": 1.0} if local else None
             if candidate.local:
-                found = self._simulated(effect, parameter, form, (_HERE, -_HERE), everywhere)
+                found = self._simulated(effect, parameter, form, (_LOCAL_SIZE_UNITS, -_LOCAL_SIZE_UNITS), everywhere)
             else:
-                found = self._simulated(effect, parameter, form, (_LADDER[1], _LADDER[3]), everywhere)
+                found = self._simulated(effect, parameter, form, (_SIZE_GRID_UNITS[1], _SIZE_GRID_UNITS[3]), everywhere)
                 if _differ(found):
-                    both = (*_LADDER, *(-size for size in _LADDER))
+                    both = (*_SIZE_GRID_UNITS, *(-size for size in _SIZE_GRID_UNITS))
                     found = self._simulated(effect, parameter, form, both, everywhere)
                 else:
                     found = found[:1]
@@ -162,7 +164,7 @@ def _differ(found: list[Response]) -> bool:
     """Whether the responses to several sizes are not the same per unit."""
     sizes = [np.linalg.norm(response.errors) for response in found]
     apart = max(np.linalg.norm(response.errors - found[0].errors) for response in found)
-    return bool(apart > _BENT * max(sizes))
+    return bool(apart > _NONLINEARITY * max(sizes))
 
 
 @dataclass(frozen=True)
@@ -180,23 +182,23 @@ class _Column:
     along: Vector
 
 
-class Scan:
+class ScoreTest:
     """Tries candidates on what a fit leaves.
 
     Args:
-        study: the windows.
+        problem: the windows.
         fit: of the car so far, with its derivatives.
         responses: of the library, which may be those of a car nearby.
     """
 
-    def __init__(self, study: Study, fit: Fit, responses: Responses) -> None:
+    def __init__(self, problem: IdentificationProblem, fit: Fit, responses: Responses) -> None:
         self._fit, self._responses = fit, responses
         self._columns: dict[int, _Column] = {}
         self._products: dict[tuple[int, int], Vector] = {}
         white = fit.noise.whiten(fit.errors)
         self._root = np.sqrt(weights(white))[:, None]
         J = fit.noise.whiten(fit.jacobian) * self._root[..., None]
-        known = study.known_before(fit.position)
+        known = problem.prior_precision(fit.position)
         # what is known of the values as further rows, so that projecting is plain least squares
         tall = np.concatenate([J.reshape(-1, J.shape[2]), np.diag(np.sqrt(known))])
         basis = np.linalg.qr(tall)[0]
@@ -206,24 +208,24 @@ class Scan:
         self._basis = basis[:rows].reshape(*J.shape[:2], -1)
         self._left = left[:rows].reshape(J.shape[:2])
 
-    def try_all(self, found: list[Candidate]) -> Iterator[Prospect]:
+    def try_all(self, found: list[Candidate]) -> Iterator[ScoredCandidate]:
         """The best place, form and size of each candidate that shows at all."""
         for candidate in found:
             best = None
             about = EFFECTS[candidate.effect].PARAMETERS
             for combination in product(*(about[p].tried for p in candidate.shapes)):
-                prospect = self._try(candidate, dict(zip(candidate.shapes, combination, strict=True)))
-                if prospect is not None and (best is None or prospect.gain > best.gain):
-                    best = prospect
+                scored = self._try(candidate, dict(zip(candidate.shapes, combination, strict=True)))
+                if scored is not None and (best is None or scored.improvement > best.improvement):
+                    best = scored
             if best is not None:
                 yield best
 
-    def _try(self, candidate: Candidate, shape: Values) -> Prospect | None:
+    def _try(self, candidate: Candidate, shape: Values) -> ScoredCandidate | None:
         responses = [self._responses.of(candidate, p, shape) for p in candidate.amplitudes]
-        bent = np.array([len(known) > 1 for known, _ in responses]) & (not candidate.local)
-        sizes = sorted({abs(r.size) for (known, _), b in zip(responses, bent, strict=True) if b for r in known})
+        nonlinear = np.array([len(known) > 1 for known, _ in responses]) & (not candidate.local)
+        sizes = sorted({abs(r.size) for (known, _), b in zip(responses, nonlinear, strict=True) if b for r in known})
         best: tuple[float, Vector] | None = None
-        for size in sizes or [_HERE]:
+        for size in sizes or [_LOCAL_SIZE_UNITS]:
             signs = np.ones(len(responses))
             for _ in range(2):
                 gram, along, seen = self._normal(
@@ -240,11 +242,11 @@ class Scan:
                 continue
             # the slope serves for all: with nominal values that make up for it, it goes on
             if sizes and size > sizes[0]:
-                limited = np.sign(amounts) * np.clip(np.abs(amounts), size * _REACH[0], size * _REACH[1])
-                amounts = np.where(bent, limited, amounts)
-            gain = float(2 * along @ amounts - amounts @ gram @ amounts)
-            if best is None or gain > best[0]:
-                best = gain, np.asarray(amounts, dtype=np.float64)
+                limited = np.sign(amounts) * np.clip(np.abs(amounts), size * _SIZE_REACH[0], size * _SIZE_REACH[1])
+                amounts = np.where(nonlinear, limited, amounts)
+            improvement = float(2 * along @ amounts - amounts @ gram @ amounts)
+            if best is None or improvement > best[0]:
+                best = improvement, np.asarray(amounts, dtype=np.float64)
         if best is None:
             return None
         values = dict(shape)
@@ -255,7 +257,7 @@ class Scan:
             values[parameter] = float(
                 np.clip(wanted, about.lower + margin * (about.lower < about.neutral), about.upper - margin)
             )
-        return Prospect(candidate, values, best[0])
+        return ScoredCandidate(candidate, values, best[0])
 
     def _normal(self, raw: list[Vector], shares: list[Vector | None]) -> tuple[Vector, Vector, bool]:
         """Normal equations of the amounts, with what the fitted values can take up projected out.
@@ -275,7 +277,7 @@ class Scan:
         gram = whole - taken @ taken.T
         along = -np.array([w @ c.along for c, w in zip(columns, weight, strict=True)])
         size, left = np.diag(whole), np.diag(gram)
-        return gram, along, bool((size > _SHOWS**2).all() and (left > _LEAST**2 * size).any())
+        return gram, along, bool((size > _VISIBLE_NOISE_SHARE**2).all() and (left > _LEAST**2 * size).any())
 
     def _column(self, raw: Vector) -> _Column:
         if id(raw) not in self._columns:

@@ -23,7 +23,7 @@ _ON_BOUND = 1e-3  # of the range, that a nominal value keeps from its bounds
 
 
 @dataclass(frozen=True)
-class Car:
+class CarEstimate:
     """A vehicle with moved nominal values and effects.
 
     Attributes:
@@ -40,13 +40,13 @@ class Car:
     mass_std: float = MASS_STD
 
     @classmethod
-    def of(cls, vehicle: Vehicle, mass_std: float = MASS_STD) -> Car:
+    def of(cls, vehicle: Vehicle, mass_std: float = MASS_STD) -> CarEstimate:
         """The car as the vehicle file has it."""
         return cls(vehicle, np.zeros(len(COEFFICIENTS) + 1), {}, mass_std)
 
-    def at(self, theta: Vector) -> Car:
+    def at(self, theta: Vector) -> CarEstimate:
         """The same car with coefficients ``theta`` ``(17,)``."""
-        known, scales, nominal = knowledge(self.vehicle), _scaling(self.vehicle), self.vehicle.nominal
+        known, scales, nominal = prior_std(self.vehicle), _scaling(self.vehicle), self.vehicle.nominal
         base = np.where(scales, nominal, 1.0)
         grown = base * np.log(np.where(scales, theta, 1.0) / base)
         return replace(self, moved=np.append(np.where(scales, grown, theta - nominal) / known, self.moved[-1]))
@@ -55,12 +55,12 @@ class Car:
         """Standard deviations of the coefficients from those of :attr:`moved`, ``(17,)``."""
         nominal, scales = self.vehicle.nominal, _scaling(self.vehicle)
         grown = np.where(scales, np.array(self.theta) / np.where(scales, nominal, 1.0), 1.0)
-        return np.asarray(relative * knowledge(self.vehicle) * grown)
+        return np.asarray(relative * prior_std(self.vehicle) * grown)
 
     @property
     def limits(self) -> tuple[Vector, Vector]:
         """The least and the largest of :attr:`moved`."""
-        vehicle, known, scales = self.vehicle, knowledge(self.vehicle), _scaling(self.vehicle)
+        vehicle, known, scales = self.vehicle, prior_std(self.vehicle), _scaling(self.vehicle)
         margin = _ON_BOUND * (vehicle.upper - vehicle.lower)
         nominal = np.where(scales, vehicle.nominal, 1.0)
         bounds = [
@@ -73,7 +73,7 @@ class Car:
     @property
     def theta(self) -> Coefficients:
         """The coefficients, inside their bounds."""
-        step = np.clip(self.moved, *self.limits)[:-1] * knowledge(self.vehicle)
+        step = np.clip(self.moved, *self.limits)[:-1] * prior_std(self.vehicle)
         nominal, scales = self.vehicle.nominal, _scaling(self.vehicle)
         grown = nominal * np.exp(np.where(scales, step / np.where(scales, nominal, 1.0), 0.0))
         return Coefficients(*np.where(scales, grown, nominal + step).tolist())
@@ -89,11 +89,11 @@ class Car:
         """All effects, ready to act."""
         return (*self.vehicle.active_effects, *(EFFECTS[name](**values) for name, values in self.effects.items()))
 
-    def with_effect(self, name: str, values: Values) -> Car:
+    def with_effect(self, name: str, values: Values) -> CarEstimate:
         """The same car with an effect added or changed."""
         return replace(self, effects={**self.effects, name: dict(values)})
 
-    def without(self, name: str) -> Car:
+    def without(self, name: str) -> CarEstimate:
         """The same car without an effect."""
         return replace(self, effects={key: values for key, values in self.effects.items() if key != name})
 
@@ -108,7 +108,7 @@ class Car:
         return vehicle.with_effects(self.effects.items())
 
 
-class Fleet(NamedTuple):
+class CarBatch(NamedTuple):
     """``P`` cars as one, whose values are arrays of shape ``(P, 1)`` that broadcast against ``W`` simulations.
 
     What is the same in all of them stays a number.
@@ -119,7 +119,7 @@ class Fleet(NamedTuple):
     effects: tuple[Effect, ...]
 
     @classmethod
-    def of(cls, cars: Sequence[Car]) -> Fleet:
+    def of(cls, cars: Sequence[CarEstimate]) -> CarBatch:
         """Cars of one vehicle with the same effects in the same order."""
         first = cars[0]
         if len(cars) == 1:
@@ -144,7 +144,7 @@ def _scaling(vehicle: Vehicle) -> npt.NDArray[np.bool_]:
     return np.asarray((vehicle.lower >= 0) & (vehicle.nominal > 0))
 
 
-def knowledge(vehicle: Vehicle) -> Vector:
+def prior_std(vehicle: Vehicle) -> Vector:
     """Standard deviations of the 17 nominal values; where the file has none, that of a uniform spread in the bounds."""
     uniform = (vehicle.upper - vehicle.lower) / np.sqrt(12.0)
     stated = [vehicle.coefficients[name].std for name in COEFFICIENTS]

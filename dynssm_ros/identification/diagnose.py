@@ -10,15 +10,21 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.identification.car import Car, knowledge
-from dynssm_ros.identification.improvement import Gain, measure
-from dynssm_ros.identification.integrator import Searched, searched
-from dynssm_ros.identification.minimum_effect import noticeable
+from dynssm_ros.identification.car import CarEstimate, prior_std
+from dynssm_ros.identification.improvement import Improvement, measure_improvement
+from dynssm_ros.identification.integrator import SearchResult, search_causes
+from dynssm_ros.identification.minimum_effect import minimum_detectable
 from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import per_unit
-from dynssm_ros.identification.residuals import Bunched, Systematic, bunched, systematic
+from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance, clustered, explained_variance
 from dynssm_ros.identification.selection import Refined, Selection
-from dynssm_ros.identification.windows import Windows, compared_every, fit_windows, held_out_windows, recorded_rows
+from dynssm_ros.identification.windows import (
+    SimulationWindows,
+    compared_every,
+    fit_windows,
+    held_out_windows,
+    recorded_rows,
+)
 from dynssm_ros.signals.recording import Recording, default_min_speed
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
@@ -28,7 +34,7 @@ from dynssm_ros.vehicle.effects import EFFECTS, require_context
 from dynssm_ros.vehicle.single_track import Integrator
 
 Verdict = Literal["effects", "none", "unexplained"]
-Say = Callable[[str], None]
+OnProgress = Callable[[str], None]
 
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
@@ -44,7 +50,7 @@ class Cause:
         effect: its name.
         values: parameters with which it acts.
         std: standard deviations of those that were fitted.
-        gain: decrease of twice the negative log-likelihood by it.
+        improvement: decrease of twice the negative log-likelihood by it.
         delta_bic: what is left when its parameters are paid for.
         heldout_gain: share of the error on the held-out rows that is gone by it.
         alternatives: effects that explain the data as well.
@@ -53,7 +59,7 @@ class Cause:
     effect: str
     values: dict[str, float]
     std: dict[str, float]
-    gain: float
+    improvement: float
     delta_bic: float
     heldout_gain: float
     alternatives: tuple[str, ...]
@@ -68,10 +74,10 @@ class Diagnosis:
             library says why.
         causes: the strongest first.
         vehicle: the vehicle with effects and refitted nominal values.
-        gain: on the held-out rows.
+        improvement: on the held-out rows.
         left: what is systematic in the errors of the extended car, on the rows of the fit.
-        bunched: how those errors are spread over time.
-        noticeable: how far off neutral each effect that is not named would have to be to be named (the unit of its
+        clustered: how those errors are spread over time.
+        minimum_detectable: how far off neutral each effect that is not named would have to be to be named (the unit of its
             first parameter).
         selection: how it was found.
         car: the extended car as fitted.
@@ -84,22 +90,22 @@ class Diagnosis:
     verdict: Verdict
     causes: tuple[Cause, ...]
     vehicle: Vehicle
-    gain: Gain
-    left: Systematic
-    bunched: Bunched
-    noticeable: Mapping[str, float]
+    improvement: Improvement
+    left: ExplainedVariance
+    clustered: ClusteredResiduals
+    minimum_detectable: Mapping[str, float]
     selection: Selection
-    car: Car
+    car: CarEstimate
     std: Vector
     notes: tuple[str, ...]
     protocol: Mapping[str, str]
-    windows: Windows
+    windows: SimulationWindows
 
     def to_json(self, vehicle_path: str) -> dict[str, Any]:
         """For programs; ``vehicle_path`` is where the extended vehicle was written."""
-        gain = self.gain
-        at = gain.horizon
-        rmse = {name: by_channel(values[at]) for name, values in gain.rmse.items()}
+        improvement = self.improvement
+        at = improvement.horizon
+        rmse = {name: by_channel(values[at]) for name, values in improvement.rmse.items()}
         return {
             "verdict": self.verdict,
             "causes": [
@@ -119,22 +125,24 @@ class Diagnosis:
                 for cause in self.causes
             ],
             "gain": {
-                "horizon_s": float(gain.horizons[at]),
+                "horizon_s": float(improvement.horizons[at]),
                 "before": rmse[GIVEN],
                 "recalibrated": rmse[RECALIBRATED],
                 "after": rmse[EXTENDED],
-                "reduction": by_channel(gain.reduction[at]),
-                "interval_95": _intervals(gain.interval[:, at]),
-                "reduction_from_recalibrated": by_channel(gain.reduction_from(RECALIBRATED)[at]),
-                "interval_95_from_recalibrated": _intervals(gain.interval_from(RECALIBRATED)[:, at]),
+                "reduction": by_channel(improvement.reduction[at]),
+                "interval_95": _intervals(improvement.interval[:, at]),
+                "reduction_from_recalibrated": by_channel(improvement.reduction_from(RECALIBRATED)[at]),
+                "interval_95_from_recalibrated": _intervals(improvement.interval_from(RECALIBRATED)[:, at]),
             },
             "systematic": {
-                "before": by_channel(gain.systematic[GIVEN][at].share),
-                "recalibrated": by_channel(gain.systematic[RECALIBRATED][at].share),
-                "after": by_channel(gain.systematic[EXTENDED][at].share),
-                "gone": by_channel(gain.systematic_gone(GIVEN)[at]),
+                "before": by_channel(improvement.explained_variance[GIVEN][at].share),
+                "recalibrated": by_channel(improvement.explained_variance[RECALIBRATED][at].share),
+                "after": by_channel(improvement.explained_variance[EXTENDED][at].share),
+                "gone": by_channel(improvement.systematic_gone(GIVEN)[at]),
             },
-            "noticeable": {effect: size if np.isfinite(size) else None for effect, size in self.noticeable.items()},
+            "noticeable": {
+                effect: size if np.isfinite(size) else None for effect, size in self.minimum_detectable.items()
+            },
             "notes": list(self.notes),
             "vehicle": vehicle_path,
         }
@@ -157,7 +165,7 @@ def diagnose(
     min_speed: float | None = None,
     integrator: Integrator | None = None,
     line: ClosedLine | None = None,
-    say: Say = lambda words: None,
+    on_progress: OnProgress = lambda words: None,
 ) -> Diagnosis:
     """Finds out what a vehicle file gets wrong about a recording.
 
@@ -169,33 +177,35 @@ def diagnose(
         min_speed: stretches below are left out (m/s); ``None``: :func:`default_min_speed`.
         integrator: of the simulation; ``None``: Runge-Kutta, unless Euler steps are clearly closer to the data.
         line: of the track, from which positions on the lap are counted; ``None``: the first full lap of the recording.
-        say: told what is being done.
+        on_progress: told what is being done.
 
     Raises:
         RecordingError: another sampling time than the vehicle's, a constant or missing channel, too few rows.
         ConfigurationError: an effect of the vehicle needs a signal that the recording has not; options out of range.
     """
     at = _prepare(recording, vehicle, horizon, holdout, min_speed, line)
-    found = searched(at.fitted, at.car, integrator, say)
-    study, selection, fit = found.study, found.selection, found.selection.fit
-    windows = study.windows
+    found = search_causes(at.fitted, at.car, integrator, on_progress)
+    problem, selection, fit = found.problem, found.selection, found.selection.fit
+    windows = problem.windows
     at = at._replace(unseen=replace(at.unseen, integrator=windows.integrator, substeps=windows.substeps))
-    say("measuring the gain on held-out laps")
-    gain = measure(at.unseen, {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: fit.car}, at.steps)
-    sizes = noticeable(study, fit, found.search.found)
+    on_progress("measuring the improvement on held-out laps")
+    improvement = measure_improvement(
+        at.unseen, {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: fit.car}, at.steps
+    )
+    sizes = minimum_detectable(problem, fit, found.search.found)
     limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
-    limits += [*_hidden(sizes), *_not_live(fit.car.extended(knowledge(vehicle)))]
-    std = np.sqrt(np.diag(study.covariance(fit)))
+    limits += [*_hidden(sizes), *_not_live(fit.car.extended(prior_std(vehicle)))]
+    std = np.sqrt(np.diag(problem.covariance(fit)))
     causes = tuple(_cause(one, found, at, std) for one in selection.chosen)
-    left = systematic(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], study.block)
+    left = explained_variance(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], problem.block)
     white = fit.noise.whiten(fit.errors)
     in_noise = weights(white) * (white**2).mean(axis=1)
-    together = bunched(in_noise, windows.time, study.block, selection.inflation)
+    together = clustered(in_noise, windows.time, problem.block, selection.inflation)
     return Diagnosis(
         "effects" if causes else "unexplained" if left.is_there or together.is_there else "none",
         causes,
         fit.car.extended(fit.car.in_units(np.minimum(std[:17], 1.0))),
-        gain,
+        improvement,
         left,
         together,
         sizes,
@@ -211,10 +221,10 @@ def diagnose(
 class _Prepared(NamedTuple):
     """What a diagnosis works on."""
 
-    fitted: Windows
+    fitted: SimulationWindows
     steps: int
-    unseen: Windows
-    car: Car
+    unseen: SimulationWindows
+    car: CarEstimate
     notes: list[str]
     protocol: dict[str, str]
 
@@ -259,10 +269,10 @@ def _prepare(
         "Fit": f"{len(fitted)} simulations of {steps * recording.T_s:g} s, from {speed:g} m/s",
         "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * recording.T_s:g} s",
     }
-    return _Prepared(fitted, asked, unseen, Car.of(vehicle), notes, protocol)
+    return _Prepared(fitted, asked, unseen, CarEstimate.of(vehicle), notes, protocol)
 
 
-def _cause(one: Refined, found: Searched, at: _Prepared, std: Vector) -> Cause:
+def _cause(one: Refined, found: SearchResult, at: _Prepared, std: Vector) -> Cause:
     effect, fit = one.candidate.effect, found.selection.fit
     known = {
         name: float(std[18 + k]) * per_unit(effect, name, fit.car.effects[effect][name])
@@ -276,7 +286,7 @@ def _cause(one: Refined, found: Searched, at: _Prepared, std: Vector) -> Cause:
         effect,
         dict(fit.car.effects[effect]),
         known,
-        one.gain,
+        one.improvement,
         float(one.delta_bic),
         float(1.0 - np.sqrt((with_it / np.maximum(without, 1e-300)).mean())),
         tuple(found.selection.alternatives[effect]),

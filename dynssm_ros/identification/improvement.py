@@ -9,17 +9,17 @@ from functools import cached_property
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.identification.car import Car
+from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.problem import BLOCK
-from dynssm_ros.identification.residuals import Systematic, systematic
-from dynssm_ros.identification.windows import Windows
+from dynssm_ros.identification.residuals import ExplainedVariance, explained_variance
+from dynssm_ros.identification.windows import SimulationWindows
 
 _DRAWS = 400
 _NEXT_TO_NONE = 0.01  # of the squared error
 
 
 @dataclass(frozen=True)
-class Gain:
+class Improvement:
     """Errors of several cars on the held-out rows.
 
     Attributes:
@@ -27,17 +27,17 @@ class Gain:
         horizons: times ahead (s), shape ``(n,)``.
         horizon: number of the one that the diagnosis is about.
         errors: predicted minus measured at these times by car, each ``(W, n, 3)`` (m/s, m/s, rad/s).
-        systematic: what of them is no noise, by car, one for each horizon.
+        explained_variance: what of them is no noise, by car, one for each horizon.
         windows: the simulations.
         seed: of the bootstrap over blocks in time.
     """
 
-    cars: Mapping[str, Car]
+    cars: Mapping[str, CarEstimate]
     horizons: Vector
     horizon: int
     errors: Mapping[str, Vector]
-    systematic: Mapping[str, tuple[Systematic, ...]]
-    windows: Windows
+    explained_variance: Mapping[str, tuple[ExplainedVariance, ...]]
+    windows: SimulationWindows
     seed: int = 0
 
     @cached_property
@@ -74,14 +74,16 @@ class Gain:
         NaN where there was next to none.
         """
         before, after = (
-            np.stack([s.share for s in self.systematic[car]]) * self.rmse[car] ** 2
+            np.stack([s.share for s in self.explained_variance[car]]) * self.rmse[car] ** 2
             for car in (name, list(self.errors)[-1])
         )
-        there = np.stack([s.share for s in self.systematic[name]]) > _NEXT_TO_NONE
+        there = np.stack([s.share for s in self.explained_variance[name]]) > _NEXT_TO_NONE
         return np.where(there, 1.0 - after / np.maximum(before, 1e-300), np.nan)
 
 
-def measure(windows: Windows, cars: Mapping[str, Car], steps: int, seed: int = 0) -> Gain:
+def measure_improvement(
+    windows: SimulationWindows, cars: Mapping[str, CarEstimate], steps: int, seed: int = 0
+) -> Improvement:
     """Simulates ``cars`` from every start.
 
     Args:
@@ -94,13 +96,13 @@ def measure(windows: Windows, cars: Mapping[str, Car], steps: int, seed: int = 0
     errors = {name: windows.errors(car)[:, np.array(ahead) - 1] for name, car in cars.items()}
     block = blocks(windows)
     found = {
-        name: tuple(systematic(replace(windows, steps=k), e[:, i], block) for i, k in enumerate(ahead))
+        name: tuple(explained_variance(replace(windows, steps=k), e[:, i], block) for i, k in enumerate(ahead))
         for name, e in errors.items()
     }
-    return Gain(cars, np.array(ahead) * windows.data.T_s, ahead.index(steps), errors, found, windows, seed)
+    return Improvement(cars, np.array(ahead) * windows.data.T_s, ahead.index(steps), errors, found, windows, seed)
 
 
-def blocks(windows: Windows) -> Indices:
+def blocks(windows: SimulationWindows) -> Indices:
     """Number of the block in time of each window, shape ``(W,)``."""
     return np.unique((windows.time // BLOCK).astype(np.intp), return_inverse=True)[1]
 

@@ -13,74 +13,76 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.identification.candidates import candidates
-from dynssm_ros.identification.car import Car
-from dynssm_ros.identification.problem import Fit, Study
+from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.problem import Fit, IdentificationProblem
 from dynssm_ros.identification.selection import Search, Selection
-from dynssm_ros.identification.windows import Windows
+from dynssm_ros.identification.windows import SimulationWindows
 from dynssm_ros.vehicle.single_track import Integrator
 
 _TRIED = 300  # windows with which the integrator is chosen at first
 _CLEARLY = 20.0  # difference of twice the log-likelihood for which another integrator is taken than Runge-Kutta
 
 
-class Searched(NamedTuple):
+class SearchResult(NamedTuple):
     """What a search found, with what it was made of.
 
     Attributes:
-        study: of the windows in the steps that were taken.
+        problem: of the windows in the steps that were taken.
         search: all fits.
         selection: the causes.
         impossible: effects that cannot be tried, and why.
     """
 
-    study: Study
+    problem: IdentificationProblem
     search: Search
     selection: Selection
     impossible: dict[str, str]
 
 
-def searched(windows: Windows, car: Car, integrator: Integrator | None, say: Callable[[str], None]) -> Searched:
+def search_causes(
+    windows: SimulationWindows, car: CarEstimate, integrator: Integrator | None, on_progress: Callable[[str], None]
+) -> SearchResult:
     """Searches for causes.
 
     Args:
         windows: for the fit.
         car: as the vehicle file has it.
         integrator: of the simulation; ``None``: chosen by the data.
-        say: told what is being done.
+        on_progress: told what is being done.
     """
     if integrator is not None:
-        return _search(_stepped(windows, car, integrator)[0], car, say)
-    say("choosing how the model steps")
+        return _search(_stepped(windows, car, integrator)[0], car, on_progress)
+    on_progress("choosing how the model steps")
     runge_kutta, euler = _stepped(windows, car, "rk4"), _stepped(windows, car, "euler")
     first, other = (euler, runge_kutta) if _by_euler(runge_kutta[1], euler[1]) else (runge_kutta, euler)
-    found = _search(first[0], car, say)
+    found = _search(first[0], car, on_progress)
     fit = found.selection.fit
-    fits = {first[0].integrator: fit, other[0].integrator: Study(other[0], car).fit(fit.car, fit.free)}
+    fits = {first[0].integrator: fit, other[0].integrator: IdentificationProblem(other[0], car).fit(fit.car, fit.free)}
     if _by_euler(fits["rk4"], fits["euler"]) == (first is euler):
         return found
-    return _search(other[0], car, say)
+    return _search(other[0], car, on_progress)
 
 
 def _by_euler(runge_kutta: Fit, euler: Fit) -> bool:
     return euler.objective < runge_kutta.objective - _CLEARLY
 
 
-def _search(windows: Windows, car: Car, say: Callable[[str], None]) -> Searched:
-    study = Study(windows, car)
-    found, impossible = candidates(study, car)
-    search = Search(study, car, found, say)
-    return Searched(study, search, search.run(), impossible)
+def _search(windows: SimulationWindows, car: CarEstimate, on_progress: Callable[[str], None]) -> SearchResult:
+    problem = IdentificationProblem(windows, car)
+    found, impossible = candidates(problem, car)
+    search = Search(problem, car, found, on_progress)
+    return SearchResult(problem, search, search.run(), impossible)
 
 
-def _stepped(windows: Windows, car: Car, integrator: Integrator) -> tuple[Windows, Fit]:
+def _stepped(windows: SimulationWindows, car: CarEstimate, integrator: Integrator) -> tuple[SimulationWindows, Fit]:
     """The windows in steps that are short enough for the recalibrated car too, and its fit to some of them.
 
     That car may be much stiffer than the one of the file, and a simulation whose steps are too long for it runs away.
     """
     some = windows.select(np.arange(0, len(windows), -(-len(windows) // _TRIED)))
-    trial = some.stepping(integrator, car.vehicle)
-    fit = Study(trial, car).fit(car, ())
-    finer = trial.stepping(integrator, car.vehicle.with_nominal(np.array(fit.car.theta)))
+    trial = some.with_integrator(integrator, car.vehicle)
+    fit = IdentificationProblem(trial, car).fit(car, ())
+    finer = trial.with_integrator(integrator, car.vehicle.with_nominal(np.array(fit.car.theta)))
     if finer.substeps > trial.substeps:
-        trial, fit = finer, Study(finer, car).fit(fit.car, ())
+        trial, fit = finer, IdentificationProblem(finer, car).fit(fit.car, ())
     return replace(windows, integrator=integrator, substeps=trial.substeps), fit

@@ -10,21 +10,21 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.candidates import Candidate
 from dynssm_ros.identification.car import Values
 from dynssm_ros.identification.noise import weights
-from dynssm_ros.identification.problem import Fit, Study, unit
-from dynssm_ros.identification.selection import SURE
+from dynssm_ros.identification.problem import Fit, IdentificationProblem, unit
+from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 
 _PLACES = np.linspace(0.0, 1.0, 8, endpoint=False)  # of the lap
 _NOTHING = 1e-9  # of a squared error in units of the noise
 
 
-def noticeable(study: Study, fit: Fit, found: Iterable[Candidate]) -> dict[str, float]:
+def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable[Candidate]) -> dict[str, float]:
     """The least change of each effect's first parameter, beside a fit, that the data would call a cause.
 
     An effect on a stretch of the lap is taken at several places, and the middle of their answers given.
 
     Args:
-        study: the windows.
+        problem: the windows.
         fit: of the car with all causes.
         found: what can be tried; the first candidate of an effect speaks for it, those of the fit are left out.
 
@@ -32,8 +32,8 @@ def noticeable(study: Study, fit: Fit, found: Iterable[Candidate]) -> dict[str, 
         By effect, in the unit of the parameter; infinite where it changes nothing that was measured.
     """
     J = (fit.noise.whiten(fit.jacobian) * _root(fit)[:, None, None]).reshape(-1, fit.jacobian.shape[2])
-    H = J.T @ J + np.diag(study.known_before(fit.position))
-    needed = (np.log(study.windows.target.size) + SURE) * study.inflation(fit)
+    H = J.T @ J + np.diag(problem.prior_precision(fit.position))
+    needed = (np.log(problem.windows.target.size) + DECISIVE_DELTA_BIC) * problem.inflation(fit)
     taken = {effect for effect, _ in fit.free}
     out: dict[str, float] = {}
     for candidate in found:
@@ -43,17 +43,17 @@ def noticeable(study: Study, fit: Fit, found: Iterable[Candidate]) -> dict[str, 
         about, parameter = EFFECTS[effect].PARAMETERS, candidate.amplitudes[0]
         form = {name: about[name].neutral for name in candidate.shapes}
         places = [{LOCATION[0]: float(place)} for place in _PLACES] if candidate.local else [{}]
-        left = np.median([_left(_column(study, fit, effect, parameter, form | at), J, H) for at in places])
+        left = np.median([_left(_column(problem, fit, effect, parameter, form | at), J, H) for at in places])
         out[effect] = float(np.sqrt(needed / left) * unit(effect, parameter)) if left > _NOTHING else float("inf")
     return out
 
 
-def _column(study: Study, fit: Fit, effect: str, parameter: str, form: Values) -> Vector:
+def _column(problem: IdentificationProblem, fit: Fit, effect: str, parameter: str, form: Values) -> Vector:
     """What a unit of a parameter does to the whitened errors, shape ``(W * 3 K,)``."""
     about = EFFECTS[effect].PARAMETERS[parameter]
     moved = about.neutral + about.direction * unit(effect, parameter)
     values = dict(fit.car.effects.get(effect, {})) | form | {parameter: moved}
-    change = study.errors(fit.car.with_effect(effect, values)) - fit.errors
+    change = problem.errors(fit.car.with_effect(effect, values)) - fit.errors
     return (fit.noise.whiten(change) * _root(fit)[:, None]).ravel()
 
 

@@ -4,7 +4,7 @@ An error after ``k`` steps is what the error of the start has become by then, mi
 the disturbances in between. With variances ``P`` of the start, ``R`` of the measurement and ``Q`` of a disturbance per
 step, the ``3 K`` errors of a window have the covariance ``G diag(P, Q, ..., Q) G' + I R``, where ``G`` follows from the
 derivatives of the steps. Errors that are divided by its root are independent of unit variance, so that sums of squares
-are likelihoods. Windows of like speed share their ``G``.
+are likelihoods. SimulationWindows of like speed share their ``G``.
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ _STRIDE = 3.0  # of the logarithm of a variance in one round, at most
 _FLAT = 1e-3  # curvature added where a variance that vanishes has none
 _SETTLED = 1e-2  # of twice the logarithm of the likelihood, that another round promises
 _REWEIGHTED = 8  # times at most, that far errors are weighed anew
-_FAR = 4.0  # a window whose squared error exceeds the expected one by this factor counts only as much as that
+_OUTLIER_FACTOR = (
+    4.0  # a window whose squared error exceeds the expected one by this factor counts only as much as that
+)
 
 
 @dataclass(frozen=True)
-class Spread:
+class NoiseResponse:
     """Where noise goes: groups of windows and their response matrices.
 
     Attributes:
@@ -42,7 +44,7 @@ class Spread:
     G: Vector
 
     @classmethod
-    def of(cls, transitions: Vector, speed: Vector) -> Spread:
+    def of(cls, transitions: Vector, speed: Vector) -> NoiseResponse:
         """Groups windows by speed (m/s), shape ``(W,)``, and follows noise along ``transitions`` ``(W, K, 3, 3)``."""
         count = int(np.clip(len(speed) // 6, 1, _GROUPS))
         edges = np.quantile(speed, np.linspace(0, 1, count + 1)[1:-1])
@@ -65,7 +67,7 @@ class Spread:
 class Noise:
     """Variances of measurement, disturbance and start, ``v = (R, Q, P)``, shape ``(9,)``, and what they make of errors."""
 
-    spread: Spread
+    spread: NoiseResponse
     v: Vector
 
     @cached_property
@@ -96,10 +98,10 @@ class Noise:
 def weights(white: Vector) -> Vector:
     """Weight of each window, 1 unless its whitened errors ``(W, 3 K)`` are far out."""
     size = (white**2).sum(axis=1)
-    return np.asarray(np.minimum(1.0, _FAR * white.shape[1] / np.maximum(size, 1e-300)))
+    return np.asarray(np.minimum(1.0, _OUTLIER_FACTOR * white.shape[1] / np.maximum(size, 1e-300)))
 
 
-def fit_noise(spread: Spread, errors: Vector, start: Vector, floor: Vector) -> Noise:
+def fit_noise(spread: NoiseResponse, errors: Vector, start: Vector, floor: Vector) -> Noise:
     """The variances that make ``errors`` ``(W, 3 K)`` most likely.
 
     Args:
@@ -118,7 +120,7 @@ def fit_noise(spread: Spread, errors: Vector, start: Vector, floor: Vector) -> N
     return noise
 
 
-def _most_likely(spread: Spread, errors: Vector, start: Vector, floor: Vector) -> Vector:
+def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Vector) -> Vector:
     """Fisher scoring in the logarithms of the variances, within their bounds."""
     count = np.bincount(spread.group, minlength=len(spread.G)).astype(float)
     moment = np.stack([errors[spread.group == m].T @ errors[spread.group == m] for m in range(len(spread.G))])

@@ -11,9 +11,9 @@ import numpy.typing as npt
 from scipy.optimize import lsq_linear
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.car import Car
-from dynssm_ros.identification.noise import Noise, Spread, fit_noise, weights
-from dynssm_ros.identification.windows import Windows
+from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.noise import Noise, NoiseResponse, fit_noise, weights
+from dynssm_ros.identification.windows import SimulationWindows
 from dynssm_ros.vehicle.effects import EFFECTS
 
 Free = tuple[tuple[str, str], ...]
@@ -24,8 +24,8 @@ _UNIT = 0.1  # of the way from neutral to the upper bound: in this unit effects 
 _FREE = 10.0  # of these units an effect's parameter may be, as one standard deviation
 _ROUNDS = 30
 _NOMINAL_STEP, _EFFECT_STEP = 1e-3, 0.02  # of the derivatives: standard deviations known before, units of an effect
-_KEPT = 0.5  # of what a quadratic promises: derivatives that keep less are too old
-_LOUD, _LEAST = 1e-2, 1e-12  # of the variance of a channel: more than any noise, and less
+_KEPT_PROMISE = 0.5  # of what a quadratic promises: derivatives that keep less are too old
+_LARGEST_NOISE_SHARE, _LEAST = 1e-2, 1e-12  # of the variance of a channel: more than any noise, and less
 _DAMPING = (0.0, 0.03, 0.3, 3.0, 30.0)
 _CONVERGED = 0.3  # of the squared error
 
@@ -65,10 +65,10 @@ class Fit:
         jacobian: their derivatives by the 18 nominal values (in standard deviations) and by ``free`` (in units), shape
             ``(W, 3 K, 18 + len(free))``.
         noise: under which it was fitted.
-        objective: twice the negative logarithm of likelihood and knowledge.
+        objective: twice the negative logarithm of likelihood and prior.
     """
 
-    car: Car
+    car: CarEstimate
     free: Free
     errors: Vector
     jacobian: Vector
@@ -81,12 +81,12 @@ class Fit:
         return position(self.car, self.free)
 
 
-def position(car: Car, free: Free) -> Vector:
+def position(car: CarEstimate, free: Free) -> Vector:
     """The values of a car in the units of a fit."""
     return np.concatenate([car.moved, [_in_units(e, name, car.effects[e][name]) for e, name in free]])
 
 
-def limits(car: Car, free: Free) -> tuple[Vector, Vector]:
+def limits(car: CarEstimate, free: Free) -> tuple[Vector, Vector]:
     """The least and the largest values, in the units of a fit."""
     bounds = [(EFFECTS[e].PARAMETERS[name].lower, EFFECTS[e].PARAMETERS[name].upper) for e, name in free]
     inside = np.array([[_in_units(*pair, bound) for bound in b] for pair, b in zip(free, bounds, strict=True)])
@@ -94,7 +94,7 @@ def limits(car: Car, free: Free) -> tuple[Vector, Vector]:
     return np.concatenate([lower, inside.reshape(-1, 2)[:, 0]]), np.concatenate([upper, inside.reshape(-1, 2)[:, 1]])
 
 
-def placed(car: Car, free: Free, p: Vector) -> Car:
+def with_values(car: CarEstimate, free: Free, p: Vector) -> CarEstimate:
     """The car at other values, within their bounds."""
     n = len(car.moved)
     p = np.clip(p, *limits(car, free))
@@ -104,35 +104,35 @@ def placed(car: Car, free: Free, p: Vector) -> Car:
     return replace(car, moved=p[:n], effects=effects)
 
 
-class Study:
-    """Windows with their noise, and fits to them.
+class IdentificationProblem:
+    """SimulationWindows with their noise, and fits to them.
 
     Args:
         windows: the simulations that are compared with the measurement.
         car: gives the derivatives along which noise spreads.
     """
 
-    def __init__(self, windows: Windows, car: Car) -> None:
+    def __init__(self, windows: SimulationWindows, car: CarEstimate) -> None:
         self.windows = windows
         speed = windows.target[:, :, 0].mean(axis=1)
-        self.spread = Spread.of(windows.transitions(car), speed)
+        self.spread = NoiseResponse.of(windows.transitions(car), speed)
         block = (windows.time // BLOCK).astype(np.intp)
         self.block: npt.NDArray[np.intp] = np.unique(block, return_inverse=True)[1]
         self._channels = np.tile(windows.spread**2, 3)
 
-    def errors(self, car: Car, context: dict[str, float] | None = None) -> Vector:
+    def errors(self, car: CarEstimate, context: dict[str, float] | None = None) -> Vector:
         """Errors of a car, shape ``(W, 3 K)``."""
         return self.windows.errors(car, context).reshape(len(self.windows), -1)
 
-    def errors_of(self, cars: Sequence[Car], context: dict[str, float] | None = None) -> Vector:
+    def errors_of(self, cars: Sequence[CarEstimate], context: dict[str, float] | None = None) -> Vector:
         """Errors of several cars that differ in values alone, shape ``(P, W, 3 K)``."""
         return self.windows.errors_of(cars, context).reshape(len(cars), len(self.windows), -1)
 
     def noise(self, errors: Vector) -> Noise:
         """The noise under which ``errors`` are most likely, whatever it was taken for before."""
-        return fit_noise(self.spread, errors, _LOUD * self._channels, _LEAST * self._channels)
+        return fit_noise(self.spread, errors, _LARGEST_NOISE_SHARE * self._channels, _LEAST * self._channels)
 
-    def columns(self, car: Car, errors: Vector, free: Free, first: int = 0) -> Vector:
+    def columns(self, car: CarEstimate, errors: Vector, free: Free, first: int = 0) -> Vector:
         """Derivatives of ``errors`` by the 18 nominal values and by ``free``, from the ``first`` on.
 
         Shape ``(W, 3 K, P - first)``.
@@ -145,27 +145,29 @@ class Study:
             moved = at.copy()
             moved[k] += step if at[k] + step <= upper[k] else -step
             done[k - first] = moved[k] - at[k]
-            cars.append(placed(car, free, moved))
+            cars.append(with_values(car, free, moved))
         change = self.errors_of(cars) - errors
         return np.asarray(np.moveaxis(change, 0, -1) / done)
 
     def objective(self, errors: Vector, p: Vector, noise: Noise) -> float:
-        """Twice the negative logarithm of likelihood and knowledge."""
+        """Twice the negative logarithm of likelihood and prior."""
         white = noise.whiten(errors)
         size, limit = (white**2).sum(axis=1), 4.0 * white.shape[1]
         far = np.maximum(size / limit, 1.0)
         return float(
-            (np.minimum(size, limit) + limit * np.log(far)).sum() + noise.log_det + (p * self.known_before(p)) @ p
+            (np.minimum(size, limit) + limit * np.log(far)).sum() + noise.log_det + (p * self.prior_precision(p)) @ p
         )
 
     @staticmethod
-    def known_before(p: Vector) -> Vector:
+    def prior_precision(p: Vector) -> Vector:
         """Inverse variance of what is known of each value beforehand."""
         known = np.full(len(p), _FREE**-2)
         known[:18] = 1.0
         return known
 
-    def fit(self, car: Car, free: Free, near: Fit | None = None, rounds: int = _ROUNDS, rough: bool = False) -> Fit:
+    def fit(
+        self, car: CarEstimate, free: Free, near: Fit | None = None, rounds: int = _ROUNDS, rough: bool = False
+    ) -> Fit:
         """Levenberg-Marquardt from ``car``; the noise is fitted along.
 
         Derivatives by the nominal values hardly change, so they are those of a fit nearby while they keep what they promise
@@ -178,7 +180,7 @@ class Study:
             rounds: of linearising anew, at most.
             rough: whether it may end with the derivatives of ``near``.
         """
-        car = placed(car, free, position(car, free))
+        car = with_values(car, free, position(car, free))
         errors, n = self.errors(car), len(car.moved)
         noise = self.noise(errors)
         p = position(car, free)
@@ -196,7 +198,7 @@ class Study:
             before, promised, gained = best, 0.0, 0.0
             for damping in _DAMPING:
                 step = _step(H + damping * np.diag(np.diag(H)), g, lower - p, upper - p)
-                other = placed(car, free, p + step)
+                other = with_values(car, free, p + step)
                 there = self.errors(other)
                 value = self.objective(there, position(other, free), noise)
                 if value < best:
@@ -210,30 +212,30 @@ class Study:
             settled = before - best < _CONVERGED
             if settled and (rough or not stale):
                 break
-            if stale and (settled or gained < _KEPT * promised):
+            if stale and (settled or gained < _KEPT_PROMISE * promised):
                 nominal = None
             elif not stale:
                 nominal = jacobian[..., :n]
         return Fit(car, free, errors, jacobian, noise, best)
 
-    def part(self, fit: Fit, every: int) -> tuple[Study, Fit]:
+    def part(self, fit: Fit, every: int) -> tuple[IdentificationProblem, Fit]:
         """One window of each ``every``, and what ``fit`` is there."""
         other = copy(self)
         other.windows = self.windows.select(np.arange(0, len(self.windows), every))
-        other.spread = Spread(self.spread.group[::every], self.spread.G)
+        other.spread = NoiseResponse(self.spread.group[::every], self.spread.G)
         other.block = self.block[::every]
         noise, errors = Noise(other.spread, fit.noise.v), fit.errors[::every]
         objective = other.objective(errors, fit.position, noise)
         return other, replace(fit, errors=errors, jacobian=fit.jacobian[::every], noise=noise, objective=objective)
 
-    def eased(self, cars: Sequence[Car], near: Fit) -> list[Car]:
+    def warm_started(self, cars: Sequence[CarEstimate], near: Fit) -> list[CarEstimate]:
         """The same cars with the values of ``near`` moved to where its derivatives say that they fit best."""
         out = []
         for car, errors in zip(cars, self.errors_of(cars), strict=True):
             p = position(car, near.free)
             H, g = self._normal(errors, near.jacobian, p, near.noise)
             lower, upper = limits(car, near.free)
-            out.append(placed(car, near.free, p + _step(H, g, lower - p, upper - p)))
+            out.append(with_values(car, near.free, p + _step(H, g, lower - p, upper - p)))
         return out
 
     def _normal(self, errors: Vector, jacobian: Vector, p: Vector, noise: Noise) -> tuple[Vector, Vector]:
@@ -241,7 +243,7 @@ class Study:
         white = noise.whiten(errors)
         root = np.sqrt(weights(white))[:, None]
         J = (noise.whiten(jacobian) * root[..., None]).reshape(-1, len(p))
-        known = self.known_before(p)
+        known = self.prior_precision(p)
         H = J.T @ J + np.diag(known)
         g = J.T @ (white * root).ravel() + known * p
         return H, g
@@ -252,7 +254,7 @@ class Study:
         Shape ``(P, P)``.
         """
         information, _ = self._scores(fit)
-        known = np.diag(self.known_before(fit.position))
+        known = np.diag(self.prior_precision(fit.position))
         bread = np.linalg.inv(information + known)
         return np.asarray(bread @ (self.inflation(fit) * information + known) @ bread)
 
@@ -272,7 +274,7 @@ class Study:
         ratio = np.einsum("pi,pq,qi->i", vectors[:, told], meat, vectors[:, told]) / values[told]
         inflation = float(ratio.mean()) if told.any() else 1.0
         if last:
-            known = np.diag(self.known_before(fit.position))
+            known = np.diag(self.prior_precision(fit.position))
             n = len(information) - last
             taken = np.linalg.solve((information + known)[:n, :n], information[:n, n:])
             left = np.concatenate([-taken, np.eye(last)])

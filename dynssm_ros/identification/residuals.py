@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.identification.windows import Windows
+from dynssm_ros.identification.windows import SimulationWindows
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _FOLDS = 10
@@ -20,11 +20,11 @@ _SURE = 3.0  # standard errors by which the explanation must be better than none
 
 
 @dataclass(frozen=True)
-class Systematic:
+class ExplainedVariance:
     """What of the errors at the end of the windows is no noise.
 
     Attributes:
-        share: of the squared error, by channel, that the signals and the place foretell where they were not fitted to,
+        share: of the squared error, by channel, that the signals and the place predict where they were not fitted to,
             shape ``(3,)``.
         by_place: the same from the place on the lap alone; NaN without laps.
         sure: by how many standard errors the whole is better than no explanation.
@@ -45,7 +45,7 @@ class Systematic:
 
 
 @dataclass(frozen=True)
-class Bunched:
+class ClusteredResiduals:
     """How errors are spread over time: noise is everywhere alike, a cause that is missing comes and goes.
 
     Attributes:
@@ -65,7 +65,7 @@ class Bunched:
         return self.sure > _BEYOND_CHANCE or self.inflation > _INFLATED
 
 
-def bunched(sizes: Vector, time: Vector, block: Indices, inflation: float, seed: int = 0) -> Bunched:
+def clustered(sizes: Vector, time: Vector, block: Indices, inflation: float, seed: int = 0) -> ClusteredResiduals:
     """Looks for errors that come together.
 
     Args:
@@ -84,10 +84,10 @@ def bunched(sizes: Vector, time: Vector, block: Indices, inflation: float, seed:
     by_chance = np.array([uneven(rng.permutation(sizes)) for _ in range(_ORDERS)])
     worst = time[block == int(np.argmax(np.bincount(block, sizes) / count))]
     sure = (uneven(sizes) - by_chance.mean()) / max(by_chance.std(), 1e-12)
-    return Bunched(float(sure), inflation, (float(worst.min()), float(worst.max())))
+    return ClusteredResiduals(float(sure), inflation, (float(worst.min()), float(worst.max())))
 
 
-def systematic(windows: Windows, errors: Vector, block: Indices) -> Systematic:
+def explained_variance(windows: SimulationWindows, errors: Vector, block: Indices) -> ExplainedVariance:
     """Explains errors by what was going on and where.
 
     Args:
@@ -101,12 +101,12 @@ def systematic(windows: Windows, errors: Vector, block: Indices) -> Systematic:
     X = _features(np.stack(list(signals.values()), axis=1))
     places = _places(windows)
     fold = block * _FOLDS // (block.max() + 1)
-    alone = None if places is None else _foretold(places, y, fold)
-    both = _foretold(X if places is None else np.concatenate([X, places], axis=1), y, fold)
+    alone = None if places is None else _cross_validated(places, y, fold)
+    both = _cross_validated(X if places is None else np.concatenate([X, places], axis=1), y, fold)
     better = ((y**2) - (y - both) ** 2).sum(axis=1)
     sums = np.bincount(block, better)
     sure = float(sums.sum() / max(np.sqrt((sums**2).sum()), 1e-12))
-    return Systematic(
+    return ExplainedVariance(
         _share(y, both),
         np.full(3, np.nan) if alone is None else _share(y, alone),
         sure,
@@ -118,7 +118,7 @@ def systematic(windows: Windows, errors: Vector, block: Indices) -> Systematic:
     )
 
 
-def _signals(windows: Windows) -> dict[str, Vector]:
+def _signals(windows: SimulationWindows) -> dict[str, Vector]:
     """What was going on in each window, on average."""
     at = windows.starts[:, None] + np.arange(windows.steps)
     v_x, v_y, omega, r, delta, r_cmd, delta_cmd = windows.data.rows[:, at].mean(axis=2)
@@ -138,13 +138,13 @@ def _signals(windows: Windows) -> dict[str, Vector]:
 
 
 def _features(signals: Vector) -> Vector:
-    """The signals and their squares; products of all of them would foretell wildly where nothing alike was driven."""
+    """The signals and their squares; products of all of them would predict wildly where nothing alike was driven."""
     spread = signals.std(axis=0)
     z = (signals - signals.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
     return np.concatenate([np.ones((len(z), 1)), z, z**2], axis=1)
 
 
-def _places(windows: Windows) -> Vector | None:
+def _places(windows: SimulationWindows) -> Vector | None:
     if "s" not in windows.data.context:
         return None
     here = windows.context(windows.steps // 2)
@@ -152,7 +152,7 @@ def _places(windows: Windows) -> Vector | None:
     return np.asarray(np.eye(_PLACES)[bin_])
 
 
-def _stretches(windows: Windows, places: Vector, y: Vector) -> dict[str, tuple[float, float]]:
+def _stretches(windows: SimulationWindows, places: Vector, y: Vector) -> dict[str, tuple[float, float]]:
     """The part of the lap, by channel, at which the mean error is farthest from zero in its standard errors."""
     count = np.maximum(places.sum(axis=0), 1.0)[:, None]
     mean = places.T @ y / count
@@ -162,7 +162,7 @@ def _stretches(windows: Windows, places: Vector, y: Vector) -> dict[str, tuple[f
     return {c: (float(k * length), float((k + 1) * length)) for c, k in zip(STATE_SIGNALS, worst, strict=True)}
 
 
-def _foretold(X: Vector, y: Vector, fold: Indices) -> Vector:
+def _cross_validated(X: Vector, y: Vector, fold: Indices) -> Vector:
     """What ridge regression on the other parts says of each part."""
     out = np.zeros_like(y)
     for part in np.unique(fold):
@@ -172,8 +172,8 @@ def _foretold(X: Vector, y: Vector, fold: Indices) -> Vector:
     return np.asarray(np.clip(out, -4.0, 4.0))
 
 
-def _share(y: Vector, foretold: Vector) -> Vector:
-    left = ((y - foretold) ** 2).sum(axis=0) / np.maximum((y**2).sum(axis=0), 1e-12)
+def _share(y: Vector, predicted: Vector) -> Vector:
+    left = ((y - predicted) ** 2).sum(axis=0) / np.maximum((y**2).sum(axis=0), 1e-12)
     return np.asarray(np.maximum(0.0, 1.0 - left))
 
 

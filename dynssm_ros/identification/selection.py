@@ -9,24 +9,24 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dynssm_ros.identification.candidates import Candidate, Prospect, Responses, Scan
-from dynssm_ros.identification.car import Car
+from dynssm_ros.identification.candidates import Candidate, Responses, ScoredCandidate, ScoreTest
+from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.noise import weights
-from dynssm_ros.identification.problem import Fit, Study, position
+from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
 from dynssm_ros.vehicle.effects import EFFECTS
 
-Say = Callable[[str], None]
+OnProgress = Callable[[str], None]
 
-SURE = 10.0  # difference in the information criterion that counts as very strong (Kass and Raftery 1995)
-_ALIKE = 6.0  # the same that is hardly strong: explanations that are not farther apart are not told apart
-_HOPEFUL = 9  # candidates of which several sizes are tried in each round
-_FEW = 150  # windows on which they are tried
+DECISIVE_DELTA_BIC = 10.0  # difference in the information criterion that counts as very strong (Kass and Raftery 1995)
+AMBIGUITY_DELTA_BIC = 6.0  # the same that is hardly strong: explanations that are not farther apart are not told apart
+_SHORTLIST = 9  # candidates of which several sizes are tried in each round
+_SHORTLIST_WINDOWS = 150  # windows on which they are tried
 _REFINED = 4  # of them are fitted in full
-_PROMISING = 0.15  # of the best prospect, that another one must reach to be fitted in full
-_CLOSE = 0.9  # of the best evidence, near which others are fitted to the end as well
-_MOST = 4  # effects
+_SHORTLIST_SHARE = 0.15  # of the best scored, that another one must reach to be fitted in full
+_NEAR_BEST_SHARE = 0.9  # of the best evidence, near which others are fitted to the end as well
+_MAX_CAUSES = 4  # effects
 _FOLDS = 5
-_EASED = 3  # times that nominal values make room for an effect before it is fitted
+_WARM_STARTS = 3  # times that nominal values make room for an effect before it is fitted
 _SHARES = (1.6, 1.0, 0.6, 0.3)  # of what linearised errors promise
 
 
@@ -37,14 +37,14 @@ class Refined:
     Attributes:
         candidate: what was added.
         fit: with it.
-        gain: decrease of twice the negative logarithm of likelihood and knowledge, by the errors' true freedom.
+        improvement: decrease of twice the negative logarithm of likelihood and prior, by the errors' true freedom.
         delta_bic: what is left of it when its parameters are paid for.
         crossed: decrease of the squared error on parts of the data that the fit did not see.
     """
 
     candidate: Candidate
     fit: Fit
-    gain: float
+    improvement: float
     delta_bic: float
     crossed: float
 
@@ -58,7 +58,7 @@ class Selection:
         fit: the fit with all effects that the data ask for.
         chosen: those effects, the strongest first, each with its evidence against the fit without it.
         alternatives: for each of them, other effects that explain the data as well.
-        tried: the best gain of each effect on the first scan, by name.
+        tried: the best improvement of each effect on the first score test, by name.
         inflation: of the variance, by errors that hang together.
     """
 
@@ -74,26 +74,32 @@ class _Start(NamedTuple):
     """Where to fit a candidate from, and roughly what it is worth."""
 
     candidate: Candidate
-    car: Car
-    worth: float
+    car: CarEstimate
+    expected_delta_bic: float
 
 
 class Search:
-    """Selects effects by the information criterion and by what they gain on parts of the data left out.
+    """Selects effects by the information criterion and by what they improvement on parts of the data left out.
 
     Args:
-        study: the windows.
+        problem: the windows.
         car: where to start.
         found: the candidates.
-        say: told what is being done.
+        on_progress: told what is being done.
     """
 
-    def __init__(self, study: Study, car: Car, found: Sequence[Candidate], say: Say = lambda words: None) -> None:
-        self._study, self.found, self._say = study, list(found), say
-        self._price = np.log(3.0 * study.windows.steps * len(study.windows))
-        say("recalibrating the nominal car")
-        self.base = study.fit(car, ())
-        self._responses = Responses(study, self.base.car, self.base.errors)
+    def __init__(
+        self,
+        problem: IdentificationProblem,
+        car: CarEstimate,
+        found: Sequence[Candidate],
+        on_progress: OnProgress = lambda words: None,
+    ) -> None:
+        self._study, self.found, self._report = problem, list(found), on_progress
+        self._price = np.log(3.0 * problem.windows.steps * len(problem.windows))
+        on_progress("recalibrating the nominal car")
+        self.base = problem.fit(car, ())
+        self._responses = Responses(problem, self.base.car, self.base.errors)
         self._ranked: dict[frozenset[Candidate], list[Refined]] = {}
         self._fits: dict[frozenset[Candidate], Fit] = {frozenset(): self.base}
         self.tried: dict[str, float] = {}
@@ -101,7 +107,7 @@ class Search:
     def run(self) -> Selection:
         """Forward while it pays; then each effect is exchanged against all others, or dropped."""
         chosen: list[Candidate] = []
-        while len(chosen) < _MOST:
+        while len(chosen) < _MAX_CAUSES:
             best = next((r for r in self.ranked(tuple(chosen)) if _pays(r)), None)
             if best is None:
                 break
@@ -147,20 +153,24 @@ class Search:
             return self._ranked[key]
         fit = self.fit(before)
         taken = {c.effect for c in before}
-        self._say("trying all effects" + (f" beside {', '.join(taken)}" if taken else ""))
-        scan = Scan(self._study, fit, self._responses)
-        prospects = list(scan.try_all([c for c in self.found if c.effect not in taken]))
-        best: dict[str, Prospect] = {}
-        for prospect in sorted(prospects, key=self._worth, reverse=True):
-            best.setdefault(prospect.candidate.effect, prospect)
+        self._report("trying all effects" + (f" beside {', '.join(taken)}" if taken else ""))
+        score_test = ScoreTest(self._study, fit, self._responses)
+        scored_candidates = list(score_test.try_all([c for c in self.found if c.effect not in taken]))
+        best: dict[str, ScoredCandidate] = {}
+        for scored in sorted(scored_candidates, key=self._expected_delta_bic, reverse=True):
+            best.setdefault(scored.candidate.effect, scored)
         if not before:
-            self.tried = {name: p.gain for name, p in best.items()}
-        hopeful = [p for p in best.values() if self._worth(p) >= -self._price][:_HOPEFUL]
-        some, near = self._study.part(fit, max(1, len(self._study.windows) // _FEW))
-        starts = sorted((self._start(some, near, p) for p in hopeful), key=lambda start: start.worth, reverse=True)
-        least = max([-self._price, *(_PROMISING * start.worth for start in starts[:1])])
-        refined = [self._refine(fit, start) for start in starts[:_REFINED] if start.worth >= least]
-        close = max([-_ALIKE, *(_CLOSE * r.delta_bic - 2 * _ALIKE for r in refined)])
+            self.tried = {name: p.improvement for name, p in best.items()}
+        shortlist = [p for p in best.values() if self._expected_delta_bic(p) >= -self._price][:_SHORTLIST]
+        some, near = self._study.part(fit, max(1, len(self._study.windows) // _SHORTLIST_WINDOWS))
+        starts = sorted(
+            (self._start(some, near, p) for p in shortlist), key=lambda start: start.expected_delta_bic, reverse=True
+        )
+        least = max([-self._price, *(_SHORTLIST_SHARE * start.expected_delta_bic for start in starts[:1])])
+        refined = [self._refine(fit, start) for start in starts[:_REFINED] if start.expected_delta_bic >= least]
+        close = max(
+            [-AMBIGUITY_DELTA_BIC, *(_NEAR_BEST_SHARE * r.delta_bic - 2 * AMBIGUITY_DELTA_BIC for r in refined)]
+        )
         refined = [self._polish(key, fit, r) if r.delta_bic > close else r for r in refined]
         self._ranked[key] = sorted(refined, key=lambda r: -r.delta_bic)
         return self._ranked[key]
@@ -172,46 +182,46 @@ class Search:
             self._fits[key] = self._study.fit(rough.fit.car, rough.fit.free, rough.fit)
         return self._judge(without, self._fits[key], rough.candidate)
 
-    def _worth(self, prospect: Prospect) -> float:
-        return float(prospect.gain - self._price * len(prospect.candidate.parameters))
+    def _expected_delta_bic(self, scored: ScoredCandidate) -> float:
+        return float(scored.improvement - self._price * len(scored.candidate.parameters))
 
     def _refine(self, fit: Fit, start: _Start) -> Refined:
         candidate = start.candidate
-        self._say(f"fitting {candidate.effect}")
+        self._report(f"fitting {candidate.effect}")
         free = (*fit.free, *candidate.free)
         return self._judge(fit, self._study.fit(start.car, free, fit, rough=True), candidate)
 
-    def _start(self, some: Study, near: Fit, prospect: Prospect) -> _Start:
+    def _start(self, some: IdentificationProblem, near: Fit, scored: ScoredCandidate) -> _Start:
         """Where to fit from, and what is reached there.
 
         What linearised errors promise is too much where an effect grows faster than its size, and too little where the
         nominal values have hidden it: so several sizes are tried, as they are and with the nominal values moved along.
         """
-        candidate, cars = prospect.candidate, []
+        candidate, cars = scored.candidate, []
         for share in _SHARES:
-            values = dict(prospect.values)
+            values = dict(scored.values)
             for name in candidate.amplitudes:
                 about = EFFECTS[candidate.effect].PARAMETERS[name]
                 wanted = about.neutral + share * (values[name] - about.neutral)
                 values[name] = float(np.clip(wanted, about.lower, about.upper))
             cars.append(near.car.with_effect(candidate.effect, values))
-        eased = cars
-        for _ in range(_EASED):
-            eased = some.eased(eased, near)
-        cars, free = cars + eased, (*near.free, *candidate.free)
+        warm_started = cars
+        for _ in range(_WARM_STARTS):
+            warm_started = some.warm_started(warm_started, near)
+        cars, free = cars + warm_started, (*near.free, *candidate.free)
         reached = [
             some.objective(errors, position(car, free), near.noise)
             for car, errors in zip(cars, some.errors_of(cars), strict=True)
         ]
-        gain = (near.objective - min(reached)) * len(self._study.windows) / len(some.windows)
-        worth = gain - self._price * len(candidate.parameters)
-        return _Start(candidate, cars[int(np.argmin(reached))], worth)
+        improvement = (near.objective - min(reached)) * len(self._study.windows) / len(some.windows)
+        expected_delta_bic = improvement - self._price * len(candidate.parameters)
+        return _Start(candidate, cars[int(np.argmin(reached))], expected_delta_bic)
 
     def _judge(self, without: Fit, fit: Fit, candidate: Candidate) -> Refined:
         inflation = self._study.inflation(fit, len(fit.free) - len(without.free))
-        gain = (without.objective - fit.objective) / inflation
-        delta = gain - self._price * (len(fit.free) - len(without.free))
-        return Refined(candidate, fit, gain, delta, self._crossed(without, fit))
+        improvement = (without.objective - fit.objective) / inflation
+        delta = improvement - self._price * (len(fit.free) - len(without.free))
+        return Refined(candidate, fit, improvement, delta, self._crossed(without, fit))
 
     def _against(self, chosen: tuple[Candidate, ...], one: Candidate) -> Refined:
         """What ``one`` is worth among ``chosen``."""
@@ -236,7 +246,7 @@ class Search:
             ranked = self.ranked(rest)
             if ranked and ranked[0].candidate.effect != one.effect:
                 here = next((r for r in ranked if r.candidate == one), None)
-                if here is None or ranked[0].delta_bic > here.delta_bic + _ALIKE:
+                if here is None or ranked[0].delta_bic > here.delta_bic + AMBIGUITY_DELTA_BIC:
                     chosen[:] = [*rest, ranked[0].candidate]
                     return
 
@@ -247,7 +257,7 @@ class Search:
         return [
             r.candidate.effect
             for r in self.ranked(rest)
-            if r.candidate.effect != one.effect and r.delta_bic > own - _ALIKE and _pays(r)
+            if r.candidate.effect != one.effect and r.delta_bic > own - AMBIGUITY_DELTA_BIC and _pays(r)
         ]
 
     def _crossed(self, without: Fit, fit: Fit) -> float:
@@ -268,7 +278,7 @@ class Search:
         J = noise_of.noise.whiten(fit.jacobian[..., moving]) * root[:, None, None]
         r = white * root[:, None]
         p = fit.position[moving]
-        known = self._study.known_before(p)
+        known = self._study.prior_precision(p)
         H = [np.tensordot(J[parts == f], J[parts == f], ([0, 1], [0, 1])) for f in range(_FOLDS)]
         g = [np.einsum("wnp,wn->p", J[parts == f], r[parts == f]) for f in range(_FOLDS)]
         total = 0.0
@@ -279,4 +289,4 @@ class Search:
 
 
 def _pays(refined: Refined) -> bool:
-    return refined.delta_bic > SURE and refined.crossed > 0
+    return refined.delta_bic > DECISIVE_DELTA_BIC and refined.crossed > 0

@@ -14,24 +14,24 @@ import numpy.typing as npt
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.identification.car import Car, Fleet
+from dynssm_ros.identification.car import CarBatch, CarEstimate
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
-from dynssm_ros.vehicle.single_track import Integrator, settled_memory, settling_rate, step_with_memory
+from dynssm_ros.vehicle.single_track import Integrator, settled_effect_states, settling_rate, step_with_effect_states
 
 _FINEST = 16  # integration steps per sampling time, at most
 WARM_UP = 0.64  # s of measured rows along which a simulation is led before it runs free
 _FOLLOWING = 0.16  # s, time constant with which a simulation that is led follows the measured rows
 _COMPARED = 13  # rows of each simulation, at most: more hang together
-_MOST = 500  # windows in a fit, evenly spread: more would cost time and tell little
+_MAX_WINDOWS = 500  # windows in a fit, evenly spread: more would cost time and tell little
 _MEASURED = 3000  # windows in held-out rows
 _LEAST = 24  # windows with which a fit can begin
 _WILD = 1e3  # a prediction farther off than this many spreads of its channel counts as that far
 
 
 @dataclass(frozen=True)
-class Track:
+class RecordedRows:
     """The rows of a recording as the simulations read them.
 
     Attributes:
@@ -48,7 +48,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Windows:
+class SimulationWindows:
     """``W`` simulations, compared with the measurement at ``K`` rows each.
 
     Attributes:
@@ -64,7 +64,7 @@ class Windows:
             to it, such as a relaxing tyre, be taken for smaller than they are.
     """
 
-    data: Track = field(repr=False)
+    data: RecordedRows = field(repr=False)
     starts: Indices
     steps: int
     warm: int
@@ -76,11 +76,11 @@ class Windows:
     def __len__(self) -> int:
         return len(self.starts)
 
-    def select(self, chosen: Indices | npt.NDArray[np.bool_]) -> Windows:
+    def select(self, chosen: Indices | npt.NDArray[np.bool_]) -> SimulationWindows:
         """Some of the simulations."""
         return replace(self, starts=self.starts[chosen])
 
-    def stepping(self, integrator: Integrator, vehicle: Vehicle) -> Windows:
+    def with_integrator(self, integrator: Integrator, vehicle: Vehicle) -> SimulationWindows:
         """The same simulations in Euler steps of the sampling time, or in Runge-Kutta steps that are short enough.
 
         A step is at most the inverse of the rate at which the linear car settles; see :func:`settling_rate`.
@@ -107,25 +107,25 @@ class Windows:
         """The other signals ``shift`` rows after the starts."""
         return {name: values[self.starts + shift] for name, values in self.data.context.items()}
 
-    def errors(self, car: Car, context: dict[str, float] | None = None) -> Vector:
+    def errors(self, car: CarEstimate, context: dict[str, float] | None = None) -> Vector:
         """Predicted minus measured states (m/s, m/s, rad/s), shape ``(W, K, 3)``; see :meth:`errors_of`."""
         return np.asarray(self.errors_of([car], context)[0])
 
-    def errors_of(self, cars: Sequence[Car], context: dict[str, float] | None = None) -> Vector:
+    def errors_of(self, cars: Sequence[CarEstimate], context: dict[str, float] | None = None) -> Vector:
         """Predicted minus measured states of ``P`` cars at once, shape ``(P, W, K, 3)``.
 
         Args:
             cars: what is simulated; they differ in values alone.
             context: values that replace signals of the recording, the same in all rows.
         """
-        fleet = Fleet.of(cars)
+        fleet = CarBatch.of(cars)
         carries = any(effect.carries for effect in fleet.effects)
         shift = -self.warm if carries or self.filtered else 0
         taken = 1.0 - np.exp(-self.data.T_s / _FOLLOWING) if self.filtered else 1.0
         first = self.data.rows[:, self.starts + shift]
         here = self.context(shift) | (context or {})
         state = State(*first[:3])
-        memory = settled_memory(
+        effect_states = settled_effect_states(
             np, state, Applied(*first[3:5]), fleet.theta, fleet.constants, fleet.effects, context=here
         )
         out = np.empty((len(cars), len(self), self.steps // self.every, 3))
@@ -134,7 +134,7 @@ class Windows:
                 rows = self.data.rows[:, self.starts + k]
                 if k <= 0:
                     state = State(*(led + taken * (row - led) for led, row in zip(state, rows[:3], strict=True)))
-                state, memory = self._step(fleet, state, memory, rows, k, context)
+                state, effect_states = self._step(fleet, state, effect_states, rows, k, context)
                 if k >= 0 and (k + 1) % self.every == 0:
                     for channel, value in enumerate(state):
                         out[:, :, k // self.every, channel] = value
@@ -142,9 +142,9 @@ class Windows:
         out -= self.target
         return np.asarray(np.clip(np.nan_to_num(out, copy=False, nan=1e9, posinf=1e9, neginf=-1e9), -limit, limit))
 
-    def transitions(self, car: Car) -> Vector:
+    def transitions(self, car: CarEstimate) -> Vector:
         """Derivatives of each compared row by the one before, along the measured rows, shape ``(W, K, 3, 3)``."""
-        fleet = Fleet.of([car])
+        fleet = CarBatch.of([car])
         fleet = fleet._replace(effects=tuple(effect for effect in fleet.effects if not effect.carries))
         out = np.empty((len(self), self.steps, 3, 3))
         for k in range(self.steps):
@@ -169,18 +169,18 @@ class Windows:
 
     def _step(
         self,
-        fleet: Fleet,
+        fleet: CarBatch,
         state: State,
-        memory: Mapping[str, Vector],
+        effect_states: Mapping[str, Vector],
         rows: Vector,
         k: int,
         context: Mapping[str, float] | None,
     ) -> tuple[State, dict[str, Vector]]:
         """One step from the rows ``k`` after the starts."""
-        return step_with_memory(
+        return step_with_effect_states(
             np,
             state,
-            memory,
+            effect_states,
             applied_inputs(rows),
             fleet.theta,
             fleet.constants,
@@ -192,9 +192,9 @@ class Windows:
         )
 
 
-def recorded_rows(recording: Recording, context: dict[str, Vector]) -> Track:
+def recorded_rows(recording: Recording, context: dict[str, Vector]) -> RecordedRows:
     """The rows of a recording with other signals by name."""
-    return Track(recording.matrix.T, context, recording.T_s, (recording.time - recording.time[0]) / 1e9)
+    return RecordedRows(recording.matrix.T, context, recording.T_s, (recording.time - recording.time[0]) / 1e9)
 
 
 def compared_every(steps: int) -> int:
@@ -202,7 +202,9 @@ def compared_every(steps: int) -> int:
     return -(-steps // _COMPARED)
 
 
-def fit_windows(recording: Recording, data: Track, horizon: float, min_speed: float, cut: int) -> Windows:
+def fit_windows(
+    recording: Recording, data: RecordedRows, horizon: float, min_speed: float, cut: int
+) -> SimulationWindows:
     """Simulations for a fit, end to end before the row ``cut``.
 
     Args:
@@ -230,11 +232,13 @@ def fit_windows(recording: Recording, data: Track, horizon: float, min_speed: fl
             f"recording {', '.join(recording.info.source)}: {len(starts)} stretches of {steps * recording.T_s:g} s at "
             f"{min_speed:g} m/s or more{beside}; expected at least {_LEAST}"
         )
-    chosen = np.array(starts)[np.linspace(0, len(starts) - 1, min(len(starts), _MOST)).round().astype(int)]
-    return Windows(data, chosen, steps, warm, every=every, filtered=True)
+    chosen = np.array(starts)[np.linspace(0, len(starts) - 1, min(len(starts), _MAX_WINDOWS)).round().astype(int)]
+    return SimulationWindows(data, chosen, steps, warm, every=every, filtered=True)
 
 
-def held_out_windows(recording: Recording, data: Track, steps: int, long: int, min_speed: float, cut: int) -> Windows:
+def held_out_windows(
+    recording: Recording, data: RecordedRows, steps: int, long: int, min_speed: float, cut: int
+) -> SimulationWindows:
     """Overlapping simulations of ``long`` steps for measuring, behind the row ``cut``; ``steps``: of those of the fit.
 
     Raises:
@@ -249,4 +253,4 @@ def held_out_windows(recording: Recording, data: Track, steps: int, long: int, m
             f"{long * recording.T_s:g} s can be simulated; expected at least {_LEAST}: record longer or hold out more"
         )
     every = max(1, steps // 4, len(later) // _MEASURED)
-    return Windows(data, later[::every], long, warm)
+    return SimulationWindows(data, later[::every], long, warm)

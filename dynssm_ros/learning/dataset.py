@@ -1,4 +1,4 @@
-"""Windows of a recording as tensors, and their split into training and validation."""
+"""TrainingWindows of a recording as tensors, and their split into training and validation."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ class SplitConfig(StrictModel):
 
 
 @dataclass(frozen=True)
-class Windows:
-    """Windows that end at ``ends`` in the rows ``matrix`` ``(N, 7)``; formed batch by batch, never stored."""
+class TrainingWindows:
+    """TrainingWindows that end at ``ends`` in the rows ``matrix`` ``(N, 7)``; formed batch by batch, never stored."""
 
     matrix: Tensor
     ends: Tensor
@@ -53,19 +53,19 @@ class Windows:
         return len(self.ends)
 
     def batch(self, index: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Windows ``(B, H, 7)`` and their measured increments ``s_{t+1} - s_t`` ``(B, 3)``."""
+        """TrainingWindows ``(B, H, 7)`` and their measured increments ``s_{t+1} - s_t`` ``(B, 3)``."""
         ends = self.ends[index]
         rows = ends[:, None] + torch.arange(1 - self.H, 1, device=ends.device)
         return self.matrix[rows], self.matrix[ends + 1, :3] - self.matrix[ends, :3]
 
-    def to(self, device: torch.device) -> Windows:
+    def to(self, device: torch.device) -> TrainingWindows:
         """The same windows on ``device``."""
-        return Windows(self.matrix.to(device), self.ends.to(device), self.H)
+        return TrainingWindows(self.matrix.to(device), self.ends.to(device), self.H)
 
 
 def split_windows(
     recording: Recording, H: int, config: SplitConfig, min_speed: float, least: int
-) -> tuple[Windows, Windows]:
+) -> tuple[TrainingWindows, TrainingWindows]:
     """Training and validation windows: by alternating blocks in time, so that no row serves both, or at random.
 
     The random split is drawn for the last rows of the windows, so that it is the same one for windows of any length.
@@ -101,16 +101,16 @@ def split_windows(
             "more driving is needed"
         )
     matrix = torch.tensor(recording.matrix, dtype=torch.float32)
-    return Windows(matrix, torch.tensor(training), H), Windows(matrix, torch.tensor(held), H)
+    return TrainingWindows(matrix, torch.tensor(training), H), TrainingWindows(matrix, torch.tensor(held), H)
 
 
-def all_windows(recording: Recording, H: int, min_speed: float) -> Windows:
+def all_windows(recording: Recording, H: int, min_speed: float) -> TrainingWindows:
     """Every window of ``recording`` at ``min_speed`` (m/s) or more."""
     matrix = torch.tensor(recording.matrix, dtype=torch.float32)
-    return Windows(matrix, torch.tensor(recording.window_ends(H, min_speed=min_speed)), H)
+    return TrainingWindows(matrix, torch.tensor(recording.window_ends(H, min_speed=min_speed)), H)
 
 
-def normalisation(recording: Recording, windows: Windows) -> Normalisation:
+def normalisation(recording: Recording, windows: TrainingWindows) -> Normalisation:
     """Scales from the training windows.
 
     Raises:

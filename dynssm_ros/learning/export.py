@@ -22,7 +22,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import replacing
-from dynssm_ros.learning.dataset import Windows
+from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import TrainableModel
 from dynssm_ros.learning.models.registry import build_model, parse_model_config
@@ -220,8 +220,8 @@ def eager_prediction(artifact: Artifact) -> Callable[[], None]:
 
 
 def _sample_windows(trained: Trained, count: int = 256) -> Tensor:
-    """Windows spread over the training data."""
+    """TrainingWindows spread over the training data."""
     matrix = torch.tensor(trained.recording.matrix, dtype=torch.float32)
     ends = trained.recording.window_ends(trained.H, min_speed=trained.vehicle.minimum_speed)
     chosen = torch.tensor(ends[np.linspace(0, len(ends) - 1, count).astype(int)])
-    return Windows(matrix, chosen, trained.H).batch(slice(None))[0]
+    return TrainingWindows(matrix, chosen, trained.H).batch(slice(None))[0]

@@ -18,7 +18,7 @@ from dynssm_ros import __version__
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.files import replacing
 from dynssm_ros.learning.augmentation import Augmentation
-from dynssm_ros.learning.dataset import Windows
+from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import COMPONENTS, LossConfig, Scales, scales
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel, TrainingConfig
 from dynssm_ros.runtime.artifact import Normalisation
@@ -68,8 +68,8 @@ class Optimisation:
         vehicle: Vehicle,
         model: TrainableModel,
         scale: Normalisation,
-        training: Windows,
-        validation: Windows,
+        training: TrainingWindows,
+        validation: TrainingWindows,
         checkpoint: Path,
         device: torch.device,
     ) -> None:
@@ -199,7 +199,7 @@ def _schedule(settings: TrainingConfig, optimiser: torch.optim.Optimizer) -> tor
     return torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs, floor)
 
 
-def _identity(config: ModelConfig, vehicle: Vehicle, training: Windows) -> str:
+def _identity(config: ModelConfig, vehicle: Vehicle, training: TrainingWindows) -> str:
     """Names a training by code, data, car and configuration, so that a checkpoint is never continued for another."""
     digest = hashlib.sha256(f"{__version__} {torch.__version__} {config.model_dump_json()}".encode())
     digest.update(vehicle.model_dump_json().encode())

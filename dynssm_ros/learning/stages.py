@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.learning.dataset import Windows, all_windows, normalisation, split_windows
+from dynssm_ros.learning.dataset import TrainingWindows, all_windows, normalisation, split_windows
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.learning.models.registry import build_model
 from dynssm_ros.learning.optimisation import History, Optimisation, OptimisationResult, Progress
@@ -127,14 +127,16 @@ def check_device(device: str) -> None:
 
 
 @torch.no_grad()
-def validation_rmse(model: TrainableModel, windows: Windows) -> tuple[float, float, float]:
+def validation_rmse(model: TrainableModel, windows: TrainingWindows) -> tuple[float, float, float]:
     """One-step RMSE of each state over ``windows`` (m/s, m/s, rad/s)."""
     batch, target = windows.batch(slice(None))
     rmse = (model(batch).increment - target).square().mean(0).sqrt().tolist()
     return rmse[0], rmse[1], rmse[2]
 
 
-def _split(recording: Recording, config: ModelConfig, vehicle: Vehicle, extra_rows: int = 0) -> tuple[Windows, Windows]:
+def _split(
+    recording: Recording, config: ModelConfig, vehicle: Vehicle, extra_rows: int = 0
+) -> tuple[TrainingWindows, TrainingWindows]:
     """Training and validation windows of ``extra_rows`` more rows than the model's."""
     rows, least = config.rows(vehicle.sampling_time) + extra_rows, config.training.effort[1]
     return split_windows(recording, rows, config.training, vehicle.minimum_speed, least)

@@ -72,7 +72,9 @@ class ControllerNode(Node):
         track = describe(self, "track", "club", "Track: built-in name or CSV file.", read_only=True)
         scale = describe(self, "scale", 1.0, "Size of the track.", (1e-4, 1e4), read_only=True)
         line = describe(self, "line", "racing", "What to follow: centre, racing or a file with speeds.", read_only=True)
-        pace = describe(self, "pace", 0.9, "Share of the car's limits in the line's speed.", (0.1, 2.0), read_only=True)
+        speed_scale = describe(
+            self, "speed_scale", 0.9, "Share of the car's limits in the line's speed.", (0.1, 2.0), read_only=True
+        )
         objective: Objective = choose(
             self, "objective", "tracking", get_args(Objective), "To follow the line's speed, or to go as far as can be."
         )
@@ -87,7 +89,7 @@ class ControllerNode(Node):
             raise ConfigurationError(f"parameter horizon: {horizon}; expected {_STEPS[0]} to {_STEPS[1]}, or 0")
         car = load_vehicle(vehicle)
         road = load_track(track).scaled(scale)
-        reference = load_reference(line, car, road, pace)
+        reference = load_reference(line, car, road, speed_scale)
         settings = Settings.of(car, objective, horizon or None, offset_free)
         settings = replace(settings, deadline=car.sampling_time / self._rate)
         driver = LiveController(car, reference, road, settings, max_age, self._watchdog)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.improvement import Gain
+from dynssm_ros.identification.improvement import Improvement
 from dynssm_ros.reporting.evaluation_figures import (
     MEASURED,
     NO_MODEL,
@@ -33,9 +33,9 @@ _LONGEST = 2.2  # of the recalibrated car's error; what the car as given exceeds
 
 
 @styled
-def simulated_and_measured(gain: Gain) -> Figure:
+def simulated_and_measured(improvement: Improvement) -> Figure:
     """The liveliest held-out stretch: measured, and simulations that start anew from measured states."""
-    windows = gain.windows
+    windows = improvement.windows
     T_s, rows = windows.data.T_s, windows.data.rows
     at = windows.starts
     shown = at[liveliest(windows.time, rows[:3, at].T, _SECONDS)]
@@ -53,7 +53,7 @@ def simulated_and_measured(gain: Gain) -> Figure:
         panel.set_ylabel(f"{SYMBOLS[channel]} ({UNITS[channel]})")
         low, high = np.ptp(rows[c, whole]) * np.array([-0.4, 0.4]) + [rows[c, whole].min(), rows[c, whole].max()]
         panel.set_ylim(low, high)
-    for (name, car), colour in zip(gain.cars.items(), _COLOURS, strict=True):
+    for (name, car), colour in zip(improvement.cars.items(), _COLOURS, strict=True):
         predicted = runs.errors(car) + runs.target
         path = np.concatenate([np.moveaxis(rows[:3, runs.starts], 0, 1)[:, None], predicted], axis=1)
         path = np.concatenate([path, np.full((len(path), 1, 3), np.nan)], axis=1)  # lifts the pen
@@ -67,21 +67,21 @@ def simulated_and_measured(gain: Gain) -> Figure:
 
 
 @styled
-def gain_by_horizon(gain: Gain) -> Figure:
+def gain_by_horizon(improvement: Improvement) -> Figure:
     """Errors of each car at each horizon, a panel per channel."""
     figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
     axes = figure.subplots(1, 3)
-    places = np.arange(len(gain.horizons))
-    width = 0.8 / len(gain.rmse)
+    places = np.arange(len(improvement.horizons))
+    width = 0.8 / len(improvement.rmse)
     for c, (panel, channel) in enumerate(zip(axes, STATE_SIGNALS, strict=True)):
-        others = np.max([values[:, c] for values in list(gain.rmse.values())[1:]])
-        for k, (name, values) in enumerate(gain.rmse.items()):
+        others = np.max([values[:, c] for values in list(improvement.rmse.values())[1:]])
+        for k, (name, values) in enumerate(improvement.rmse.items()):
             at = places + (k - 1) * width
             panel.bar(at, np.minimum(values[:, c], _LONGEST * others), 0.9 * width, color=_COLOURS[k], label=name)
             for x, value in zip(at, values[:, c], strict=True):
                 if value > _LONGEST * others:
                     panel.text(x, _LONGEST * others, text(float(value)), ha="center", va="bottom", fontsize=8)
-        panel.set_xticks(places, [f"{ahead:.4g} s" for ahead in gain.horizons])
+        panel.set_xticks(places, [f"{ahead:.4g} s" for ahead in improvement.horizons])
         panel.set_title(f"{SYMBOLS[channel]} ({UNITS[channel]})", pad=14)
         panel.grid(axis="x", visible=False)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
@@ -90,7 +90,7 @@ def gain_by_horizon(gain: Gain) -> Figure:
 
 @styled
 def evidence(tried: Mapping[str, float], named: Sequence[str]) -> Figure:
-    """Gain of each effect alone, the largest at the top; named causes are coloured."""
+    """Improvement of each effect alone, the largest at the top; named causes are coloured."""
     ordered = sorted(tried.items(), key=lambda item: item[1])
     figure = Figure(figsize=(WIDTH, 0.8 + 0.22 * max(len(ordered), 1)), layout="constrained")
     panel = figure.subplots()
@@ -105,18 +105,18 @@ def evidence(tried: Mapping[str, float], named: Sequence[str]) -> Figure:
 
 
 @styled
-def errors_over_time(gain: Gain) -> Figure:
+def errors_over_time(improvement: Improvement) -> Figure:
     """Errors one step and the horizon ahead over time, of the recalibrated and of the extended car."""
     figure = Figure(figsize=(WIDTH, 5.0), layout="constrained")
     axes = figure.subplots(3, 2, sharex=True)
-    order = np.argsort(gain.windows.time)
-    t = gain.windows.time[order]
-    for (name, values), colour in zip(list(gain.errors.items())[1:], _COLOURS[1:], strict=True):
-        for column, h in enumerate((0, gain.horizon)):
+    order = np.argsort(improvement.windows.time)
+    t = improvement.windows.time[order]
+    for (name, values), colour in zip(list(improvement.errors.items())[1:], _COLOURS[1:], strict=True):
+        for column, h in enumerate((0, improvement.horizon)):
             for c in range(3):
                 axes[c, column].plot(t, values[order, h, c], color=colour, lw=0.8, label=name)
-    for column, h in enumerate((0, gain.horizon)):
-        axes[0, column].set_title(f"{gain.horizons[h]:.4g} s ahead")
+    for column, h in enumerate((0, improvement.horizon)):
+        axes[0, column].set_title(f"{improvement.horizons[h]:.4g} s ahead")
         axes[2, column].set_xlabel("time (s)")
         for c, channel in enumerate(STATE_SIGNALS):
             axes[c, column].axhline(0.0, color=MEASURED, lw=0.8)
@@ -127,23 +127,23 @@ def errors_over_time(gain: Gain) -> Figure:
 
 
 @styled
-def errors_over(label: str, x: Vector, gain: Gain) -> Figure:
+def errors_over(label: str, x: Vector, improvement: Improvement) -> Figure:
     """Mean and spread of the errors against something, one step and the horizon ahead, a column per channel.
 
     Args:
         label: of the abscissa.
         x: abscissa of each simulation, shape ``(W,)``.
-        gain: whose errors are shown.
+        improvement: whose errors are shown.
     """
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     axes = figure.subplots(2, 3, sharex=True)
     bins = _binned(x)
     centre = [x[b].mean() for b in bins]
-    for row, h in enumerate((0, gain.horizon)):
+    for row, h in enumerate((0, improvement.horizon)):
         for c, channel in enumerate(STATE_SIGNALS):
             panel: Axes = axes[row, c]
             reach = 0.0
-            for (name, errors), colour in zip(gain.errors.items(), _COLOURS, strict=True):
+            for (name, errors), colour in zip(improvement.errors.items(), _COLOURS, strict=True):
                 mean = np.array([errors[b, h, c].mean() for b in bins])
                 panel.plot(centre, mean, "o-", color=colour, ms=2.5, label=name)
                 if colour != NO_MODEL:
@@ -156,7 +156,7 @@ def errors_over(label: str, x: Vector, gain: Gain) -> Figure:
                 panel.set_title(f"{SYMBOLS[channel]} error ({UNITS[channel]})")
             else:
                 panel.set_xlabel(label)
-        axes[row, 0].set_ylabel(f"{gain.horizons[h]:.4g} s ahead")
+        axes[row, 0].set_ylabel(f"{improvement.horizons[h]:.4g} s ahead")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
     return figure
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from dynssm_ros.identification.diagnose import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
-from dynssm_ros.identification.residuals import Systematic
-from dynssm_ros.identification.selection import SURE
+from dynssm_ros.identification.residuals import ExplainedVariance
+from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC
 from dynssm_ros.reporting import diagnosis_figures
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.page import Report, Section
@@ -22,8 +22,8 @@ _LITTLE = 0.02  # of the squared error; less is not worth a word
 _WIDTH = 110
 
 
-def in_words(diagnosis: Diagnosis) -> str:
-    """The result for a terminal: cause, size, evidence, gain, what to do, what is left."""
+def as_text(diagnosis: Diagnosis) -> str:
+    """The result for a terminal: cause, size, evidence, improvement, what to do, what is left."""
     lines = [headline(diagnosis)]
     for number, cause in enumerate(diagnosis.causes, 1):
         lines += ["", f"{number}. {cause.effect}: {size_in_words(cause)}"]
@@ -44,7 +44,7 @@ def headline(diagnosis: Diagnosis) -> str:
     return "Something is wrong that no effect of the library explains."
 
 
-def pattern_in_words(left: Systematic) -> str:
+def pattern_in_words(left: ExplainedVariance) -> str:
     """What systematic error goes with, and where on the lap it is farthest off."""
     parts = []
     for c, channel in enumerate(STATE_SIGNALS):
@@ -62,9 +62,9 @@ def left_in_words(diagnosis: Diagnosis) -> str:
     """What the extended car gets wrong beyond noise; empty if there is nothing."""
     parts = []
     if diagnosis.left.is_there:
-        parts.append(f"Systematic error that is left, and what it goes with: {pattern_in_words(diagnosis.left)}")
-    if diagnosis.bunched.is_there:
-        low, high = diagnosis.bunched.when
+        parts.append(f"ExplainedVariance error that is left, and what it goes with: {pattern_in_words(diagnosis.left)}")
+    if diagnosis.clustered.is_there:
+        low, high = diagnosis.clustered.when
         parts.append(
             "Errors come together over seconds as noise does not, so that something is missing that comes and goes; they are "
             f"largest {low:.0f} to {high:.0f} s into the recording."
@@ -90,7 +90,8 @@ def evidence_in_words(cause: Cause) -> str:
         if cause.heldout_gain > 0
         else f"on held-out laps it takes nothing away ({percent(cause.heldout_gain)})"
     )
-    return f"the information criterion is better by {cause.delta_bic:.0f} (above {SURE:.0f} is very strong); {held_out}"
+    strong = f"above {DECISIVE_DELTA_BIC:.0f} is very strong"
+    return f"the information criterion is better by {cause.delta_bic:.0f} ({strong}); {held_out}"
 
 
 def alternatives_in_words(cause: Cause) -> str:
@@ -101,15 +102,15 @@ def alternatives_in_words(cause: Cause) -> str:
 
 def gain_in_words(diagnosis: Diagnosis) -> list[str]:
     """Errors before and after, by channel."""
-    gain = diagnosis.gain
-    at = gain.horizon
-    low, high = gain.interval_from(RECALIBRATED)[:, at]
-    lines = [f"Error on held-out laps {gain.horizons[at]:.4g} s ahead:"]
+    improvement = diagnosis.improvement
+    at = improvement.horizon
+    low, high = improvement.interval_from(RECALIBRATED)[:, at]
+    lines = [f"Error on held-out laps {improvement.horizons[at]:.4g} s ahead:"]
     for c, channel in enumerate(STATE_SIGNALS):
-        values = ", ".join(f"{text(float(values[at, c]))} {name}" for name, values in gain.rmse.items())
+        values = ", ".join(f"{text(float(values[at, c]))} {name}" for name, values in improvement.rmse.items())
         lines.append(
-            f"   {channel} ({UNITS[channel]}): {values}: {percent(float(gain.reduction[at, c]))} less than as given, "
-            f"{percent(float(gain.reduction_from(RECALIBRATED)[at, c]))} less than recalibrated "
+            f"   {channel} ({UNITS[channel]}): {values}: {percent(float(improvement.reduction[at, c]))} less than as given, "
+            f"{percent(float(improvement.reduction_from(RECALIBRATED)[at, c]))} less than recalibrated "
             f"(95 %: {percent(float(low[c]))} to {percent(float(high[c]))})"
         )
     return lines
@@ -164,25 +165,25 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
 
 
 def _gained(diagnosis: Diagnosis) -> Iterator[Section]:
-    gain = diagnosis.gain
+    improvement = diagnosis.improvement
     yield Section(
         "Simulated and measured",
         f"A lively stretch of the held-out laps. Each simulation starts at a measured state and runs free for "
-        f"{gain.horizons[-1]:.4g} s, with the measured throttle and steering.",
-        diagnosis_figures.simulated_and_measured(gain),
+        f"{improvement.horizons[-1]:.4g} s, with the measured throttle and steering.",
+        diagnosis_figures.simulated_and_measured(improvement),
     )
     yield Section(
-        "Gain on held-out laps",
+        "Improvement on held-out laps",
         "Root mean square error of simulations that start at measured states of laps that neither the fit nor the "
         f"selection saw: the car {GIVEN}, its nominal values {RECALIBRATED} without any cause, and {EXTENDED} by the "
         "causes. Intervals are from a bootstrap over blocks in time. What is systematic the signals and the place on the "
-        "lap foretell, on parts of the data to which that was not fitted.",
-        diagnosis_figures.gain_by_horizon(gain),
+        "lap predict, on parts of the data to which that was not fitted.",
+        diagnosis_figures.gain_by_horizon(improvement),
         _gain_table(diagnosis),
     )
     yield Section(
-        "Systematic error and noise",
-        "The same errors in two parts: what the signals and the place on the lap foretell, and the rest, which is noise "
+        "ExplainedVariance error and noise",
+        "The same errors in two parts: what the signals and the place on the lap predict, and the rest, which is noise "
         "or what the signals do not show. By place alone is what repeats lap after lap. Gone is the share of the "
         f"systematic squared error of the car {GIVEN} that the extended one does not make. {left_in_words(diagnosis)}",
         None,
@@ -191,16 +192,17 @@ def _gained(diagnosis: Diagnosis) -> Iterator[Section]:
 
 
 def _shown(diagnosis: Diagnosis) -> Iterator[Section]:
-    gain = diagnosis.gain
-    windows = gain.windows
+    improvement = diagnosis.improvement
+    windows = improvement.windows
     rows = windows.data.rows
     yield Section(
         "Errors over time",
-        f"Predicted minus measured on the held-out laps, one step and {gain.horizons[gain.horizon]:.4g} s ahead.",
-        diagnosis_figures.errors_over_time(gain),
+        "Predicted minus measured on the held-out laps, one step and "
+        f"{improvement.horizons[improvement.horizon]:.4g} s ahead.",
+        diagnosis_figures.errors_over_time(improvement),
     )
     # what was going on half the way into the simulation
-    at = windows.starts + round(gain.horizons[gain.horizon] / windows.data.T_s / 2)
+    at = windows.starts + round(improvement.horizons[improvement.horizon] / windows.data.T_s / 2)
     against = {
         "speed (m/s)": rows[0, at],
         "lateral acceleration (m/s²)": rows[0, at] * rows[2, at],
@@ -213,8 +215,8 @@ def _shown(diagnosis: Diagnosis) -> Iterator[Section]:
         yield Section(
             f"Errors against {label.split(' (')[0]}",
             "Mean and spread in bins: where the mean is off zero by more than the line's wiggling, the error is "
-            f"systematic. The car {GIVEN} may leave the panel.",
-            diagnosis_figures.errors_over(label, values, gain),
+            f"explained_variance. The car {GIVEN} may leave the panel.",
+            diagnosis_figures.errors_over(label, values, improvement),
         )
 
 
@@ -242,41 +244,41 @@ def _found(diagnosis: Diagnosis) -> Iterator[Section]:
 
 
 def _gain_table(diagnosis: Diagnosis) -> Table:
-    gain = diagnosis.gain
+    improvement = diagnosis.improvement
     columns = (
-        Column("channel"), Column("ahead", "s"), *(Column(name, group="error") for name in gain.rmse),
+        Column("channel"), Column("ahead", "s"), *(Column(name, group="error") for name in improvement.rmse),
         *(
             Column(title, "%", f"less than {name}")
             for name in (GIVEN, RECALIBRATED) for title in ("share", "from", "to")
         ),
     )  # fmt: skip
-    less = [(gain.reduction_from(name), *gain.interval_from(name)) for name in (GIVEN, RECALIBRATED)]
+    less = [(improvement.reduction_from(name), *improvement.interval_from(name)) for name in (GIVEN, RECALIBRATED)]
     rows: list[list[Value]] = []
     for c, channel in enumerate(STATE_SIGNALS):
-        for k, ahead in enumerate(gain.horizons):
-            values = [float(values[k, c]) for values in gain.rmse.values()]
+        for k, ahead in enumerate(improvement.horizons):
+            values = [float(values[k, c]) for values in improvement.rmse.values()]
             shares = [round(100 * float(v[k, c])) for one in less for v in one]
             rows.append([f"{channel} ({UNITS[channel]})", f"{ahead:.4g}", *values, *shares])
     return Table(columns, rows)
 
 
 def _systematic_table(diagnosis: Diagnosis) -> Table:
-    gain = diagnosis.gain
+    improvement = diagnosis.improvement
     columns = (
         Column("channel"), Column("ahead", "s"),
-        *(Column(title, "", name) for name in gain.rmse for title in ("systematic", "rest")),
-        Column("gone", "%", "systematic"),
-        *(Column(name, "%", "systematic by place alone") for name in (GIVEN, EXTENDED)),
+        *(Column(title, "", name) for name in improvement.rmse for title in ("explained_variance", "rest")),
+        Column("gone", "%", "explained_variance"),
+        *(Column(name, "%", "explained_variance by place alone") for name in (GIVEN, EXTENDED)),
     )  # fmt: skip
-    gone = gain.systematic_gone(GIVEN)
+    gone = improvement.systematic_gone(GIVEN)
     rows: list[list[Value]] = []
     for c, channel in enumerate(STATE_SIGNALS):
-        for k, ahead in enumerate(gain.horizons):
+        for k, ahead in enumerate(improvement.horizons):
             parts: list[Value] = []
-            for name, values in gain.rmse.items():
-                share = float(gain.systematic[name][k].share[c])
+            for name, values in improvement.rmse.items():
+                share = float(improvement.explained_variance[name][k].share[c])
                 parts += [float(values[k, c] * np.sqrt(part)) for part in (share, 1.0 - share)]
-            place = [100 * float(gain.systematic[name][k].by_place[c]) for name in (GIVEN, EXTENDED)]
+            place = [100 * float(improvement.explained_variance[name][k].by_place[c]) for name in (GIVEN, EXTENDED)]
             rows.append([f"{channel} ({UNITS[channel]})", f"{ahead:.4g}", *parts, 100 * float(gone[k, c]), *place])
     return Table(columns, rows)
 
@@ -285,7 +287,7 @@ def _noticeable_table(diagnosis: Diagnosis) -> Table:
     columns = (Column("effect"), Column("noticed from"), Column("unit"), Column("judged"))
     rows: list[list[Value]] = []
     for effect, size in sorted(
-        diagnosis.noticeable.items(), key=lambda item: item[1] / EFFECTS[item[0]].magnitude().span
+        diagnosis.minimum_detectable.items(), key=lambda item: item[1] / EFFECTS[item[0]].magnitude().span
     ):
         about = EFFECTS[effect].magnitude()
         rows.append([effect, size, "" if about.unit == "1" else about.unit, "yes" if size <= about.span else "no"])

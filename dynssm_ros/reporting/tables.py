@@ -11,9 +11,9 @@ import rich.box
 import rich.table
 from rich.markup import escape
 
-from dynssm_ros.evaluation.spread import Spread
+from dynssm_ros.evaluation.spread import SeedSpread
 
-Value = float | int | str | Spread | None
+Value = float | int | str | SeedSpread | None
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Cell:
 class Table:
     """Values in rows. ``None``, NaN and infinity show as a dash; numbers have three significant digits.
 
-    The :class:`Spread` of several seeds shows as mean ± standard deviation and is compared by its mean.
+    The :class:`SeedSpread` of several seeds shows as mean ± standard deviation and is compared by its mean.
     """
 
     columns: tuple[Column, ...]
@@ -148,7 +148,7 @@ class Table:
 
 def text(value: Value) -> str:
     """A value as shown: integers and large numbers in full, others with three significant digits; the mean of a spread."""
-    if isinstance(value, Spread):
+    if isinstance(value, SeedSpread):
         return text(value.mean)
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "–"
@@ -166,7 +166,7 @@ def percent(share: float) -> str:
 
 def _spread(value: Value) -> str:
     """The standard deviation over several seeds, with as many decimals as the mean."""
-    if not isinstance(value, Spread) or value.n == 1 or not math.isfinite(value.std):
+    if not isinstance(value, SeedSpread) or value.n == 1 or not math.isfinite(value.std):
         return ""
     mean = text(value.mean)
     return f"± {value.std:.1e}" if "e" in mean else f"± {value.std:,.{len(mean.partition('.')[2])}f}"
@@ -174,7 +174,7 @@ def _spread(value: Value) -> str:
 
 def _number(value: Value) -> float | None:
     """What ``value`` is compared by; ``None`` for words and dashes."""
-    if isinstance(value, Spread):
+    if isinstance(value, SeedSpread):
         return value.mean
     return None if isinstance(value, str) else value
 

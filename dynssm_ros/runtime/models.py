@@ -15,8 +15,8 @@ from dynssm_ros.runtime.artifact import Artifact, open_artifact
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle import Coefficients, State, Vehicle
-from dynssm_ros.vehicle.effects import initial_memory
-from dynssm_ros.vehicle.single_track import Integrator, step_with_memory
+from dynssm_ros.vehicle.effects import initial_effect_states
+from dynssm_ros.vehicle.single_track import Integrator, step_with_effect_states
 
 
 class WindowPrediction(NamedTuple):
@@ -95,11 +95,11 @@ class SingleTrack:
     def _following(self, rows: Vector) -> Vector:
         """Next states ``(N, 3)`` of single rows ``(N, 7)``."""
         now = rows.T
-        memory = initial_memory(self._effects, now[3], now[4])
-        state, _ = step_with_memory(
+        effect_states = initial_effect_states(self._effects, now[3], now[4])
+        state, _ = step_with_effect_states(
             np,
             State(*now[:3]),
-            memory,
+            effect_states,
             applied_inputs(now),
             Coefficients(*self._theta),
             self.vehicle.constants,
@@ -156,7 +156,7 @@ class OnnxModel:
         options = ort.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.enable_mem_reuse = False  # small tensors: planning their reuse costs more than their memory
+        options.enable_mem_reuse = False  # small tensors: planning their reuse costs more than their effect states
         options.log_severity_level = 3
         try:
             self._session = ort.InferenceSession(artifact.onnx, options, providers=["CPUExecutionProvider"])

@@ -1,7 +1,7 @@
 """rosbag2 folders and single files (MCAP and SQLite3), any message type that the bag describes.
 
 Reading is rosbags' work. What is added here: one clear error per kind of damage, and the way around it where there is
-one - bags that were cut off (:mod:`dynssm_ros.signals.rescue`), that lack their metadata or index, or some of whose
+one - bags that were cut off (:mod:`dynssm_ros.signals.recover`), that lack their metadata or index, or some of whose
 files are lost.
 """
 
@@ -24,7 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.files import replacing
-from dynssm_ros.signals.rescue import is_short, is_unindexed, log_left, merge_log, rescue, unpack, unpacked_message
+from dynssm_ros.signals.recover import is_short, is_unindexed, log_left, merge_log, recover, unpack, unpacked_message
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 _NO_INDEX = "it has no index"
@@ -211,19 +211,19 @@ def _usable_file(file: Path, scratch: Path, notes: list[str]) -> Path | None:
     if damage is None:
         return source
     damage = damage.replace(str(source), file.name)
-    rescued = scratch / f"rescued{source.suffix}"
-    messages, complete = rescue(source, rescued)
+    recovered = scratch / f"recovered{source.suffix}"
+    messages, complete = recover(source, recovered)
     if messages == 0:
         notes.append(f"{file.name} holds nothing: not a bag, or cut off before its first message ({damage})")
         return None
-    if (left := _damage(rescued)) is not None:
-        notes.append(f"{file.name} cannot be read ({left.replace(str(rescued), file.name)})")
+    if (left := _damage(recovered)) is not None:
+        notes.append(f"{file.name} cannot be read ({left.replace(str(recovered), file.name)})")
         return None
     if not complete:
         notes.append(f"{file.name} is cut off ({damage}): recovered {messages} messages up to the cut")
     elif damage != _NO_INDEX:
         notes.append(f"{file.name} cannot be read as it is ({damage}): its {messages} ROS messages were copied")
-    return rescued
+    return recovered
 
 
 def _damage(file: Path) -> str | None:

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.double_track import DoubleTrack
-from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step_with_memory
+from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step_with_effect_states
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose, world_velocity
-from dynssm_ros.vehicle.single_track import Integrator, Motion, StageEffect, measured_state, settled_memory
+from dynssm_ros.vehicle.single_track import Integrator, Motion, StageEffect, measured_state, settled_effect_states
 
 PlantKind = str
 """Name of a plant, see :data:`PLANTS`."""
@@ -45,13 +45,13 @@ class _Odometer(StageEffect):
 
     def inputs(self, xp: Any, q: Motion) -> None:
         """Shows the pose to the effects that follow."""
-        q.context = {**q.context, **{name: q.memory[f"pose.{name}"] for name in Pose._fields}}
+        q.context = {**q.context, **{name: q.effect_states[f"pose.{name}"] for name in Pose._fields}}
 
     def accelerations(self, xp: Any, q: Motion) -> None:
         """Sets the rates of the pose."""
         x, y, theta = self.POSE
-        q.memory_rate[x], q.memory_rate[y] = world_velocity(xp, q.memory[theta], q.v_x, q.v_y)
-        q.memory_rate[theta] = q.omega
+        q.effect_state_rates[x], q.effect_state_rates[y] = world_velocity(xp, q.effect_states[theta], q.v_x, q.v_y)
+        q.effect_state_rates[theta] = q.omega
 
 
 class SingleTrackPlant:
@@ -94,7 +94,7 @@ class SingleTrackPlant:
         self._steps = 0
         self._track = {} if lap_length is None else {"lap_length": lap_length}
         require_context(effects, {*self._context(0.0), *Pose._fields}, "simulation")
-        self._memory = settled_memory(
+        self._memory = settled_effect_states(
             SCALAR, state, Applied(0.0, 0.0), self._theta, vehicle.constants, self._effects,
             dict(zip(_Odometer.POSE, pose, strict=True)), self._context(0.0), measured=False,
         )  # fmt: skip
@@ -117,7 +117,7 @@ class SingleTrackPlant:
         pieces = self._substeps if self._late else 1  # a late reading falls between two steps
         h, context = self._vehicle.sampling_time / pieces, self._context(s)
         for _ in range(pieces):
-            self.state, self._memory = step_with_memory(
+            self.state, self._memory = step_with_effect_states(
                 SCALAR,
                 self.state,
                 self._memory,

@@ -131,7 +131,7 @@ class Vehicle(StrictModel):
     @field_validator("effects")
     @classmethod
     def _one_memory_each(cls, value: tuple[EffectEntry, ...]) -> tuple[EffectEntry, ...]:
-        names = [entry.name for entry in value if EFFECTS[entry.name].MEMORY]
+        names = [entry.name for entry in value if EFFECTS[entry.name].EFFECT_STATES]
         twice = [name for name in names if names.count(name) > 1]
         if twice:
             raise ValueError(f"effect {twice[0]} has a state of its own and can be listed only once")

@@ -133,8 +133,8 @@ class Motion:
     omega_dot: Array = 0.0
     # states that effects carry along (a lag, a relaxing tyre) with their rates, what else was measured, and the time (s)
     # over which the integrator holds the rates
-    memory: dict[str, Array] = field(default_factory=dict)
-    memory_rate: dict[str, Array] = field(default_factory=dict)
+    effect_states: dict[str, Array] = field(default_factory=dict)
+    effect_state_rates: dict[str, Array] = field(default_factory=dict)
     context: Mapping[str, Array] = field(default_factory=dict)
     h: float = _INSTANT
 
@@ -194,11 +194,11 @@ class StageEffect:
     def accelerations(self, xp: Any, q: Motion) -> None:
         """Changes the derivatives of the state."""
 
-    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+    def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """What is measured of the true ``state``."""
         return state
 
-    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+    def true(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """The true state of which ``state`` is measured: the inverse of :meth:`measured`."""
         return state
 
@@ -297,7 +297,7 @@ def motion(
     theta: Coefficients,
     constants: Constants,
     effects: Sequence[StageEffect] = (),
-    memory: Mapping[str, Array] | None = None,
+    effect_states: Mapping[str, Array] | None = None,
     context: Mapping[str, Array] | None = None,
     h: float = _INSTANT,
 ) -> Motion:
@@ -310,7 +310,7 @@ def motion(
         theta: the 17 coefficients, broadcastable to ``(...)``.
         constants: mass and geometry.
         effects: physics beyond the nominal model, in the order in which it acts.
-        memory: the effects' own states by name; those left out are settled, and are in ``memory`` of the result.
+        effect_states: the effects' own states by name; those left out are settled and returned with the result.
         context: other signals by the names of ``CONTEXT_UNITS`` (time, heading, track position, ...) that effects read.
         h: time (s) over which an integrator holds the rates; lags that are quicker settle within it.
 
@@ -327,7 +327,7 @@ def motion(
         h_cg=constants.h_cg,
         F_z0=constants.F_z0,
         load_transfer=constants.load_transfer,
-        memory=dict(memory or {}),
+        effect_states=dict(effect_states or {}),
         context=context or {},
         h=h,
     )
@@ -361,32 +361,32 @@ def measuring(effects: Sequence[StageEffect]) -> tuple[StageEffect, ...]:
     return tuple(effect for effect in effects if effect.measures)
 
 
-def measured_state(xp: Any, state: State, effects: Sequence[StageEffect], memory: Mapping[str, Array]) -> State:
+def measured_state(xp: Any, state: State, effects: Sequence[StageEffect], effect_states: Mapping[str, Array]) -> State:
     """What sensors show of the true ``state``: the effects that measure, one after the other."""
     for effect in measuring(effects):
-        state = effect.measured(xp, state, memory)
+        state = effect.measured(xp, state, effect_states)
     return state
 
 
-def true_state(xp: Any, state: State, effects: Sequence[StageEffect], memory: Mapping[str, Array]) -> State:
+def true_state(xp: Any, state: State, effects: Sequence[StageEffect], effect_states: Mapping[str, Array]) -> State:
     """The true state behind a measured one: the inverse of :func:`measured_state`."""
     for effect in reversed(measuring(effects)):
-        state = effect.true(xp, state, memory)
+        state = effect.true(xp, state, effect_states)
     return state
 
 
-def settled_memory(
+def settled_effect_states(
     xp: Any,
     state: State,
     applied: Applied,
     theta: Coefficients,
     constants: Constants,
     effects: Sequence[StageEffect],
-    memory: Mapping[str, Array] | None = None,
+    effect_states: Mapping[str, Array] | None = None,
     context: Mapping[str, Array] | None = None,
     measured: bool = True,
 ) -> dict[str, Array]:
-    """``memory`` and the effects' own states that it lacks, settled.
+    """``effect_states`` and the effects' own states that it lacks, settled.
 
     A sensor's state that hides part of the true motion hangs on that motion in turn; where ``state`` is a measured one,
     both are found by a secant step, exact as far as the motion is linear in what is hidden.
@@ -399,18 +399,18 @@ def settled_memory(
         theta: the 17 coefficients.
         constants: mass and geometry.
         effects: physics beyond the nominal model.
-        memory: own states that are known, by name; they stay.
+        effect_states: own states that are known, by name; they stay.
         context: other signals, as in :func:`motion`.
         measured: whether ``state`` is what is measured or the true one.
     """
-    known = dict(memory or {})
+    known = dict(effect_states or {})
     if all(name in known for effect in effects for name in effect.carries):
         return known
     sensors = measuring(effects) if measured else ()
 
     def settled(hidden: Mapping[str, Array]) -> dict[str, Array]:
         true = true_state(xp, state, sensors, {**known, **hidden})
-        return motion(xp, true, applied, theta, constants, effects, known, context).memory
+        return motion(xp, true, applied, theta, constants, effects, known, context).effect_states
 
     first = settled({})
     names = [name for sensor in sensors for name in sensor.carries if name not in known]
@@ -435,16 +435,18 @@ def step(
 ) -> State:
     """Advances the measured state by ``T_s`` seconds under constant inputs, Eq. (32).
 
-    The paper's step is one forward Euler step; ``integrator="rk4"`` and ``substeps`` refine it. Effects with memory
-    start settled; :func:`step_with_memory` carries it on.
+    The paper's step is one forward Euler step; ``integrator="rk4"`` and ``substeps`` refine it. States of effects
+    start settled; :func:`step_with_effect_states` carries it on.
     """
-    return step_with_memory(xp, state, {}, applied, theta, constants, T_s, effects, integrator, substeps, context)[0]
+    return step_with_effect_states(
+        xp, state, {}, applied, theta, constants, T_s, effects, integrator, substeps, context
+    )[0]
 
 
-def step_with_memory(
+def step_with_effect_states(
     xp: Any,
     state: State,
-    memory: Mapping[str, Array],
+    effect_states: Mapping[str, Array],
     applied: Applied,
     theta: Coefficients,
     constants: Constants,
@@ -455,22 +457,24 @@ def step_with_memory(
     context: Mapping[str, Array] | None = None,
     measured: bool = True,
 ) -> tuple[State, dict[str, Array]]:
-    """Like :func:`step`, and integrates the effects' own states (``memory``, by name) with the car's.
+    """Like :func:`step`, and integrates the effects' own states (``effect_states``, by name) with the car's.
 
-    States of effects that ``memory`` lacks start settled. ``measured`` says whether the states are measured ones, as
+    States of effects that ``effect_states`` lacks start settled. ``measured`` says whether the states are measured ones, as
     models step them, or true ones, as a plant does.
     """
-    memory = settled_memory(xp, state, applied, theta, constants, effects, memory, context, measured)
-    moved, changed = increment(
-        xp, state, memory, applied, theta, constants, T_s, effects, integrator, substeps, context, measured
+    effect_states = settled_effect_states(
+        xp, state, applied, theta, constants, effects, effect_states, context, measured
     )
-    return State(*_add(state, moved)), {name: value + changed[name] for name, value in memory.items()}
+    moved, changed = increment(
+        xp, state, effect_states, applied, theta, constants, T_s, effects, integrator, substeps, context, measured
+    )
+    return State(*_add(state, moved)), {name: value + changed[name] for name, value in effect_states.items()}
 
 
 def increment(
     xp: Any,
     state: State,
-    memory: Mapping[str, Array],
+    effect_states: Mapping[str, Array],
     applied: Applied,
     theta: Coefficients,
     constants: Constants,
@@ -481,28 +485,30 @@ def increment(
     context: Mapping[str, Array] | None = None,
     measured: bool = True,
 ) -> tuple[State, dict[str, Array]]:
-    """How much the state and the effects' own states change in ``T_s`` seconds; see :func:`step_with_memory`.
+    """How much the state and the effects' own states change in ``T_s`` seconds; see :func:`step_with_effect_states`.
 
     In single precision an increment is known far better than the difference of two states.
     """
-    memory = settled_memory(xp, state, applied, theta, constants, effects, memory, context, measured)
+    effect_states = settled_effect_states(
+        xp, state, applied, theta, constants, effects, effect_states, context, measured
+    )
     sensors = measuring(effects) if measured else ()
-    true = true_state(xp, state, sensors, memory)
-    names, h = tuple(memory), T_s / substeps
+    true = true_state(xp, state, sensors, effect_states)
+    names, h = tuple(effect_states), T_s / substeps
 
     def rates(y: Sequence[Array]) -> tuple[Array, ...]:
         carried = dict(zip(names, y[3:], strict=True))
         q = motion(xp, State(*y[:3]), applied, theta, constants, effects, carried, context, h)
-        return (q.a_x, q.a_y, q.omega_dot, *(q.memory_rate[name] for name in names))
+        return (q.a_x, q.a_y, q.omega_dot, *(q.effect_state_rates[name] for name in names))
 
     advance = _INTEGRATORS[integrator]
-    start: tuple[Array, ...] = (*true, *memory.values())
+    start: tuple[Array, ...] = (*true, *effect_states.values())
     moved = advance(rates, start, h)
     for _ in range(substeps - 1):
         moved = _add(moved, advance(rates, _add(start, moved), h))
     change, changed = State(*moved[:3]), dict(zip(names, moved[3:], strict=True))
     if sensors:
-        end = {name: value + changed[name] for name, value in memory.items()}
+        end = {name: value + changed[name] for name, value in effect_states.items()}
         change = State(*_subtract(measured_state(xp, State(*_add(true, change)), sensors, end), state))
     return change, changed
 

@@ -17,10 +17,10 @@ from benchmarks.hidden_causes.outcomes import Outcome, judge, matrix, rates
 from benchmarks.hidden_causes.page import page
 from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
 from dynssm_ros.files import write_json
-from dynssm_ros.identification.car import Car
+from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.diagnose import Cause
-from dynssm_ros.identification.problem import Study
-from dynssm_ros.identification.windows import Track, Windows
+from dynssm_ros.identification.problem import IdentificationProblem
+from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
 from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import load_track
@@ -173,13 +173,15 @@ def test_the_least_sizes_are_just_noticeable() -> None:
     rows = np.concatenate([drive.measured.T, drive.feedback.T, (drive.command - drive.feedback).T])
     time = (drive.time - drive.time[0]) / 1e9
     lap = {"s": drive.s % drive.track.length, "lap_length": np.full(len(time), drive.track.length)}
-    track = Track(rows, {"t": time, "theta": drive.pose[:, 2]} | lap, car.sampling_time, time)
-    study = Study(Windows(track, np.arange(8, rows.shape[1] - 14, 13), 13, 8, "euler"), Car.of(car))
-    fit = study.fit(Car.of(car), ())
+    track = RecordedRows(rows, {"t": time, "theta": drive.pose[:, 2]} | lap, car.sampling_time, time)
+    problem = IdentificationProblem(
+        SimulationWindows(track, np.arange(8, rows.shape[1] - 14, 13), 13, 8, "euler"), CarEstimate.of(car)
+    )
+    fit = problem.fit(CarEstimate.of(car), ())
     J = fit.noise.whiten(fit.jacobian).reshape(-1, 18)
     for name, effect in EFFECTS.items():
         values = effect.drawn(effect.TYPICAL[0], np.random.default_rng(0))
-        change = fit.noise.whiten(study.errors(fit.car.with_effect(name, values)) - fit.errors).ravel()
+        change = fit.noise.whiten(problem.errors(fit.car.with_effect(name, values)) - fit.errors).ravel()
         seen = J.T @ change
         evidence = change @ change - seen @ np.linalg.solve(J.T @ J + np.eye(18), seen)
         assert 40 < evidence < 5 * 49, name

@@ -11,7 +11,7 @@ import yaml
 
 from benchmarks.paper.plan import load_plan
 from benchmarks.paper.race_document import write_races
-from benchmarks.paper.race_figures import lap_over_pace
+from benchmarks.paper.race_figures import lap_over_speed_scale
 from benchmarks.paper.racing import NUMBERS
 from benchmarks.paper.reference import load_reference
 from benchmarks.paper.results import Made, read_results
@@ -81,7 +81,7 @@ def test_the_document_sets_the_papers_rows_beside(plan, root, tmp_path):
 def test_races_that_differ_in_their_pace_make_a_figure_together(plan, root, tmp_path):
     """Three of them do, two do not; the published times are those of the race that has them beside."""
     lap = plan.races["lap"]
-    laps = {f"lap_{k}": lap.model_copy(update={"pace": 0.8 + k / 10, "paper": None}) for k in range(3)}
+    laps = {f"lap_{k}": lap.model_copy(update={"speed_scale": 0.8 + k / 10, "paper": None}) for k in range(3)}
     laps["lap_0"] = laps["lap_0"].model_copy(update={"paper": "ETHZMobil", "title": "The first"})
     driven = json.loads((root / race_key("lap") / NUMBERS).read_text())
     for k, name in enumerate(laps):
@@ -98,7 +98,7 @@ def test_races_that_differ_in_their_pace_make_a_figure_together(plan, root, tmp_
 
 def test_lap_times_over_the_pace(tmp_path):
     """What was completed is a line, what was not a mark at the top, and the paper's times are level."""
-    figure = lap_over_pace(
+    figure = lap_over_speed_scale(
         {"a": {0.8: 6.0, 0.9: 5.5, 1.0: None}, "b": {0.8: 6.5, 0.9: 6.4, 1.0: 6.3}},
         {"the line": {0.8: 5.9, 0.9: 5.2, 1.0: 4.7}},
         {"theirs": 4.88},
@@ -111,7 +111,7 @@ def test_lap_times_over_the_pace(tmp_path):
     lost = [line for line in axes.lines if line.get_linestyle() == "None" and len(line.get_ydata())]
     assert [list(line.get_ydata()) for line in lost] == [[top]]
     assert [text.get_text() for text in axes.texts] == ["theirs: 4.88 s"]
-    figure.savefig(tmp_path / "pace.png")
+    figure.savefig(tmp_path / "speed_scale.png")
 
 
 def test_a_race_that_could_not_be_driven_says_why(plan, root, tmp_path):
@@ -124,7 +124,7 @@ def test_a_race_that_could_not_be_driven_says_why(plan, root, tmp_path):
 
 def test_what_decides_the_laps_is_in_the_recipe(plan):
     step = race_step(plan)
-    assert step.recipe()["race"]["pace"] == 1.0
+    assert step.recipe()["race"]["speed_scale"] == 1.0
     assert "text" not in step.recipe()["race"]
     assert set(step.uses) == set(step.trained.values()) == set()
 

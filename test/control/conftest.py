@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.control.horizon_model import Car, HorizonModel
+from dynssm_ros.control.horizon_model import HorizonModel, SteppedCar
 from dynssm_ros.control.nmpc import Nmpc
 from dynssm_ros.control.reference import Reference, load_reference
 from dynssm_ros.control.settings import Settings
@@ -60,17 +60,17 @@ def circle():
 
 @pytest.fixture(scope="session")
 def horizon_model(orca):
-    return HorizonModel(Car(orca.constants, orca.sampling_time, (), "rk4", 2), N)
+    return HorizonModel(SteppedCar(orca.constants, orca.sampling_time, (), "rk4", 2), N)
 
 
 @pytest.fixture
 def controller(horizon_model, orca):
     """Builds a controller of the 1:43 car on ``(track, reference)``."""
 
-    def build(track, reference, objective="tracking", deadline=math.inf, slip=None, leash=None, **options):
+    def build(track, reference, objective="tracking", deadline=math.inf, slip=None, lag_bound=None, **options):
         settings = replace(Settings.of(orca, objective, N), deadline=deadline)
         settings = settings if slip is None else replace(settings, slip=slip)
-        settings = settings if leash is None else replace(settings, leash=leash)
+        settings = settings if lag_bound is None else replace(settings, lag_bound=lag_bound)
         return Nmpc(horizon_model, orca.inputs, reference, track, settings, **options)
 
     return build

@@ -27,8 +27,8 @@ STAMP = 1_700_000_000_000_000_000
 def online(orca, club):
     """Builds the controller on the club track."""
 
-    def build(line="centre", pace=0.7, N=10, **options):
-        reference = load_reference(line, orca, club, pace)
+    def build(line="centre", speed_scale=0.7, N=10, **options):
+        reference = load_reference(line, orca, club, speed_scale)
         return LiveController(orca, reference, club, replace(Settings.of(orca, N=N), deadline=math.inf), **options)
 
     return build
@@ -48,7 +48,7 @@ def steps(monkeypatch):
     return recorded
 
 
-class Car:
+class SteppedCar:
     """The simulated car, rolling at first, that obeys each command one step late."""
 
     def __init__(self, vehicle, track, v_x=1.5):
@@ -91,7 +91,7 @@ def test_laps_from_a_standing_start_stay_between_the_borders(online, orca, club)
 
 
 def test_it_plans_from_where_the_car_is_when_the_command_acts(online, orca, club, steps):
-    controller, car = online(), Car(orca, club)
+    controller, car = online(), SteppedCar(orca, club)
     steps.clear()
     for _ in range(40):
         car.answered(controller)
@@ -104,7 +104,7 @@ def test_it_plans_from_where_the_car_is_when_the_command_acts(online, orca, club
 
 
 def test_what_the_predictor_says_reaches_the_plan_and_is_dropped_when_it_falls_silent(online, orca, club, steps):
-    controller, car = online(max_age=0.1), Car(orca, club)
+    controller, car = online(max_age=0.1), SteppedCar(orca, club)
     theta = orca.nominal + 0.05 * (orca.upper - orca.nominal)
     theta[-1] = orca.nominal[-1]
     for _ in range(5):
@@ -129,7 +129,7 @@ def test_what_the_predictor_says_reaches_the_plan_and_is_dropped_when_it_falls_s
 
 @pytest.mark.parametrize(("spoilt", "by"), [(0, math.nan), (3, math.inf), (5, 1e300)])
 def test_odometry_that_is_not_finite_is_refused_and_the_drive_goes_on(online, orca, club, spoilt, by):
-    controller, car = online(), Car(orca, club)
+    controller, car = online(), SteppedCar(orca, club)
     for _ in range(5):
         car.answered(controller)
     row = [*car.plant.pose, *car.plant.measured]
@@ -143,7 +143,7 @@ def test_odometry_that_is_not_finite_is_refused_and_the_drive_goes_on(online, or
     [State(9e5, 0.0, 0.0), State(2.0, -9e5, 0.0), State(2.0, 0.0, 9e5), State(-3.0, 1.0, 5.0), State(0.0, 0.0, 0.0)],
 )
 def test_odometry_that_cannot_be_yields_a_command_that_can(online, orca, club, state):
-    controller, car = online(), Car(orca, club)
+    controller, car = online(), SteppedCar(orca, club)
     for _ in range(3):
         car.answered(controller)
     command = controller.step(car.stamp, car.plant.pose, state)
@@ -152,7 +152,7 @@ def test_odometry_that_cannot_be_yields_a_command_that_can(online, orca, club, s
 
 
 def test_odometry_that_comes_twice_or_late_is_refused(online, orca, club):
-    controller, car = online(), Car(orca, club)
+    controller, car = online(), SteppedCar(orca, club)
     car.answered(controller)
     car.answered(controller)
     for back in (1, 2):
@@ -160,7 +160,7 @@ def test_odometry_that_comes_twice_or_late_is_refused(online, orca, club):
 
 
 def test_odometry_at_twice_the_rate_is_answered_every_other_time(online, orca, club):
-    controller, car = online(), Car(orca, club)
+    controller, car = online(), SteppedCar(orca, club)
     assert isinstance(car.answered(controller), Applied)
     half = controller.step(car.stamp - T_S // 2, car.plant.pose, car.plant.measured)
     assert half is None
@@ -168,11 +168,11 @@ def test_odometry_at_twice_the_rate_is_answered_every_other_time(online, orca, c
 
 
 def test_time_that_jumps_back_begins_a_new_drive(online, orca, club):
-    controller, car = online(), Car(orca, club)
+    controller, car = online(), SteppedCar(orca, club)
     for _ in range(10):
         car.answered(controller)
     driven = controller.laps.s
-    car = Car(orca, club)
+    car = SteppedCar(orca, club)
     car.stamp -= 10**9
     car.answered(controller)
     assert controller.laps.s != driven
@@ -180,7 +180,7 @@ def test_time_that_jumps_back_begins_a_new_drive(online, orca, club):
 
 
 def test_a_car_that_is_slower_than_the_line_is_brought_up_to_speed(online, orca, club, steps):
-    controller, car = online(), Car(orca, club, v_x=0.0)
+    controller, car = online(), SteppedCar(orca, club, v_x=0.0)
     steps.clear()
     car.answered(controller)
     assert controller.verdict()[1].startswith("gets up to speed")
@@ -192,7 +192,7 @@ def test_a_car_that_is_slower_than_the_line_is_brought_up_to_speed(online, orca,
 
 
 def test_a_gap_ends_the_plan_and_the_car_is_found_wherever_it_is(online, orca, club, steps):
-    controller, car = online(), Car(orca, club)
+    controller, car = online(), SteppedCar(orca, club)
     for _ in range(10):
         car.answered(controller)
     s = 0.6 * club.length
@@ -204,7 +204,7 @@ def test_a_gap_ends_the_plan_and_the_car_is_found_wherever_it_is(online, orca, c
 
 
 def test_far_off_the_road_it_brakes_and_says_so(online, orca, club):
-    controller, car = online(), Car(orca, club)
+    controller, car = online(), SteppedCar(orca, club)
     for _ in range(5):
         car.answered(controller)
     steering = car.sent.delta
@@ -219,7 +219,7 @@ def test_far_off_the_road_it_brakes_and_says_so(online, orca, club):
 
 
 def test_brakes_hold_the_steering(online, orca, club):
-    controller, car = online(), Car(orca, club)
+    controller, car = online(), SteppedCar(orca, club)
     for _ in range(20):
         car.answered(controller)
     assert controller.brake() == (orca.inputs.throttle[0], car.sent.delta)
@@ -228,7 +228,7 @@ def test_brakes_hold_the_steering(online, orca, club):
 def test_late_plans_are_counted_and_told(orca, club):
     reference = load_reference("centre", orca, club, 0.7)
     controller = LiveController(orca, reference, club, replace(Settings.of(orca, N=10), deadline=0.0))
-    car = Car(orca, club)
+    car = SteppedCar(orca, club)
     for _ in range(5):
         assert isinstance(car.answered(controller), Applied)
     assert controller.counts["late"] == 4, "the first plan may take its time"

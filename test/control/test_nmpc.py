@@ -112,7 +112,7 @@ def test_no_step_of_a_plan_slides(orca, circle, controller, objective):
     track, reference = circle(radius=0.6, speed=2.0)
     now, most = state_vector((0.6, 0.0, np.pi / 2), (1.9, 0.0, 2.0), (0.4, 0.1)), {}
     for bound in (0.08, np.inf):
-        nmpc = controller(track, reference, objective, slip=(np.inf, bound), leash=0.0)  # 5 looks at one instant
+        nmpc = controller(track, reference, objective, slip=(np.inf, bound), lag_bound=0.0)  # 5 looks at one instant
         for _ in range(5):
             plan = nmpc.plan(now, nominal(orca))
         v_x, v_y, omega = plan.x[1:, 3:6].T
@@ -133,11 +133,11 @@ def test_no_more_steering_is_planned_than_the_front_makes_use_of(orca, circle, c
     assert most[0.15] < 0.17 < 0.4 < most[np.inf]
 
 
-@pytest.mark.parametrize("leash", [0.0, 0.02])
-def test_time_lost_is_made_up_for_within_the_leash(symmetric_orca, circle, controller, leash):
+@pytest.mark.parametrize("lag_bound", [0.0, 0.02])
+def test_time_lost_is_made_up_for_within_the_leash(symmetric_orca, circle, controller, lag_bound):
     """A start at 1.2 m/s where the line is driven with 1.5 m/s: what is lost until then is won back, or it is not."""
     track, reference = circle()
-    nmpc, feedback, lost = controller(track, reference, leash=leash), Applied(0.0, 0.0), []
+    nmpc, feedback, lost = controller(track, reference, lag_bound=lag_bound), Applied(0.0, 0.0), []
     plant = make_plant(symmetric_orca, "rk4", Pose(1.0, 0.0, np.pi / 2), State(1.2, 0.0, 1.2))
     place = 0.0
     for k in range(60):
@@ -147,7 +147,7 @@ def test_time_lost_is_made_up_for_within_the_leash(symmetric_orca, circle, contr
         feedback = nmpc.command(nmpc.plan(now, nominal(symmetric_orca), 0.02 * k))
         plant.advance(feedback)
     assert max(lost) > 0.005
-    if leash:
+    if lag_bound:
         assert abs(lost[-1]) < 1e-3
     else:
         assert lost[-1] > 0.005

@@ -9,8 +9,8 @@ import pytest
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.identification.calibration import calibrate
-from dynssm_ros.identification.car import Car
-from dynssm_ros.identification.windows import Windows, recorded_rows
+from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.windows import SimulationWindows, recorded_rows
 from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
@@ -30,7 +30,7 @@ def windy() -> Recording:
 
 def errors(recording: Recording, car: Vehicle) -> np.ndarray:
     data = recorded_rows(recording, recording_context(recording))
-    return Windows(data, recording.window_ends(1, horizon=3), 3, 0, "euler").errors(Car.of(car))
+    return SimulationWindows(data, recording.window_ends(1, horizon=3), 3, 0, "euler").errors(CarEstimate.of(car))
 
 
 def test_time_and_heading_are_known(windy: Recording) -> None:
@@ -43,5 +43,5 @@ def test_the_signal_that_the_recording_has_not_is_named(windy: Recording) -> Non
     with pytest.raises(ConfigurationError, match=r"effect grip_patch needs the signal s \(m\)"):
         calibrate(windy, patchy)
     lap = {"s": np.linspace(0, 300, len(windy)), "lap_length": np.full(len(windy), 1000.0)}
-    placed = replace(windy, columns=windy.columns | lap)
-    assert np.isfinite(calibrate(placed, patchy, starts=1).theta).all()
+    with_values = replace(windy, columns=windy.columns | lap)
+    assert np.isfinite(calibrate(with_values, patchy, starts=1).theta).all()

@@ -13,7 +13,7 @@ from benchmarks.hidden_causes.cases import Case, record, size
 from benchmarks.hidden_causes.outcomes import judge
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.identification.diagnose import Diagnosis, diagnose
-from dynssm_ros.reporting.diagnosis_report import diagnosis_report, in_words
+from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle
@@ -42,7 +42,7 @@ def test_nothing_is_named_where_nothing_is_hidden(seed: int, laps: Laps) -> None
     found = diagnose(recording, vehicle, integrator="euler", line=LINE)
     assert (found.verdict, found.causes) == ("none", ())
     assert found.vehicle.effects == ()
-    assert "right within the noise" in in_words(found)
+    assert "right within the noise" in as_text(found)
 
 
 def test_two_causes_are_both_named(laps: Laps) -> None:
@@ -64,10 +64,11 @@ def test_the_extended_car_errs_less_on_held_out_rows(lagging: tuple[Recording, V
     hidden = size("steering_lag", np.random.default_rng(1))["time_constant"]
     assert cause.values["time_constant"] == pytest.approx(hidden, abs=4 * cause.std["time_constant"])
     assert cause.heldout_gain > 0.02
-    assert found.gain.reduction[found.gain.horizon, 2] > 0.1
-    low, high = found.gain.interval[:, found.gain.horizon]
+    assert found.improvement.reduction[found.improvement.horizon, 2] > 0.1
+    low, high = found.improvement.interval[:, found.improvement.horizon]
     assert (
-        (low <= found.gain.reduction[found.gain.horizon]) & (found.gain.reduction[found.gain.horizon] <= high)
+        (low <= found.improvement.reduction[found.improvement.horizon])
+        & (found.improvement.reduction[found.improvement.horizon] <= high)
     ).all()
     assert [entry.name for entry in found.vehicle.effects] == ["steering_lag"]
     assert found.vehicle.name == vehicle.name
@@ -75,7 +76,7 @@ def test_the_extended_car_errs_less_on_held_out_rows(lagging: tuple[Recording, V
 
 def test_no_held_out_row_reaches_the_fit(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
     recording, vehicle, found = lagging
-    cut = int(found.gain.windows.starts.min())
+    cut = int(found.improvement.windows.starts.min())
     assert found.windows.starts.max() + found.windows.steps < cut
     rng = np.random.default_rng(0)
     poisoned = {name: values.copy() for name, values in recording.columns.items()}
@@ -86,7 +87,7 @@ def test_no_held_out_row_reaches_the_fit(lagging: tuple[Recording, Vehicle, Diag
     assert [(c.effect, c.values, c.delta_bic) for c in other.causes] == [
         (c.effect, c.values, c.delta_bic) for c in found.causes
     ]
-    assert other.gain.rmse["extended"][0, 0] > 2 * found.gain.rmse["extended"][0, 0]
+    assert other.improvement.rmse["extended"][0, 0] > 2 * found.improvement.rmse["extended"][0, 0]
 
 
 def test_the_json_is_that_of_the_contract(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
@@ -106,7 +107,7 @@ def test_the_json_is_that_of_the_contract(lagging: tuple[Recording, Vehicle, Dia
 
 def test_words_and_report_name_cause_size_gain_and_advice(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
     found = lagging[2]
-    words = in_words(found)
+    words = as_text(found)
     for part in (
         "steering_lag: time_constant = ",
         "±",

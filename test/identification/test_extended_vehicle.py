@@ -11,8 +11,8 @@ from dynssm_ros.control.race import Course, race
 from dynssm_ros.control.race_models import load_prediction_model
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
-from dynssm_ros.identification.car import Car
-from dynssm_ros.identification.windows import Track, Windows
+from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.stages import train
@@ -37,7 +37,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     moved = np.zeros(len(COEFFICIENTS) + 1)
     moved[COEFFICIENTS.index("D_f")] = 0.5
     path = tmp_path_factory.mktemp("extended") / "vehicle.yaml"
-    save_vehicle(Car(load_vehicle("orca"), moved, CAUSES).extended(np.full(17, 0.01)), path, "extended")
+    save_vehicle(CarEstimate(load_vehicle("orca"), moved, CAUSES).extended(np.full(17, 0.01)), path, "extended")
     return path
 
 
@@ -59,11 +59,11 @@ def recording(bag: Path) -> Recording:
 
 
 def test_it_drives_in_the_simulator_as_the_diagnosis_simulates_it(extended: Vehicle, recording: Recording) -> None:
-    track = Track(recording.matrix.T, {}, recording.T_s, (recording.time - recording.time[0]) / 1e9)
-    some = Windows(track, np.arange(50, len(recording) - 20, 10), 10, 40, "euler")
-    errors = np.abs(some.errors(Car.of(extended))).max(axis=(0, 1))
+    track = RecordedRows(recording.matrix.T, {}, recording.T_s, (recording.time - recording.time[0]) / 1e9)
+    some = SimulationWindows(track, np.arange(50, len(recording) - 20, 10), 10, 40, "euler")
+    errors = np.abs(some.errors(CarEstimate.of(extended))).max(axis=(0, 1))
     # the state of the lag is led along the rows before the start, and forgets where that began
-    assert (errors < 1e-3 * np.abs(some.errors(Car.of(load_vehicle("orca")))).max(axis=(0, 1))).all()
+    assert (errors < 1e-3 * np.abs(some.errors(CarEstimate.of(load_vehicle("orca")))).max(axis=(0, 1))).all()
 
 
 def test_it_trains_a_model_and_the_node_predicts_with_it(

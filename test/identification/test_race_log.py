@@ -21,7 +21,7 @@ def test_yaw_is_found_to_come_late_and_the_extended_car_errs_less(
     putnam: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # half the simulations of a diagnosis proper tell the same, in half the time
-    monkeypatch.setattr(windows, "_MOST", 250)
+    monkeypatch.setattr(windows, "_MAX_WINDOWS", 250)
     recording = extract([putnam], load_signal_map("av21"), 25.0)
     seen = recording.split_last(0.25)[0]
     car = calibrate(seen, load_vehicle("av21").unmeasured(), starts=1).vehicle
@@ -29,7 +29,7 @@ def test_yaw_is_found_to_come_late_and_the_extended_car_errs_less(
     assert found.verdict == "effects"
     # a yaw rate that is measured late and a steering that answers late are hard to tell apart in this log
     assert found.causes[0].effect in LATE_OR_ELSEWHERE
-    at = found.gain.horizon
-    assert found.gain.horizons[at] == pytest.approx(0.6)
-    assert found.gain.reduction[at, 1] >= 0.3
-    assert found.gain.reduction_from(RECALIBRATED)[at, 1] >= 0.3
+    at = found.improvement.horizon
+    assert found.improvement.horizons[at] == pytest.approx(0.6)
+    assert found.improvement.reduction[at, 1] >= 0.3
+    assert found.improvement.reduction_from(RECALIBRATED)[at, 1] >= 0.3

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.residuals import bunched, systematic
-from dynssm_ros.identification.windows import Track, Windows
+from dynssm_ros.identification.residuals import clustered, explained_variance
+from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
 
 N, K = 6000, 10
 
 
-def driven(place: bool = True) -> Windows:
+def driven(place: bool = True) -> SimulationWindows:
     rng = np.random.default_rng(0)
     time = 0.04 * np.arange(N)
     waves = [
@@ -20,17 +20,17 @@ def driven(place: bool = True) -> Windows:
     ]
     rows = np.stack([30 + 5 * waves[0], waves[1], 0.3 * waves[2], waves[3], 0.1 * waves[4], 0 * time, 0 * time])
     context = {"s": (37.0 * time) % 1000.0, "lap_length": np.full(N, 1000.0)} if place else {}
-    return Windows(Track(rows, context, 0.04, time), np.arange(0, N - K, K), K, 0)
+    return SimulationWindows(RecordedRows(rows, context, 0.04, time), np.arange(0, N - K, K), K, 0)
 
 
-def errors(windows: Windows, planted: np.ndarray) -> np.ndarray:
+def errors(windows: SimulationWindows, planted: np.ndarray) -> np.ndarray:
     noise = np.random.default_rng(1).standard_normal((len(windows), 3))
     return noise + planted[:, None]
 
 
 def test_noise_is_no_pattern() -> None:
     windows = driven()
-    found = systematic(windows, errors(windows, np.zeros(len(windows))), windows.starts // 75)
+    found = explained_variance(windows, errors(windows, np.zeros(len(windows))), windows.starts // 75)
     assert not found.is_there
     assert (found.share < 0.02).all()
 
@@ -38,7 +38,7 @@ def test_noise_is_no_pattern() -> None:
 def test_an_error_that_follows_a_signal_is_seen_and_the_signal_is_named() -> None:
     windows = driven(place=False)
     speed = windows.data.rows[0, windows.starts] - 30
-    found = systematic(windows, errors(windows, speed / 3.5), windows.starts // 75)
+    found = explained_variance(windows, errors(windows, speed / 3.5), windows.starts // 75)
     assert found.is_there
     np.testing.assert_allclose(found.share, 0.45, atol=0.1)  # half, less what estimating costs
     assert next(iter(found.pattern["v_y"])) == "speed"
@@ -48,7 +48,9 @@ def test_an_error_that_follows_a_signal_is_seen_and_the_signal_is_named() -> Non
 def test_an_error_that_repeats_at_a_place_is_seen_as_such() -> None:
     windows = driven()
     lap = windows.context(K // 2)["s"] / 1000.0
-    found = systematic(windows, errors(windows, np.where(np.abs(lap - 0.4) < 0.1, 3.0, 0.0)), windows.starts // 75)
+    found = explained_variance(
+        windows, errors(windows, np.where(np.abs(lap - 0.4) < 0.1, 3.0, 0.0)), windows.starts // 75
+    )
     assert found.is_there
     assert found.by_place == pytest.approx(np.full(3, 0.55), abs=0.12)
     low, high = found.stretch["v_y"]
@@ -59,10 +61,10 @@ def test_errors_that_come_together_are_told_from_the_same_errors_anywhere() -> N
     rng, W = np.random.default_rng(2), 180
     time, sizes = np.arange(W) * 0.5, rng.chisquare(20, W) / 20
     block = (time // 3).astype(int)
-    assert not bunched(sizes, time, block, 1.0).is_there
+    assert not clustered(sizes, time, block, 1.0).is_there
     oil = np.where((time >= 30) & (time < 36), 2.0, 0.0)
-    found = bunched(sizes + oil, time, block, 1.0)
+    found = clustered(sizes + oil, time, block, 1.0)
     assert found.is_there
     assert 30 <= found.when[0] < found.when[1] < 36
-    assert not bunched(rng.permutation(sizes + oil), time, block, 1.0).is_there
-    assert bunched(sizes, time, block, 5.0).is_there
+    assert not clustered(rng.permutation(sizes + oil), time, block, 1.0).is_there
+    assert clustered(sizes, time, block, 5.0).is_there

@@ -1,4 +1,4 @@
-"""Windows of simulation, the noise in them, and fits to them: exact where the truth is known."""
+"""SimulationWindows of simulation, the noise in them, and fits to them: exact where the truth is known."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.car import Car, knowledge
-from dynssm_ros.identification.noise import Noise, Spread, fit_noise, weights
-from dynssm_ros.identification.problem import Study, placed, position
-from dynssm_ros.identification.windows import Track, Windows
+from dynssm_ros.identification.car import CarEstimate, prior_std
+from dynssm_ros.identification.noise import Noise, NoiseResponse, fit_noise, weights
+from dynssm_ros.identification.problem import IdentificationProblem, position, with_values
+from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.track.tracks import load_track
@@ -21,32 +21,37 @@ AV21 = load_vehicle("av21")
 LAG = {"steering_lag": {"time_constant": 0.1}}
 
 
-def windows(vehicle: Vehicle, noise: tuple[float, float, float] = (0.0, 0.0, 0.0), duration: float = 50.0) -> Windows:
+def windows(
+    vehicle: Vehicle, noise: tuple[float, float, float] = (0.0, 0.0, 0.0), duration: float = 50.0
+) -> SimulationWindows:
     run = simulate(vehicle, load_track("road_course"), duration=duration, noise=noise, seed=3)
     rows = np.concatenate([run.measured.T, run.feedback.T, (run.command - run.feedback).T])
     time = (run.time - run.time[0]) / 1e9
-    track = Track(rows, {"t": time, "theta": run.pose[:, 2]}, vehicle.sampling_time, time)
-    return Windows(track, np.arange(8, rows.shape[1] - 13, 12), 12, 8, "euler")
+    track = RecordedRows(rows, {"t": time, "theta": run.pose[:, 2]}, vehicle.sampling_time, time)
+    return SimulationWindows(track, np.arange(8, rows.shape[1] - 13, 12), 12, 8, "euler")
 
 
 def test_the_true_car_makes_no_errors_and_a_wrong_one_does() -> None:
     some = windows(AV21)
-    assert np.abs(some.errors(Car.of(AV21))).max() < 1e-9
-    assert np.abs(some.errors(Car.of(AV21).with_effect("drag", {"coefficient": 0.3}))).max() > 1e-2
+    assert np.abs(some.errors(CarEstimate.of(AV21))).max() < 1e-9
+    assert np.abs(some.errors(CarEstimate.of(AV21).with_effect("drag", {"coefficient": 0.3}))).max() > 1e-2
 
 
 def test_a_lag_is_led_along_the_rows_before_the_start() -> None:
     lagging = AV21.with_effect("steering_lag", LAG["steering_lag"])
     some = windows(lagging)
     settled = replace(some, warm=0)
-    assert np.abs(some.errors(Car.of(lagging))).max() < 0.02 * np.abs(settled.errors(Car.of(lagging))).max()
-    in_fit = replace(Car.of(AV21), effects=LAG)
-    np.testing.assert_array_equal(some.errors(in_fit), some.errors(Car.of(lagging)))
+    assert (
+        np.abs(some.errors(CarEstimate.of(lagging))).max()
+        < 0.02 * np.abs(settled.errors(CarEstimate.of(lagging))).max()
+    )
+    in_fit = replace(CarEstimate.of(AV21), effects=LAG)
+    np.testing.assert_array_equal(some.errors(in_fit), some.errors(CarEstimate.of(lagging)))
 
 
 def test_steps_are_differentiated_by_their_start() -> None:
     some = windows(AV21, duration=10.0)
-    at, car = some.starts[3], Car.of(AV21)
+    at, car = some.starts[3], CarEstimate.of(AV21)
     moved = some.data.rows.copy()
     moved[1, at] += 1e-3
     changed = replace(some, data=replace(some.data, rows=moved)).errors(car)[3, 0] - some.errors(car)[3, 0]
@@ -55,28 +60,28 @@ def test_steps_are_differentiated_by_their_start() -> None:
 
 def test_runge_kutta_steps_are_short_enough_for_the_car() -> None:
     some = windows(AV21, duration=20.0)
-    chosen = some.stepping("rk4", AV21)
+    chosen = some.with_integrator("rk4", AV21)
     fine = replace(chosen, substeps=16)
-    coarse = chosen.errors(Car.of(AV21)) - fine.errors(Car.of(AV21))
+    coarse = chosen.errors(CarEstimate.of(AV21)) - fine.errors(CarEstimate.of(AV21))
     assert chosen.substeps <= 2
-    assert np.abs(coarse).max() < 0.02 * np.abs(fine.errors(Car.of(AV21))).max()
+    assert np.abs(coarse).max() < 0.02 * np.abs(fine.errors(CarEstimate.of(AV21))).max()
     stiff = AV21.with_nominal(AV21.nominal * np.where(np.array(COEFFICIENTS) == "B_r", 4.0, 1.0))
-    assert some.stepping("rk4", stiff).substeps > chosen.substeps
-    assert some.stepping("euler", stiff).substeps == 1
+    assert some.with_integrator("rk4", stiff).substeps > chosen.substeps
+    assert some.with_integrator("euler", stiff).substeps == 1
 
 
 def test_a_simulation_that_runs_away_counts_as_far_off_and_not_as_nan() -> None:
     some = windows(AV21, duration=10.0)
-    wild = some.errors(Car.of(AV21).with_effect("steering_gain", {"factor": 1e200}))
+    wild = some.errors(CarEstimate.of(AV21).with_effect("steering_gain", {"factor": 1e200}))
     assert np.isfinite(wild).all()
 
 
 def test_noise_is_recovered_and_whitened() -> None:
     stds = (0.02, 0.03, 0.004)
     some = windows(AV21, stds)
-    study = Study(some, Car.of(AV21))
-    errors = study.errors(Car.of(AV21))
-    noise = study.noise(errors)
+    problem = IdentificationProblem(some, CarEstimate.of(AV21))
+    errors = problem.errors(CarEstimate.of(AV21))
+    noise = problem.noise(errors)
     np.testing.assert_allclose(np.sqrt(noise.v[:3]), stds, rtol=0.1)
     assert (np.sqrt(noise.v[3:6]) < np.array(stds) / 4).all()
     white = noise.whiten(errors)
@@ -87,7 +92,7 @@ def test_noise_is_recovered_and_whitened() -> None:
 def test_disturbances_on_the_way_are_told_from_noise_of_the_measurement() -> None:
     rng, W, K = np.random.default_rng(0), 1500, 6
     keep = np.broadcast_to(0.8 * np.eye(3), (W, K, 3, 3))
-    spread = Spread.of(keep, np.ones(W))
+    spread = NoiseResponse.of(keep, np.ones(W))
     R, Q = np.array([0.1, 0.2, 0.3]), np.array([0.05, 0.1, 0.2])
     state, errors = R * rng.standard_normal((W, 3)), []
     for _ in range(K):
@@ -99,8 +104,8 @@ def test_disturbances_on_the_way_are_told_from_noise_of_the_measurement() -> Non
 
 def test_a_filtered_start_is_closer_to_the_car_than_a_measured_row() -> None:
     some = windows(AV21, (0.02, 0.03, 0.004))
-    noise = Study(replace(some, starts=some.starts[2:], warm=16, filtered=True), Car.of(AV21))
-    R, _, P = noise.noise(noise.errors(Car.of(AV21))).v.reshape(3, 3)
+    noise = IdentificationProblem(replace(some, starts=some.starts[2:], warm=16, filtered=True), CarEstimate.of(AV21))
+    R, _, P = noise.noise(noise.errors(CarEstimate.of(AV21))).v.reshape(3, 3)
     assert (P < 0.4 * R).all()
 
 
@@ -108,9 +113,11 @@ def test_a_filtered_start_is_closer_to_the_car_than_a_measured_row() -> None:
 def test_a_relaxing_tyre_is_not_taken_for_a_shorter_one_where_starts_are_filtered(filtered: bool) -> None:
     effect, free = "tire_relaxation", (("tire_relaxation", "length"),)
     some = windows(AV21.with_effect(effect, {"length": 0.8}), (0.02, 0.02, 0.003), duration=100.0)
-    study = Study(replace(some, starts=some.starts[2:], warm=16, filtered=filtered), Car.of(AV21))
-    fit = study.fit(Car.of(AV21).with_effect(effect, {"length": 0.4}), free)
-    off = (fit.car.effects[effect]["length"] - 0.8) / (0.3 * np.sqrt(study.covariance(fit)[-1, -1]))
+    problem = IdentificationProblem(
+        replace(some, starts=some.starts[2:], warm=16, filtered=filtered), CarEstimate.of(AV21)
+    )
+    fit = problem.fit(CarEstimate.of(AV21).with_effect(effect, {"length": 0.4}), free)
+    off = (fit.car.effects[effect]["length"] - 0.8) / (0.3 * np.sqrt(problem.covariance(fit)[-1, -1]))
     assert abs(off) < 2.5 if filtered else off < -2.5
 
 
@@ -122,7 +129,7 @@ def test_a_window_that_is_far_out_counts_less() -> None:
 
 
 def test_whitening_undoes_what_the_covariance_says() -> None:
-    spread = Spread.of(np.broadcast_to(0.9 * np.eye(3), (5, 4, 3, 3)), np.arange(5.0))
+    spread = NoiseResponse.of(np.broadcast_to(0.9 * np.eye(3), (5, 4, 3, 3)), np.arange(5.0))
     noise = Noise(spread, np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.5, 0.6, 0.7]))
     np.testing.assert_allclose(noise.whiten(np.stack([noise.roots[0]] * 5))[0], np.eye(12), atol=1e-12)
     assert noise.log_det == pytest.approx(5 * np.linalg.slogdet(noise.roots[0] @ noise.roots[0].T)[1])
@@ -131,25 +138,25 @@ def test_whitening_undoes_what_the_covariance_says() -> None:
 def test_a_fit_finds_planted_values_and_knows_how_well() -> None:
     stds = (0.01, 0.01, 0.002)
     some = windows(AV21.with_effect("drag", {"coefficient": 0.4}), stds)
-    study = Study(some, Car.of(AV21))
+    problem = IdentificationProblem(some, CarEstimate.of(AV21))
     free = (("drag", "coefficient"),)
-    fit = study.fit(Car.of(AV21).with_effect("drag", {"coefficient": 0.0}), free)
-    std = 0.2 * np.sqrt(study.covariance(fit)[-1, -1])
+    fit = problem.fit(CarEstimate.of(AV21).with_effect("drag", {"coefficient": 0.0}), free)
+    std = 0.2 * np.sqrt(problem.covariance(fit)[-1, -1])
     assert abs(fit.car.effects["drag"]["coefficient"] - 0.4) < 3 * std < 0.2
-    assert study.inflation(fit) < 1.5
-    assert study.inflation(fit, 1) < 3.0
-    without = study.fit(Car.of(AV21), ())
+    assert problem.inflation(fit) < 1.5
+    assert problem.inflation(fit, 1) < 3.0
+    without = problem.fit(CarEstimate.of(AV21), ())
     assert without.objective - fit.objective > 100
 
 
 def test_values_are_placed_and_read_back_within_their_bounds() -> None:
-    car, free = Car.of(AV21).with_effect("drag", {"coefficient": 0.2}), (("drag", "coefficient"),)
+    car, free = CarEstimate.of(AV21).with_effect("drag", {"coefficient": 0.2}), (("drag", "coefficient"),)
     p = position(car, free)
-    assert placed(car, free, p).effects == car.effects
+    assert with_values(car, free, p).effects == car.effects
     p[-1] = 1e3
-    assert placed(car, free, p).effects["drag"]["coefficient"] == 2.0
+    assert with_values(car, free, p).effects["drag"]["coefficient"] == 2.0
     p[:18] = 1e9
-    theta = np.array(placed(car, free, p).theta)
+    theta = np.array(with_values(car, free, p).theta)
     assert ((AV21.lower < theta) & (theta < AV21.upper)).all()
 
 
@@ -157,16 +164,16 @@ def test_what_the_vehicle_file_does_not_say_is_known_by_its_bounds() -> None:
     open_car = AV21.with_nominal(AV21.nominal)
     coefficients = {name: c.model_copy(update={"std": None}) for name, c in open_car.coefficients.items()}
     open_car = open_car.model_copy(update={"coefficients": coefficients})
-    np.testing.assert_allclose(knowledge(open_car), (AV21.upper - AV21.lower) / np.sqrt(12))
-    stated = knowledge(AV21)[COEFFICIENTS.index("D_f")]
+    np.testing.assert_allclose(prior_std(open_car), (AV21.upper - AV21.lower) / np.sqrt(12))
+    stated = prior_std(AV21)[COEFFICIENTS.index("D_f")]
     assert stated == AV21.coefficients["D_f"].std
 
 
 def test_the_extended_vehicle_is_the_car_as_fitted(laps: Callable[..., tuple[Recording, Vehicle]]) -> None:
-    car = replace(Car.of(AV21), moved=np.full(18, 0.5)).with_effect("mass", {"factor": 1.1})
+    car = replace(CarEstimate.of(AV21), moved=np.full(18, 0.5)).with_effect("mass", {"factor": 1.1})
     vehicle = car.extended(np.ones(17))
     np.testing.assert_allclose(vehicle.nominal, np.array(car.theta))
     assert vehicle.constants.m == pytest.approx(790 * np.exp(0.005))
     assert [(entry.name, entry.parameters) for entry in vehicle.effects] == [("mass", {"factor": 1.1})]
     some = windows(AV21, duration=10.0)
-    np.testing.assert_allclose(some.errors(Car.of(vehicle)), some.errors(car), atol=1e-12)
+    np.testing.assert_allclose(some.errors(CarEstimate.of(vehicle)), some.errors(car), atol=1e-12)

@@ -1,4 +1,4 @@
-"""Windows and their split: nothing leaks, nothing crosses a gap, and scales are of the training data."""
+"""TrainingWindows and their split: nothing leaks, nothing crosses a gap, and scales are of the training data."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.learning.dataset import Windows, normalisation, split_windows
+from dynssm_ros.learning.dataset import TrainingWindows, normalisation, split_windows
 from dynssm_ros.learning.models.base import ModelConfig, TrainingConfig
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
@@ -34,7 +34,7 @@ def training(**changes: float | str) -> TrainingConfig:
     return TrainingConfig.model_validate(fields | {"validation_block": 20 * T_s, "validation_every": 3} | changes)
 
 
-def rows(windows: Windows) -> set[int]:
+def rows(windows: TrainingWindows) -> set[int]:
     """All rows that these windows and their targets touch."""
     return {int(end) + k for end in windows.ends for k in range(1 - windows.H, 2)}
 
@@ -133,7 +133,7 @@ def test_a_constant_input_is_not_scaled(laps: Recording, make_config: Callable[.
 def test_a_state_that_never_changes_is_refused_by_name(laps: Recording) -> None:
     columns = {**laps.columns, "omega": np.zeros(len(laps))}
     straight = Recording(laps.info, laps.time, laps.segment, columns)
-    windows = Windows(torch.tensor(straight.matrix), torch.tensor(straight.window_ends(4)), 4)
+    windows = TrainingWindows(torch.tensor(straight.matrix), torch.tensor(straight.window_ends(4)), 4)
     with pytest.raises(RecordingError, match="drive 0: omega never changes; expected a car that drives corners"):
         normalisation(straight, windows)
 

@@ -17,7 +17,7 @@ import yaml
 
 from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.learning import export as export_module
-from dynssm_ros.learning.dataset import Windows
+from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.export import TOLERANCE, check_export, check_replaceable, load_torch, save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.registry import parse_model_config
@@ -72,7 +72,9 @@ def artifact(trained: Callable[[str], Trained], tmp_path_factory: pytest.TempPat
 
 def some_windows(recording: Recording, count: int, H: int = 4) -> torch.Tensor:
     ends = np.linspace(H, len(recording) - 2, count).astype(int)
-    return Windows(torch.tensor(recording.matrix, dtype=torch.float32), torch.tensor(ends), H).batch(slice(None))[0]
+    return TrainingWindows(torch.tensor(recording.matrix, dtype=torch.float32), torch.tensor(ends), H).batch(
+        slice(None)
+    )[0]
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -108,7 +108,7 @@ class Stand:
             self.send_odometry()
             if parameters:
                 self.send_parameters(**parameters)
-            pause.wait(PERIOD / 1e9)  # nobody sets it: the pace of a car
+            pause.wait(PERIOD / 1e9)  # nobody sets it: the speed_scale of a car
         return until()
 
     def _keep(self, place: list, message: Odometry | JointState) -> None:
@@ -142,7 +142,7 @@ def assert_possible(commands: list[JointState]) -> None:
 def test_three_processes_drive_laps_and_the_predictor_may_die(stand: Stand, small_model: Path) -> None:
     rate = possible_rate()
     predictor = stand.start("predictor", model=small_model, diagnostics_period=0.1)
-    stand.control(line="centre", pace=0.7, rate=rate, watchdog=1.0)
+    stand.control(line="centre", speed_scale=0.7, rate=rate, watchdog=1.0)
     stand.start("simulator", driver="external", rate=rate, watchdog=1.0)
     assert stand.diagnosed("drives, adapted coefficients"), stand.told[-1]
     assert stand.wait_for(lambda: stand.laps() >= 1), stand.told[-1]

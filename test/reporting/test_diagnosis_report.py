@@ -1,4 +1,4 @@
-"""What a diagnosis shows: gains with intervals, systematic parts, noticeable sizes, words, figures."""
+"""What a diagnosis shows: gains with intervals, systematic parts, just detectable sizes, words, figures."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from dynssm_ros.identification.candidates import Candidate
-from dynssm_ros.identification.car import Car
+from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.diagnose import EXTENDED, GIVEN, RECALIBRATED, Diagnosis
-from dynssm_ros.identification.improvement import Gain, measure
-from dynssm_ros.identification.minimum_effect import noticeable
-from dynssm_ros.identification.problem import Study
-from dynssm_ros.identification.windows import Track, Windows
+from dynssm_ros.identification.improvement import Improvement, measure_improvement
+from dynssm_ros.identification.minimum_effect import minimum_detectable
+from dynssm_ros.identification.problem import IdentificationProblem
+from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
 from dynssm_ros.reporting.diagnosis_figures import errors_over, gain_by_horizon, simulated_and_measured
 from dynssm_ros.reporting.diagnosis_report import (
+    as_text,
     diagnosis_report,
-    in_words,
     left_in_words,
     pattern_in_words,
     size_in_words,
@@ -35,7 +35,7 @@ STEPS = 10
 Lagging = tuple[Recording, Vehicle, Diagnosis]
 
 
-def driven(noise: float, straight: bool = False) -> Windows:
+def driven(noise: float, straight: bool = False) -> SimulationWindows:
     run = simulate(TRUE, load_track("road_course"), duration=40.0, seed=2)
     stds = noise * np.array([0.02, 0.02, 0.003])
     measured = run.measured + stds * np.random.default_rng(0).standard_normal(run.measured.shape)
@@ -43,43 +43,45 @@ def driven(noise: float, straight: bool = False) -> Windows:
     if straight:
         rows[[1, 2, 4, 6]] = 0.0
     time = (run.time - run.time[0]) / 1e9
-    track = Track(rows, {"t": time}, AV21.sampling_time, time)
-    return Windows(track, np.arange(8, rows.shape[1] - 2 * STEPS - 1, STEPS // 2), 2 * STEPS, 8, "euler")
+    track = RecordedRows(rows, {"t": time}, AV21.sampling_time, time)
+    return SimulationWindows(track, np.arange(8, rows.shape[1] - 2 * STEPS - 1, STEPS // 2), 2 * STEPS, 8, "euler")
 
 
 @pytest.fixture(scope="module")
-def gain() -> Gain:
+def improvement() -> Improvement:
     """Of the true car over one that lacks both effects, and over one that lacks the weaker one."""
     cars = {GIVEN: AV21, RECALIBRATED: AV21.with_effect("steering_gain", {"factor": 1.1}), EXTENDED: TRUE}
-    return measure(driven(1.0), {name: Car.of(vehicle) for name, vehicle in cars.items()}, STEPS)
+    return measure_improvement(driven(1.0), {name: CarEstimate.of(vehicle) for name, vehicle in cars.items()}, STEPS)
 
 
-def test_errors_are_those_of_simulations_from_every_start(gain: Gain) -> None:
-    assert gain.horizons.tolist() == [0.04, STEPS * 0.04, 2 * STEPS * 0.04]
-    expected = np.sqrt((gain.windows.errors(Car.of(AV21))[:, STEPS - 1] ** 2).mean(axis=0))
-    np.testing.assert_allclose(gain.rmse[GIVEN][gain.horizon], expected)
+def test_errors_are_those_of_simulations_from_every_start(improvement: Improvement) -> None:
+    assert improvement.horizons.tolist() == [0.04, STEPS * 0.04, 2 * STEPS * 0.04]
+    expected = np.sqrt((improvement.windows.errors(CarEstimate.of(AV21))[:, STEPS - 1] ** 2).mean(axis=0))
+    np.testing.assert_allclose(improvement.rmse[GIVEN][improvement.horizon], expected)
 
 
-def test_reductions_lie_in_their_intervals_and_hang_on_what_they_are_measured_from(gain: Gain) -> None:
-    at = gain.horizon
+def test_reductions_lie_in_their_intervals_and_hang_on_what_they_are_measured_from(improvement: Improvement) -> None:
+    at = improvement.horizon
     for name in (GIVEN, RECALIBRATED):
-        low, high = gain.interval_from(name)
-        reduction = gain.reduction_from(name)
-        np.testing.assert_allclose(reduction, 1 - gain.rmse[EXTENDED] / gain.rmse[name])
+        low, high = improvement.interval_from(name)
+        reduction = improvement.reduction_from(name)
+        np.testing.assert_allclose(reduction, 1 - improvement.rmse[EXTENDED] / improvement.rmse[name])
         assert ((low <= reduction) & (reduction <= high)).all()
-    assert gain.interval[0, at, 1] > 0.4  # steering: most of the error sideways
-    assert gain.reduction_from(RECALIBRATED)[at, 1] < 0.5 * gain.reduction[at, 1]  # drag: little of it
-    assert gain.reduction_from(RECALIBRATED)[at, 0] > 0.2
+    assert improvement.interval[0, at, 1] > 0.4  # steering: most of the error sideways
+    assert improvement.reduction_from(RECALIBRATED)[at, 1] < 0.5 * improvement.reduction[at, 1]  # drag: little of it
+    assert improvement.reduction_from(RECALIBRATED)[at, 0] > 0.2
 
 
-def test_what_a_right_car_leaves_is_noise_and_the_systematic_part_is_gone(gain: Gain) -> None:
-    at = gain.horizon
-    assert gain.systematic[GIVEN][at].share[1] > 0.5
-    assert (gain.systematic[EXTENDED][at].share < 0.1).all()
-    assert not gain.systematic[EXTENDED][at].is_there
-    assert gain.systematic_gone(GIVEN)[at, 1] > 0.95
+def test_what_a_right_car_leaves_is_noise_and_the_systematic_part_is_gone(improvement: Improvement) -> None:
+    at = improvement.horizon
+    assert improvement.explained_variance[GIVEN][at].share[1] > 0.5
+    assert (improvement.explained_variance[EXTENDED][at].share < 0.1).all()
+    assert not improvement.explained_variance[EXTENDED][at].is_there
+    assert improvement.systematic_gone(GIVEN)[at, 1] > 0.95
     assert np.isnan(
-        replace(gain, errors=dict.fromkeys(gain.errors, gain.errors[EXTENDED])).systematic_gone(EXTENDED)[0]
+        replace(improvement, errors=dict.fromkeys(improvement.errors, improvement.errors[EXTENDED])).systematic_gone(
+            EXTENDED
+        )[0]
     ).any()
 
 
@@ -88,23 +90,25 @@ def test_twice_the_noise_hides_effects_about_twice_as_large() -> None:
     sizes = []
     for noise in (1.0, 2.0):
         windows = driven(noise)
-        study = Study(replace(windows, starts=windows.starts[::2], steps=STEPS), Car.of(TRUE))
-        sizes.append(noticeable(study, study.fit(Car.of(TRUE), (), rounds=1), found))
+        problem = IdentificationProblem(replace(windows, starts=windows.starts[::2], steps=STEPS), CarEstimate.of(TRUE))
+        sizes.append(minimum_detectable(problem, problem.fit(CarEstimate.of(TRUE), (), rounds=1), found))
     for effect in sizes[0]:
         assert 1.3 < sizes[1][effect] / sizes[0][effect] < 2.7
         assert sizes[0][effect] < 0.5 * EFFECTS[effect].magnitude().span
 
 
 def test_straight_driving_shows_no_steering_error() -> None:
-    study = Study(replace(driven(1.0, straight=True), steps=STEPS), Car.of(AV21))
-    fit = study.fit(Car.of(AV21), (), rounds=1)
-    assert noticeable(study, fit, [Candidate("steering_gain", ("factor",))]) == {"steering_gain": float("inf")}
+    problem = IdentificationProblem(replace(driven(1.0, straight=True), steps=STEPS), CarEstimate.of(AV21))
+    fit = problem.fit(CarEstimate.of(AV21), (), rounds=1)
+    assert minimum_detectable(problem, fit, [Candidate("steering_gain", ("factor",))]) == {
+        "steering_gain": float("inf")
+    }
 
 
 def test_words_say_cause_size_evidence_gain_and_what_to_do(lagging: Lagging) -> None:
     found = lagging[2]
     (cause,) = found.causes
-    words = in_words(found)
+    words = as_text(found)
     assert words.startswith("The simulation lacks: steering_lag.")
     assert f"steering_lag: {size_in_words(cause)}" in words
     assert "Evidence: the information criterion is better by" in words
@@ -115,8 +119,8 @@ def test_words_say_cause_size_evidence_gain_and_what_to_do(lagging: Lagging) -> 
     assert left_in_words(found) == ""
 
 
-def test_a_pattern_names_signals_and_the_place(gain: Gain) -> None:
-    left = gain.systematic[GIVEN][gain.horizon]
+def test_a_pattern_names_signals_and_the_place(improvement: Improvement) -> None:
+    left = improvement.explained_variance[GIVEN][improvement.horizon]
     assert "lateral acceleration" in pattern_in_words(left)
     somewhere = replace(left, stretch=dict.fromkeys(STATE_SIGNALS, (100.0, 200.0)))
     assert "farthest off 100 to 200 m into the lap" in pattern_in_words(somewhere)
@@ -134,17 +138,17 @@ def test_the_json_measures_from_both_cars(lagging: Lagging) -> None:
 def test_the_report_shows_one_step_and_the_horizon_over_time_place_and_signals(lagging: Lagging) -> None:
     page = diagnosis_report(lagging[2]).html()
     assert page.count("data:image/svg+xml") == 9
-    for title in ("Simulated and measured", "Systematic error and noise", "Errors over time", "Errors against speed",
+    for title in ("Simulated and measured", "ExplainedVariance error and noise", "Errors over time", "Errors against speed",
                   "Errors against steering", "Errors against throttle", "Errors against position on the lap",
                   "Errors against lateral acceleration", "What these laps would show", "Nominal values"):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
 
 
-def test_figures_have_a_row_for_one_step_and_one_for_the_horizon(gain: Gain) -> None:
-    axes = errors_over("speed (m/s)", gain.windows.data.rows[0, gain.windows.starts], gain).axes
+def test_figures_have_a_row_for_one_step_and_one_for_the_horizon(improvement: Improvement) -> None:
+    axes = errors_over("speed (m/s)", improvement.windows.data.rows[0, improvement.windows.starts], improvement).axes
     assert [a.get_ylabel() for a in axes[::3]] == ["0.04 s ahead", "0.4 s ahead"]
-    assert len(gain_by_horizon(gain).axes) == 3
-    lines = simulated_and_measured(gain).axes[1].lines
+    assert len(gain_by_horizon(improvement).axes) == 3
+    lines = simulated_and_measured(improvement).axes[1].lines
     assert [line.get_label() for line in lines] == ["measured", GIVEN, RECALIBRATED, EXTENDED]
     x, y = (np.asarray(v) for v in lines[-1].get_data())
     starts = np.isin(np.round(x / 0.04), np.round(np.asarray(lines[0].get_xdata()) / 0.04))

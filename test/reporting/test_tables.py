@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from dynssm_ros.evaluation.spread import Spread, spreads
+from dynssm_ros.evaluation.spread import SeedSpread, spreads
 from dynssm_ros.reporting.tables import Column, Table, percent, text
 
 
@@ -42,7 +42,7 @@ def test_nothing_is_best_without_a_rival(table):
     [
         (None, "–"), (float("nan"), "–"), (float("-inf"), "–"), ("x", "x"), (85193, "85,193"), (0, "0"),
         (0.0209, "0.0209"),
-        (0.02, "0.0200"), (999.7, "1,000"), (Spread(0.02, 0.3, 2), "0.0200"),
+        (0.02, "0.0200"), (999.7, "1,000"), (SeedSpread(0.02, 0.3, 2), "0.0200"),
         (1e-7, "1.00e-07"), (150.0, "150"), (12345.6, "12,346"), (np.float64(0.5), "0.500"),
     ],
 )  # fmt: skip
@@ -53,10 +53,10 @@ def test_values_show_with_three_digits_and_a_dash_for_what_is_not_a_number(value
 @pytest.mark.parametrize(
     ("value", "shown"),
     [
-        (Spread(0.02891, 0.00042, 3), "0.0289 ± 0.0004"), (Spread(0.02, 7e-6, 2), "0.0200 ± 0.0000"),
-        (Spread(4374.0, 110.2, 2), "4,374 ± 110"), (Spread(12.0, 1.25, 2), "12.0 ± 1.2"),
-        (Spread(1.2e-7, 3.4e-8, 2), "1.20e-07 ± 3.4e-08"), (Spread(0.02, 0.0, 1), "0.0200"),
-        (Spread(float("nan"), float("nan"), 2), "–"),
+        (SeedSpread(0.02891, 0.00042, 3), "0.0289 ± 0.0004"), (SeedSpread(0.02, 7e-6, 2), "0.0200 ± 0.0000"),
+        (SeedSpread(4374.0, 110.2, 2), "4,374 ± 110"), (SeedSpread(12.0, 1.25, 2), "12.0 ± 1.2"),
+        (SeedSpread(1.2e-7, 3.4e-8, 2), "1.20e-07 ± 3.4e-08"), (SeedSpread(0.02, 0.0, 1), "0.0200"),
+        (SeedSpread(float("nan"), float("nan"), 2), "–"),
     ],
 )  # fmt: skip
 def test_a_spread_over_seeds_has_the_decimals_of_its_mean(value, shown):
@@ -66,7 +66,7 @@ def test_a_spread_over_seeds_has_the_decimals_of_its_mean(value, shown):
 
 def test_spreads_are_compared_by_their_means():
     columns = (Column("model"), Column("v_x", best="min"))
-    table = Table(columns, [["a", Spread(0.02, 0.5, 2)], ["b", Spread(0.03, 0.0, 1)], ["c", 0.025]])
+    table = Table(columns, [["a", SeedSpread(0.02, 0.5, 2)], ["b", SeedSpread(0.03, 0.0, 1)], ["c", 0.025]])
     assert marked(table) == {(0, 1)}
     assert "| a | **0.0200 ± 0.5000** |" in table.markdown()
 
@@ -75,8 +75,8 @@ def test_spreads_of_several_runs_are_mean_and_sample_standard_deviation():
     one, two = spreads([np.array([1.0, 5.0]), np.array([3.0, 5.0])])
     assert (one.mean, one.n) == (2.0, 2)
     assert one.std == pytest.approx(np.sqrt(2))
-    assert two == Spread(5.0, 0.0, 2)
-    assert spreads([np.array([7.0])]) == [Spread(7.0, 0.0, 1)]
+    assert two == SeedSpread(5.0, 0.0, 2)
+    assert spreads([np.array([7.0])]) == [SeedSpread(7.0, 0.0, 1)]
 
 
 def test_percent_is_whole():
@@ -111,6 +111,6 @@ def test_terminal_shows_names_as_they_are(table):
 
 def test_terminal_stacks_the_spread_below_the_mean():
     sink = StringIO()
-    Console(file=sink, width=100).print(Table((Column("a"),), [[Spread(0.02, 0.003, 2)]]).rich())
+    Console(file=sink, width=100).print(Table((Column("a"),), [[SeedSpread(0.02, 0.003, 2)]]).rich())
     above, below = (line.strip() for line in sink.getvalue().splitlines() if "0.0" in line)
     assert (above, below) == ("0.0200", "± 0.0030")

@@ -1,4 +1,4 @@
-"""The plant: the published Euler protocol, Runge-Kutta, pose and effect memory."""
+"""The plant: the published Euler protocol, Runge-Kutta, pose and effect states."""
 
 import numpy as np
 import pytest

@@ -12,7 +12,7 @@ import torch
 
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, load_vehicle
 from dynssm_ros.vehicle.effects import CONTEXT_UNITS, EFFECTS, Effect, build_effect
-from dynssm_ros.vehicle.single_track import Integrator, settled_memory, step_with_memory
+from dynssm_ros.vehicle.single_track import Integrator, settled_effect_states, step_with_effect_states
 
 AV21 = load_vehicle("av21_paper")
 SIZES = (3, 2, len(COEFFICIENTS), len(CONTEXT_UNITS))
@@ -31,14 +31,14 @@ def samples(n: int = 12) -> list[np.ndarray]:
 
 
 def advance(xp: Any, effect: Effect, integrator: Integrator, state: Any, inputs: Any, theta: Any, signals: Any) -> Any:
-    """The next state and memory after the inputs have doubled, each entry of shape ``(n,)``."""
+    """The next state and effect states after the inputs have doubled, each entry of shape ``(n,)``."""
     start, coefficients = State(*state), Coefficients(*theta)
     context = dict(zip(CONTEXT_UNITS, signals, strict=True))
     feedback, applied = Applied(0.5 * inputs[0], 0.5 * inputs[1]), Applied(*inputs)
     effects = (effect,)
-    memory = settled_memory(xp, start, feedback, coefficients, AV21.constants, effects, context=context)
-    following, carried = step_with_memory(
-        xp, start, memory, applied, coefficients, AV21.constants, 0.04, effects, integrator, 2, context
+    effect_states = settled_effect_states(xp, start, feedback, coefficients, AV21.constants, effects, context=context)
+    following, carried = step_with_effect_states(
+        xp, start, effect_states, applied, coefficients, AV21.constants, 0.04, effects, integrator, 2, context
     )
     return [*following, *carried.values()]
 
@@ -59,7 +59,7 @@ def test_numpy_torch_and_casadi_agree_to_1e_12(
     vectors, parts = symbols()
     f = casadi.Function("f", vectors, [casadi.vertcat(*advance(casadi, effect, integrator, *parts))])
     by_casadi = np.array(f.map(data[0].shape[1])(*data))
-    assert len(by_numpy) == 3 + len(effect.MEMORY)
+    assert len(by_numpy) == 3 + len(effect.EFFECT_STATES)
     for other in (by_torch, by_casadi):
         np.testing.assert_allclose(other, by_numpy, rtol=1e-12, atol=1e-12)
 

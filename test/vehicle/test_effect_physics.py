@@ -8,7 +8,7 @@ import pytest
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, motion
 from dynssm_ros.vehicle.effects import build_effect
-from dynssm_ros.vehicle.single_track import GRAVITY, Motion, step_with_memory
+from dynssm_ros.vehicle.single_track import GRAVITY, Motion, step_with_effect_states
 
 AV21 = load_vehicle("av21")
 CONSTANTS, THETA = AV21.constants, Coefficients(*AV21.nominal)
@@ -100,18 +100,20 @@ def test_load_transfer_of_a_car_without_any_is_one_clear_line() -> None:
 
 def test_relaxing_tyres_reach_their_slip_over_the_distance_rolled() -> None:
     relaxing = (build_effect("tire_relaxation", {"length": 0.6}),)
-    front, rear = relaxing[0].MEMORY
+    front, rear = relaxing[0].EFFECT_STATES
     # too heavy to be moved by its tyres, so that speed and slip stay as the slip angles build up
     heavy = CONSTANTS.model_copy(update={"m": 1e9, "h_cg": 0.0, "load_transfer": False})
     theta, state = THETA._replace(I_z=1e12), State(20.0, 0.0, 0.0)
-    _, memory = step_with_memory(np, state, {front: 0.0, rear: 0.0}, APPLIED, theta, heavy, 0.03, relaxing, "rk4", 100)
-    assert memory[front] == pytest.approx(APPLIED.delta * (1 - np.exp(-20.0 * 0.03 / 0.6)), rel=1e-3)
-    assert memory[rear] == pytest.approx(0.0, abs=1e-6)
+    _, effect_states = step_with_effect_states(
+        np, state, {front: 0.0, rear: 0.0}, APPLIED, theta, heavy, 0.03, relaxing, "rk4", 100
+    )
+    assert effect_states[front] == pytest.approx(APPLIED.delta * (1 - np.exp(-20.0 * 0.03 / 0.6)), rel=1e-3)
+    assert effect_states[rear] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_relaxing_tyres_pull_by_the_slip_that_they_have_reached() -> None:
     relaxing = build_effect("tire_relaxation", {"length": 0.6})
-    reached = dict(zip(relaxing.MEMORY, (0.01, -0.02), strict=True))
+    reached = dict(zip(relaxing.EFFECT_STATES, (0.01, -0.02), strict=True))
     q = motion(np, STATE, APPLIED, THETA, CONSTANTS, (relaxing,), reached)
     assert (q.alpha_f, q.alpha_r) == pytest.approx((0.01, -0.02))
 

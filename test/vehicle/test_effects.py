@@ -1,4 +1,4 @@
-"""Effects: each acts after its own stage, carries its memory, and is absent at its neutral value."""
+"""Effects: each acts after its own stage, carries its effect states, and is absent at its neutral value."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dynssm_ros.vehicle.effects import (
     Effect,
     Parameter,
     build_effect,
-    initial_memory,
+    initial_effect_states,
     parse_effect,
     require_context,
 )
@@ -28,8 +28,8 @@ from dynssm_ros.vehicle.single_track import (
     Integrator,
     Motion,
     StageEffect,
-    settled_memory,
-    step_with_memory,
+    settled_effect_states,
+    step_with_effect_states,
 )
 
 VEHICLE = load_vehicle("av21_paper")
@@ -39,8 +39,8 @@ STATE, APPLIED = State(30.0, 0.4, 0.2), Applied(0.4, 0.05)
 CONTEXT = {"t": 60.0, "s": 1900.0, "lap_length": 4000.0, "x": 5.0, "y": -3.0, "theta": 1.1, "roll": 0.03}
 
 
-def act(*effects: Effect, memory: dict[str, Array] | None = None) -> Motion:
-    return motion(np, STATE, APPLIED, THETA, CONSTANTS, effects, memory)
+def act(*effects: Effect, effect_states: dict[str, Array] | None = None) -> Motion:
+    return motion(np, STATE, APPLIED, THETA, CONSTANTS, effects, effect_states)
 
 
 @dataclass(frozen=True)
@@ -100,11 +100,11 @@ class YawTorque(Effect):
 
 @dataclass(frozen=True)
 class ThrottleLag(Effect):
-    MEMORY: ClassVar[tuple[str, ...]] = ("throttle_lag.r",)
+    EFFECT_STATES: ClassVar[tuple[str, ...]] = ("throttle_lag.r",)
     time_constant: float = 0.2
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        q.r = lagged(q, self.MEMORY[0], q.r, self.time_constant)
+        q.r = lagged(q, self.EFFECT_STATES[0], q.r, self.time_constant)
 
 
 def test_an_effect_on_the_inputs_is_a_motion_under_other_inputs() -> None:
@@ -181,37 +181,41 @@ def test_effects_act_in_the_order_given() -> None:
     ids=["own", "throttle_lag", "steering_lag", "odometry_delay"],
 )
 def test_a_lag_approaches_its_input_exponentially(effect: Effect, target: float, start: float) -> None:
-    name, T, tau = effect.MEMORY[0], 0.3, 0.1 if effect.NAME == "odometry_delay" else 0.2
-    memory = initial_memory((effect,), 0.1, 0.02)
-    assert memory[name] == start
-    _, memory = step_with_memory(
-        np, STATE, memory, APPLIED, THETA, CONSTANTS, T, (effect,), integrator="rk4", substeps=100
+    name, T, tau = effect.EFFECT_STATES[0], 0.3, 0.1 if effect.NAME == "odometry_delay" else 0.2
+    effect_states = initial_effect_states((effect,), 0.1, 0.02)
+    assert effect_states[name] == start
+    _, effect_states = step_with_effect_states(
+        np, STATE, effect_states, APPLIED, THETA, CONSTANTS, T, (effect,), integrator="rk4", substeps=100
     )
-    assert memory[name] == pytest.approx(target + (start - target) * np.exp(-T / tau), rel=1e-8)
+    assert effect_states[name] == pytest.approx(target + (start - target) * np.exp(-T / tau), rel=1e-8)
 
 
 def test_a_lag_under_forward_euler_decays_by_its_own_factor() -> None:
     effect = build_effect("steering_lag", {"time_constant": 0.2})
-    memory: dict[str, Array] = {"steering_lag.delta": 0.0}
+    effect_states: dict[str, Array] = {"steering_lag.delta": 0.0}
     state = STATE
     for _ in range(5):
-        state, memory = step_with_memory(np, state, memory, APPLIED, THETA, CONSTANTS, 0.04, (effect,))
-    assert memory["steering_lag.delta"] == pytest.approx(APPLIED.delta * (1 - (1 - 0.04 / 0.2) ** 5), rel=1e-12)
+        state, effect_states = step_with_effect_states(
+            np, state, effect_states, APPLIED, THETA, CONSTANTS, 0.04, (effect,)
+        )
+    assert effect_states["steering_lag.delta"] == pytest.approx(APPLIED.delta * (1 - (1 - 0.04 / 0.2) ** 5), rel=1e-12)
 
 
 def test_a_lag_that_the_steps_do_not_resolve_settles_and_acts_as_its_mean_over_the_step() -> None:
     tau, T_s = 0.004, 0.04
     effect = build_effect("steering_lag", {"time_constant": tau})
-    state, memory = step_with_memory(np, STATE, {"steering_lag.delta": 0.0}, APPLIED, THETA, CONSTANTS, T_s, (effect,))
-    assert memory["steering_lag.delta"] == APPLIED.delta
+    state, effect_states = step_with_effect_states(
+        np, STATE, {"steering_lag.delta": 0.0}, APPLIED, THETA, CONSTANTS, T_s, (effect,)
+    )
+    assert effect_states["steering_lag.delta"] == APPLIED.delta
     mean = APPLIED.delta * (1 - tau / T_s * (1 - np.exp(-T_s / tau)))
-    expected, _ = step_with_memory(np, STATE, {}, APPLIED._replace(delta=mean), THETA, CONSTANTS, T_s)
+    expected, _ = step_with_effect_states(np, STATE, {}, APPLIED._replace(delta=mean), THETA, CONSTANTS, T_s)
     np.testing.assert_allclose(state, expected, rtol=0, atol=1e-5)
 
 
 def test_the_lagged_steering_is_what_acts_on_the_tyres() -> None:
     lag = build_effect("steering_lag", {"time_constant": 0.1})
-    lagged_motion = act(lag, memory={"steering_lag.delta": 0.02})
+    lagged_motion = act(lag, effect_states={"steering_lag.delta": 0.02})
     direct = motion(np, STATE, APPLIED._replace(delta=0.02), THETA, CONSTANTS)
     found = (lagged_motion.a_x, lagged_motion.a_y, lagged_motion.omega_dot)
     np.testing.assert_allclose(found, (direct.a_x, direct.a_y, direct.omega_dot), rtol=1e-12)
@@ -219,19 +223,21 @@ def test_the_lagged_steering_is_what_acts_on_the_tyres() -> None:
 
 def test_states_of_effects_start_settled_one_behind_the_other() -> None:
     chain = (build_effect("steering_offset", {"offset": 0.01}), build_effect("steering_lag", {"time_constant": 0.1}))
-    assert initial_memory(chain, 0.3, 0.02) == {"steering_lag.delta": 0.02 + 0.01}
+    assert initial_effect_states(chain, 0.3, 0.02) == {"steering_lag.delta": 0.02 + 0.01}
     known = {"steering_lag.delta": 0.5}
-    assert settled_memory(np, STATE, APPLIED, THETA, CONSTANTS, chain, known) == known
-    settled, _ = step_with_memory(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, chain)
-    plain, _ = step_with_memory(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, chain[:1])
+    assert settled_effect_states(np, STATE, APPLIED, THETA, CONSTANTS, chain, known) == known
+    settled, _ = step_with_effect_states(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, chain)
+    plain, _ = step_with_effect_states(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, chain[:1])
     np.testing.assert_allclose(settled, plain, rtol=1e-15)
 
 
 def advanced(integrator: Integrator, *effects: Effect) -> State:
     """Two half steps after the inputs have changed to ``APPLIED``."""
     context = CONTEXT if effects else {}
-    memory = settled_memory(np, STATE, Applied(0.1, 0.02), THETA, CONSTANTS, effects, context=context)
-    return step_with_memory(np, STATE, memory, APPLIED, THETA, CONSTANTS, 0.04, effects, integrator, 2, context)[0]
+    effect_states = settled_effect_states(np, STATE, Applied(0.1, 0.02), THETA, CONSTANTS, effects, context=context)
+    return step_with_effect_states(
+        np, STATE, effect_states, APPLIED, THETA, CONSTANTS, 0.04, effects, integrator, 2, context
+    )[0]
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
@@ -241,11 +247,13 @@ def test_a_neutral_effect_changes_nothing(name: str, integrator: Integrator) -> 
     effect = build_effect(name, neutral)
     assert effect.is_neutral
     assert effect.carries == effect.needs == ()
-    assert initial_memory((effect,), *APPLIED) == {}
+    assert initial_effect_states((effect,), *APPLIED) == {}
     plain = advanced(integrator)
-    found, memory = step_with_memory(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, (effect,), integrator, 2)
+    found, effect_states = step_with_effect_states(
+        np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, (effect,), integrator, 2
+    )
     assert found == plain
-    assert memory == {}
+    assert effect_states == {}
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
@@ -302,8 +310,8 @@ def test_every_shipped_effect_acts_away_from_its_neutral_value(
     name: str, acting: Callable[..., dict[str, float]]
 ) -> None:
     effect = build_effect(name, acting(name))
-    memory = settled_memory(np, STATE, APPLIED, THETA, CONSTANTS, (effect,), context=CONTEXT)
-    assert set(memory) == set(effect.carries) == set(effect.MEMORY)
+    effect_states = settled_effect_states(np, STATE, APPLIED, THETA, CONSTANTS, (effect,), context=CONTEXT)
+    assert set(effect_states) == set(effect.carries) == set(effect.EFFECT_STATES)
     assert np.abs(np.subtract(advanced("rk4", effect), advanced("rk4"))).max() > 1e-4
 
 

@@ -18,9 +18,9 @@ from dynssm_ros.vehicle.single_track import (
     Motion,
     measured_state,
     measuring,
-    settled_memory,
+    settled_effect_states,
     step,
-    step_with_memory,
+    step_with_effect_states,
     true_state,
 )
 
@@ -74,10 +74,10 @@ def test_only_sensors_that_are_off_measure() -> None:
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_true_state_comes_back_from_the_measured_one(name: str, acting: Callable[..., dict[str, float]]) -> None:
     chain = (build_effect("odometry_misalignment", {"angle": 0.03}), build_effect(name, acting(name)))
-    memory = dict.fromkeys(chain[1].MEMORY, 0.07)
-    back = true_state(np, measured_state(np, STATE, chain, memory), chain, memory)
+    effect_states = dict.fromkeys(chain[1].EFFECT_STATES, 0.07)
+    back = true_state(np, measured_state(np, STATE, chain, effect_states), chain, effect_states)
     np.testing.assert_allclose(back, STATE, rtol=1e-14)
-    assert measured_state(np, STATE, chain, memory) != STATE
+    assert measured_state(np, STATE, chain, effect_states) != STATE
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
@@ -87,9 +87,11 @@ def test_a_model_steps_what_is_measured_of_the_true_motion(
 ) -> None:
     car = (build_effect("drag", {"coefficient": 0.3}), build_effect(name, acting(name)))
     rest = (THETA, CONSTANTS, 0.04, car, integrator, 2)
-    memory = settled_memory(np, STATE, Applied(0.1, 0.02), THETA, CONSTANTS, car, measured=False)
-    true, carried = step_with_memory(np, STATE, memory, APPLIED, *rest, measured=False)
-    found, beside = step_with_memory(np, measured_state(np, STATE, car, memory), memory, APPLIED, *rest)
+    effect_states = settled_effect_states(np, STATE, Applied(0.1, 0.02), THETA, CONSTANTS, car, measured=False)
+    true, carried = step_with_effect_states(np, STATE, effect_states, APPLIED, *rest, measured=False)
+    found, beside = step_with_effect_states(
+        np, measured_state(np, STATE, car, effect_states), effect_states, APPLIED, *rest
+    )
     np.testing.assert_allclose(found, measured_state(np, true, car, carried), rtol=1e-13)
     assert beside == pytest.approx(carried, rel=1e-12)
 
@@ -97,37 +99,49 @@ def test_a_model_steps_what_is_measured_of_the_true_motion(
 @pytest.mark.parametrize("name", SENSORS)
 def test_what_happens_does_not_depend_on_the_sensors(name: str, acting: Callable[..., dict[str, float]]) -> None:
     sensor = (build_effect(name, acting(name)),)
-    true, _ = step_with_memory(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, sensor, measured=False)
+    true, _ = step_with_effect_states(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, sensor, measured=False)
     assert true == step(np, STATE, APPLIED, THETA, CONSTANTS, 0.04)
 
 
 def test_a_filtered_yaw_rate_approaches_a_constant_one_exponentially() -> None:
     lag = build_effect("yaw_rate_lag", {"time_constant": 0.1})
-    (name,) = lag.MEMORY
+    (name,) = lag.EFFECT_STATES
     effects = (Torque(0.0), lag)
-    true, memory = step_with_memory(
+    true, effect_states = step_with_effect_states(
         np, STATE, {name: 0.15}, APPLIED, THETA, CONSTANTS, 0.08, effects, "rk4", 40, measured=False
     )
-    measured = measured_state(np, true, effects, memory).omega
+    measured = measured_state(np, true, effects, effect_states).omega
     assert measured == pytest.approx(0.2 - 0.15 * np.exp(-0.08 / 0.1), rel=1e-9)
 
 
 def test_a_filtered_yaw_rate_follows_a_ramp_one_time_constant_behind() -> None:
     lag = build_effect("yaw_rate_lag", {"time_constant": 0.1})
     effects = (Torque(1.5), lag)
-    true, memory = step_with_memory(
-        np, STATE, dict.fromkeys(lag.MEMORY, 0.0), APPLIED, THETA, CONSTANTS, 1.5, effects, "rk4", 100, measured=False
+    true, effect_states = step_with_effect_states(
+        np,
+        STATE,
+        dict.fromkeys(lag.EFFECT_STATES, 0.0),
+        APPLIED,
+        THETA,
+        CONSTANTS,
+        1.5,
+        effects,
+        "rk4",
+        100,
+        measured=False,
     )
     assert true.omega == pytest.approx(0.2 + 1.5 * 1.5)
-    assert measured_state(np, true, effects, memory).omega == pytest.approx(true.omega - 0.1 * 1.5, rel=1e-5)
+    assert measured_state(np, true, effects, effect_states).omega == pytest.approx(true.omega - 0.1 * 1.5, rel=1e-5)
 
 
 def test_a_filter_that_the_steps_do_not_resolve_settles() -> None:
     lag = build_effect("yaw_rate_lag", {"time_constant": 0.004})
-    effects, memory, state = (Torque(1.5), lag), dict.fromkeys(lag.MEMORY, 0.3), STATE
+    effects, effect_states, state = (Torque(1.5), lag), dict.fromkeys(lag.EFFECT_STATES, 0.3), STATE
     for _ in range(2):
-        state, memory = step_with_memory(np, state, memory, APPLIED, THETA, CONSTANTS, 0.04, effects, measured=False)
-    assert memory[lag.MEMORY[0]] == pytest.approx(0.004 * 1.5)
+        state, effect_states = step_with_effect_states(
+            np, state, effect_states, APPLIED, THETA, CONSTANTS, 0.04, effects, measured=False
+        )
+    assert effect_states[lag.EFFECT_STATES[0]] == pytest.approx(0.004 * 1.5)
 
 
 @pytest.mark.parametrize("time_constant", [0.03, 0.08, 0.2])
@@ -139,10 +153,10 @@ def test_behind_one_filtered_row_is_the_yaw_rate_whose_acceleration_explains_the
         return float(behind - time_constant * omega_dot)
 
     lag = build_effect("yaw_rate_lag", {"time_constant": time_constant})
-    memory = settled_memory(np, STATE, APPLIED, THETA, CONSTANTS, (lag,))
+    effect_states = settled_effect_states(np, STATE, APPLIED, THETA, CONSTANTS, (lag,))
     expected = brentq(unexplained, -1.0, 1.0)
     assert abs(expected) > 0.05
-    assert memory[lag.MEMORY[0]] == pytest.approx(expected, rel=0.02)
+    assert effect_states[lag.EFFECT_STATES[0]] == pytest.approx(expected, rel=0.02)
 
 
 def test_tyres_relax_behind_a_filtered_yaw_rate_by_the_true_slip() -> None:
@@ -150,10 +164,12 @@ def test_tyres_relax_behind_a_filtered_yaw_rate_by_the_true_slip() -> None:
         build_effect("yaw_rate_lag", {"time_constant": 0.08}),
         build_effect("tire_relaxation", {"length": 0.5}),
     )
-    memory = settled_memory(np, STATE, APPLIED, THETA, CONSTANTS, (tyres, lag))
-    true = true_state(np, STATE, (lag,), memory)
+    effect_states = settled_effect_states(np, STATE, APPLIED, THETA, CONSTANTS, (tyres, lag))
+    true = true_state(np, STATE, (lag,), effect_states)
     slip = motion(np, true, APPLIED, THETA, CONSTANTS)
-    assert [memory[name] for name in tyres.MEMORY] == pytest.approx([slip.alpha_f, slip.alpha_r], rel=1e-12)
+    assert [effect_states[name] for name in tyres.EFFECT_STATES] == pytest.approx(
+        [slip.alpha_f, slip.alpha_r], rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("delay", [0.01, 0.03, 0.04])
@@ -161,8 +177,8 @@ def test_late_odometry_is_early_actuators(delay: float) -> None:
     """From a late measurement on, a step of T_s has the inputs of before for ``delay`` and the present ones after."""
     before, T_s = Applied(0.1, 0.02), 0.04
     late = (build_effect("odometry_delay", {"delay": delay}),)
-    memory = settled_memory(np, STATE, before, THETA, CONSTANTS, late)
-    found, _ = step_with_memory(np, STATE, memory, APPLIED, THETA, CONSTANTS, T_s, late)
+    effect_states = settled_effect_states(np, STATE, before, THETA, CONSTANTS, late)
+    found, _ = step_with_effect_states(np, STATE, effect_states, APPLIED, THETA, CONSTANTS, T_s, late)
     share = delay / T_s
     mean = Applied(*(share * old + (1 - share) * new for old, new in zip(before, APPLIED, strict=True)))
     np.testing.assert_allclose(found, step(np, STATE, mean, THETA, CONSTANTS, T_s), rtol=1e-13)
@@ -172,13 +188,13 @@ def test_delayed_inputs_keep_their_swing() -> None:
     """The gain of the Pade approximation is 1 and its phase that of the delay, here at 1 Hz."""
     late = build_effect("odometry_delay", {"delay": 0.06})
     h, w = 1e-3, 2 * np.pi
-    memory: dict[str, Any] = dict.fromkeys(late.MEMORY, 0.0)
+    effect_states: dict[str, Any] = dict.fromkeys(late.EFFECT_STATES, 0.0)
     times = np.arange(0.0, 3.0, h)
     acted = np.empty_like(times)
     for k, t in enumerate(times):
-        q = motion(np, STATE, Applied(0.0, 0.1 * np.sin(w * t)), THETA, CONSTANTS, (late,), memory, h=h)
+        q = motion(np, STATE, Applied(0.0, 0.1 * np.sin(w * t)), THETA, CONSTANTS, (late,), effect_states, h=h)
         acted[k] = q.delta
-        memory = {name: value + h * q.memory_rate[name] for name, value in memory.items()}
+        effect_states = {name: value + h * q.effect_state_rates[name] for name, value in effect_states.items()}
     wave = np.exp(-1j * w * times[2000:])  # the last period
     swing = 2 * np.mean(acted[2000:] * wave)
     assert abs(swing) == pytest.approx(0.1, rel=0.01)

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle, load_vehicle, motion, step
-from dynssm_ros.vehicle.effects import initial_memory
-from dynssm_ros.vehicle.single_track import GRAVITY, Integrator, step_with_memory
+from dynssm_ros.vehicle.effects import initial_effect_states
+from dynssm_ros.vehicle.single_track import GRAVITY, Integrator, step_with_effect_states
 
 SPEEDS = {"orca": (0.5, 3.0), "av21_paper": (5.0, 60.0)}
 SHIFTS = ("S_hf", "S_vf", "S_hr", "S_vr")
@@ -64,14 +64,14 @@ def samples(vehicle: Vehicle, n: int = 40) -> tuple[np.ndarray, np.ndarray, np.n
 def advance(
     xp: Any, vehicle: Vehicle, state: Any, inputs: Any, theta: Any, integrator: Integrator, substeps: int
 ) -> list[Any]:
-    """Accelerations of the motion, then the next state and memory, each entry of shape ``(n,)``."""
+    """Accelerations of the motion, then the next state and effect states, each entry of shape ``(n,)``."""
     applied, effects = Applied(*inputs), vehicle.active_effects
-    memory = initial_memory(effects, inputs[0], 0.5 * inputs[1])
-    q = motion(xp, State(*state), applied, Coefficients(*theta), vehicle.constants, effects, memory)
-    following, carried = step_with_memory(
+    effect_states = initial_effect_states(effects, inputs[0], 0.5 * inputs[1])
+    q = motion(xp, State(*state), applied, Coefficients(*theta), vehicle.constants, effects, effect_states)
+    following, carried = step_with_effect_states(
         xp,
         State(*state),
-        memory,
+        effect_states,
         applied,
         Coefficients(*theta),
         vehicle.constants,
@@ -255,10 +255,12 @@ def test_slip_is_defined_at_standstill_and_in_reverse(vehicle: Vehicle) -> None:
 
 
 def test_memory_and_context_are_not_changed_by_motion(vehicle: Vehicle) -> None:
-    memory, context = {"own": 1.0}, {"time": 2.0}
-    q = motion(np, State(1.0, 0.0, 0.0), Applied(0.0, 0.0), theta_of(vehicle), vehicle.constants, (), memory, context)
-    q.memory["own"] = 5.0
-    assert memory == {"own": 1.0}
+    effect_states, context = {"own": 1.0}, {"time": 2.0}
+    q = motion(
+        np, State(1.0, 0.0, 0.0), Applied(0.0, 0.0), theta_of(vehicle), vehicle.constants, (), effect_states, context
+    )
+    q.effect_states["own"] = 5.0
+    assert effect_states == {"own": 1.0}
     assert q.context["time"] == 2.0
 
 

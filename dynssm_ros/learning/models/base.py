@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from dynssm_ros.configuration import StrictModel
-from dynssm_ros.learning.dataset import SplitConfig, Windows
+from dynssm_ros.learning.dataset import SplitConfig, TrainingWindows
 from dynssm_ros.learning.losses import LossConfig, Output, Scales, objective
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
@@ -130,7 +130,7 @@ class TrainableModel(nn.Module):
         """The weighted terms of the loss on windows ``(B, H + EXTRA_ROWS, 7)`` and increments ``(B, 3)``."""
         return objective(self(window), target, loss, scales)
 
-    def fit(self, training: Windows) -> bool:
+    def fit(self, training: TrainingWindows) -> bool:
         """Fits in closed form; returns whether that is all the training there is."""
         return False
 
@@ -138,7 +138,7 @@ class TrainableModel(nn.Module):
         """Starts from a trained model; see :attr:`ModelConfig.start`."""
         raise NotImplementedError
 
-    def post_fit(self, validation: Windows) -> None:
+    def post_fit(self, validation: TrainingWindows) -> None:
         """Fits what is fitted on validation windows once the weights are found."""
 
     def held_out_errors(self, window: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

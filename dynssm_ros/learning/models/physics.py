@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import Coefficients, State, Vehicle
-from dynssm_ros.vehicle.effects import initial_memory
+from dynssm_ros.vehicle.effects import initial_effect_states
 from dynssm_ros.vehicle.single_track import Integrator, increment
 
 INPUTS = len(WINDOW_COLUMNS)
@@ -74,7 +74,7 @@ class PhysicsLayer(nn.Module):
         moved, _ = increment(
             _XP,
             State(*rows[:3]),
-            initial_memory(self.effects, rows[3], rows[4]),
+            initial_effect_states(self.effects, rows[3], rows[4]),
             applied_inputs(rows),
             Coefficients(*torch.split(theta, 1, dim=-1)),
             self.vehicle.constants,

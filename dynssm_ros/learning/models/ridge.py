@@ -8,7 +8,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from dynssm_ros.learning.dataset import SplitConfig, Windows
+from dynssm_ros.learning.dataset import SplitConfig, TrainingWindows
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel, scale_buffers
 from dynssm_ros.learning.models.physics import INPUTS
@@ -45,7 +45,7 @@ class Ridge(TrainableModel):
         return Output(self.increment_scale * self.linear(features), None, None, None, None)
 
     @torch.no_grad()
-    def fit(self, training: Windows) -> bool:
+    def fit(self, training: TrainingWindows) -> bool:
         """Closed-form solution in double precision; the intercept is free of the penalty."""
         windows, increments = training.batch(slice(None))
         features = ((windows - self.mean) / self.std).flatten(1).double()

@@ -17,7 +17,7 @@ from dynssm_ros.vehicle.effects.base import (
     LOCATION,
     Effect,
     Parameter,
-    initial_memory,
+    initial_effect_states,
     require_context,
 )
 from dynssm_ros.vehicle.effects.drivetrain import LockedDifferential
@@ -42,7 +42,7 @@ __all__ = [
     "Effect",
     "Parameter",
     "build_effect",
-    "initial_memory",
+    "initial_effect_states",
     "parse_effect",
     "register_effect",
     "require_context",

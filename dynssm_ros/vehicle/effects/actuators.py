@@ -53,12 +53,12 @@ class SteeringLag(Effect):
     MANOEUVRE = "quick steering from side to side at constant speed"
     PARAMETERS = {"time_constant": Parameter("s", 0.0, 0.5, 0.0)}
     TYPICAL = (0.015, 0.2)
-    MEMORY = ("steering_lag.delta",)
+    EFFECT_STATES = ("steering_lag.delta",)
     time_constant: Array = 0.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
         """Replaces the steering by its lagged value."""
-        q.delta = lagged(q, self.MEMORY[0], q.delta, self.time_constant)
+        q.delta = lagged(q, self.EFFECT_STATES[0], q.delta, self.time_constant)
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class ThrottleLag(Effect):
     MANOEUVRE = "steps of throttle and brake on a straight"
     PARAMETERS = {"time_constant": Parameter("s", 0.0, 0.5, 0.0)}
     TYPICAL = (0.012, 0.4)
-    MEMORY = ("throttle_lag.r",)
+    EFFECT_STATES = ("throttle_lag.r",)
     time_constant: Array = 0.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
         """Replaces the throttle by its lagged value."""
-        q.r = lagged(q, self.MEMORY[0], q.r, self.time_constant)
+        q.r = lagged(q, self.EFFECT_STATES[0], q.r, self.time_constant)

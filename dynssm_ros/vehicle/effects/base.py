@@ -90,7 +90,7 @@ class Effect(StageEffect):
         MANOEUVRE: the driving that shows it best.
         PARAMETERS: the parameters by name.
         VARIANTS: sets of parameters to be fitted together, the simplest first; empty: all of them.
-        MEMORY: names of its own states. :func:`lagged` settles and integrates them.
+        EFFECT_STATES: names of its own states. :func:`lagged` settles and integrates them.
         SENSOR: it changes what the sensors show; the car moves as without it.
         TYPICAL: how far it is off neutral in a car that is badly set up: just noticeable in ordinary laps, and large.
         DIRECTIONS: to which sides of neutral it is met in a car that can be driven; empty: those that its bounds admit.
@@ -102,7 +102,7 @@ class Effect(StageEffect):
     MANOEUVRE: ClassVar[str] = ""
     PARAMETERS: ClassVar[dict[str, Parameter]] = {}
     VARIANTS: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    MEMORY: ClassVar[tuple[str, ...]] = ()
+    EFFECT_STATES: ClassVar[tuple[str, ...]] = ()
     SENSOR: ClassVar[bool] = False
     TYPICAL: ClassVar[tuple[float, float]] = (0.0, 0.0)
     DIRECTIONS: ClassVar[tuple[float, ...]] = ()
@@ -167,7 +167,7 @@ class Effect(StageEffect):
     @property
     def carries(self) -> tuple[str, ...]:
         """Its own states, by name; none while it is absent."""
-        return () if self.is_neutral else self.MEMORY
+        return () if self.is_neutral else self.EFFECT_STATES
 
     @property
     def reading_delay(self) -> float:
@@ -193,18 +193,18 @@ def _is_number(value: Array, number: float) -> bool:
     return isinstance(value, (int, float)) and value == number
 
 
-def initial_memory(effects: Sequence[StageEffect], r: Array, delta: Array) -> dict[str, Array]:
+def initial_effect_states(effects: Sequence[StageEffect], r: Array, delta: Array) -> dict[str, Array]:
     """The own states of ``effects`` on the inputs, settled under throttle ``r`` and steering ``delta``.
 
-    States on anything else hang on the car's motion: ``settled_memory`` finds all of them, and the step functions those
-    that are missing.
+    States on anything else depend on the car's motion: ``settled_effect_states`` finds all of them, and the step functions
+    those that are missing.
     """
     zero = Coefficients(*(0.0,) * len(Coefficients._fields))
     q = Motion(0.0, 0.0, 0.0, r, delta, theta=zero, m=0.0, l_f=0.0, l_r=0.0, h_cg=0.0, F_z0=0.0, load_transfer=False)
     for effect in effects:
         if not effect.is_neutral:
             effect.inputs(None, q)
-    return q.memory
+    return q.effect_states
 
 
 def require_context(effects: Iterable[StageEffect], available: Iterable[str], where: str) -> None:
@@ -228,15 +228,15 @@ def _lacking(effect: StageEffect, signal: str, have: Container[str]) -> str:
 
 
 def lagged(q: Motion, name: str, target: Array, time_constant: Array) -> Array:
-    """``target`` behind a first-order lag with the state ``q.memory[name]``; a state that is missing is settled.
+    """``target`` behind a first-order lag with the state ``q.effect_states[name]``; a state that is missing is settled.
 
     A lag that is quicker than the integrator's step would ring. Its state then reaches the target within the step, and
     the result lies between the two, for forward Euler as the mean over the step does; with a time constant of 0 it is
     the target.
     """
     resolved = at_least(time_constant, q.h)
-    state = q.memory.setdefault(name, target)
-    q.memory_rate[name] = (target - state) / resolved
+    state = q.effect_states.setdefault(name, target)
+    q.effect_state_rates[name] = (target - state) / resolved
     return target + time_constant / resolved * (state - target)
 
 

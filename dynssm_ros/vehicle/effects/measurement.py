@@ -40,12 +40,12 @@ class OdometryLeverArm(MeasurementEffect):
     x: Array = 0.0
     y: Array = 0.0
 
-    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+    def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """Velocity at the sensor."""
         v_x, v_y, omega = state
         return State(v_x - omega * self.y, v_y + omega * self.x, omega)
 
-    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+    def true(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """Velocity at the centre of gravity."""
         v_x, v_y, omega = state
         return State(v_x + omega * self.y, v_y - omega * self.x, omega)
@@ -63,11 +63,11 @@ class OdometryMisalignment(MeasurementEffect):
     TYPICAL = (0.003, 0.04)
     angle: Array = 0.0
 
-    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+    def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """Velocity in the sensor's frame."""
         return _turned(xp, state, -self.angle)
 
-    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+    def true(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """Velocity in the car's frame."""
         return _turned(xp, state, self.angle)
 
@@ -98,7 +98,7 @@ class OdometryDelay(Effect):
     MANOEUVRE = "quick changes of steering and throttle"
     PARAMETERS = {"delay": Parameter("s", 0.0, 0.3, 0.0)}
     TYPICAL = (0.008, 0.16)
-    MEMORY = ("odometry_delay.r", "odometry_delay.delta")
+    EFFECT_STATES = ("odometry_delay.r", "odometry_delay.delta")
     SENSOR = True
     delay: Array = 0.0
 
@@ -109,7 +109,7 @@ class OdometryDelay(Effect):
 
     def inputs(self, xp: Any, q: Motion) -> None:
         """Delays both inputs."""
-        throttle, steering = self.MEMORY
+        throttle, steering = self.EFFECT_STATES
         q.r = 2 * lagged(q, throttle, q.r, self.delay / 2) - q.r
         q.delta = 2 * lagged(q, steering, q.delta, self.delay / 2) - q.delta
 
@@ -126,11 +126,11 @@ class YawRateBias(MeasurementEffect):
     TYPICAL = (0.003, 0.03)
     bias: Array = 0.0
 
-    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+    def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """Adds the bias."""
         return state._replace(omega=state.omega + self.bias)
 
-    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+    def true(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """Takes the bias off."""
         return state._replace(omega=state.omega - self.bias)
 
@@ -150,20 +150,20 @@ class YawRateLag(MeasurementEffect):
     MANOEUVRE = "quick steering from side to side"
     PARAMETERS = {"time_constant": Parameter("s", 0.0, 0.5, 0.0)}
     TYPICAL = (0.013, 0.25)
-    MEMORY = ("yaw_rate_lag.behind",)
+    EFFECT_STATES = ("yaw_rate_lag.behind",)
     time_constant: Array = 0.0
 
     def accelerations(self, xp: Any, q: Motion) -> None:
         """Says how the lag of the measurement changes."""
-        (name,) = self.MEMORY
+        (name,) = self.EFFECT_STATES
         resolved = at_least(self.time_constant, q.h)
-        behind = q.memory.setdefault(name, self.time_constant * q.omega_dot)
-        q.memory_rate[name] = (self.time_constant * q.omega_dot - behind) / resolved
+        behind = q.effect_states.setdefault(name, self.time_constant * q.omega_dot)
+        q.effect_state_rates[name] = (self.time_constant * q.omega_dot - behind) / resolved
 
-    def measured(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+    def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """What the filter gives."""
-        return state._replace(omega=state.omega - memory.get(self.MEMORY[0], 0.0))
+        return state._replace(omega=state.omega - effect_states.get(self.EFFECT_STATES[0], 0.0))
 
-    def true(self, xp: Any, state: State, memory: Mapping[str, Array]) -> State:
+    def true(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """What goes into the filter."""
-        return state._replace(omega=state.omega + memory.get(self.MEMORY[0], 0.0))
+        return state._replace(omega=state.omega + effect_states.get(self.EFFECT_STATES[0], 0.0))

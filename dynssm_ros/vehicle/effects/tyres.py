@@ -60,12 +60,12 @@ class TireRelaxation(Effect):
     MANOEUVRE = "quick steering from side to side at low speed"
     PARAMETERS = {"length": Parameter("m", 0.0, 3.0, 0.0)}
     TYPICAL = (0.35, 1.2)
-    MEMORY = ("tire_relaxation.alpha_f", "tire_relaxation.alpha_r")
+    EFFECT_STATES = ("tire_relaxation.alpha_f", "tire_relaxation.alpha_r")
     length: Array = 0.0
 
     def slip(self, xp: Any, q: Motion) -> None:
         """Lets both slip angles lag."""
-        front, rear = self.MEMORY
+        front, rear = self.EFFECT_STATES
         time_constant = self.length / (abs(q.v_x) + SLOWEST)
         q.alpha_f = lagged(q, front, q.alpha_f, time_constant)
         q.alpha_r = lagged(q, rear, q.alpha_r, time_constant)

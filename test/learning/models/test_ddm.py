@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dynssm_ros.learning.dataset import Windows, split_windows
+from dynssm_ros.learning.dataset import TrainingWindows, split_windows
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.ddm import DDM
@@ -128,7 +128,7 @@ def test_it_learns_a_car_from_its_laps(make_ddm: MakeConfig, laps: Recording, or
     trained = train(laps, config, orca, tmp_path / "checkpoint.pt")
     prediction = trained.history["validation/prediction"]
     assert min(prediction) < 0.2 * prediction[0]
-    held: Windows = split_windows(laps, 4, config.training, 0.0, 1)[1]
+    held: TrainingWindows = split_windows(laps, 4, config.training, 0.0, 1)[1]
     window, increment = held.batch(slice(None))
     with torch.no_grad():
         error = trained.model(window).increment - increment

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dynssm_ros.configuration import config_root
-from dynssm_ros.learning.dataset import Windows, normalisation
+from dynssm_ros.learning.dataset import TrainingWindows, normalisation
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.dynssm.network import DynSSM, GatedResidual
@@ -35,13 +35,13 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 
 
 @pytest.fixture(scope="module")
-def windows(laps: Recording) -> Windows:
+def windows(laps: Recording) -> TrainingWindows:
     matrix = torch.tensor(laps.matrix, dtype=torch.float32)
-    return Windows(matrix, torch.tensor(laps.window_ends(4)), 4)
+    return TrainingWindows(matrix, torch.tensor(laps.window_ends(4)), 4)
 
 
 @pytest.fixture(scope="module")
-def scale(laps: Recording, windows: Windows) -> Normalisation:
+def scale(laps: Recording, windows: TrainingWindows) -> Normalisation:
     return normalisation(laps, windows)
 
 
@@ -66,7 +66,7 @@ def test_without_learned_parts_it_is_the_numpy_single_track_step(
     make_config: MakeConfig,
     orca: Vehicle,
     scale: Normalisation,
-    windows: Windows,
+    windows: TrainingWindows,
     integrator: str,
     substeps: int,
 ) -> None:
@@ -87,7 +87,7 @@ def test_without_learned_parts_it_is_the_numpy_single_track_step(
 
 
 def test_a_fresh_model_starts_next_to_the_nominal_car(
-    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: Windows
+    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: TrainingWindows
 ) -> None:
     window, _ = windows.batch(slice(None))
     output = run(build(make_config(), orca, scale), window)
@@ -103,7 +103,7 @@ def test_no_weights_push_a_coefficient_over_its_bounds(
     make_config: MakeConfig,
     orca: Vehicle,
     scale: Normalisation,
-    windows: Windows,
+    windows: TrainingWindows,
     factor: float,
     seed: int,
     alpha: float,
@@ -124,7 +124,7 @@ def test_no_weights_push_a_coefficient_over_its_bounds(
 
 
 def test_a_deviation_beyond_a_bound_is_clipped_to_it(
-    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: Windows
+    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: TrainingWindows
 ) -> None:
     model = build(make_config(adaptation={"alpha": 1.0}), orca, scale)
     assert model.head is not None
@@ -138,7 +138,7 @@ def test_a_deviation_beyond_a_bound_is_clipped_to_it(
 
 
 def test_a_small_deviation_is_alpha_tanh_of_the_range(
-    make_config: MakeConfig, scale: Normalisation, windows: Windows, orca: Vehicle
+    make_config: MakeConfig, scale: Normalisation, windows: TrainingWindows, orca: Vehicle
 ) -> None:
     middle = orca.with_nominal((orca.lower + orca.upper) / 2)
     model = build(make_config(adaptation={"alpha": 0.3}), middle, scale)
@@ -172,7 +172,7 @@ def test_the_gate_lies_between_0_and_1_and_scales_the_correction(seed: int, fact
 
 
 def test_the_correction_is_lambda_s_delta_gate_r(
-    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: Windows
+    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: TrainingWindows
 ) -> None:
     model = build(make_config(residual={"scale": 0.4}), orca, scale)
     assert model.residual is not None
@@ -190,7 +190,7 @@ def test_the_correction_is_lambda_s_delta_gate_r(
 
 @pytest.mark.parametrize("inputs", ["raw", "normalised"])
 def test_the_residual_sees_context_deviation_latest_row_and_physics(
-    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: Windows, inputs: str
+    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: TrainingWindows, inputs: str
 ) -> None:
     model = build(make_config(residual={"inputs": inputs}), orca, scale)
     assert model.residual is not None
@@ -217,7 +217,7 @@ def test_the_residual_sees_context_deviation_latest_row_and_physics(
 
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_an_ablation_runs_and_lacks_its_component(
-    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: Windows, name: str
+    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: TrainingWindows, name: str
 ) -> None:
     model = build(make_config(**ABLATIONS[name]), orca, scale)
     window, _ = windows.batch(slice(0, 5))
@@ -236,7 +236,7 @@ def test_an_ablation_runs_and_lacks_its_component(
 
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_an_ablation_trains_all_that_it_has(
-    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: Windows, name: str
+    make_config: MakeConfig, orca: Vehicle, scale: Normalisation, windows: TrainingWindows, name: str
 ) -> None:
     model = build(make_config(**ABLATIONS[name]), orca, scale)
     window, target = windows.batch(slice(0, 64))
@@ -263,7 +263,7 @@ def test_a_standing_car_has_a_prediction_and_gradients(
 
 
 def test_effects_of_the_vehicle_act_in_the_physics_layer(
-    make_config: MakeConfig, orca: Vehicle, windows: Windows
+    make_config: MakeConfig, orca: Vehicle, windows: TrainingWindows
 ) -> None:
     car = orca.with_effect("steering_offset", {"offset": 0.02}).with_effect("front_grip", {"factor": 0.8})
     config = make_config().physics

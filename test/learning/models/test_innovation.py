@@ -41,7 +41,7 @@ def windows(recording: Recording, H: int, count: int = 20) -> torch.Tensor:
 
 
 def disturbed(given: torch.Tensor, each: torch.Tensor) -> torch.Tensor:
-    """Windows whose states drift by ``each`` more in every step."""
+    """TrainingWindows whose states drift by ``each`` more in every step."""
     steps = torch.arange(given.shape[1], dtype=torch.float32)
     return torch.cat([given[..., :3] + steps[None, :, None] * each, given[..., 3:]], dim=-1)
 

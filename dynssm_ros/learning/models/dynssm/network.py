@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from dynssm_ros.learning.dataset import Windows
+from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import TrainableModel, scale_buffers, steps_of
 from dynssm_ros.learning.models.dynssm.config import DynssmConfig
@@ -223,7 +223,7 @@ class DynSSM(TrainableModel):
             parts += [following, step.physics / self.increment_scale]
         return torch.cat(parts, dim=-1)
 
-    def post_fit(self, validation: Windows) -> None:
+    def post_fit(self, validation: TrainingWindows) -> None:
         """Fits shrinkage and variance to the errors on validation windows."""
         if self.in_window is not None:
             held = validation.batch(slice(None))

@@ -1,4 +1,4 @@
-"""The rescue of SQLite pages against SQLite itself, whatever the sizes."""
+"""The recover of SQLite pages against SQLite itself, whatever the sizes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dynssm_ros.signals.rescue import is_unindexed, log_left, rescue, unpacked_message
+from dynssm_ros.signals.recover import is_unindexed, log_left, recover, unpacked_message
 
 Row = tuple[int, int, int, bytes]
 TABLES = """
@@ -39,12 +39,12 @@ def rows_of(path: Path) -> list[Row]:
         return database.execute("SELECT * FROM messages ORDER BY id").fetchall()
 
 
-def rescued(path: Path, share: float = 1.0) -> list[Row]:
+def recovered(path: Path, share: float = 1.0) -> list[Row]:
     cut, saved = path.with_suffix(".cut.db3"), path.with_suffix(".saved.db3")
     content = path.read_bytes()
     cut.write_bytes(content[: int(share * len(content))])
     saved.unlink(missing_ok=True)
-    count, complete = rescue(cut, saved)
+    count, complete = recover(cut, saved)
     assert not complete
     found = rows_of(saved) if count else []
     assert len(found) == count
@@ -69,7 +69,7 @@ def test_rows_of_any_size_come_out_of_pages_of_any_size(
     ]
     make(path, page_size, rows)
     assert rows_of(path) == rows
-    assert rescued(path) == rows
+    assert recovered(path) == rows
 
 
 @pytest.mark.parametrize("page_size", [512, 4096])
@@ -78,7 +78,7 @@ def test_sizes_around_the_overflow_of_a_page_come_out_whole(tmp_path: Path, page
     sizes = [*range(page_size - 60, page_size + 5), *range(page_size * 2 - 30, page_size * 2), 100_000]
     rows = [(number, 1, number, bytes([number % 256]) * size) for number, size in enumerate(sizes, 1)]
     make(path, page_size, rows)
-    assert rescued(path) == rows
+    assert recovered(path) == rows
 
 
 @pytest.mark.parametrize("size", [60, 700, 9000])
@@ -89,7 +89,7 @@ def test_a_cut_leaves_the_beginning_where_the_tree_has_grown_branches(tmp_path: 
     make(path, 512 if size < 100 else 4096, rows)
     counts = []
     for share in (0.05, 0.25, 0.5, 0.75, 0.95, 1.0):
-        found = rescued(path, share)
+        found = recovered(path, share)
         assert found == rows[: len(found)]
         counts.append(len(found) / len(rows))
     assert counts[-1] == 1.0
@@ -102,7 +102,7 @@ def test_other_tables_and_other_databases_give_nothing(tmp_path: Path) -> None:
         database.execute("CREATE TABLE messages (id INTEGER PRIMARY KEY, a INTEGER, b INTEGER, c BLOB)")
         database.execute("INSERT INTO messages VALUES (1, 2, 3, x'00')")
         database.commit()
-    assert rescued(path) == []
+    assert recovered(path) == []
 
 
 def test_only_mcap_files_can_lack_an_index_and_only_sqlite_leaves_logs(tmp_path: Path) -> None:

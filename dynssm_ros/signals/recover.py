@@ -33,20 +33,20 @@ _T = TypeVar("_T")
 _McapRecord = Schema | Channel | Message | DataEnd
 
 
-class Rescued(NamedTuple):
+class Recovered(NamedTuple):
     """How many messages were copied, and whether the end was reached without meeting a cut."""
 
     messages: int
     complete: bool
 
 
-def rescue(damaged: Path, rescued: Path) -> Rescued:
-    """Copies the ROS messages before the cut of a ``.mcap`` or ``.db3`` file to ``rescued``, with an index.
+def recover(damaged: Path, recovered: Path) -> Recovered:
+    """Copies the ROS messages before the cut of a ``.mcap`` or ``.db3`` file to ``recovered``, with an index.
 
     Raises:
-        OSError: ``damaged`` cannot be read or ``rescued`` not be written.
+        OSError: ``damaged`` cannot be read or ``recovered`` not be written.
     """
-    return _rescue_mcap(damaged, rescued) if damaged.suffix == ".mcap" else _rescue_sqlite(damaged, rescued)
+    return _recover_mcap(damaged, recovered) if damaged.suffix == ".mcap" else _recover_sqlite(damaged, recovered)
 
 
 def is_unindexed(file: Path) -> bool:
@@ -120,9 +120,9 @@ def _pieces(source: IO[bytes], codec: str) -> Iterator[bytes]:
     return _until_cut(iter(lambda: stream.read(1 << 16), b""))
 
 
-def _rescue_mcap(damaged: Path, rescued: Path) -> Rescued:
+def _recover_mcap(damaged: Path, recovered: Path) -> Recovered:
     messages, complete = 0, False
-    with damaged.open("rb") as source, rescued.open("wb") as sink:
+    with damaged.open("rb") as source, recovered.open("wb") as sink:
         writer = McapWriter(sink)
         writer.start(profile="ros2")
         schemas: dict[int, int] = {0: 0}
@@ -139,7 +139,7 @@ def _rescue_mcap(damaged: Path, rescued: Path) -> Rescued:
             elif isinstance(r, DataEnd):
                 complete = True
         writer.finish()  # type: ignore[no-untyped-call]
-    return Rescued(messages, complete)
+    return Recovered(messages, complete)
 
 
 def _mcap_records(source: IO[bytes], size: int) -> Iterator[_McapRecord]:
@@ -176,17 +176,17 @@ def _chunk_content(body: bytes) -> bytes:
     return b"".join(_pieces(io.BytesIO(data), codec)) if codec else data
 
 
-def _rescue_sqlite(damaged: Path, rescued: Path) -> Rescued:
+def _recover_sqlite(damaged: Path, recovered: Path) -> Recovered:
     """Copies the small tables, which lie at the front, by SQLite, and the messages page by page.
 
     SQLite finds messages from the root of their tree, whose branches move towards the end of the file as it grows: in a
     file cut at two thirds it would find none.
     """
     address = f"file:{quote(str(damaged))}?mode=ro&immutable=1"
-    with closing(sqlite3.connect(address, uri=True)) as source, closing(sqlite3.connect(rescued)) as sink:
+    with closing(sqlite3.connect(address, uri=True)) as source, closing(sqlite3.connect(recovered)) as sink:
         tables = dict(_until_cut(_definitions(source)))
         if "messages" not in tables or "topics" not in tables:
-            return Rescued(0, False)
+            return Recovered(0, False)
         for table, statement in tables.items():
             sink.execute(statement)
             row: tuple[object, ...]
@@ -195,7 +195,7 @@ def _rescue_sqlite(damaged: Path, rescued: Path) -> Rescued:
         sink.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
         sink.commit()
         ((count,),) = sink.execute("SELECT count(*) FROM messages JOIN topics ON messages.topic_id = topics.id")
-    return Rescued(int(count), False)
+    return Recovered(int(count), False)
 
 
 def _definitions(source: sqlite3.Connection) -> Iterator[tuple[str, str]]:
