@@ -4,7 +4,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup demo paper test colcon-test clean
+.PHONY: help setup demo paper docs test colcon-test clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -30,13 +30,16 @@ help: ## this list
 setup: $(STAMP) ## the virtual environment alone
 
 demo: $(STAMP) ## from simulated laps to a live prediction and its report
-	@$(BIN)/dynssm demo --out "$(OUT)"
+	@$(BIN)/python -m examples.demo --out "$(OUT)"
 
 paper: OUT = out/paper
 paper: $(STAMP) ## docs/results.md and results_race.md measured anew, about two hours on two cores; continues after a kill
 	@doit() { $(BIN)/python -m doit "$$@"; }
 	doit run -f benchmarks/paper/dodo.py -n $(JOBS) out="$(OUT)" data="$(DYNSSM_DATA)" results=docs/results.md $(ARGS) step || true
 	doit run -f benchmarks/paper/dodo.py out="$(OUT)" data="$(DYNSSM_DATA)" results=docs/results.md $(ARGS) document
+
+docs: $(STAMP) ## the documentation as a site, out/site/index.html
+	@$(BIN)/sphinx-build -W --keep-going -q -b html docs out/site
 
 test: $(STAMP) ## style, types and all tests
 	@set -x
@@ -53,7 +56,7 @@ colcon-test: $(STAMP) ## build and use the package in a fresh colcon workspace
 
 clean: ## remove what was built, the environment too
 	rm -rf $(VENV) build dist install log out *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
-	find dynssm_ros test launch -name __pycache__ -prune -exec rm -rf {} +
+	find dynssm_ros benchmarks examples test launch -name __pycache__ -prune -exec rm -rf {} +
 
 $(STAMP): setup.py constraints.txt pyproject.toml
 	@if ! $(BIN)/python -m pip --version > /dev/null 2>&1; then
@@ -80,7 +83,7 @@ $(STAMP): setup.py constraints.txt pyproject.toml
 	  $$python -m venv --clear $(VENV)
 	fi
 	echo "== installing dynssm_ros with the versions of constraints.txt; the large parts are"
-	$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt -e '.[ros,test]' \
+	$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt -e '.[all,docs,test]' \
 	  | awk '/Downloading .*[0-9][0-9]\.[0-9] MB\)/ {print "   " $$2, $$3, $$4; fflush()}
 	         /^Installing collected/ {print "== unpacking", NF - 3, "packages"; fflush()}'
 	touch $@

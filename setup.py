@@ -18,48 +18,55 @@ def shared(*folders):
     return sorted(entries.items())
 
 
+EXTRAS = {
+    # training, calibration and diagnosis
+    "train": ["torch>=2.13", "onnx>=1.17", "onnxscript>=0.5", "scipy>=1.11"],
+    # tracks, simulated cars and the controller: derivatives of the vehicle equations, and the DAQP solver
+    "race": ["casadi>=3.7", "scipy>=1.11"],
+    # figures and pages
+    "report": ["matplotlib>=3.9", "jinja2>=3.1", "scipy>=1.11"],
+    # ROS 2 Jazzy as wheels, for machines without it; a sourced ROS installation provides the same modules
+    "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
+}
+
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     description="Vehicle dynamics for autonomous racing: learned from rosbags, deployed on ROS 2, explained.",
     maintainer="dynssm_ros developers",
     maintainer_email="maintainers@dynssm-ros.invalid",
     license="Apache-2.0",
     python_requires=">=3.10,<3.13",  # 3.10 to 3.12 are the Pythons of the ROS 2 distributions that Jazzy users run
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "evaluation/templates/*"]},
+    package_data={NAME: ["py.typed", "reporting/templates/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         *shared("config", "launch"),
     ],
     zip_safe=False,
-    # The floors are the oldest that pass the tests together; `constraints.txt` has the versions of `make demo`.
+    # The floors are the oldest that pass the tests together; `constraints.txt` has the versions of `make demo`. The core is
+    # what a car needs to extract, replay and predict; dynssm_ros/extras.py says which library belongs to which extra.
     install_requires=[
         "setuptools",  # the console scripts that colcon writes
         "numpy>=1.26",
-        "scipy>=1.11",
-        "torch>=2.13",  # training
-        "onnx>=1.17",  # the exported graph ...
-        "onnxscript>=0.5",  # ... and what torch exports it by
         "onnxruntime>=1.19",  # the deployed predictor
         "safetensors>=0.4",  # weights without pickle
         "pyarrow>=15",  # recordings
         "pydantic>=2.7",  # configuration
+        "typing-extensions>=4.8",
         "pyyaml>=6.0.1",
         "rosbags>=0.11.6",  # bags without a ROS installation
         "mcap>=1.1.1",  # what a cut MCAP file still holds
-        "casadi>=3.7",  # the controller of `dynssm race`: derivatives of the vehicle equations, and the DAQP solver
-        "joblib>=1.4",  # steps of `dynssm paper` side by side
         "typer>=0.20",
         "rich>=14.3",
-        "matplotlib>=3.9",  # the figures and ...
-        "jinja2>=3.1",  # ... the page of the reports
     ],
-    extras_require={
-        # ROS 2 Jazzy as wheels, for machines without it; a sourced ROS installation provides the same modules
-        "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
+    extras_require=EXTRAS
+    | {
+        "all": sorted({each for extra in EXTRAS.values() for each in extra}),
+        "docs": ["sphinx", "myst-parser", "furo"],
         "test": [
+            "doit",  # the benchmarks' workflow
             "hypothesis",
             "mypy",
             "pytest",

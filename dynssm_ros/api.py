@@ -137,7 +137,7 @@ def extract(
 def calibrate(
     recordings: Log | Sequence[Log],
     vehicle: Vehicle | PathLike,
-    horizon: float = 0.5,
+    horizon: float | None = None,
     min_speed: float | None = None,
     holdout: float = 0.0,
     integrator: Integrator = "euler",
@@ -151,7 +151,7 @@ def calibrate(
     Args:
         recordings: of one car.
         vehicle: start values, bounds, and what is known before.
-        horizon: length of the simulations that are compared with the laps (s).
+        horizon: length of the simulations that are compared with the laps (s); if not given, 0.5, less for short logs.
         min_speed: slower rows are left out (m/s); the vehicle file's if not given.
         holdout: last fraction of each recording that is left out.
         integrator: of the model.

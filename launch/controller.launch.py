@@ -15,13 +15,13 @@ ARGUMENTS = {  # name: default, description, nodes that take it as a parameter
     "scale": ("1.0", "Size of the track.", ("controller", "simulator")),
     "rate": ("1.0", "Speed of the simulated car's time over real time.", ("controller", "simulator")),
     "line": ("racing", "What is followed: centre, racing or a file with speeds.", ("controller",)),
-    "pace": ("0.9", "Share of the car's limits in the line's speed.", ("controller",)),
+    "speed_scale": ("0.9", "Share of the car's limits in the line's speed.", ("controller",)),
     "objective": ("tracking", "tracking or progress.", ("controller",)),
     "plant": ("euler", "How the car is simulated: euler, rk4 or double_track.", ("simulator",)),
     "effects": ("", "Physics that only the simulated car has: NAME[:k=v,...], apart by blanks.", ("simulator",)),
     "model": ("", "Model folder; without one no predictor is started.", ("predictor",)),
 }
-NUMBERS = ("scale", "rate", "pace")
+NUMBERS = ("scale", "rate", "speed_scale")
 
 
 def stack(context: LaunchContext) -> list[Node]:
@@ -36,7 +36,7 @@ def stack(context: LaunchContext) -> list[Node]:
             package="dynssm_ros",
             executable=executable,
             name=name,
-            namespace=LaunchConfiguration("namespace"),
+            namesspeed_scale=LaunchConfiguration("namesspeed_scale"),
             parameters=[_parameters(executable, given)],
             ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",
@@ -64,7 +64,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "simulator", default_value="true", choices=["true", "false"], description="Start the simulated car."
             ),
-            DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes."),
+            DeclareLaunchArgument("namesspeed_scale", default_value="", description="Namesspeed_scale of the nodes."),
             DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn or error."),
             OpaqueFunction(function=stack),
         ]

@@ -53,7 +53,7 @@ def imports(source: str, module: str, is_package: bool = False) -> Iterator[tupl
 
 def floor_of(module: str) -> int:
     """The floor of a module; those beside the rooms are below all, the API below the nodes and the command line."""
-    room = [*module.split("."), ""][1]
+    room = [*module.split("."), "__init__"][1]
     if room in TOP:
         return FLOOR["nodes"]
     return FLOOR.get(room, -1)

@@ -18,14 +18,20 @@ import yaml
 
 import dynssm_ros
 from dynssm_ros.configuration import config_root
+from dynssm_ros.extras import EXTRAS
 from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle.parameters import load_vehicle
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "dynssm_ros"
-PIP_NAMES = {"yaml": "pyyaml"}
-ROSDEP_KEYS = {"onnxruntime": "python3-onnxruntime-pip", "rosbags": "python3-rosbags-pip"}
+PIP_NAMES = {"yaml": "pyyaml", "typing_extensions": "typing-extensions"}
+ROSDEP_KEYS = {
+    "onnxruntime": "python3-onnxruntime-pip",
+    "rosbags": "python3-rosbags-pip",
+    "casadi": "casadi-pip",
+    "mcap": "mcap-ros2-support",
+}
 FROM_ROS = ("rclpy", "_msgs", "_interfaces")  # of the ROS installation or the `ros` extra
 NEEDED_BY_OTHERS = {"setuptools", "onnxscript"}  # by the console scripts; by torch's ONNX export
 
@@ -67,8 +73,9 @@ def third_party_imports() -> set[str]:
 
 
 def requirements(arguments: dict[str, Any]) -> dict[str, str]:
-    """Floor of every required distribution, by lower-case name; empty without one."""
-    pairs = (requirement.partition(">=") for requirement in arguments["install_requires"])
+    """Floor of every distribution that the core or an extra of users requires, by lower-case name; empty without one."""
+    wanted = {*arguments["install_requires"], *arguments["extras_require"]["all"]}
+    pairs = (requirement.partition(">=") for requirement in wanted if not requirement.startswith("ros-"))
     return {name.lower(): floor for name, _, floor in pairs}
 
 
@@ -110,14 +117,14 @@ def test_every_import_is_declared_to_ros(manifest: ElementTree.Element) -> None:
     declared = {depend.text for depend in manifest.findall("exec_depend")}
     undeclared = pip_only((ROOT / "package.xml").read_text(encoding="utf-8"))
     for name in third_party_imports():
-        key = name if name.endswith(FROM_ROS) else ROSDEP_KEYS.get(name, f"python3-{name}")
+        key = name if name.endswith(FROM_ROS) else ROSDEP_KEYS.get(name, f"python3-{name.replace('_', '-')}")
         assert key in declared or name in undeclared, f"{name}: no {key} in package.xml"
 
 
 def test_manifest_repeats_the_requirements(arguments: dict[str, Any], manifest: ElementTree.Element) -> None:
     modules = {distribution: module for module, distribution in PIP_NAMES.items()}
     keys = {
-        ROSDEP_KEYS.get(name, f"python3-{modules.get(name, name)}"): floor
+        ROSDEP_KEYS.get(name, f"python3-{modules.get(name, name).replace('_', '-')}"): floor
         for name, floor in requirements(arguments).items()
     }
     floors = {depend.text: depend.get("version_gte", "") for depend in manifest.findall("exec_depend")}
@@ -126,6 +133,14 @@ def test_manifest_repeats_the_requirements(arguments: dict[str, Any], manifest: 
     assert {key: floors[key] for key in keys.keys() & floors.keys()} == {
         key: floor for key, floor in keys.items() if key in floors
     }
+
+
+def test_extras_hold_what_the_package_says_of_them(arguments: dict[str, Any]) -> None:
+    for extra, libraries in EXTRAS.items():
+        required = {re.split(r"[\[><=]", each)[0] for each in arguments["extras_require"][extra]}
+        assert {f"ros-jazzy-{name}" if extra == "ros" else name for name in libraries} <= required
+    core = {re.split(r"[><=]", each)[0] for each in arguments["install_requires"]}
+    assert not core & {"torch", "casadi", "matplotlib", "scipy", "onnx", "jinja2"}
 
 
 def test_every_requirement_is_pinned(arguments: dict[str, Any]) -> None:
@@ -315,7 +330,7 @@ def test_controller_launch_file_starts_the_stack_that_is_asked_for(load_launch: 
     }
     assert nodes["predictor"]["parameters"] == [{"model": "out/model"}]
     assert nodes["simulator"]["parameters"][0]["driver"] == "external"
-    assert nodes["controller"]["parameters"][0]["pace"] == 0.7
+    assert nodes["controller"]["parameters"][0]["speed_scale"] == 0.7
     (alone,) = all_launched(file, simulator="false")
     assert alone.named["executable"] == "controller"
 

@@ -23,8 +23,13 @@ def calibrate(
     vehicle: VehicleOption,
     out: Annotated[Path, typer.Option(help="Vehicle file to write.", dir_okay=False)],
     horizon: Annotated[
-        float, typer.Option(help="Length of the simulations that are compared with the laps (s).", min=0.0)
-    ] = 0.5,
+        float | None,
+        typer.Option(
+            help="Length of the simulations that are compared with the laps (s).",
+            min=0.0,
+            show_default="0.5, less for short recordings",
+        ),
+    ] = None,
     integrator: Annotated[
         Integrator, typer.Option(help="Steps of the model: T_s as in the paper, or finer.")
     ] = "euler",

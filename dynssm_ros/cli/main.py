@@ -9,10 +9,8 @@ import typer
 from rich.markup import escape
 
 from dynssm_ros import __version__
-from dynssm_ros.cli.bench import bench
 from dynssm_ros.cli.calibrate import calibrate
 from dynssm_ros.cli.console import errors
-from dynssm_ros.cli.demo import demo
 from dynssm_ros.cli.diagnose import diagnose
 from dynssm_ros.cli.evaluate import evaluate
 from dynssm_ros.cli.extract import extract
@@ -32,7 +30,7 @@ app = typer.Typer(
 # click's base of all usage errors, wherever typer keeps its click
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
-for command in (demo, simulate, extract, calibrate, train, evaluate, replay, diagnose, race, bench):
+for command in (simulate, extract, calibrate, train, evaluate, replay, diagnose, race):
     app.command()(command)
 
 

@@ -35,7 +35,8 @@ def train(
             )
         except KeyboardInterrupt:
             folder = out.absolute()
-            kept = sorted(folder.parent.glob(f"{folder.name}.checkpoint*.pt"))
+            states = folder.parent.glob(f"{folder.name}.checkpoint*.pt")
+            kept = sorted(states, key=lambda path: path.stat().st_mtime_ns)
             name = kept[-1].name if kept else "the beginning"
             errors.print(f"interrupted; the same command continues from {name}")
             raise typer.Exit(130) from None

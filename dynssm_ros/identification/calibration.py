@@ -7,16 +7,18 @@ estimated with them. What the vehicle file knows of a coefficient (its standard 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.errors import RecordingError
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
-from dynssm_ros.identification.windows import SimulationWindows, fit_windows, recorded_rows
+from dynssm_ros.identification.windows import RecordedRows, SimulationWindows, fit_windows, recorded_rows
 from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
@@ -25,7 +27,8 @@ from dynssm_ros.vehicle.single_track import Integrator
 
 Progress = Callable[[int, int], None]
 
-HORIZON_S = 0.5
+HORIZONS_S = (0.5, 0.25, 0.1)
+"""Lengths of the simulations: the first for which a recording has stretches enough."""
 _SEARCHED = 4000  # rows with which a starting point is judged
 _SEARCH_PRIOR, _POLISHED = 0.1, 3  # weight of what is known before, at first; rounds that find it
 _INSIDE = 1e-6  # of the range, that a starting point keeps from its bounds
@@ -62,7 +65,7 @@ class Calibration:
 def calibrate(
     recording: Recording,
     vehicle: Vehicle,
-    horizon: float = HORIZON_S,
+    horizon: float | None = None,
     min_speed: float | None = None,
     integrator: Integrator = "euler",
     starts: int = 3,
@@ -74,7 +77,7 @@ def calibrate(
     Args:
         recording: measured or simulated laps.
         vehicle: start values, bounds and what is known before; its effects are part of the model.
-        horizon: length of the simulations that are compared with the laps (s).
+        horizon: length of the simulations that are compared with the laps (s); ``None``: 0.5, less for short recordings.
         min_speed: rows that are slower are left out (m/s); ``None``: the vehicle file's.
         integrator: of the model: ``euler`` steps of T_s as in the paper, or ``rk4``.
         starts: starting points: the nominal values, the middle of the bounds, then seeded random ones.
@@ -90,7 +93,7 @@ def calibrate(
     require_context(vehicle.active_effects, context, f"recording {', '.join(recording.info.source)}")
     speed = vehicle.minimum_speed if min_speed is None else min_speed
     data = recorded_rows(recording, context)
-    windows = fit_windows(recording, data, horizon, speed, len(recording))
+    windows = _windows(recording, data, HORIZONS_S if horizon is None else (horizon,), speed)
     given = CarEstimate.of(vehicle, mass_std=0.0)
     single = recording.window_ends(1, horizon=1, min_speed=speed)
     one_step = SimulationWindows(data, single, 1, 0).with_integrator(integrator, vehicle)
@@ -121,6 +124,20 @@ def calibrate(
         windows.target.shape[0] * windows.target.shape[1],
         windows.steps * recording.T_s,
     )
+
+
+def _windows(
+    recording: Recording, data: RecordedRows, horizons: Sequence[float], min_speed: float
+) -> SimulationWindows:
+    """Simulations of the longest of ``horizons`` (s) for which there are stretches enough.
+
+    Raises:
+        RecordingError: none of them.
+    """
+    for horizon in horizons[:-1]:
+        with suppress(RecordingError):
+            return fit_windows(recording, data, horizon, min_speed, len(recording))
+    return fit_windows(recording, data, horizons[-1], min_speed, len(recording))
 
 
 def _nearest_start(

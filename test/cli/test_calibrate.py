@@ -92,7 +92,7 @@ def test_a_straight_drive_says_what_it_cannot_determine(dynssm: Run, laps: Path,
     ("options", "words"),
     [
         (["--vehicle", "av21"], "sampling time 0.02 s, but vehicle av21 has 0.04 s; extract with --rate 25"),
-        (["--vehicle", "orca", "--min-speed", "90"], "0 stretches of 0.52 s at 90 m/s or more"),
+        (["--vehicle", "orca", "--min-speed", "90"], "0 stretches of 0.1 s at 90 m/s or more"),
         (["--vehicle", "gone"], "'gone' is neither a file nor a shipped name"),
     ],
 )

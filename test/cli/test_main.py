@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-COMMANDS = ("demo", "simulate", "extract", "calibrate", "train", "evaluate", "replay", "bench")
+COMMANDS = ("simulate", "extract", "calibrate", "train", "evaluate", "replay")
 
 
 def dynssm(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -34,12 +34,12 @@ def test_every_command_has_help(command: str) -> None:
         (["drive"], "No such command 'drive'"),
         (["extract"], "Missing argument"),
         (["extract", "bag", "--signals", "av21", "--rate", "0", "--out", "r.parquet"], "'--rate'"),
-        (["bench", "--model", "/nowhere"], "/nowhere: no such model folder"),
+        (["--model", "/nowhere"], "/nowhere: no such model folder"),
         (
             ["train", "r.parquet", "--model", "nothing", "--vehicle", "orca", "--out", "m"],
             "'nothing' is neither a file",
         ),
-        (["train", "r.parquet", "--model", "ridge_orca", "--vehicle", "orca", "--out", "m", "--device", "tpu"], "tpu"),
+        (["train", "r.parquet", "--model", "ridge", "--vehicle", "orca", "--out", "m", "--device", "tpu"], "tpu"),
     ],
 )
 def test_a_usage_error_is_one_line_and_exit_status_1(arguments: list[str], expected: str) -> None:

@@ -69,7 +69,7 @@ def test_the_commands_lead_from_a_bag_to_predictions(dynssm, laps_bag: Path, tin
     ("changes", "words"),
     [
         ({"vehicle": "av21"}, "sampling time 0.02 s, but vehicle av21 has 0.04 s"),
-        ({"model": "ridge_av21", "commands": "topics"}, "min_speed|5 m/s or more"),
+        ({"model": "gpt", "commands": "topics"}, "neither a file nor a shipped name"),
         ({"commands": "topics", "recording": "gone.parquet"}, "no such recording"),
     ],
 )
@@ -78,7 +78,7 @@ def test_what_does_not_fit_is_one_line_and_leaves_nothing(
 ) -> None:
     laps = tmp_path / "laps.parquet"
     assert dynssm("extract", laps_bag, "--signals", "default", "--rate", 50, "--out", laps)[0] == 0
-    given = {"recording": str(laps), "model": "ridge_orca", "vehicle": "orca"} | changes
+    given = {"recording": str(laps), "model": "ridge", "vehicle": "orca"} | changes
     recording = given.pop("recording")
     options = [part for name, value in given.items() for part in (f"--{name}", value)]
     status, _, err = dynssm("train", recording, *options, "--out", tmp_path / "model")
@@ -91,7 +91,7 @@ def test_what_does_not_fit_is_one_line_and_leaves_nothing(
 def test_a_model_file_with_a_wrong_field_names_it(dynssm, laps_bag: Path, tmp_path: Path) -> None:
     laps, model = tmp_path / "laps.parquet", tmp_path / "model.yaml"
     dynssm("extract", laps_bag, "--signals", "default", "--rate", 50, "--out", laps)
-    model.write_text(yaml.safe_dump({"base": "dynssm_orca", "name": "x", "gru": {"hidden": -1}}))
+    model.write_text(yaml.safe_dump({"base": "dynssm", "name": "x", "gru": {"hidden": -1}}))
     status, _, err = dynssm("train", laps, "--model", model, "--vehicle", "orca", "--out", tmp_path / "m")
     assert status == 1
     assert "model.yaml: gru.hidden" in err

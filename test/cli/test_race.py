@@ -7,7 +7,7 @@ import json
 import pytest
 from PIL import Image
 
-SHORT = ("--vehicle", "orca", "--track", "club", "--plant", "euler", "--line", "centre", "--pace", "0.8")
+SHORT = ("--vehicle", "orca", "--track", "club", "--plant", "euler", "--line", "centre", "--speed-scale", "0.8")
 
 
 def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):

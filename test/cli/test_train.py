@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from dynssm_ros.learning import training
+from dynssm_ros.learning import optimisation as training
+from dynssm_ros.learning import stages
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -97,7 +98,7 @@ def test_seed_epochs_and_commands_of_the_command_line_win(dynssm: Run, arguments
 def test_a_folder_that_is_no_model_is_refused_before_a_training_is_spent_on_it(
     dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(training, "train", None)
+    monkeypatch.setattr(stages, "train", None)
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "thesis.tex").touch()
     status, _, err = dynssm(*arguments)

@@ -181,12 +181,15 @@ def test_straight_driving_tells_the_drive_force_and_admits_that_it_tells_no_tyre
 # --- bad input ----------------------------------------------------------------------------------
 
 
-def test_too_few_rows_are_refused(drive: Drive, orca: Vehicle) -> None:
+def test_short_recordings_are_cut_into_shorter_stretches_and_too_short_ones_refused(
+    drive: Drive, orca: Vehicle
+) -> None:
+    assert calibrate(drive(orca, 400), orca, starts=1).horizon == pytest.approx(0.26)
     with pytest.raises(
         RecordingError, match=r"drive 0: 14 stretches of 0\.52 s at 0 m/s or more; expected at least 24"
     ):
-        calibrate(drive(orca, 400), orca)
-    with pytest.raises(RecordingError, match=r"0 stretches of 0\.52 s at 50 m/s or more"):
+        calibrate(drive(orca, 400), orca, horizon=0.5)
+    with pytest.raises(RecordingError, match=r"0 stretches of 0\.1 s at 50 m/s or more"):
         calibrate(drive(orca, 1500), orca, min_speed=50.0)
 
 

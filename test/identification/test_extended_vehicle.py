@@ -14,7 +14,7 @@ from dynssm_ros.control.settings import Settings
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
 from dynssm_ros.learning.export import save_artifact
-from dynssm_ros.learning.models.base import ModelConfig
+from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.models import OnnxModel
@@ -69,7 +69,7 @@ def test_it_drives_in_the_simulator_as_the_diagnosis_simulates_it(extended: Vehi
 def test_it_trains_a_model_and_the_node_predicts_with_it(
     extended: Vehicle, bag: Path, recording: Recording, small_model: Path, tmp_path: Path
 ) -> None:
-    config = ModelConfig.model_validate(open_artifact(small_model).card.architecture)
+    config = parse_model_config(open_artifact(small_model).card.architecture, "card")
     saved = save_artifact(train(recording, config, extended, tmp_path / "checkpoint.pt"), tmp_path / "model")
     artifact = open_artifact(saved.path)
     assert artifact.card.vehicle == extended
@@ -83,7 +83,7 @@ def test_it_trains_a_model_and_the_node_predicts_with_it(
 
 def test_it_races(extended: Vehicle, path: Path) -> None:
     club = load_track("club")
-    line = load_reference("centre", extended, club, pace=0.6)
+    line = load_reference("centre", extended, club, speed_scale=0.6)
     course = Course(extended, club, "euler", line, Settings.of(extended))
     lap = race(course, load_prediction_model(str(path), load_vehicle("orca"), extended, "euler"))
     assert lap.completed

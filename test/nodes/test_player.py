@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dynssm_ros.nodes.live import LiveRun, collecting, isolated_environment, predictor_process
+from benchmarks.live_run import LiveRun, collecting, isolated_environment, predictor_process
 from dynssm_ros.signals.messages import PREDICTION_TOPIC
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynssm_ros.nodes.live import run_live
+from benchmarks.live_run import run_live
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor

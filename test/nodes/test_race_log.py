@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.live_run import run_live
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.learning.stages import train
-from dynssm_ros.nodes.live import run_live
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(180)]
 def model(putnam: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """DynSSM after two epochs on the log, without commands as the car did not record them."""
     folder = tmp_path_factory.mktemp("putnam")
-    config = load_model_config("dynssm_av21")
+    config = load_model_config("dynssm")
     config = config.model_copy(update={"training": config.training.model_copy(update={"epochs": 2})})
     recording = extract([putnam], load_signal_map("av21"), 25.0)
     return save_artifact(train(recording, config, load_vehicle("av21"), folder / "c.pt"), folder / "model").path

@@ -1,22 +1,24 @@
-"""``dynssm bench``: latency and throughput of models on this machine, side by side."""
+"""Latency and throughput of models on this machine, side by side: ``python -m benchmarks.latency --model DIR``."""
 
 from __future__ import annotations
 
+import argparse
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 from dynssm_ros.api import disambiguated
 from dynssm_ros.arrays import Vector
-from dynssm_ros.cli.console import JsonOption, console, progress_bar
+from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
 from dynssm_ros.reporting.tables import Column, Table
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
@@ -29,17 +31,9 @@ from dynssm_ros.signals.standard import recording_to_bag
 _WARM_UP, _BLOCK = 50, 200  # calls
 
 
-def bench(
-    model: Annotated[
-        list[Path], typer.Option(help="Model folder; repeat to compare with the first.", metavar="DIR", file_okay=False)
-    ],
-    rate: Annotated[float, typer.Option(help="Odometry rate of the live part (Hz).", min=1.0, max=1000.0)] = 100.0,
-    duration: Annotated[float, typer.Option(help="Length of the live part of each model (s).", min=2.0)] = 15.0,
-    calls: Annotated[int, typer.Option(help="Predictions that are timed.", min=100)] = 2000,
-    json: JsonOption = None,
-) -> None:
+def latency(model: Sequence[Path], rate: float, duration: float, calls: int, json: Path | None) -> None:
     """Measure predictors on one core, against eager torch in the same run, and the live node through DDS."""
-    artifacts = open_artifacts(model)
+    artifacts = open_artifacts(list(model))
     drives = {
         name: sample_drive(artifact, rate, duration + 2 * artifact.card.window * artifact.card.sampling_time)
         for name, artifact in artifacts.items()
@@ -168,7 +162,7 @@ def measure_node(
     artifact: Artifact, drive: Recording, duration: float, progress: Callable[[int, int], None]
 ) -> dict[str, Any]:
     """Plays the drive to a predictor process; latency from odometry published to prediction received, rate, losses."""
-    from dynssm_ros.nodes.live import run_live
+    from benchmarks.live_run import run_live
 
     with tempfile.TemporaryDirectory(prefix="dynssm-") as folder:
         bag = Path(folder) / "drive"
@@ -213,3 +207,24 @@ def _samples(drive: Recording) -> Iterator[tuple[int, dict[str, float], dict[str
             odometry = {name: float(drive[name][k]) for name in (*STATE_SIGNALS, *POSE_SIGNALS)}
             yield stamp + lap, actuators, odometry
         lap += round(len(drive) * drive.T_s * 1e9)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--model", type=Path, action="append", required=True, help="model folder; repeat to compare with the first"
+    )
+    parser.add_argument("--rate", type=float, default=100.0, help="odometry rate of the live part (Hz)")
+    parser.add_argument("--duration", type=float, default=15.0, help="length of the live part of each model (s)")
+    parser.add_argument("--calls", type=int, default=2000, help="predictions that are timed")
+    parser.add_argument("--json", type=Path, help="also write the result as JSON")
+    given = parser.parse_args()
+    try:
+        latency(given.model, given.rate, given.duration, given.calls, given.json)
+    except UserError as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

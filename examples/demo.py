@@ -1,4 +1,4 @@
-"""``dynssm demo``: the whole way on the embedded simulator and a real DDS bus, ending with an HTML report.
+"""``make demo``: the whole way on the embedded simulator and a real DDS bus, ending with an HTML report.
 
 A car drives laps on one track; its bag becomes a recording, a calibrated vehicle and a trained DynSSM; that is scored
 on another track, and then runs as a node in its own process while the other track's bag is played to it in real time.
@@ -7,13 +7,13 @@ The simulated car is not the model's: it integrates finely, its sensors are nois
 
 from __future__ import annotations
 
+import argparse
+import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 
 from dynssm_ros import api
 from dynssm_ros.cli.console import console, progress_bar
@@ -49,11 +49,7 @@ class _Live:
     verdicts: list[str]
 
 
-def demo(
-    out: Annotated[Path, typer.Option(help="Folder for everything that is made on the way.", file_okay=False)] = Path(
-        "out/demo"
-    ),
-) -> None:
+def demo(out: Path = Path("out/demo")) -> None:
     """Show the whole way: simulate, extract, calibrate, train, evaluate, predict live on DDS, report."""
     begin = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
@@ -127,7 +123,7 @@ def _evaluate(recording: Recording, car: Vehicle, model: Path) -> Evaluation:
 
 def _run_live(model: Path, bag: Path, recording: Recording) -> _Live:
     """Plays the bag to the node and sets its predictions beside what was measured a moment later."""
-    from dynssm_ros.nodes.live import run_live
+    from benchmarks.live_run import run_live
 
     with progress_bar("6 predict live on DDS") as progress:
         run = run_live(model, bag, recording.T_s, duration=LIVE_TIME, progress=progress)
@@ -181,3 +177,14 @@ def _report(evaluation: Evaluation, live: _Live) -> Report:
     return Report(
         "From a race log to a live prediction", f"{base.summary} {_live_words(live)}.", sections, protocol, base.table
     )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/demo"), help="folder for everything that is made on the way"
+    )
+    try:
+        demo(parser.parse_args().out)
+    except UserError as error:
+        sys.exit(f"error: {error}")

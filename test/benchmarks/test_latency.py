@@ -1,4 +1,4 @@
-"""`dynssm bench` on the small model."""
+"""`python -m benchmarks.latency` on the small model."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from dynssm_ros.cli.bench import open_artifacts
-from dynssm_ros.cli.main import app
+from benchmarks.latency import latency, open_artifacts
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.learning.stages import train
@@ -23,9 +21,7 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
 def test_bench_writes_what_the_contract_promises(small_model: Path, tmp_path: Path) -> None:
     out = tmp_path / "bench.json"
-    arguments = ["bench", "--model", str(small_model), "--duration", "3", "--calls", "200", "--json", str(out)]
-    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
-    assert result.exit_code == 0
+    latency([small_model], 100.0, 3.0, 200, out)
     figures = json.loads(out.read_text())
     assert 0 < figures["predictor_us"]["p50"] <= figures["predictor_us"]["p99"]
     assert 0 < figures["node_latency_ms"]["p50"] <= figures["node_latency_ms"]["p99"]
@@ -35,21 +31,20 @@ def test_bench_writes_what_the_contract_promises(small_model: Path, tmp_path: Pa
     assert figures.pop("models") == {"small": figures}
 
 
-def test_models_are_set_beside_the_first(small_model: Path, tmp_path: Path, laps_bag: Path) -> None:
+def test_models_are_set_beside_the_first(
+    small_model: Path, tmp_path: Path, laps_bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     recording = extract([laps_bag], load_signal_map("default"), 50.0)
     (tmp_path / "small_ddm.yaml").write_text("{base: ddm_orca, name: small_ddm, dense: {layers: 2, width: 8}}")
     config = load_model_config(tmp_path / "small_ddm.yaml").with_training(epochs=1)
     ddm = save_artifact(train(recording, config, load_vehicle("orca"), tmp_path / "c.pt"), tmp_path / "ddm").path
     out = tmp_path / "bench.json"
-    models = [part for path in (small_model, ddm) for part in ("--model", str(path))]
-    arguments = ["bench", *models, "--duration", "2", "--calls", "200", "--json", str(out)]
-    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
-    assert result.exit_code == 0
+    latency([small_model, ddm], 100.0, 2.0, 200, out)
     figures = json.loads(out.read_text())
     first, second = figures["models"]["small"], figures["models"]["small_ddm"]
     assert {name: figures[name] for name in first} == first
     assert second.keys() == first.keys()
-    (row,) = (line.split() for line in result.stdout.splitlines() if line.split()[:1] == ["small_ddm"])
+    (row,) = (line.split() for line in capsys.readouterr().out.splitlines() if line.split()[:1] == ["small_ddm"])
     assert float(row[3]) == pytest.approx(second["predictor_us"]["p50"] / first["predictor_us"]["p50"], rel=0.01)
 
 
