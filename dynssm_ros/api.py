@@ -363,7 +363,8 @@ def diagnose(
 
     Example:
         >>> hidden = {"steering_offset": {"offset": 0.03}}
-        >>> laps = recorded(simulate("orca", "club", duration=40.0, plant="rk4", effects=hidden))
+        >>> noise = (0.005, 0.005, 0.02)
+        >>> laps = recorded(simulate("orca", "club", duration=40.0, plant="rk4", effects=hidden, noise=noise))
         >>> [cause.effect for cause in diagnose(laps, "orca", integrator="rk4").causes]
         ['steering_offset']
     """

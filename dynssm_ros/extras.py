@@ -1,10 +1,12 @@
-"""Optional parts of the installation: which library belongs to which extra, and how a missing one is reported."""
+"""Optional parts: libraries by extra and how a missing one is reported; modules of the user's own."""
 
 from __future__ import annotations
 
+import os
+from importlib import import_module
 from importlib.util import find_spec
 
-from dynssm_ros.errors import UserError
+from dynssm_ros.errors import ConfigurationError, UserError
 
 EXTRAS: dict[str, tuple[str, ...]] = {
     "train": ("torch", "onnx", "onnxscript", "scipy"),
@@ -33,3 +35,17 @@ def require(what: str, *extras: str) -> None:
     if missing:
         names = ",".join(sorted(set(missing.values())))
         raise MissingExtraError(f"{what} needs {', '.join(missing)}: pip install 'dynssm_ros[{names}]'")
+
+
+def load_plugins() -> None:
+    """Imports the modules that ``DYNSSM_PLUGINS`` names, apart by commas; they register effects, models or plants.
+
+    Raises:
+        ConfigurationError: one cannot be imported.
+    """
+    name = ""
+    try:
+        for name in filter(None, os.environ.get("DYNSSM_PLUGINS", "").split(",")):
+            import_module(name.strip())
+    except ImportError as error:
+        raise ConfigurationError(f"DYNSSM_PLUGINS: module {name} cannot be imported ({error})") from error

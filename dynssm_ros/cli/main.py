@@ -19,6 +19,7 @@ from dynssm_ros.cli.replay import replay
 from dynssm_ros.cli.simulate import simulate
 from dynssm_ros.cli.train import train
 from dynssm_ros.errors import UserError
+from dynssm_ros.extras import load_plugins
 
 app = typer.Typer(
     name="dynssm",
@@ -48,6 +49,7 @@ def _options(version: bool = typer.Option(False, "--version", callback=_print_ve
 def main() -> None:
     """Runs the command line; whatever is wrong with what the user gave is one line and exit status 1."""
     try:
+        load_plugins()
         status = app(standalone_mode=False)
     except UserError as error:
         _fail(str(error))

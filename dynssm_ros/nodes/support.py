@@ -17,6 +17,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError, UserError
+from dynssm_ros.extras import load_plugins
 from dynssm_ros.vehicle import Applied
 
 NodeType = TypeVar("NodeType", bound=Node)
@@ -118,6 +119,7 @@ def run(
     rclpy.init(args=args)
     node: NodeType | None = None
     try:
+        load_plugins()
         node = make_node()
         work(node)
     except UserError as error:

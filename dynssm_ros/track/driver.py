@@ -55,7 +55,7 @@ class Driver:
         self._stiffness = sum(cornering_stiffness(self._theta))
         rng = np.random.default_rng(seed)
         lap_time = float(np.sum(np.diff(line.s, append=line.length) / self._profile))
-        self._pace = SlowVariation(rng, lap_time / 2)
+        self._slowing = SlowVariation(rng, lap_time / 2)
         self._place = SlowVariation(rng, lap_time / 2)
 
     def speed(self, s: float) -> float:
@@ -101,9 +101,9 @@ class Driver:
         th, car = self._theta, self._vehicle.constants
         horizon = 5 * self._vehicle.sampling_time
         ahead = s + state.v_x * horizon
-        pace = 1 - self._slower * (1 + self._pace(time)) / 2
+        slowed = 1 - self._slower * (1 + self._slowing(time)) / 2
         tighter = math.sqrt(max(1 - float(self.line.curvature(ahead)) * offset, 0.1))
-        error = pace * tighter * self.speed(ahead) - state.v_x
+        error = slowed * tighter * self.speed(ahead) - state.v_x
         cornering = car.m * state.v_x * state.omega * math.sin(previous.delta) * car.l_r / (car.l_f + car.l_r)
         force = car.m * error / horizon + th.C_r0 + th.C_r2 * state.v_x**2 + cornering
         return float(force / max(th.C_m1 - th.C_m2 * state.v_x, 0.1 * th.C_m1))

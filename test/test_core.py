@@ -1,0 +1,106 @@
+"""The core alone (`pip install .`): what the car needs works without torch, casadi, scipy and matplotlib."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dynssm_ros.extras import EXTRAS, MissingExtraError, require
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+HIDDEN = sorted({library for extra, libraries in EXTRAS.items() if extra != "ros" for library in libraries})
+BLOCKED = f"""
+import sys
+from importlib.abc import MetaPathFinder
+
+class Hidden(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {HIDDEN!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Hidden())
+"""
+
+
+def run(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Runs code in a process that has the core's libraries alone."""
+    command = [sys.executable, "-c", BLOCKED + code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
+
+
+DYNSSM = f"""
+import dynssm_ros.extras as extras
+extras.find_spec = lambda name: None if name in {HIDDEN!r} else object()
+from dynssm_ros.cli.main import main
+sys.argv = ["dynssm", *sys.argv[1:]]
+main()
+"""
+
+
+def test_a_log_is_extracted_and_replayed(laps_bag: Path, small_model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "laps.parquet"
+    done = run(DYNSSM, "extract", laps_bag, "--signals", "default", "--rate", 50, "--out", out)
+    assert (done.returncode, done.stderr) == (0, "")
+    done = run(DYNSSM, "replay", laps_bag, "--model", small_model, "--out", tmp_path / "replayed")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "predictions" in done.stdout
+
+
+def test_the_predictor_node_is_importable_with_all_that_it_uses() -> None:
+    done = run("import dynssm_ros.nodes.predictor, dynssm_ros.nodes.player\nassert 'torch' not in sys.modules")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "extra"),
+    [
+        (["train", "r.parquet", "--model", "dynssm", "--vehicle", "orca", "--out", "m"], "train"),
+        (["calibrate", "r.parquet", "--vehicle", "orca", "--out", "c.yaml"], "train"),
+        (["diagnose", "r.parquet", "--vehicle", "orca", "--out", "d"], "report,train"),
+        (["race", "--vehicle", "orca", "--track", "club", "--model", "true", "--out", "r"], "race,report"),
+        (["simulate", "--vehicle", "orca", "--track", "club", "--out", "b"], "race"),
+        (["evaluate", "r.parquet", "--model", "persistence", "--out", "e"], "report"),
+    ],
+)
+def test_a_missing_extra_is_one_line_that_names_it(arguments: list[str], extra: str) -> None:
+    done = run(DYNSSM, *arguments)
+    assert done.returncode == 1
+    (line,) = done.stderr.strip().splitlines()
+    assert f"pip install 'dynssm_ros[{extra}]'" in line
+
+
+def test_what_is_there_is_not_asked_for() -> None:
+    require("the tests", "train", "race", "report")
+    with pytest.raises(KeyError):
+        require("nobody", "no_such_extra")
+    assert issubclass(MissingExtraError, Exception)
+
+
+@pytest.mark.live
+@pytest.mark.timeout(600)
+def test_an_environment_with_the_core_alone_predicts_live_on_dds(
+    laps_bag: Path, small_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Installed anew from the declared requirements; the node runs there, the bag is played from here."""
+    from benchmarks import live_run
+
+    environment = tmp_path / "core"
+    subprocess.run([sys.executable, "-m", "venv", environment], check=True)
+    python = environment / "bin" / "python"
+    install = [python, "-m", "pip", "install", "-q", "--disable-pip-version-check", "-c", "constraints.txt", ".[ros]"]
+    clean = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "LD_LIBRARY_PATH")}
+    clean.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
+    subprocess.run(install, check=True, cwd=REPOSITORY, env=clean, capture_output=True)
+    listed = subprocess.run([python, "-m", "pip", "list"], check=True, capture_output=True, text=True, env=clean).stdout
+    assert not {"torch", "casadi", "matplotlib", "scipy"} & {line.split()[0] for line in listed.splitlines() if line}
+    monkeypatch.setattr(live_run.sys, "executable", str(python))
+    monkeypatch.delenv("LD_LIBRARY_PATH", raising=False)
+    monkeypatch.delenv("_ROS_WHEELS_BOOTSTRAP_COMPLETE", raising=False)
+    monkeypatch.chdir(tmp_path)  # away from the source tree
+    run = live_run.run_live(small_model, laps_bag, 0.02, duration=4.0)
+    assert len(run.predicted) > 150
+    assert run.missing() == []
