@@ -1,0 +1,85 @@
+"""Selection and the choice of the integrator on short synthetic drives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dynssm_ros.identification.candidates import Candidate
+from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.integrator import search_causes
+from dynssm_ros.identification.problem import IdentificationProblem
+from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
+from dynssm_ros.identification.windows import SimulationWindows, fit_windows, recorded_rows
+from dynssm_ros.signals.context import recording_context
+from dynssm_ros.simulation.laps import as_recording, simulate
+from dynssm_ros.track.tracks import load_track
+from dynssm_ros.vehicle import load_vehicle
+
+ORCA = load_vehicle("orca")
+FEW = [
+    Candidate("steering_offset", ("offset",)),
+    Candidate("drive_gain", ("factor",)),
+    Candidate("front_grip", ("factor",)),
+    Candidate("drag", ("coefficient",)),
+]
+
+
+def windows(plant: str = "euler", **effects: dict[str, float]) -> SimulationWindows:
+    car = ORCA.with_effects(effects.items())
+    run = simulate(car, load_track("club"), duration=25.0, plant=plant, noise=(0.005, 0.005, 0.02))
+    recording = as_recording(run)
+    data = recorded_rows(recording, recording_context(recording))
+    return fit_windows(recording, data, 0.3, 0.0, len(recording))
+
+
+def search(**effects: dict[str, float]) -> Search:
+    given = windows(**effects).with_integrator("euler", ORCA)
+    return Search(IdentificationProblem(given, CarEstimate.of(ORCA)), CarEstimate.of(ORCA), FEW)
+
+
+def test_a_pair_is_found_the_stronger_first_and_with_its_sizes() -> None:
+    found = search(steering_offset={"offset": 0.03}, drive_gain={"factor": 1.15}).run()
+    assert {one.candidate.effect for one in found.chosen} == {"steering_offset", "drive_gain"}
+    evidence = [one.delta_bic for one in found.chosen]
+    assert evidence == sorted(evidence, reverse=True)
+    assert min(evidence) > DECISIVE_DELTA_BIC
+    assert found.fit.car.effects["steering_offset"]["offset"] == pytest.approx(0.03, rel=0.1)
+    assert found.fit.car.effects["drive_gain"]["factor"] == pytest.approx(1.15, rel=0.05)
+    assert found.fit.objective < found.base.objective
+
+
+def test_nothing_is_chosen_where_nothing_is_hidden() -> None:
+    found = search().run()
+    assert found.chosen == []
+    assert found.fit is found.base
+
+
+def test_leaving_one_out_is_a_fit_without_it() -> None:
+    searching = search(steering_offset={"offset": 0.03})
+    found = searching.run()
+    (one,) = found.chosen
+    without = searching.leave_out(found, one)
+    assert "steering_offset" not in without.car.effects
+    assert without.objective - found.fit.objective == pytest.approx(
+        one.improvement * max(1.0, found.inflation), rel=0.5
+    )
+
+
+def test_evidence_that_does_not_repeat_does_not_pay() -> None:
+    searching = search()
+    fit = searching.base
+    strong = Refined(FEW[0], fit, 100.0, 90.0, 5.0)
+    assert _pays(strong)
+    assert not _pays(replace(strong, crossed=-1.0))
+    assert not _pays(replace(strong, delta_bic=DECISIVE_DELTA_BIC))
+
+
+@pytest.mark.parametrize("plant", ["euler", "rk4"])
+def test_the_integrator_is_that_of_the_data(plant: str) -> None:
+    found = search_causes(windows(plant), CarEstimate.of(ORCA), None, lambda words: None)
+    assert found.problem.windows.integrator == plant
+    assert [one.candidate.effect for one in found.selection.chosen] == []
+    assert np.isfinite(found.selection.fit.objective)
