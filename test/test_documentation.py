@@ -1,21 +1,35 @@
-"""What the README says is what the code does."""
+"""What README and documentation say is what the code does."""
 
 from __future__ import annotations
 
 import ast
+import importlib
 import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import reduce
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import typer
 import yaml
 
+import dynssm_ros
 from dynssm_ros.cli.main import app
+from dynssm_ros.extras import EXTRAS
+from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.signals import messages
+from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.signal_map import SIGNALS, load_signal_map
+from dynssm_ros.vehicle import load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 
 ROOT = Path(__file__).resolve().parent.parent
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = {path.name: path.read_text(encoding="utf-8") for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]}
+MEASURED = ("results.md", "results_race.md")  # written by `make paper`, in the words of the version that measured
+README = PAGES["README.md"]
 
 
 def table(head: str, text: str = README) -> dict[str, list[str]]:
@@ -37,9 +51,169 @@ def test_every_command_is_described_and_every_described_one_exists() -> None:
     assert described == registered
 
 
+def code_lines() -> Iterator[tuple[str, str]]:
+    """Page and line of all code in blocks, with continued lines joined."""
+    for name, text in PAGES.items():
+        if name in MEASURED:
+            continue
+        joined = re.sub(r"\\\n\s*", "", text)
+        fenced = re.findall(r"^```(?:bash)?\n(.*?)^```", joined, flags=re.M | re.S)
+        for line in [*re.findall(r"^(?: {4}|\t)(.*)", joined, flags=re.M), *"\n".join(fenced).splitlines()]:
+            yield name, line.split("  #")[0].strip()
+
+
+def options() -> dict[str, set[str]]:
+    """Options by command."""
+    group = typer.main.get_command(app)
+    return {
+        name: {option for parameter in command.params for option in parameter.opts}
+        for name, command in group.commands.items()  # type: ignore[attr-defined]
+    }
+
+
+def test_every_command_in_a_code_block_exists_with_its_options() -> None:
+    known, seen = options(), set()
+    for page, line in code_lines():
+        for command, rest in re.findall(r"\bdynssm (\w+)((?: [^#|&;]*)?)", line):
+            assert command in known, f"{page}: {line}"
+            given = set(re.findall(r"(?<=\s)--[a-z-]+", rest))
+            assert given <= known[command], f"{page}: {line}: {given - known[command]}"
+            seen.add(command)
+    assert seen >= set(known)
+
+
+def test_every_option_that_a_page_names_exists() -> None:
+    elsewhere = {"--help", "--ros-args", "--symlink-install", "--system-site-packages", "--backend"}
+    known = set().union(*options().values()) | elsewhere
+    for page, text in PAGES.items():
+        if page not in MEASURED:
+            named = set(re.findall(r"`(--[a-z-]+)", text))
+            assert named <= known, f"{page}: {named - known}"
+
+
+def test_every_module_that_a_code_block_runs_exists() -> None:
+    outside = {"venv", "colcon", "doit"}
+    for page, line in code_lines():
+        for module in re.findall(r"python3? -m ([\w.]+)", line):
+            assert module in outside or find_spec(module), f"{page}: {line}"
+        for file in re.findall(r"doit (?:.* )?-f (\S+)", line):
+            assert (ROOT / file).is_file(), f"{page}: {line}"
+
+
+def test_every_node_parameter_in_a_code_block_is_declared() -> None:
+    seen = set()
+    for page, line in code_lines():
+        found = re.match(r"(?:ros2 run dynssm_ros )?(predictor|player|controller|simulator) --ros-args (.*)", line)
+        if found:
+            declared = set(declared_parameters(found[1])) | set(re.findall(r'"(\w+)"', node_source(found[1])))
+            given = set(re.findall(r"-p (\w+):=", found[2]))
+            assert given <= declared, f"{page}: {line}"
+            seen.add(found[1])
+    assert seen == {"predictor", "player", "controller", "simulator"}
+
+
+def test_links_lead_somewhere() -> None:
+    for page, text in PAGES.items():
+        folder = ROOT if (ROOT / page).is_file() else ROOT / "docs"
+        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
+            assert "://" in target or (folder / target).exists(), f"{page}: {target}"
+
+
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "-d", str(tmp_path / "trees")]
+    built = subprocess.run(
+        [*command, str(ROOT / "docs"), str(tmp_path / "site")], capture_output=True, text=True, check=False
+    )
+    assert built.returncode == 0, built.stderr
+    pages = {path.name for path in (tmp_path / "site").glob("*.html")}
+    assert pages >= {name.replace(".md", ".html") for name in PAGES if (ROOT / "docs" / name).is_file()}
+
+
+def test_the_readme_is_short_and_shows_a_picture() -> None:
+    assert len(README.splitlines()) <= 120
+    assert re.search(r"!\[.+\]\(docs/.+\)", README)
+
+
+def test_python_in_the_pages_compiles_and_imports_what_there_is() -> None:
+    blocks = [(page, block) for page, text in PAGES.items() for block in re.findall(r"```python\n(.*?)```", text, re.S)]
+    assert blocks
+    for page, block in blocks:
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("dynssm_ros"):
+                module = importlib.import_module(node.module)
+                for alias in node.names:
+                    assert hasattr(module, alias.name), f"{page}: {node.module}.{alias.name}"
+
+
+def test_the_example_of_the_api_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from dynssm_ros.simulation.laps import write_run
+
+    monkeypatch.chdir(tmp_path)
+    write_run(dynssm_ros.simulate("orca", "club", duration=40.0, noise=(0.01, 0.01, 0.03)), "bag")
+    (block,) = re.findall(r"```python\n(.*?)```", PAGES["api.md"], re.S)
+    exec(compile(block, "api.md", "exec"), {})
+
+
+def test_every_equation_of_the_paper_is_where_the_page_says() -> None:
+    named = set(re.findall(r"`((?:vehicle|signals|learning|runtime|control)\.[\w.]+)`", PAGES["paper.md"]))
+    assert len(named) > 10
+    for name in named:
+        parts = name.split(".")
+        modules = ["dynssm_ros." + ".".join(parts[: k + 1]) for k in range(len(parts))]
+        deepest = max((m for m in modules if _is_module(m)), key=len)
+        rest = ("dynssm_ros." + name).removeprefix(deepest).strip(".")
+        reduce(getattr, filter(None, rest.split(".")), importlib.import_module(deepest))
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def test_every_verdict_is_explained_and_every_explained_one_exists() -> None:
+    page = PAGES["troubleshooting.md"]
+    source = " ".join(
+        re.sub(r'"\s*\n?\s*f?"', "", path.read_text(encoding="utf-8")) for path in (ROOT / "dynssm_ros").rglob("*.py")
+    )
+    verdicts = set(table("verdict", page))
+    assert {refusal.value for refusal in Refusal} <= verdicts
+    for words in [*verdicts, *re.findall(r"^\| `([^`]+)` \| [^|]+ \| [^|]+ \| [^|]+ \|$", page, flags=re.M)]:
+        assert words in source, words
+    for words in table("line contains", page):
+        assert words in source, words
+
+
+def test_the_switches_that_pages_name_are_fields_of_model_files() -> None:
+    fields = load_model_config("dynssm").model_dump()
+    for page in ("tuning.md", "paper.md"):
+        for name in re.findall(r"^\| [^|]*`([a-z_]+(?:\.[a-z_]+)?)` \|", PAGES[page], flags=re.M):
+            block, _, field = name.partition(".")
+            assert block in fields, name
+            assert not field or field in fields[block], name
+
+
+def test_the_extras_of_the_installation_page_are_those_of_the_package() -> None:
+    assert set(table("extra", PAGES["installation.md"])) == {*EXTRAS, "(core)", "all"}
+
+
+def test_the_vehicle_file_of_the_tutorial_is_one() -> None:
+    car = load_vehicle(ROOT / "examples" / "racer_1_10.yaml")
+    described = re.findall(r"^\| `(\w+)`", PAGES["my_car.md"], flags=re.M)
+    assert {"m", "l_f", "l_r", "h_cg", "F_z0", "load_transfer", "sampling_time", "minimum_speed", "inputs"} <= set(
+        described
+    )
+    assert car.sampling_time == 0.02
+
+
+def node_source(node: str) -> str:
+    return (ROOT / "dynssm_ros" / "nodes" / f"{node}.py").read_text(encoding="utf-8")
+
+
 def declared_parameters(node: str) -> dict[str, object]:
     """What a node declares: default values by name."""
-    tree = ast.parse((ROOT / "dynssm_ros" / "nodes" / f"{node}.py").read_text(encoding="utf-8"))
+    tree = ast.parse(node_source(node))
     return {
         call.args[1].value: call.args[2].value
         for call in ast.walk(tree)
@@ -50,7 +224,7 @@ def declared_parameters(node: str) -> dict[str, object]:
 
 def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_file() -> None:
     declared = declared_parameters("predictor")
-    assert {name: cells[0].strip("`") for name, cells in table("parameter").items()} == {
+    assert {name: cells[0].strip("`") for name, cells in table("parameter", PAGES["predictor.md"]).items()} == {
         name: str(value) for name, value in declared.items()
     }
     shipped = yaml.safe_load((ROOT / "config" / "predictor.yaml").read_text())["/**"]["ros__parameters"]
@@ -58,8 +232,7 @@ def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_fi
 
 
 def test_the_parameters_of_the_controller_are_those_of_its_page() -> None:
-    page = (ROOT / "docs" / "controller.md").read_text(encoding="utf-8")
-    described = {name: cells[0].strip("`") for name, cells in table("parameter", page).items()}
+    described = {name: cells[0].strip("`") for name, cells in table("parameter", PAGES["controller.md"]).items()}
     declared = declared_parameters("controller")
     as_ros_writes = {
         name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in declared.items()
@@ -79,18 +252,18 @@ def test_every_signal_and_shipped_file_is_named() -> None:
     text = " ".join(README.split())
     for name in SIGNALS:
         assert re.search(rf"\b{name}\b", text), name
-    for kind in ("vehicles", "signals"):
+    for kind in ("vehicles", "signals", "models"):
         for path in (ROOT / "config" / kind).glob("*.yaml"):
             assert f"`{path.stem}`" in text, path.stem
 
 
-@pytest.mark.parametrize("target", re.findall(r"^    make (\w+)", README, flags=re.M))
+@pytest.mark.parametrize("target", sorted(set(re.findall(r"^    make (\w+)", "\n".join(PAGES.values()), flags=re.M))))
 def test_the_make_targets_exist(target: str) -> None:
     assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), flags=re.M)
 
 
 def _topic_rows() -> list[list[str]]:
-    lines = README.splitlines()
+    lines = PAGES["predictor.md"].splitlines()
     start = next(k for k, line in enumerate(lines) if line.startswith("| direction |"))
     rows = []
     for line in lines[start + 2 :]:
@@ -101,7 +274,7 @@ def _topic_rows() -> list[list[str]]:
 
 
 def test_the_effects_of_the_document_are_those_of_the_code() -> None:
-    rows = [line for line in (ROOT / "docs" / "effects.md").read_text(encoding="utf-8").splitlines() if "| `" in line]
+    rows = [line for line in PAGES["effects.md"].splitlines() if "| `" in line]
     cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
     described = {name.strip("`"): (what, re.findall(r"`(\w+)`", how), advice) for name, what, how, advice in cells}
     assert described == {

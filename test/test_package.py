@@ -322,7 +322,7 @@ def test_controller_launch_file_starts_the_stack_that_is_asked_for(load_launch: 
     file = load_launch("controller.launch.py")
     *declared, _ = file.generate_launch_description().positional[0]
     assert all(argument.named["description"] for argument in declared)
-    nodes = {node.named["executable"]: node.named for node in all_launched(file, model="out/model", pace="0.7")}
+    nodes = {node.named["executable"]: node.named for node in all_launched(file, model="out/model", speed_scale="0.7")}
     assert {name: node["name"] for name, node in nodes.items()} == {
         "controller": "controller",
         "simulator": "simulator",
