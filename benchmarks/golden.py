@@ -116,14 +116,14 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str], list[Path]]]:
             yield (
                 f"{car}/{plant}/race",
                 ["race", "--vehicle", car, "--track", "club" if car == "orca" else "oval", "--plant", plant,
-                 "--model", "true", "--model", f"{folder / f'dynssm_{car}'}", "--pace", "0.8", "--out", f"{out}"],
+                 "--model", "true", "--model", f"{folder / f'dynssm_{car}'}", "--speed-scale", "0.8", "--out", f"{out}"],
                 [out / "results.json"],
             )  # fmt: skip
     out = folder / "orca_progress"
     yield (
         "orca/progress/race",
         ["race", "--vehicle", "orca", "--track", "club", "--model", "true", "--model", f"{folder / 'orca_rk4.yaml'}",
-         "--objective", "progress", "--offset-free", "--pace", "0.85", "--effect", "front_grip:factor=0.9", "--out",
+         "--objective", "progress", "--offset-free", "--speed-scale", "0.85", "--effect", "front_grip:factor=0.9", "--out",
          f"{out}"],
         [out / "results.json"],
     )  # fmt: skip

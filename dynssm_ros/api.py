@@ -266,7 +266,7 @@ def evaluate(
         vehicle: of the single-track baselines.
         holdout: score only this last fraction of the recording.
         commands: protocol; if not given, that of the models' training.
-        min_speed: stretches below are left out (m/s); if not given, 5 for full-size cars, else 0.
+        min_speed: stretches below are left out (m/s); the largest ``minimum_speed`` of the models' cars if not given.
         horizon: length of the rollouts (s); if not given, 0.3 up to T_s = 0.02 s, else 0.6.
         stride: a rollout starts at every ``stride``-th row.
         track: on which errors are placed; if not given, the first full lap of the recording.
@@ -355,7 +355,7 @@ def diagnose(
         vehicle: the simulated car; how well it is known decides whether a coefficient that has to move is a cause.
         horizon: time that is simulated from a measured state on (s).
         holdout: share at the end that only measures the improvement; whole laps if there are three.
-        min_speed: stretches below are left out (m/s); if not given, 5 for full-size cars, else 0.
+        min_speed: stretches below are left out (m/s); the vehicle file's if not given.
         integrator: of the simulation; if not given, Runge-Kutta unless Euler is clearly closer to the data.
         track: from whose start positions on the lap are counted; if not given, the first full lap.
         commands: source of the command inputs; the recording's own if not given.

@@ -31,7 +31,7 @@ MinSpeedOption = Annotated[
     typer.Option(
         "--min-speed",
         help="Leave out stretches below this speed (m/s).",
-        show_default="5 if the recording exceeds 10 m/s as full-size cars do, else 0",
+        show_default="the vehicle file's minimum_speed",
     ),
 ]
 PlantOption = Annotated[

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +29,7 @@ from dynssm_ros.evaluation.regimes import Regime, driving_regimes, regime_rmse
 from dynssm_ros.evaluation.rollout import default_horizon, score_rollouts
 from dynssm_ros.evaluation.score import Group, Score, grouped
 from dynssm_ros.runtime.models import WindowModel
-from dynssm_ros.signals.recording import Recording, default_min_speed
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.track.lap_position import first_lap
 from dynssm_ros.track.lines import ClosedLine
@@ -110,6 +110,10 @@ class Evaluation:
         }
 
 
+def _minimum_speed(models: Iterable[WindowModel]) -> float:
+    return max((model.vehicle.minimum_speed for model in models if model.vehicle is not None), default=0.0)
+
+
 def evaluate(
     recording: Recording,
     models: Mapping[str, WindowModel],
@@ -130,7 +134,7 @@ def evaluate(
         models: by the name to show; not empty.
         name: of the recording, for people; its sources if empty.
         split: which part of it this is, for people.
-        min_speed: stretches below are left out (m/s); :func:`default_min_speed` if ``None``.
+        min_speed: stretches below are left out (m/s); if ``None``, the largest ``minimum_speed`` of the models' cars.
         horizon_s: length of the rollouts (s); :func:`default_horizon` if ``None``.
         stride: a rollout starts at every ``stride``-th usable row.
         batch: windows per call of a model.
@@ -146,7 +150,7 @@ def evaluate(
         check_fit(model, recording)
     steps = horizon_steps(default_horizon(recording.T_s) if horizon_s is None else horizon_s, recording.T_s)
     H = max(model.H for model in models.values())
-    speed = default_min_speed(recording) if min_speed is None else min_speed
+    speed = _minimum_speed(models.values()) if min_speed is None else min_speed
     rows = recording.window_ends(H, 1, speed)
     starts = recording.window_ends(H, steps, speed)[::stride]
     if len(starts) == 0:

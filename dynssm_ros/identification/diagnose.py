@@ -25,7 +25,7 @@ from dynssm_ros.identification.windows import (
     held_out_windows,
     recorded_rows,
 )
-from dynssm_ros.signals.recording import Recording, default_min_speed
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
 from dynssm_ros.track.lines import ClosedLine
@@ -174,7 +174,7 @@ def diagnose(
         vehicle: the nominal car. How well its coefficients are known decides whether one that has to move is a cause.
         horizon: time that is simulated from a measured state on (s).
         holdout: share of the recording, at its end, that neither fit nor selection sees; whole laps if there are three.
-        min_speed: stretches below are left out (m/s); ``None``: :func:`default_min_speed`.
+        min_speed: stretches below are left out (m/s); ``None``: the vehicle file's.
         integrator: of the simulation; ``None``: Runge-Kutta, unless Euler steps are clearly closer to the data.
         line: of the track, from which positions on the lap are counted; ``None``: the first full lap of the recording.
         on_progress: told what is being done.
@@ -250,7 +250,7 @@ def _prepare(
     every = compared_every(steps)
     steps = every * -(-steps // every)
     notes = _check_signals(recording)
-    speed = default_min_speed(recording) if min_speed is None else min_speed
+    speed = vehicle.minimum_speed if min_speed is None else min_speed
     cut, split = _cut(recording, holdout)
     line = first_lap(recording.select(slice(None, cut))) if line is None else line
     if line is None:

@@ -39,10 +39,6 @@ class RecordingInfo(StrictModel):
     notes: tuple[str, ...] = Field(default=(), description="what was recovered, dropped or bridged")
 
 
-FULL_SIZE_SPEED = 10.0  # a recording that exceeds this speed (m/s) is of a full-size car
-FULL_SIZE_MIN_SPEED = 5.0  # m/s; the published evaluations of full-size cars leave out slower rows
-
-
 @dataclass(frozen=True)
 class Recording:
     """Signals of a run on a uniform time grid.
@@ -240,8 +236,3 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
         np.concatenate([r.segment + offset for r, offset in zip(recordings, offsets, strict=True)]).astype(np.int32),
         {name: np.concatenate([r.columns[name] for r in recordings]) for name in names},
     )
-
-
-def default_min_speed(recording: Recording) -> float:
-    """Speed (m/s) below which rows are not scored: 5 for full-size cars as in the literature, none for small ones."""
-    return FULL_SIZE_MIN_SPEED if recording["v_x"].max(initial=0.0) > FULL_SIZE_SPEED else 0.0

@@ -111,7 +111,7 @@ class Vehicle(StrictModel):
     minimum_speed: float = Field(
         default=0.0,
         ge=0,
-        description="slower rows are neither calibrated nor trained on (m/s): the car parks or creeps there",
+        description="slower rows are not calibrated, trained, diagnosed or scored on (m/s): the car parks or creeps there",
     )
     inputs: InputLimits
     coefficients: dict[str, Coefficient]

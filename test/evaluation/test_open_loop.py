@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.errors import ArtifactError, RecordingError
-from dynssm_ros.evaluation.open_loop import default_min_speed, evaluate, shared_commands
+from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
 from dynssm_ros.runtime.models import Persistence, SingleTrack, WindowPrediction
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
@@ -174,9 +174,11 @@ def test_no_usable_window_is_refused_with_what_was_needed(recording):
         evaluate(recording, {"m": Model()}, min_speed=100.0)
 
 
-def test_only_full_size_cars_have_a_least_speed(recording):
-    assert default_min_speed(recording) == 5.0
-    assert default_min_speed(make_recording(np.full((10, 3), 3.0))) == 0.0
+def test_rows_are_scored_from_the_least_speed_of_the_models_cars_on(recording):
+    assert evaluate(recording, {"m": Model()}).min_speed == 0.0
+    slow = load_vehicle("orca").model_copy(update={"minimum_speed": 3.0, "sampling_time": recording.T_s})
+    car = SingleTrack(slow)
+    assert evaluate(recording, {"m": Model(), "car": car}).min_speed == 3.0
 
 
 def test_published_orca_run_is_a_single_track_trajectory(orca_bag):
