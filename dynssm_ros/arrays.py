@@ -1,6 +1,8 @@
-"""Array types of the whole package, named once."""
+"""Array types and formulas of the whole package, named once."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,3 +13,17 @@ Indices = npt.NDArray[np.intp]
 """Row numbers."""
 Mask = npt.NDArray[np.bool_]
 """Which rows or entries are meant."""
+
+
+def normal_equations(J: Any, r: Any, precision: Any) -> tuple[Any, Any]:
+    """``J^T J + precision`` and ``J^T r``: the equations of a maximum a posteriori estimate, after Gauss and Newton.
+
+    Calibration, diagnosis and the estimation within a model's window solve them, in numpy and in torch.
+
+    Args:
+        J: derivatives of the residuals in units of their standard deviation, ``(..., n, K)``.
+        r: residuals in the same units, ``(n,)`` or ``(..., n, 1)``.
+        precision: inverse covariance of the prior, ``(K, K)``.
+    """
+    transposed = J.swapaxes(-1, -2)
+    return transposed @ J + precision, transposed @ r

@@ -47,7 +47,7 @@ class OwnMpc(Node):
         u = opti.variable(STEPS, 2)
         start, last, theta, points = (opti.parameter(*shape) for shape in ((6, 1), (1, 2), (17, 1), (STEPS, 2)))
         pose, state = Pose(*ca.vertsplit(start[:3])), State(*ca.vertsplit(start[3:]))
-        cost, before = 0, last
+        cost, before = ca.MX(0), last
         for k in range(STEPS + 1):
             # a command acts one step after the odometry that it answers: until then, the last one
             command = last if k == 0 else u[k - 1, :]

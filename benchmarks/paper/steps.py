@@ -26,7 +26,7 @@ from dynssm_ros.evaluation.open_loop import Evaluation, evaluate
 from dynssm_ros.files import write_json
 from dynssm_ros.identification.calibration import calibrate
 from dynssm_ros.learning.models.base import ModelConfig
-from dynssm_ros.runtime.models import OnnxModel, WindowModel, load_model
+from dynssm_ros.runtime.models import WindowModel, load_model
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording
@@ -365,8 +365,8 @@ def _load(root: Path, part: Part, commands: Commands) -> Recording:
 def _windows(model: WindowModel, vehicle: Vehicle) -> Vector:
     """Windows around what the model was trained on, or around steady driving, shape ``(M, H, 7)``."""
     mean, std = np.array([10.0, *[0.0] * 6]), np.zeros(len(WINDOW_COLUMNS))
-    if isinstance(model, OnnxModel):
-        scales = model.artifact.card.normalisation
+    if model.card is not None:
+        scales = model.card.normalisation
         mean, std = np.array(scales.input_mean), np.array(scales.input_std)
     drawn = np.random.default_rng(0).standard_normal((_WINDOWS, model.H, len(WINDOW_COLUMNS)))
     windows: Vector = mean + 0.5 * std * drawn
@@ -375,7 +375,7 @@ def _windows(model: WindowModel, vehicle: Vehicle) -> Vector:
 
 def _cost(model: WindowModel, times: Vector) -> dict[str, Any]:
     p50, p99 = np.percentile(times, [50, 99])
-    card = model.artifact.card if isinstance(model, OnnxModel) else None
+    card = model.card
     return {
         "parameters": model.parameters,
         "flops": model.flops,

@@ -9,7 +9,7 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.horizon_model import INPUTS, STATES, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Plan
-from dynssm_ros.runtime.models import OnnxModel, WindowModel
+from dynssm_ros.runtime.models import WindowModel
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import Coefficients, State, Vehicle, step
 
@@ -64,7 +64,7 @@ class Adaptive:
 
     def __init__(self, model: WindowModel, vehicle: Vehicle, along_horizon: bool = False) -> None:
         own = model.vehicle or vehicle
-        card = model.artifact.card if isinstance(model, OnnxModel) else None
+        card = model.card
         self.name = model.name
         self.H = model.H
         self.car = SteppedCar.of(own) if card is None else SteppedCar.of(own, card.integrator, card.substeps)

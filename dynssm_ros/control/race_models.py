@@ -7,7 +7,7 @@ from pathlib import Path
 from dynssm_ros.control.horizon_model import SteppedCar
 from dynssm_ros.control.prediction_model import Adaptive, Fixed, PredictionModel
 from dynssm_ros.errors import ArtifactError, ConfigurationError
-from dynssm_ros.runtime.models import OnnxModel, Persistence, SingleTrack, SingleTrackEwma, WindowModel, load_model
+from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma, WindowModel, load_model
 from dynssm_ros.simulation.plant import PlantKind, plant_type
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 
@@ -55,7 +55,7 @@ def load_prediction_model(
 
 
 def _check_car(given: str, model: WindowModel, vehicle: Vehicle) -> None:
-    error = ArtifactError if isinstance(model, OnnxModel) else ConfigurationError
+    error = ConfigurationError if model.card is None else ArtifactError
     if model.T_s and abs(model.T_s - vehicle.sampling_time) > 1e-9:
         raise error(
             f"model {given}: sampling time {model.T_s:g} s; expected that of vehicle {vehicle.name}, "

@@ -15,7 +15,7 @@ from dynssm_ros.evaluation.metrics import by_channel, finite
 from dynssm_ros.evaluation.regimes import Regime
 from dynssm_ros.evaluation.rollout import Rollout
 from dynssm_ros.evaluation.spread import SeedSpread, mean_and_std, spreads
-from dynssm_ros.runtime.models import OnnxModel, WindowModel
+from dynssm_ros.runtime.models import WindowModel
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _WITH_STD = ("rmse", "max_error", "ade", "fde", "coverage_90", "explained")  # what is stated with its spread over seeds
@@ -54,7 +54,7 @@ class Score:
     @property
     def seed(self) -> int | None:
         """Seed of the training; ``None`` for models without training."""
-        return self.model.artifact.card.training.get("seed") if isinstance(self.model, OnnxModel) else None
+        return None if self.model.card is None else self.model.card.training.get("seed")
 
     @property
     def latency_p50(self) -> float:
@@ -157,9 +157,8 @@ def grouped(scores: Mapping[str, Score]) -> dict[str, Group]:
 
 
 def _differ_by_seed_only(scores: Sequence[Score]) -> bool:
-    recipes = [
-        _without_seeds(score.model.artifact.card.architecture) for score in scores if isinstance(score.model, OnnxModel)
-    ]
+    cards = [score.model.card for score in scores if score.model.card is not None]
+    recipes = [_without_seeds(card.architecture) for card in cards]
     same = len(recipes) == len(scores) and all(recipe == recipes[0] for recipe in recipes)
     return same and len({score.seed for score in scores}) == len(scores)
 

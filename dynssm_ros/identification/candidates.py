@@ -168,7 +168,7 @@ def _differ(found: list[Response]) -> bool:
 
 
 @dataclass(frozen=True)
-class _Column:
+class _WhitenedResponse:
     """A response as the errors see it, window by window.
 
     Attributes:
@@ -193,7 +193,7 @@ class ScoreTest:
 
     def __init__(self, problem: IdentificationProblem, fit: Fit, responses: Responses) -> None:
         self._fit, self._responses = fit, responses
-        self._columns: dict[int, _Column] = {}
+        self._columns: dict[int, _WhitenedResponse] = {}
         self._products: dict[tuple[int, int], Vector] = {}
         white = fit.noise.whiten(fit.errors)
         self._root = np.sqrt(weights(white))[:, None]
@@ -279,11 +279,11 @@ class ScoreTest:
         size, left = np.diag(whole), np.diag(gram)
         return gram, along, bool((size > _VISIBLE_NOISE_SHARE**2).all() and (left > _LEAST**2 * size).any())
 
-    def _column(self, raw: Vector) -> _Column:
+    def _column(self, raw: Vector) -> _WhitenedResponse:
         if id(raw) not in self._columns:
             white = self._fit.noise.whiten(raw) * self._root
             taken = np.einsum("wn,wnp->wp", white, self._basis)
-            self._columns[id(raw)] = _Column(white, taken, np.einsum("wn,wn->w", white, self._left))
+            self._columns[id(raw)] = _WhitenedResponse(white, taken, np.einsum("wn,wn->w", white, self._left))
         return self._columns[id(raw)]
 
     def _product(self, a: Vector, b: Vector) -> Vector:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import lsq_linear
 
-from dynssm_ros.arrays import Vector
+from dynssm_ros.arrays import Vector, normal_equations
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.noise import Noise, NoiseResponse, fit_noise, weights
 from dynssm_ros.identification.windows import SimulationWindows
@@ -244,9 +244,8 @@ class IdentificationProblem:
         root = np.sqrt(weights(white))[:, None]
         J = (noise.whiten(jacobian) * root[..., None]).reshape(-1, len(p))
         known = self.prior_precision(p)
-        H = J.T @ J + np.diag(known)
-        g = J.T @ (white * root).ravel() + known * p
-        return H, g
+        H, g = normal_equations(J, (white * root).ravel(), np.diag(known))
+        return H, g + known * p
 
     def covariance(self, fit: Fit) -> Vector:
         """Covariance of the fitted values in the units of the fit, robust against errors that hang together in blocks.

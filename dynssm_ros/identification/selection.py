@@ -70,7 +70,7 @@ class Selection:
     inflation: float = 1.0
 
 
-class _Start(NamedTuple):
+class _CandidateStart(NamedTuple):
     """Where to fit a candidate from, and roughly what it is worth."""
 
     candidate: Candidate
@@ -185,13 +185,13 @@ class Search:
     def _expected_delta_bic(self, scored: ScoredCandidate) -> float:
         return float(scored.improvement - self._price * len(scored.candidate.parameters))
 
-    def _refine(self, fit: Fit, start: _Start) -> Refined:
+    def _refine(self, fit: Fit, start: _CandidateStart) -> Refined:
         candidate = start.candidate
         self._report(f"fitting {candidate.effect}")
         free = (*fit.free, *candidate.free)
         return self._judge(fit, self._study.fit(start.car, free, fit, rough=True), candidate)
 
-    def _start(self, some: IdentificationProblem, near: Fit, scored: ScoredCandidate) -> _Start:
+    def _start(self, some: IdentificationProblem, near: Fit, scored: ScoredCandidate) -> _CandidateStart:
         """Where to fit from, and what is reached there.
 
         What linearised errors promise is too much where an effect grows faster than its size, and too little where the
@@ -215,7 +215,7 @@ class Search:
         ]
         improvement = (near.objective - min(reached)) * len(self._study.windows) / len(some.windows)
         expected_delta_bic = improvement - self._price * len(candidate.parameters)
-        return _Start(candidate, cars[int(np.argmin(reached))], expected_delta_bic)
+        return _CandidateStart(candidate, cars[int(np.argmin(reached))], expected_delta_bic)
 
     def _judge(self, without: Fit, fit: Fit, candidate: Candidate) -> Refined:
         inflation = self._study.inflation(fit, len(fit.free) - len(without.free))

@@ -49,7 +49,7 @@ class OptimisationResult:
 
 
 @dataclass
-class _State:
+class _TrainingState:
     """All that changes while training, and so all that a checkpoint holds."""
 
     epoch: int = 0
@@ -91,7 +91,9 @@ class Optimisation:
         )
         self.checkpoint = checkpoint
         self.identity = _identity(config, vehicle, training)
-        self.state = _State(history={f"{part}/{term}": [] for part in ("train", "validation") for term in COMPONENTS})
+        self.state = _TrainingState(
+            history={f"{part}/{term}": [] for part in ("train", "validation") for term in COMPONENTS}
+        )
 
     def run(self, progress: Progress | None) -> OptimisationResult:
         """Trains until the validation loss stops falling; returns the best model.
@@ -188,7 +190,7 @@ class Optimisation:
         self.optimiser.load_state_dict(content["optimiser"])
         self.schedule.load_state_dict(content["schedule"])
         self.shuffle.set_state(content["shuffle"].cpu())
-        self.state = _State(**{name: content[name] for name in vars(self.state)})
+        self.state = _TrainingState(**{name: content[name] for name in vars(self.state)})
         return self.state.epoch
 
 

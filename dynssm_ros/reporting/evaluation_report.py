@@ -16,7 +16,6 @@ from dynssm_ros.evaluation.score import Group, Score
 from dynssm_ros.reporting import evaluation_figures, track_figures
 from dynssm_ros.reporting.page import Report, Section
 from dynssm_ros.reporting.tables import Column, Table, Value, percent, text
-from dynssm_ros.runtime.models import OnnxModel, SingleTrack
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lap_position import track_position
 from dynssm_ros.vehicle import COEFFICIENTS
@@ -197,22 +196,11 @@ def _protocol(evaluation: Evaluation) -> dict[str, str]:
 
 def _origin(group: Group) -> str:
     model = group.first.model
-    if isinstance(model, OnnxModel):
-        card = model.artifact.card
-        notes = card.training | ({"seed": group.seeds} if group.seeds else {})
-        training = ", ".join(f"{key} {_plain(value)}" for key, value in notes.items())
-        trained = f"; training: {training}" if training else ""
-        steps = f"{card.substeps} step{'s' if card.substeps > 1 else ''}"
-        physics = f", integrator {card.integrator} with {steps}" if card.architecture.get("physics") else ""
-        return (
-            f"{card.kind}, window {card.window} rows, trained with commands '{card.commands}', vehicle "
-            f"{card.vehicle.name}{physics}{trained}"
-        )
-    if isinstance(model, SingleTrack):
-        return f"nominal single-track model of vehicle {model.vehicle.name}, no learning"
-    if model.name == "persistence":
-        return "the next state is the present one"
-    return f"window {model.H} rows"
+    if model.card is None:
+        return model.origin
+    notes = model.card.training | ({"seed": group.seeds} if group.seeds else {})
+    training = ", ".join(f"{key} {_plain(value)}" for key, value in notes.items())
+    return f"{model.origin}; training: {training}" if training else model.origin
 
 
 def _plain(value: object) -> str:

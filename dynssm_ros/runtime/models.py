@@ -11,7 +11,7 @@ import onnxruntime as ort
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError, ConfigurationError
-from dynssm_ros.runtime.artifact import Artifact, open_artifact
+from dynssm_ros.runtime.artifact import Artifact, ModelCard, open_artifact
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle import Coefficients, State, Vehicle
@@ -47,6 +47,14 @@ class WindowModel(Protocol):
     """Floating-point operations per prediction."""
 
     @property
+    def card(self) -> ModelCard | None:
+        """What a trained model's folder says of it; ``None`` without training."""
+
+    @property
+    def origin(self) -> str:
+        """Where its predictions come from, in words."""
+
+    @property
     def vehicle(self) -> Vehicle | None:
         """Car that it is for; ``None`` if any."""
 
@@ -62,6 +70,8 @@ class Persistence:
     H = 1
     commands: Commands | None = None
     vehicle = None
+    card: ModelCard | None = None
+    origin = "the next state is the present one"
     parameters = 0
     flops = 0
 
@@ -76,6 +86,7 @@ class SingleTrack:
     name = "single_track"
     H = 1
     commands: Commands | None = None
+    card: ModelCard | None = None
     parameters = 0
 
     def __init__(self, vehicle: Vehicle, integrator: Integrator = "euler", substeps: int = 1) -> None:
@@ -86,6 +97,11 @@ class SingleTrack:
         self._integrator: Integrator = integrator
         self._substeps = substeps
         self.flops = count_operations(self.predict, np.ones((1, self.H, len(WINDOW_COLUMNS))))
+
+    @property
+    def origin(self) -> str:
+        """The vehicle file."""
+        return f"nominal single-track model of vehicle {self.vehicle.name}, no learning"
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Steps the physics from the last row of each window."""
@@ -145,6 +161,7 @@ class OnnxModel:
     def __init__(self, artifact: Artifact) -> None:
         card = artifact.card
         self.artifact = artifact
+        self.card: ModelCard = card
         self.name = card.name
         self.T_s = card.sampling_time
         self.H = card.window
@@ -176,6 +193,17 @@ class OnnxModel:
         self._binding.bind_cpu_input("window", self._window)
         for name in self._outputs:
             self._binding.bind_output(name)
+
+    @property
+    def origin(self) -> str:
+        """Kind, window, command protocol, vehicle and physics."""
+        card = self.card
+        steps = f"{card.substeps} step{'s' if card.substeps > 1 else ''}"
+        physics = f", integrator {card.integrator} with {steps}" if card.architecture.get("physics") else ""
+        return (
+            f"{card.kind}, window {card.window} rows, trained with commands '{card.commands}', vehicle "
+            f"{card.vehicle.name}{physics}"
+        )
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Runs the graph on ``windows``; a graph without variances has those of the validation data everywhere."""

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from dynssm_ros.arrays import normal_equations
 from dynssm_ros.learning.models.dynssm.config import EstimationConfig
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 
@@ -60,8 +61,8 @@ class InWindowEstimation(nn.Module):
             moved = physics(cars).transpose(1, 2).flatten(2) / self.config.noise  # (B, 1 + K, 3 steps)
             now, slopes = moved[:, :1], moved[:, 1:] - moved[:, :1]
             errors = happened.flatten(1)[:, None] / self.config.noise - now
-            A = slopes @ slopes.transpose(1, 2) + unit
-            x = solved(A, slopes @ (errors.transpose(1, 2) + slopes.transpose(1, 2) @ x))
+            J = slopes.transpose(1, 2)
+            x = solved(*normal_equations(J, errors.transpose(1, 2) + J @ x, unit))
             theta = torch.clamp(nominal + x[:, :, 0] @ self.directions, self.lower, self.upper)
         return theta
 
