@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
+from dynssm_ros.progress import Progress
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
 from dynssm_ros.vehicle import Vehicle, load_vehicle
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from dynssm_ros.track.racing_line import LineKind
     from dynssm_ros.track.tracks import Track
 
-Progress = Callable[[int, int], None]
 PathLike = str | Path
 Log = Recording | PathLike
 """A recording, or the Parquet file of one."""

@@ -25,7 +25,7 @@ FLOORS = (  # lowest first; a room imports itself and the floors below, never an
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
-GROUND = {"arrays", "configuration", "errors", "extras", "files"}  # for all rooms, so they import none
+GROUND = {"arrays", "configuration", "errors", "extras", "files", "progress"}  # for all rooms, so they import none
 TOP = {"__init__", "api"}  # the Python API: over all rooms but those that call it
 
 ROS = {

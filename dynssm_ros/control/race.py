@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,14 +21,13 @@ from dynssm_ros.control.controller import LOST, Controller
 from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
+from dynssm_ros.progress import NamedProgress
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.simulation.plant import PlantKind, make_plant, plant_type
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Applied, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.low_speed import LowSpeedRolling
-
-Progress = Callable[[int, int, str], None]
 
 PATIENCE = 3.0  # laps at the line's own speed that a lap may take
 
@@ -244,7 +242,7 @@ class _Drive:
         return ""
 
 
-def race(course: Course, model: PredictionModel, progress: Progress | None = None) -> Race:
+def race(course: Course, model: PredictionModel, progress: NamedProgress | None = None) -> Race:
     """Drives the laps of ``course`` with ``model`` in the controller.
 
     Args:

@@ -7,7 +7,7 @@ estimated with them. What the vehicle file knows of a coefficient (its standard 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -19,13 +19,12 @@ from dynssm_ros.errors import RecordingError
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
 from dynssm_ros.identification.windows import RecordedRows, SimulationWindows, fit_windows, recorded_rows
+from dynssm_ros.progress import Progress
 from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.single_track import Integrator
-
-Progress = Callable[[int, int], None]
 
 HORIZONS_S = (0.5, 0.25, 0.1)
 """Lengths of the simulations: the first for which a recording has stretches enough."""

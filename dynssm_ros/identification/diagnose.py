@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -25,6 +25,7 @@ from dynssm_ros.identification.windows import (
     held_out_windows,
     recorded_rows,
 )
+from dynssm_ros.progress import OnProgress
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
@@ -34,7 +35,6 @@ from dynssm_ros.vehicle.effects import EFFECTS, require_context
 from dynssm_ros.vehicle.single_track import Integrator
 
 Verdict = Literal["effects", "none", "unexplained"]
-OnProgress = Callable[[str], None]
 
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25

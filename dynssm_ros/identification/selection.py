@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -13,9 +13,8 @@ from dynssm_ros.identification.candidates import Candidate, Responses, ScoredCan
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
+from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS
-
-OnProgress = Callable[[str], None]
 
 DECISIVE_DELTA_BIC = 10.0  # difference in the information criterion that counts as very strong (Kass and Raftery 1995)
 AMBIGUITY_DELTA_BIC = 6.0  # the same that is hardly strong: explanations that are not farther apart are not told apart

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,11 @@ from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import COMPONENTS, LossConfig, Scales, scales
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel, TrainingConfig
+from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
 
 History = dict[str, list[float]]
-Progress = Callable[[int, int, str], None]
-"""Called after each epoch with epochs done, epochs at most, and a line about them."""
 
 _LEARNING_RATE_FLOOR = 0.02  # the cosine schedule ends at this fraction of the learning rate
 
@@ -95,7 +93,7 @@ class Optimisation:
             history={f"{part}/{term}": [] for part in ("train", "validation") for term in COMPONENTS}
         )
 
-    def run(self, progress: Progress | None) -> OptimisationResult:
+    def run(self, progress: NamedProgress | None) -> OptimisationResult:
         """Trains until the validation loss stops falling; returns the best model.
 
         Raises:

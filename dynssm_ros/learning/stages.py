@@ -13,7 +13,8 @@ from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.learning.dataset import TrainingWindows, all_windows, normalisation, split_windows
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.learning.models.registry import build_model
-from dynssm_ros.learning.optimisation import History, Optimisation, OptimisationResult, Progress
+from dynssm_ros.learning.optimisation import History, Optimisation, OptimisationResult
+from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
@@ -57,7 +58,7 @@ def train(
     vehicle: Vehicle,
     checkpoint: Path,
     device: str = "cpu",
-    progress: Progress | None = None,
+    progress: NamedProgress | None = None,
     calibrate: Calibrate | None = None,
 ) -> Trained:
     """Trains a model; ``checkpoint`` is kept up to date and continued from if it belongs to the same training.
@@ -82,7 +83,7 @@ def train(
     files = checkpoints(config, checkpoint)
 
     def run(
-        data: Recording, of: ModelConfig, file: Path, progress: Progress | None, start: Trained | None = None
+        data: Recording, of: ModelConfig, file: Path, progress: NamedProgress | None, start: Trained | None = None
     ) -> Trained:
         car = calibrate(data, vehicle) if calibrate is not None and of.calibrates else vehicle
         return _train(data, of, car, file, device, progress, start)
@@ -151,8 +152,8 @@ def _can_be_trained_on(recording: Recording, config: ModelConfig, vehicle: Vehic
     return True
 
 
-def _stage(progress: Progress | None, name: str, stage: int, epochs: tuple[int, ...]) -> Progress | None:
-    """Progress of one of several stages, in epochs of all."""
+def _stage(progress: NamedProgress | None, name: str, stage: int, epochs: tuple[int, ...]) -> NamedProgress | None:
+    """NamedProgress of one of several stages, in epochs of all."""
     if progress is None:
         return None
     before = sum(epochs[:stage])
@@ -165,7 +166,7 @@ def _train(
     vehicle: Vehicle,
     checkpoint: Path,
     device: str,
-    progress: Progress | None,
+    progress: NamedProgress | None,
     start: Trained | None = None,
 ) -> Trained:
     """One stage; ``start`` is the outcome of the stage before."""

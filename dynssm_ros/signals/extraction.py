@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from dynssm_ros.errors import BagError
+from dynssm_ros.progress import Progress
 from dynssm_ros.signals.bags import Bag, open_bag
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import Stream, resample
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, SignalMap
-
-Progress = Callable[[int, int], None]
-"""Called with the number of messages done and the number of all."""
 
 
 def extract(

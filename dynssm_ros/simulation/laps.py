@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
+from dynssm_ros.progress import Progress
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import POSE_SIGNALS
@@ -28,9 +29,6 @@ from dynssm_ros.vehicle.kinematics import Pose
 
 START_TIME = 1_000_000_000_000_000_000  # ns: the stamp of the first sample; a fixed one, so that runs repeat
 DEFAULT_STYLE = Style()
-
-Progress = Callable[[int, int], None]
-"""Called with the simulated milliseconds or metres done and the number of all."""
 
 
 class SimulationError(UserError):
