@@ -187,11 +187,12 @@ def test_every_verdict_is_explained_and_every_explained_one_exists() -> None:
 
 def test_the_switches_that_pages_name_are_fields_of_model_files() -> None:
     fields = load_model_config("dynssm").model_dump()
-    for page in ("tuning.md", "paper.md"):
-        for name in re.findall(r"^\| [^|]*`([a-z_]+(?:\.[a-z_]+)?)` \|", PAGES[page], flags=re.M):
-            block, _, field = name.partition(".")
-            assert block in fields, name
-            assert not field or field in fields[block], name
+    named = [*table("block", PAGES["tuning.md"]), *(row[0] for row in table("deviation", PAGES["paper.md"]).values())]
+    assert len(named) > 10
+    for name in re.findall(r"[a-z_]+(?:\.[a-z_]+)?", " ".join(re.sub(r": \w+", "", each) for each in named)):
+        block, _, field = name.partition(".")
+        assert block in fields, name
+        assert not field or field in fields[block], name
 
 
 def test_the_extras_of_the_installation_page_are_those_of_the_package() -> None:
@@ -200,7 +201,9 @@ def test_the_extras_of_the_installation_page_are_those_of_the_package() -> None:
 
 def test_the_vehicle_file_of_the_tutorial_is_one() -> None:
     car = load_vehicle(ROOT / "examples" / "racer_1_10.yaml")
-    described = re.findall(r"^\| `(\w+)`", PAGES["my_car.md"], flags=re.M)
+    described = re.findall(r"\w+", " ".join(table("field", PAGES["my_car.md"])))
+    coefficients = re.findall(r"\w+", " ".join(table("coefficient", PAGES["my_car.md"])))
+    assert set(coefficients) == set(car.coefficients)
     assert {"m", "l_f", "l_r", "h_cg", "F_z0", "load_transfer", "sampling_time", "minimum_speed", "inputs"} <= set(
         described
     )
