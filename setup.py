@@ -20,11 +20,11 @@ def shared(*folders):
 
 EXTRAS = {
     # training, calibration and diagnosis
-    "train": ["torch>=2.13", "onnx>=1.17", "onnxscript>=0.5", "scipy>=1.11"],
+    "train": ["torch>=2.13", "onnx>=1.17", "onnxscript>=0.5", "scipy>=1.12"],
     # tracks, simulated cars and the controller: derivatives of the vehicle equations, and the DAQP solver
-    "race": ["casadi>=3.7", "scipy>=1.11"],
+    "race": ["casadi>=3.8", "scipy>=1.12"],
     # figures and pages
-    "report": ["matplotlib>=3.9", "jinja2>=3.1", "scipy>=1.11"],
+    "report": ["matplotlib>=3.9", "jinja2>=3.1", "scipy>=1.12"],
     # ROS 2 Jazzy as wheels, for machines without it; a sourced ROS installation provides the same modules
     "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
 }
@@ -48,7 +48,7 @@ setup(
     # The floors are the oldest that pass the tests together; `constraints.txt` has the versions of `make demo`. The core is
     # what a car needs to extract, replay and predict; dynssm_ros/extras.py says which library belongs to which extra.
     install_requires=[
-        "setuptools",  # the console scripts that colcon writes
+        "setuptools>=61",  # the console scripts that colcon writes
         "numpy>=1.26",
         "onnxruntime>=1.19",  # the deployed predictor
         "safetensors>=0.4",  # weights without pickle
