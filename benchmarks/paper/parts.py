@@ -10,7 +10,7 @@ from benchmarks.paper.plan import Part, Quantity, Range
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.recording import Recording
 
-SMOOTHING = 1.0  # s; regimes are told apart by means over this, so that they come in stretches
+SMOOTHING = 1.0  # s; regimes are defined by means over this, so that they come in stretches
 
 
 def cut(recording: Recording, part: Part) -> Recording:

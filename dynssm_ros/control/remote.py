@@ -1,4 +1,4 @@
-"""What a predictor elsewhere says of the car, as the controller's knowledge: its answers come late, singly or not at all."""
+"""The prediction model of a controller whose predictor is another process: answers come late, singly or not at all."""
 
 from __future__ import annotations
 

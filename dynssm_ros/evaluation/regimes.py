@@ -15,7 +15,7 @@ from dynssm_ros.signals.inputs import applied_inputs
 
 COASTING = 0.02  # applied throttle (fraction) that neither drives nor brakes to speak of
 QUANTITIES = {"speed": "speed", "lateral_acceleration": "lateral acceleration", "throttle": "throttle"}
-"""What the regimes are told apart by, with their titles."""
+"""Quantities that define the regimes, with their titles."""
 
 
 @dataclass(frozen=True)

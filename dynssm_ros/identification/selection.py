@@ -17,7 +17,7 @@ from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS
 
 DECISIVE_DELTA_BIC = 10.0  # difference in the information criterion that counts as very strong (Kass and Raftery 1995)
-AMBIGUITY_DELTA_BIC = 6.0  # the same that is hardly strong: explanations that are not farther apart are not told apart
+AMBIGUITY_DELTA_BIC = 6.0  # candidates within this delta BIC are reported as alternatives
 _SHORTLIST = 9  # candidates of which several sizes are tried in each round
 _SHORTLIST_WINDOWS = 150  # windows on which they are tried
 _REFINED = 4  # of them are fitted in full
@@ -78,7 +78,7 @@ class _CandidateStart(NamedTuple):
 
 
 class Search:
-    """Selects effects by the information criterion and by what they improvement on parts of the data left out.
+    """Selects effects by the information criterion and by the improvement on parts of the data that were left out.
 
     Args:
         problem: the windows.

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis and of a battery of cases."""
+"""Figures of a diagnosis and of the hidden-cause benchmark."""
 
 from __future__ import annotations
 

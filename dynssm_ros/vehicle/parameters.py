@@ -1,4 +1,4 @@
-"""The vehicle file: constants, coefficients with bounds and knowledge, input limits, effects.
+"""The vehicle file: constants, coefficients with bounds and standard deviations, input limits, effects.
 
 Names and units are the paper's (Table I); a file is checked completely when it is read, so inside the package a
 :class:`Vehicle` is trusted.

@@ -1,4 +1,4 @@
-"""The battery of hidden causes: its cases, and how they are judged."""
+"""The hidden-cause benchmark: its cases, and how they are judged."""
 
 from __future__ import annotations
 

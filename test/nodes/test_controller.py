@@ -108,7 +108,7 @@ class Stand:
             self.send_odometry()
             if parameters:
                 self.send_parameters(**parameters)
-            pause.wait(PERIOD / 1e9)  # nobody sets it: the speed_scale of a car
+            pause.wait(PERIOD / 1e9)  # nobody sets it: the rate of a car
         return until()
 
     def _keep(self, place: list, message: Odometry | JointState) -> None:
