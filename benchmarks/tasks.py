@@ -1,8 +1,7 @@
 """Benchmarks as tasks of doit, the workflow tool: what is done is kept, and made again when what it is made of changes.
 
-doit, Snakemake and DVC were compared. Snakemake has a language of its own and some forty dependencies. DVC ties every
-stage to a shell command and the data to git. doit is one small package, and its tasks are Python: they call our functions
-with our values. It notes its state only at its end, so that a kill would lose hours; :class:`NotingDB` notes it task by task.
+Why doit: CONTRIBUTING.md. It notes its state only at its end, so that a kill would lose hours; :class:`NotingDB` notes it
+task by task.
 """
 
 from __future__ import annotations

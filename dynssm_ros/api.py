@@ -257,6 +257,7 @@ def evaluate(
     stride: int = 1,
     track: Track | PathLike | None = None,
     on_progress: Progress | None = None,
+    name: str = "",
 ) -> Evaluation:
     """Scores models on a recording: one-step errors, rollouts, displacement, coverage, latency.
 
@@ -271,6 +272,7 @@ def evaluate(
         stride: a rollout starts at every ``stride``-th row.
         track: on which errors are placed; if not given, the first full lap of the recording.
         on_progress: called with predictions made.
+        name: of the recording, for people; that of its file, or its sources, if not given.
 
     Example:
         >>> laps = recorded(simulate("orca", "club", duration=10.0))
@@ -291,7 +293,8 @@ def evaluate(
         if holdout <= 0:
             raise ConfigurationError(f"--holdout {holdout:g}: expected a fraction above 0 and up to 1")
         log, split = log.split_last(holdout)[1], f"last {100 * holdout:.3g} % of the recording, as one block"
-    name = Path(recording).name if isinstance(recording, (str, Path)) else ""
+    if not name and isinstance(recording, (str, Path)):
+        name = Path(recording).name
     return evaluate(log, opened, name, split, min_speed, horizon, stride, line=line, progress=on_progress)
 
 

@@ -11,8 +11,6 @@ Vector = npt.NDArray[np.float64]
 """Real numbers in double precision; docstrings say the shape."""
 Indices = npt.NDArray[np.intp]
 """Row numbers."""
-Mask = npt.NDArray[np.bool_]
-"""Which rows or entries are meant."""
 
 
 def normal_equations(J: Any, r: Any, precision: Any) -> tuple[Any, Any]:

@@ -151,7 +151,10 @@ def test_the_example_of_the_api_page_runs(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     write_run(dynssm_ros.simulate("orca", "club", duration=40.0, noise=(0.01, 0.01, 0.03)), "bag")
     (block,) = re.findall(r"```python\n(.*?)```", PAGES["api.md"], re.S)
-    exec(compile(block, "api.md", "exec"), {})
+    made: dict[str, object] = {}
+    exec(compile(block, "api.md", "exec"), made)
+    assert set(made["scored"].scores) == {"ridge", "single_track", "persistence"}  # type: ignore[attr-defined]
+    assert (tmp_path / "car.yaml").is_file()
 
 
 def test_every_equation_of_the_paper_is_where_the_page_says() -> None:

@@ -15,14 +15,13 @@ from dynssm_ros.control.settings import Objective
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.registry import load_model_config, merge
-from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma
+from dynssm_ros.runtime.models import UNTRAINED
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.track.racing_line import LineKind
 from dynssm_ros.vehicle.parameters import EffectEntry
 
 Quantity = Literal["time", "speed", "yaw_rate", "lateral_acceleration"]
-UNTRAINED = (Persistence.name, SingleTrack.name, SingleTrackEwma.name)
 MID_RANGE = "mid_range"
 FIXED = (TRUE, MID_RANGE, *UNTRAINED)
 """Models of a race that need no training: the plant's own, the middle of the bounds, and those on the calibrated car."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.paper.plan import FIXED, UNTRAINED, Plan, Race, Split
+from benchmarks.paper.plan import FIXED, Plan, Race, Split
 from benchmarks.paper.racing import DriveLaps
 from benchmarks.paper.steps import (
     Calibrate,
@@ -19,6 +19,7 @@ from benchmarks.paper.steps import (
     Train,
     recording_key,
 )
+from dynssm_ros.runtime.models import UNTRAINED
 from dynssm_ros.signals.signal_map import Commands
 
 

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from benchmarks.paper.parts import cut
-from benchmarks.paper.plan import UNTRAINED, Car, Drive, Log, Part
+from benchmarks.paper.plan import Car, Drive, Log, Part
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.metrics import by_channel, latency_us
@@ -26,7 +26,7 @@ from dynssm_ros.evaluation.open_loop import Evaluation, evaluate
 from dynssm_ros.files import write_json
 from dynssm_ros.identification.calibration import calibrate
 from dynssm_ros.learning.models.base import ModelConfig
-from dynssm_ros.runtime.models import WindowModel, load_model
+from dynssm_ros.runtime.models import UNTRAINED, WindowModel, load_model
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording

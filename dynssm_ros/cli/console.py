@@ -26,6 +26,10 @@ CommandsOption = Annotated[
     Commands | None,
     typer.Option("--commands", help="Source of the command inputs; the signal map's or recording's own if not given."),
 ]
+CourseOption = Annotated[
+    str,
+    typer.Option("--track", help="Track: oval, road_course, club, club_b, or a file x_m,y_m,w_tr_right_m,w_tr_left_m."),
+]
 MinSpeedOption = Annotated[
     float | None,
     typer.Option(

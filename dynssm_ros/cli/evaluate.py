@@ -71,7 +71,7 @@ def evaluate(
         )
     with progress_bar("evaluating") as progress:
         evaluation = api.evaluate(
-            recording, models, vehicle, holdout, commands, min_speed, horizon, stride, track, progress
+            log, models, vehicle, holdout, commands, min_speed, horizon, stride, track, progress, recording.name
         )
     open_loop_report(evaluation).save(out / "report.html")
     with replacing(out / "results.md") as aside:

@@ -9,6 +9,7 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.cli.console import (
+    CourseOption,
     EffectOption,
     JsonOption,
     PlantOption,
@@ -23,9 +24,7 @@ from dynssm_ros.extras import require
 
 def race(
     vehicle: VehicleOption,
-    track: Annotated[
-        str, typer.Option(help="Track: oval, road_course, club, club_b, or a file x_m,y_m,w_tr_right_m,w_tr_left_m.")
-    ],
+    track: CourseOption,
     model: Annotated[
         list[str],
         typer.Option(

@@ -9,6 +9,7 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.cli.console import (
+    CourseOption,
     EffectOption,
     JsonOption,
     PlantOption,
@@ -27,9 +28,7 @@ if TYPE_CHECKING:
 
 def simulate(
     vehicle: VehicleOption,
-    track: Annotated[
-        str, typer.Option(help="Track: oval, road_course, club, club_b, or a file x_m,y_m,w_tr_right_m,w_tr_left_m.")
-    ],
+    track: CourseOption,
     out: Annotated[Path, typer.Option(help="rosbag2 folder to write (MCAP).")],
     duration: Annotated[float | None, typer.Option(help="Time to drive (s); 60 if neither this nor --laps.")] = None,
     laps: Annotated[float | None, typer.Option(help="Laps to drive, instead of a duration.")] = None,

@@ -7,12 +7,11 @@ from pathlib import Path
 from dynssm_ros.control.horizon_model import SteppedCar
 from dynssm_ros.control.prediction_model import Adaptive, Fixed, PredictionModel
 from dynssm_ros.errors import ArtifactError, ConfigurationError
-from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma, WindowModel, load_model
+from dynssm_ros.runtime.models import UNTRAINED, SingleTrack, WindowModel, load_model
 from dynssm_ros.simulation.plant import PlantKind, plant_type
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 
 TRUE = "true"
-UNTRAINED = tuple(each.name for each in (Persistence, SingleTrack, SingleTrackEwma))
 SHARED = ("m", "l_f", "l_r")  # what makes it the same car
 
 

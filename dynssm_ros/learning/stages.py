@@ -153,7 +153,7 @@ def _can_be_trained_on(recording: Recording, config: ModelConfig, vehicle: Vehic
 
 
 def _stage(progress: NamedProgress | None, name: str, stage: int, epochs: tuple[int, ...]) -> NamedProgress | None:
-    """NamedProgress of one of several stages, in epochs of all."""
+    """Progress of one of several stages, in epochs of all."""
     if progress is None:
         return None
     before = sum(epochs[:stage])

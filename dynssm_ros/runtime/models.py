@@ -149,6 +149,10 @@ class SingleTrackEwma(SingleTrack):
         return WindowPrediction(corrected, np.tile(self._theta, (count, 1)), physics)
 
 
+UNTRAINED = (Persistence.name, SingleTrack.name, SingleTrackEwma.name)
+"""Names of the models that need no training."""
+
+
 class OnnxModel:
     """A trained model, run by ONNX Runtime on one core.
 
@@ -263,5 +267,4 @@ def load_model(name_or_dir: str | Path, vehicle: Vehicle | None = None) -> Windo
             if vehicle is None:
                 raise ConfigurationError(f"model {name_or_dir}: needs --vehicle")
             return physical(vehicle)
-    names = ", ".join(each.name for each in (Persistence, SingleTrack, SingleTrackEwma))
-    raise ConfigurationError(f"model '{name_or_dir}': neither a model folder nor one of {names}")
+    raise ConfigurationError(f"model '{name_or_dir}': neither a model folder nor one of {', '.join(UNTRAINED)}")
