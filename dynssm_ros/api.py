@@ -288,6 +288,7 @@ def evaluate(
     opened = models if isinstance(models, Mapping) else open_models(models, vehicle)
     line = first_lap(log) if track is None else _centre_line(track, log)
     log = log.with_commands(commands or shared_commands(opened))
+    opened = with_offline(opened)
     split = "whole recording"
     if holdout is not None:
         if holdout <= 0:
@@ -306,6 +307,18 @@ def open_models(
     return disambiguated(opened, lambda model: model.name)
 
 
+def with_offline(models: Mapping[str, WindowModel]) -> dict[str, WindowModel]:
+    """Models, each that has an online layer followed by itself without it."""
+    from dynssm_ros.runtime.models import OnnxModel
+
+    both: dict[str, WindowModel] = {}
+    for label, model in models.items():
+        both[label] = model
+        if isinstance(model, OnnxModel) and model.online is not None:
+            both[f"{label} (offline)"] = model.offline()
+    return both
+
+
 def disambiguated(opened: Mapping[str, Any], name: Callable[[Any], str]) -> dict[str, Any]:
     """What was opened, by name; where several have the same one, by what was given."""
     called = [name(each) for each in opened.values()]
@@ -320,8 +333,21 @@ def replay(
     with_inputs: bool = False,
     max_age: float = 0.2,
     on_progress: Progress | None = None,
+    online: bool = True,
+    online_state: PathLike | None = None,
 ) -> Any:
     """Predicts offline what the node would have published for a bag, into a new bag.
+
+    Args:
+        bag: what was recorded.
+        model: model folder.
+        out: the new bag.
+        signals: signal map: which topic and field is which signal.
+        with_inputs: also copy all topics of ``bag``.
+        max_age: oldest actuator sample that a prediction may rest on (s).
+        on_progress: called with messages read.
+        online: whether the model's online layer learns and corrects, if it has one.
+        online_state: file of what it has learned: read before, if it is there, and written after.
 
     Returns:
         The number of predictions, the refusals by reason, and notes on a bag that had to be recovered.
@@ -336,8 +362,14 @@ def replay(
     from dynssm_ros.runtime.replay import replay_to_bag
 
     signal_map = signals if isinstance(signals, SignalMap) else load_signal_map(signals)
-    predictor = Predictor(OnnxModel(open_artifact(model)), signal_map, max_age)
-    return replay_to_bag(Path(bag), predictor, Path(out), with_inputs, on_progress)
+    predictor = Predictor(OnnxModel(open_artifact(model)), signal_map, max_age, online)
+    state = None if online_state is None else Path(online_state)
+    if state is not None and state.exists():
+        predictor.load_online(state)
+    outcome = replay_to_bag(Path(bag), predictor, Path(out), with_inputs, on_progress)
+    if state is not None:
+        predictor.save_online(state)
+    return outcome
 
 
 def diagnose(

@@ -22,10 +22,22 @@ def replay(
     max_age: Annotated[
         float, typer.Option(help="Oldest actuator sample that a prediction may rest on (s).", min=0.0)
     ] = 0.2,
+    online: Annotated[
+        bool, typer.Option("--online/--offline", help="Whether the model's online layer learns and corrects.")
+    ] = True,
+    online_state: Annotated[
+        Path | None,
+        typer.Option(
+            help="File of what the online layer has learned: read first if it is there, and written at the end.",
+            dir_okay=False,
+        ),
+    ] = None,
 ) -> None:
     """Predict offline what the node would have published for a bag."""
     with progress_bar("replaying") as progress:
-        count, refusals, notes = api.replay(bag, model, out, signals, with_inputs, max_age, progress)
+        count, refusals, notes = api.replay(
+            bag, model, out, signals, with_inputs, max_age, progress, online, online_state
+        )
     for note in notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     reasons = ", ".join(f"{number} x {refusal.value}" for refusal, number in refusals.items())

@@ -10,7 +10,9 @@ from time import perf_counter_ns
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.runtime.models import WindowModel, WindowPrediction
+from dynssm_ros.runtime.models import WindowModel, WindowPrediction, corrected
+from dynssm_ros.runtime.online import Learned, Seen
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 Tick = Callable[[int], None]
@@ -40,7 +42,12 @@ def gather(matrix: Vector, rows: Indices, before: int, after: int = 0) -> Vector
 
 
 def predict_rows(
-    model: WindowModel, matrix: Vector, rows: Indices, batch: int = BATCH, tick: Tick = silent
+    model: WindowModel,
+    matrix: Vector,
+    rows: Indices,
+    batch: int = BATCH,
+    tick: Tick = silent,
+    learned: Learned | None = None,
 ) -> WindowPrediction:
     """The model's predictions of the rows that follow ``rows``; windows exist only for one batch at a time.
 
@@ -50,11 +57,17 @@ def predict_rows(
         rows: last row of each window, shape ``(M,)``, ``M > 0``.
         batch: windows per call.
         tick: told of progress.
+        learned: what the model's online layer had learned at ``rows``; ``None``: it stays out.
     """
     parts = []
     for start in range(0, len(rows), batch):
         chunk = rows[start : start + batch]
-        parts.append(model.predict(gather(matrix, chunk, model.H - 1)))
+        windows = gather(matrix, chunk, model.H - 1)
+        predicted = model.predict(windows)
+        if model.online is not None and learned is not None:
+            known = learned.at(np.arange(start, start + len(chunk)))
+            predicted = corrected(predicted, windows, model.online, known)
+        parts.append(predicted._replace(seen=None))
         tick(len(chunk))
     return WindowPrediction(
         np.concatenate([part.state for part in parts]),
@@ -62,6 +75,32 @@ def predict_rows(
         _join([part.physics for part in parts]),
         _join([part.variance for part in parts]),
     )
+
+
+def learned_while_driving(
+    model: WindowModel, recording: Recording, batch: int = BATCH
+) -> tuple[Indices, Learned] | None:
+    """What the model's online layer has learned at each row of a recording that it drives through in order.
+
+    It learns wherever its window is whole and the car is not slower than its minimum speed.
+
+    Returns:
+        The rows, ascending, and what was known there; ``None`` if nothing learns.
+    """
+    layer = model.online
+    if layer is None:
+        return None
+    matrix = recording.matrix
+    ends = recording.window_ends(model.H, 0, layer.minimum_speed)
+    parts = []
+    for start in range(0, len(ends), batch):
+        windows = gather(matrix, ends[start : start + batch], model.H - 1)
+        predicted = model.predict(windows)
+        assert predicted.seen is not None
+        parts.append(predicted.seen)
+    seen = Seen(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    following = np.minimum(ends + 1, len(matrix) - 1)
+    return ends, layer.drive(seen, matrix[following, :3] - matrix[ends, :3], ends)
 
 
 def rmse(errors: Vector) -> Vector:

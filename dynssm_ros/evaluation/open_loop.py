@@ -21,6 +21,7 @@ from dynssm_ros.evaluation.metrics import (
     finite,
     gather,
     latency_us,
+    learned_while_driving,
     max_error,
     predict_rows,
     rmse,
@@ -29,6 +30,7 @@ from dynssm_ros.evaluation.regimes import Regime, driving_regimes, regime_rmse
 from dynssm_ros.evaluation.rollout import default_horizon, score_rollouts
 from dynssm_ros.evaluation.score import Group, Score, grouped
 from dynssm_ros.runtime.models import WindowModel
+from dynssm_ros.runtime.online import Learned
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.track.lap_position import first_lap
@@ -203,7 +205,9 @@ def _score(
     matrix = recording.matrix
     increments = matrix[rows + 1, :3] - matrix[rows, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
-        predicted = predict_rows(model, matrix, rows, batch, tick)
+        drive = learned_while_driving(model, recording, batch)
+        at_rows, at_starts = (None, None) if drive is None else (_at(drive, rows), _at(drive, starts))
+        predicted = predict_rows(model, matrix, rows, batch, tick, at_rows)
         errors = predicted.state - matrix[rows + 1, :3]
         return Score(
             model=model,
@@ -215,9 +219,15 @@ def _score(
             coverage_90=None if predicted.variance is None else coverage(errors, predicted.variance),
             regime_rmse=regime_rmse(regimes, errors),
             coefficients=coefficient_statistics(predicted.theta, model.vehicle),
-            rollout=score_rollouts(model, matrix, starts, steps, recording.T_s, batch, tick),
+            rollout=score_rollouts(model, matrix, starts, steps, recording.T_s, batch, tick, at_starts),
             latency_us=latency_us(model, gather(matrix, rows[:50], model.H - 1), calls),
         )
+
+
+def _at(drive: tuple[Indices, Learned], rows: Indices) -> Learned:
+    """What was known at ``rows``; where the layer did not learn, what it knew before."""
+    ends, learned = drive
+    return learned.at(np.maximum(np.searchsorted(ends, rows, side="right") - 1, 0))
 
 
 def horizon_steps(horizon_s: float, T_s: float) -> int:

@@ -16,7 +16,8 @@ import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.metrics import BATCH, Tick, gather, silent
-from dynssm_ros.runtime.models import WindowModel
+from dynssm_ros.runtime.models import WindowModel, corrected
+from dynssm_ros.runtime.online import Learned
 from dynssm_ros.vehicle.kinematics import world_velocity
 
 
@@ -57,7 +58,7 @@ def default_horizon(T_s: float) -> float:
     return 0.3 if T_s <= 0.02 + 1e-9 else 0.6
 
 
-def roll_out(model: WindowModel, stretches: Vector, steps: int) -> Vector:
+def roll_out(model: WindowModel, stretches: Vector, steps: int, learned: Learned | None = None) -> Vector:
     """Predicts ``steps`` states recursively.
 
     Args:
@@ -65,6 +66,7 @@ def roll_out(model: WindowModel, stretches: Vector, steps: int) -> Vector:
         stretches: measured rows, shape ``(M, B + steps, 7)``; row ``B - 1`` is the start, ``B >= model.H``. The last
             row's state is not used.
         steps: length of the horizon.
+        learned: what the model's online layer had learned at the starts, and keeps over the horizon.
 
     Returns:
         Predicted states of the rows after the start, shape ``(M, steps, 3)``.
@@ -72,7 +74,11 @@ def roll_out(model: WindowModel, stretches: Vector, steps: int) -> Vector:
     fed_back = stretches.copy()
     start = stretches.shape[1] - steps
     for k in range(start, start + steps):
-        fed_back[:, k, :3] = model.predict(fed_back[:, k - model.H : k]).state
+        windows = fed_back[:, k - model.H : k]
+        predicted = model.predict(windows)
+        if model.online is not None and learned is not None:
+            predicted = corrected(predicted, windows, model.online, learned, in_rollout=k > start)
+        fed_back[:, k, :3] = predicted.state
     return fed_back[:, start:, :3]
 
 
@@ -125,6 +131,7 @@ def score_rollouts(
     T_s: float,
     batch: int = BATCH,
     tick: Tick = silent,
+    learned: Learned | None = None,
 ) -> Rollout:
     """Rolls the model out from all ``starts`` and compares with what was measured.
 
@@ -136,13 +143,15 @@ def score_rollouts(
         T_s: sampling time (s).
         batch: rollouts that run side by side.
         tick: told of progress.
+        learned: what the model's online layer had learned at ``starts``.
     """
     squares, distances = np.zeros((steps, 3)), np.zeros(steps)
     for begin in range(0, len(starts), batch):
         chunk = starts[begin : begin + batch]
         stretches = gather(matrix, chunk, model.H - 1, steps)
+        known = None if learned is None else learned.at(np.arange(begin, begin + len(chunk)))
         measured = stretches[:, model.H - 1 :, :3]
-        predicted = np.concatenate([measured[:, :1], roll_out(model, stretches, steps)], axis=1)
+        predicted = np.concatenate([measured[:, :1], roll_out(model, stretches, steps, known)], axis=1)
         squares += np.sum((predicted - measured)[:, 1:] ** 2, axis=0)
         distances += np.linalg.norm(path(predicted, T_s) - path(measured, T_s), axis=-1).sum(axis=0)
         tick(len(chunk) * steps)

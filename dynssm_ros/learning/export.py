@@ -26,10 +26,12 @@ from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import TrainableModel
 from dynssm_ros.learning.models.registry import build_model, parse_model_config
+from dynssm_ros.learning.online import OnlineFeatures
 from dynssm_ros.learning.stages import Trained
 from dynssm_ros.runtime.artifact import (
     CARD,
     METRICS,
+    ONLINE,
     ONNX,
     WEIGHTS,
     Artifact,
@@ -38,6 +40,7 @@ from dynssm_ros.runtime.artifact import (
     open_artifact,
     write_card,
 )
+from dynssm_ros.runtime.online import save_layer
 
 TOLERANCE = 1e-5
 """Largest difference between ONNX and torch, in units of each state's scale."""
@@ -58,13 +61,21 @@ def deployed_outputs(output: Output) -> dict[str, Tensor]:
 class _Deployed(nn.Module):
     """The outputs that are deployed, as a flat tuple."""
 
-    def __init__(self, model: TrainableModel) -> None:
+    def __init__(self, model: TrainableModel, features: OnlineFeatures | None) -> None:
         super().__init__()
-        model = copy.deepcopy(model).eval()
-        self.model = model.for_deployment()
+        self.model = copy.deepcopy(model).eval().for_deployment()
+        self.features = features
+
+    def named(self, window: Tensor) -> dict[str, Tensor]:
+        """The outputs by name."""
+        output = self.model(window)
+        named = deployed_outputs(output)
+        if self.features is not None:
+            named["features"], named["nominal_physics"] = self.features(window, output)
+        return named
 
     def forward(self, window: Tensor) -> tuple[Tensor, ...]:
-        return tuple(deployed_outputs(self.model(window)).values())
+        return tuple(self.named(window).values())
 
 
 def save_artifact(trained: Trained, out: Path, training: dict[str, object] | None = None) -> Artifact:
@@ -84,7 +95,9 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
     with replacing(out) as folder:
         folder.mkdir()
         save_file({name: value.contiguous() for name, value in model.state_dict().items()}, folder / WEIGHTS)
-        export_onnx(model, sample, folder / ONNX)
+        export_onnx(model, sample, folder / ONNX, trained.features)
+        if trained.online is not None:
+            save_layer(trained.online, folder / ONLINE)
         difference = check_export(model, sample, folder / ONNX, np.array(trained.normalisation.state_scale))
         metrics = _metrics(trained) | {"onnx_difference": difference}
         if trained.start is not None:
@@ -103,11 +116,12 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
             substeps=substeps,
             normalisation=trained.normalisation,
             covariance=tuple(value**2 for value in trained.validation_rmse),
+            online=None if trained.online is None else trained.online.card,
             parameters=sum(p.numel() for p in model.parameters()),
             flops=count_flops(model, trained.H),
             training={"recordings": list(trained.recording.info.source), "seed": config.training.seed}
             | (training or {}),
-            checksums={name: checksum(folder / name) for name in (WEIGHTS, ONNX, METRICS)},
+            checksums={each.name: checksum(each) for each in sorted(folder.iterdir())},
         )
         write_card(card, folder)
     return open_artifact(out)
@@ -132,12 +146,11 @@ def check_replaceable(out: Path) -> None:
         raise ArtifactError(f"{out}: exists and is not a model folder; not replaced")
 
 
-def export_onnx(model: TrainableModel, sample: Tensor, file: Path) -> None:
+def export_onnx(model: TrainableModel, sample: Tensor, file: Path, features: OnlineFeatures | None = None) -> None:
     """Writes the deployed graph: input ``window`` (N, H, 7), outputs ``increment``, and what else it has."""
-    deployed = _Deployed(model)
+    deployed = _Deployed(model, features)
     with torch.no_grad():
-        output = deployed.model(sample[:1])
-    names = list(deployed_outputs(output))
+        names = list(deployed.named(sample[:1]))
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")  # the exporter's own deprecations are not the user's concern

@@ -12,16 +12,20 @@ import torch
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.learning.dataset import TrainingWindows, all_windows, normalisation, split_windows
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
+from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.models.registry import build_model
+from dynssm_ros.learning.online import Drive, OnlineFeatures, fit_layer
 from dynssm_ros.learning.optimisation import History, Optimisation, OptimisationResult
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.runtime.online import OnlineLayer, Seen
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 
 Calibrate = Callable[[Recording, Vehicle], Vehicle]
 """Fits the nominal values of a vehicle to a recording."""
 
+_BATCH = 4096  # windows
 _SHORTER = 4  # how many times fewer epochs the models have that only tell how large errors are on unknown laps
 
 
@@ -45,6 +49,9 @@ class Trained:
     """Epochs that were already done, of all stages together."""
     start: Trained | None = None
     """The model that fine-tuning started from."""
+    features: OnlineFeatures | None = None
+    """What the online layer sees; ``None`` without one, as the next."""
+    online: OnlineLayer | None = None
 
     @property
     def H(self) -> int:
@@ -85,28 +92,75 @@ def train(
     def run(
         data: Recording, of: ModelConfig, file: Path, progress: NamedProgress | None, start: Trained | None = None
     ) -> Trained:
-        car = calibrate(data, vehicle) if calibrate is not None and of.calibrates else vehicle
+        wanted = calibrate is not None and (of.calibrates or of.online is not None)
+        car = calibrate(data, vehicle) if calibrate is not None and wanted else vehicle
         return _train(data, of, car, file, device, progress, start)
 
     if config.start is not None:
         stages: tuple[int, ...] = (config.start.training.effort[0], config.training.effort[0])
         first = run(recording, config.start, files[0], _stage(progress, config.start.name, 0, stages))
-        return run(recording, config, files[1], _stage(progress, config.name, 1, stages), first)
+        return _with_layer(run(recording, config, files[1], _stage(progress, config.name, 1, stages), first), [])
     parts = [np.arange(len(recording)) * config.parts // len(recording) == k for k in range(config.parts)]
     rests = [recording.select(~part) for part in parts]
+    left_out = [recording.select(part) for part in parts]
     if not rests or not all(_can_be_trained_on(rest, config, vehicle) for rest in rests):
-        return run(recording, config, checkpoint, progress)
+        return _with_layer(run(recording, config, checkpoint, progress), [])
     shorter = config.with_training(epochs=max(1, config.training.effort[0] // _SHORTER))
     stages = (config.training.effort[0], *[shorter.training.effort[0]] * len(parts))
     trained = run(recording, config, checkpoint, _stage(progress, config.name, 0, stages))
-    errors = []
-    for k, (part, rest, file) in enumerate(zip(parts, rests, files[1:], strict=True), 1):
+    if not trained.model.LEARNS:
+        return _with_layer(trained, [(trained.model, part) for part in left_out])
+    others = []
+    for k, (rest, file) in enumerate(zip(rests, files[1:], strict=True), 1):
         report = _stage(progress, f"{config.name} without part {k} of {len(parts)}", k, stages)
-        without = run(rest, shorter, file, report).model
-        unknown = all_windows(recording.select(part), trained.H, vehicle.minimum_speed)
-        errors.append(without.held_out_errors(*unknown.batch(slice(None))))
-    trained.model.fit_variance(*(torch.cat(each) for each in zip(*errors, strict=True)))
-    return trained
+        others.append(run(rest, shorter, file, report).model)
+    trained.model.fit_on_left_out(
+        [
+            (without, all_windows(part, trained.H, vehicle.minimum_speed))
+            for without, part in zip(others, left_out, strict=True)
+        ]
+    )
+    return _with_layer(trained, list(zip(others, left_out, strict=True)))
+
+
+def _with_layer(trained: Trained, left_out: list[tuple[TrainableModel, Recording]]) -> Trained:
+    """The model with its online layer, if it is to have one.
+
+    Args:
+        trained: the model.
+        left_out: parts of the recording, each with a model that was trained without it. If there are none, the prior is
+            fitted to what the model itself says of the recording.
+    """
+    config, vehicle = trained.config, trained.vehicle
+    if config.online is None:
+        return trained
+    integrator, substeps = config.stepping
+    features = OnlineFeatures(
+        config.online, vehicle, PhysicsConfig(integrator=integrator, substeps=substeps), trained.normalisation, trained.H,
+        trained.model.LEARNS,
+    )  # fmt: skip
+    known = left_out or [(trained.model, trained.recording)]
+    drives = [_drive(features, model, part, trained.H, vehicle.minimum_speed) for model, part in known]
+    layer = fit_layer(
+        [each for each in drives if len(each.ends)],
+        features.names,
+        config.online.memory,
+        trained.normalisation,
+        vehicle,
+    )
+    return replace(trained, features=features, online=layer)
+
+
+@torch.no_grad()
+def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording, H: int, min_speed: float) -> Drive:
+    """What the layer sees of all windows of a recording, with what ``model`` predicts from them."""
+    windows = all_windows(recording, H, min_speed)
+    parts = []
+    for begin in range(0, max(len(windows), 1), _BATCH):
+        window, target = windows.batch(slice(begin, begin + _BATCH))
+        parts.append((*features(window, model.eval()(window)), target))
+    seen, physics, increments = (torch.cat(each).double().numpy() for each in zip(*parts, strict=True))
+    return Drive(Seen(seen, physics), increments, windows.ends.numpy())
 
 
 def checkpoints(config: ModelConfig, checkpoint: Path) -> list[Path]:

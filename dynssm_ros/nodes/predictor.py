@@ -6,6 +6,7 @@ the README. All thinking is in :mod:`dynssm_ros.runtime`; this node converts, ca
 
 from __future__ import annotations
 
+import pathlib
 import time
 from functools import partial
 from typing import Any
@@ -24,11 +25,14 @@ from dynssm_ros.nodes.support import SENSOR_QOS, describe, diagnostics, message_
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.health import Health
 from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.online import expert_weights
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.decoding import TopicDecoder, decoders, header_stamp_ns
 from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, twist_covariance
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import COEFFICIENTS
+
+_SAVE_PERIOD_S = 10.0
 
 
 class PredictorNode(Node):
@@ -49,12 +53,24 @@ class PredictorNode(Node):
         self._horizon = describe(
             self, "horizon", 0.0, "Length of the rollout on /dynssm/horizon (s); 0 switches it off.", (0.0, 10.0)
         )
+        online = describe(
+            self, "online", True, "Whether the model's online layer learns and corrects, if it has one.", read_only=True
+        )
+        self._state = describe(
+            self,
+            "online_state",
+            "",
+            "File of what the online layer has learned: read at the start if it is there, written while driving.",
+            read_only=True,
+        )
         period = describe(
             self, "diagnostics_period", 1.0, "Time between /diagnostics (s).", (0.1, 60.0), read_only=True
         )
         if not path:
             raise ConfigurationError("parameter model: not set; expected a model folder, e.g. -p model:=out/model")
-        self._predictor = Predictor(OnnxModel(open_artifact(path)), load_signal_map(signals), max_age)
+        self._predictor = Predictor(OnnxModel(open_artifact(path)), load_signal_map(signals), max_age, online)
+        if self._state and pathlib.Path(self._state).exists():
+            self._predictor.load_online(pathlib.Path(self._state))
         self._swap: OnnxModel | None = None
 
         self._prediction = Odometry()
@@ -74,6 +90,8 @@ class PredictorNode(Node):
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self.create_timer(period, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        if self._state:
+            self.create_timer(_SAVE_PERIOD_S, self.save_online, clock=Clock(clock_type=ClockType.STEADY_TIME))
         model = self._predictor.model
         self.get_logger().info(
             f"{model.name} ({model.parameters} parameters): {model.H} rows of {model.T_s:g} s, commands {model.commands}"
@@ -155,11 +173,28 @@ class PredictorNode(Node):
                 f"model swapped: {self._predictor.model.name} from {self._predictor.model.artifact.path}"
             )
 
+    def save_online(self) -> None:
+        """Writes what the online layer has learned, if a file is named for it."""
+        if self._state:
+            try:
+                self._predictor.save_online(pathlib.Path(self._state))
+            except UserError as error:
+                self.get_logger().error(str(error))
+
+    def destroy_node(self) -> None:
+        """Keeps what was learned before the node ends."""
+        self.save_online()
+        super().destroy_node()
+
     def _diagnose(self) -> None:
         now = time.monotonic()
         level, words = self._health.verdict(now)
         values = {"model": self._predictor.model.name, "model folder": str(self._predictor.model.artifact.path)}
         vehicle = self._predictor.model.artifact.card.vehicle.name
+        if (state := self._predictor.online) is not None:
+            values["online steps"] = str(state.steps)
+            experts = expert_weights(state.layer, state.mean)
+            values |= {f"online weight of the {name}": f"{weight:.3f}" for name, weight in experts.items()}
         self._publish_diagnostics(
             diagnostics(self, "prediction", vehicle, level, words, values | self._health.values(now))
         )

@@ -1,4 +1,4 @@
-"""The model folder: ``model.yaml``, ``weights.safetensors``, ``model.onnx``, ``metrics.json``.
+"""The model folder: ``model.yaml``, ``weights.safetensors``, ``model.onnx``, ``metrics.json``, ``online.safetensors``.
 
 It is self-contained - architecture, vehicle with bounds, normalisation, sampling time and the checksums of the other
 files are in ``model.yaml`` - and nothing in it is ever unpickled. Whatever is wrong with a folder is found when it is
@@ -20,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError, ConfigurationError
+from dynssm_ros.runtime.online import OnlineLayer, OnlineLayerCard, load_layer
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle.parameters import Vehicle
@@ -27,6 +28,7 @@ from dynssm_ros.vehicle.single_track import Integrator
 
 FORMAT_VERSION = 1
 CARD, WEIGHTS, ONNX, METRICS = "model.yaml", "weights.safetensors", "model.onnx", "metrics.json"
+ONLINE = "online.safetensors"
 
 
 class Normalisation(StrictModel):
@@ -61,6 +63,7 @@ class ModelCard(StrictModel):
     substeps: int = Field(default=1, ge=1)
     normalisation: Normalisation
     covariance: tuple[float, float, float] = Field(description="one-step error variances on validation data")
+    online: OnlineLayerCard | None = Field(default=None, description="the online layer, if it has one")
     parameters: int = Field(ge=0, description="weights that training finds")
     flops: int = Field(ge=0, description="floating-point operations per prediction")
     training: dict[str, Any] = Field(default_factory=dict, description="data, split, seed, epochs")
@@ -70,9 +73,14 @@ class ModelCard(StrictModel):
     def _consistent(self) -> ModelCard:
         if self.columns != WINDOW_COLUMNS:
             raise ValueError(f"columns {self.columns} are not {WINDOW_COLUMNS}")
-        if set(self.checksums) != {WEIGHTS, ONNX, METRICS}:
-            raise ValueError(f"checksums {sorted(self.checksums)} are not those of {WEIGHTS}, {ONNX} and {METRICS}")
+        if set(self.checksums) != set(self.files):
+            raise ValueError(f"checksums {sorted(self.checksums)} are not those of {', '.join(self.files)}")
         return self
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The folder's other files."""
+        return (WEIGHTS, ONNX, METRICS, *([ONLINE] if self.online else []))
 
 
 @dataclass(frozen=True)
@@ -92,6 +100,18 @@ class Artifact:
         """The weights as trained."""
         return self.path / WEIGHTS
 
+    def online_layer(self) -> OnlineLayer | None:
+        """The online layer as trained, if it has one.
+
+        Raises:
+            ArtifactError: its file is damaged.
+        """
+        card = self.card
+        if card.online is None:
+            return None
+        scale = np.array(card.normalisation.increment_scale)
+        return load_layer(self.path / ONLINE, card.online, scale, card.sampling_time, card.vehicle.minimum_speed)
+
 
 def open_artifact(path: str | Path) -> Artifact:
     """Opens and checks a model folder.
@@ -107,6 +127,8 @@ def open_artifact(path: str | Path) -> Artifact:
             raise ArtifactError(f"{path}: incomplete model folder, {name} is missing")
     card = read_card(path)
     for name, expected in card.checksums.items():
+        if not (path / name).is_file():
+            raise ArtifactError(f"{path}: incomplete model folder, {name} is missing")
         try:
             found = checksum(path / name)
         except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -11,7 +12,8 @@ import onnxruntime as ort
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError, ConfigurationError
-from dynssm_ros.runtime.artifact import Artifact, ModelCard, open_artifact
+from dynssm_ros.runtime.artifact import ONLINE, Artifact, ModelCard, open_artifact
+from dynssm_ros.runtime.online import Learned, OnlineLayer, Seen
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle import Coefficients, State, Vehicle
@@ -30,6 +32,30 @@ class WindowPrediction(NamedTuple):
     """The physics' part of the prediction, shape ``(N, 3)``; ``None`` if the model has no physics."""
     variance: Vector | None = None
     """Error variances that the model states with its predictions, shape ``(N, 3)``; ``None`` if it states none."""
+    seen: Seen | None = None
+    """What the online layer sees; ``None`` if the model has no such layer."""
+
+
+def corrected(
+    prediction: WindowPrediction, windows: Vector, layer: OnlineLayer, learned: Learned, in_rollout: bool = False
+) -> WindowPrediction:
+    """A model's prediction with what its online layer had learned at each window.
+
+    Args:
+        prediction: of the model itself.
+        windows: that it is from, ``(N, H, 7)``.
+        layer: the model's.
+        learned: at the last measured row of each window.
+        in_rollout: whether the last rows are predicted ones; the correction is limited then.
+    """
+    assert prediction.seen is not None
+    now = windows[:, -1, :3]
+    increments = layer.increments(prediction.seen.features, learned.weights)
+    if in_rollout:
+        increments = layer.bounded(increments, prediction.seen.physics, learned.limit)
+    fast = (now[:, :1] >= layer.minimum_speed) | (layer.minimum_speed == 0.0)
+    state = np.where(fast, now + increments, prediction.state)
+    return prediction._replace(state=state, variance=learned.variance * layer.scale**2)
 
 
 class WindowModel(Protocol):
@@ -45,6 +71,8 @@ class WindowModel(Protocol):
     parameters: int
     flops: int
     """Floating-point operations per prediction."""
+    online: OnlineLayer | None
+    """What learns on top of it while the car drives; ``None`` if nothing does."""
 
     @property
     def card(self) -> ModelCard | None:
@@ -69,6 +97,7 @@ class Persistence:
     T_s = 0.0
     H = 1
     commands: Commands | None = None
+    online: OnlineLayer | None = None
     vehicle = None
     card: ModelCard | None = None
     origin = "the next state is the present one"
@@ -86,6 +115,7 @@ class SingleTrack:
     name = "single_track"
     H = 1
     commands: Commands | None = None
+    online: OnlineLayer | None = None
     card: ModelCard | None = None
     parameters = 0
 
@@ -174,6 +204,9 @@ class OnnxModel:
         self.parameters = card.parameters
         self.flops = card.flops
         self._validated = np.array([card.covariance])
+        self.online = artifact.online_layer()
+        self.prior = card.checksums.get(ONLINE, "")
+        """Names the prior of its online layer, for what was learned from it; empty without one."""
         options = ort.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
@@ -209,6 +242,12 @@ class OnnxModel:
             f"{card.vehicle.name}{physics}"
         )
 
+    def offline(self) -> OnnxModel:
+        """The same model without its online layer, under a name of its own."""
+        model = copy.copy(self)
+        model.name, model.online = f"{self.name} (offline)", None
+        return model
+
     def predict(self, windows: Vector) -> WindowPrediction:
         """Runs the graph on ``windows``; a graph without variances has those of the validation data everywhere."""
         if len(windows) == 1:
@@ -225,6 +264,9 @@ class OnnxModel:
             None if theta is None else theta.astype(np.float64),
             None if physics is None else now + physics,
             self._validated.repeat(len(windows), axis=0) if variance is None else variance.astype(np.float64),
+            None
+            if self.online is None
+            else Seen(by_name["features"].astype(np.float64), by_name["nominal_physics"].astype(np.float64)),
         )
 
 

@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.models import OnnxModel, WindowPrediction
+from dynssm_ros.runtime.online import OnlineState
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.signal_map import SignalMap
 from dynssm_ros.vehicle import State
@@ -49,15 +52,20 @@ class Predictor:
         model: the trained model.
         signal_map: where its inputs come from.
         max_age: how old the newest sample of a signal may be when odometry arrives (s).
+        online: whether the model's online layer learns and corrects, if it has one.
 
     Raises:
         ArtifactError: the model was trained with commands that do not exist live.
         ConfigurationError: the model needs command topics and the signal map has none.
     """
 
-    def __init__(self, model: OnnxModel, signal_map: SignalMap, max_age: float = 0.2) -> None:
+    def __init__(self, model: OnnxModel, signal_map: SignalMap, max_age: float = 0.2, online: bool = True) -> None:
         self.signal_map = live_signal_map(model, signal_map)
         self.history = History(self.signal_map, model.T_s, model.H, max_age)
+        self.online: OnlineState | None = None
+        """What the online layer has learned so far; ``None`` without one."""
+        self._learns = online
+        self.model = model
         self._set_model(model)
 
     def check_swap(self, model: OnnxModel) -> None:
@@ -73,12 +81,35 @@ class Predictor:
             )
 
     def swap(self, model: OnnxModel) -> None:
-        """Exchanges the model between two predictions; the samples received so far are kept."""
+        """Exchanges the model between two predictions; the samples received so far are kept.
+
+        What was learned online is kept by a model with the same prior, and forgotten by another.
+        """
         self.check_swap(model)
         self.history.resize(model.T_s, model.H)
         self._set_model(model)
 
+    def save_online(self, path: Path) -> None:
+        """Writes what was learned online, so that another stint can start with it; nothing without an online layer."""
+        if self.online is not None:
+            self.online.save(path, self.model.prior)
+
+    def load_online(self, path: Path) -> None:
+        """Goes on from what :meth:`save_online` wrote.
+
+        Raises:
+            ArtifactError: unreadable, or learned by another model; the model has no online layer.
+        """
+        if self.online is None:
+            raise ArtifactError(f"{path}: model {self.model.name} has no online layer, or it is switched off")
+        self.online.load(path, self.model.prior)
+
     def _set_model(self, model: OnnxModel) -> None:
+        if model.online is None or not self._learns:
+            self.online = None
+        elif self.online is None or self.model.prior != model.prior:
+            self.online = model.online.start()
+        self._row: _Row | None = None
         self.model = model
         self._scale = model.artifact.card.normalisation.increment_scale
         self._period = round(model.T_s * 1e9)
@@ -91,13 +122,20 @@ class Predictor:
         """Takes the odometry sample ``values`` at ``stamp`` (ns) and predicts the instant ``stamp + T_s``."""
         refusal = self.history.add(stamp, values)
         if refusal is not None:
+            if refusal is Refusal.JUMPED_BACK and self.online is not None:
+                self.online.reset()
+                self._row = None
             return refusal
         if not _finite(values.values()):  # the pose, which is no part of the window
             return Refusal.NOT_FINITE
         window = self.history.window(stamp)
         if isinstance(window, Refusal):
             return window
-        state, theta, physics, variance = self.model.predict(window[None])
+        predicted = self.model.predict(window[None])
+        if self.online is not None:
+            self._learn(stamp, window, predicted)
+            predicted = self._corrected(predicted, window)
+        state, theta, physics, variance = predicted[:4]
         now, following = window[-1, :3].tolist(), state[0].tolist()  # a few floats are faster than a small array
         if not (_finite(following) and _finite_row(theta) and _finite_row(variance)):
             return Refusal.BAD_PREDICTION
@@ -124,7 +162,10 @@ class Predictor:
             row = window[-1].copy()
             row[:3], row[3:5], row[5:7] = state, row[3:5] + row[5:7], 0.0
             window = np.concatenate([window[1:], row[None]])
-            following = self.model.predict(window[None]).state[0]
+            predicted = self.model.predict(window[None])
+            if self.online is not None:
+                predicted = self._corrected(predicted, window, in_rollout=True)
+            following = predicted.state[0]
             pose = advance_pose(SCALAR, poses[-1], State(*state.tolist()), State(*following.tolist()), self.model.T_s)
             if not _finite(pose):
                 break
@@ -132,10 +173,74 @@ class Predictor:
             state = following
         return poses
 
+    def _learn(self, stamp: int, window: Vector, predicted: WindowPrediction) -> None:
+        """Takes the steps of T_s that were completed by ``stamp``, each from a row to the next on the layer's own grid.
+
+        The grid is that of the odometry where its rate is 1 / T_s. Else rows between the messages are cut from the
+        history. Gaps and rows slower than the minimum speed teach nothing; after them the grid starts anew.
+        """
+        assert self.online is not None
+        slack = self._period // 100
+        row, self._row = self._row, None
+        kept: Vector | None = None
+        while row is not None and row.stamp + self._period <= stamp + slack:
+            due = row.stamp + self._period
+            if due >= stamp - slack:
+                row = self._learned_row(row, stamp, window if kept is None else kept, predicted)
+                break
+            kept = window.copy() if kept is None else kept
+            earlier = self.history.window(due)  # in the place of `window`
+            row = (
+                None
+                if isinstance(earlier, Refusal)
+                else self._learned_row(row, due, earlier, self.model.predict(earlier[None]))
+            )
+        if kept is not None:
+            window[...] = kept
+        self._row = row or _row_of(stamp, window, predicted, self.online.layer.minimum_speed)
+
+    def _learned_row(self, before: _Row, stamp: int, window: Vector, predicted: WindowPrediction) -> _Row | None:
+        """Learns the step that ends with ``window``; returns its last row, ``None`` if the car was too slow there."""
+        assert self.online is not None
+        row = _row_of(stamp, window, predicted, self.online.layer.minimum_speed)
+        if row is not None:
+            self.online.update(before.features, window[-1, :3] - window[-2, :3], before.physics)
+        return row
+
+    def _corrected(self, predicted: WindowPrediction, window: Vector, in_rollout: bool = False) -> WindowPrediction:
+        """A prediction with what was learned online."""
+        online = self.online
+        assert online is not None
+        assert predicted.seen is not None
+        layer, now, features = online.layer, window[-1, :3], predicted.seen.features[0]
+        if not now[0] >= layer.minimum_speed:
+            return predicted
+        moved = online.increment(features)
+        if in_rollout:
+            moved = layer.bounded(moved, predicted.seen.physics[0], online.limit)
+        variance = online.variance(features) * layer.scale**2
+        return predicted._replace(state=(now + moved)[None], variance=variance[None])
+
     def _residual_share(self, now: list[float], following: list[float], physics: list[float]) -> float:
         residual = sum(abs(a - b) / s for a, b, s in zip(following, physics, self._scale, strict=True))
         explained = sum(abs(a - b) / s for a, b, s in zip(physics, now, self._scale, strict=True))
         return residual / (residual + explained) if residual > 0 else 0.0
+
+
+class _Row(NamedTuple):
+    """A row that the online layer has yet to see the next one of."""
+
+    stamp: int
+    features: Vector
+    physics: Vector
+
+
+def _row_of(stamp: int, window: Vector, predicted: WindowPrediction, minimum_speed: float) -> _Row | None:
+    """The last row of ``window``; ``None`` if the car was slower than ``minimum_speed`` (m/s) within it."""
+    assert predicted.seen is not None
+    if not window[:, 0].min() >= minimum_speed:
+        return None
+    return _Row(stamp, predicted.seen.features[0], predicted.seen.physics[0])
 
 
 def live_signal_map(model: OnnxModel, signal_map: SignalMap) -> SignalMap:

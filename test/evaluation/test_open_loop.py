@@ -39,7 +39,7 @@ def recording():
 class Model:
     """Predicts the present state plus ``offset``."""
 
-    parameters, flops, vehicle, card, origin = 123, 456, None, None, "the present state"
+    parameters, flops, vehicle, card, origin, online = 123, 456, None, None, "the present state", None
 
     def __init__(self, H=1, offset=0.0, T_s=0.0, commands=None, variance=None, name="model"):
         self.H, self.offset, self.T_s, self.commands, self.name = H, offset, T_s, commands, name

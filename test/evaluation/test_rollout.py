@@ -33,6 +33,8 @@ def planted():
 class Truth:
     """Knows the planted map, from a window of ``H`` rows; remembers its windows."""
 
+    online = None
+
     def __init__(self, H=3, bias=0.0):
         self.H, self.bias, self.seen = H, bias, []
 

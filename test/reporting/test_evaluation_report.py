@@ -35,7 +35,7 @@ class Adaptive:
     """The truth with coefficients that move and stated variances."""
 
     name, T_s, H, commands, parameters, flops = "adaptive<b>", 0.0, 3, None, 10, 20
-    card, origin = None, "the truth"
+    card, origin, online = None, "the truth", None
 
     def __init__(self, vehicle):
         self.vehicle, self.truth = vehicle, SingleTrack(vehicle)

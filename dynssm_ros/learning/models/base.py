@@ -62,6 +62,23 @@ class GruConfig(StrictModel):
     layers: int = Field(default=1, ge=1)
 
 
+class OnlineConfig(StrictModel):
+    """The online layer on top of the model: a Bayesian linear layer that keeps learning while the car drives."""
+
+    lags: int = Field(default=10, ge=1, description="measured increments of the channel itself, back from the last")
+    other_lags: int = Field(default=2, ge=0, description="the same of the other channels")
+    input_lags: int = Field(default=3, ge=1, description="changes of throttle and steering")
+    error_average: float = Field(default=0.6, gt=0, description="the physics' mean error is that over so long (s)")
+    memory: float = Field(
+        default=1000.0, gt=0, description="time constant with which weights return to their prior (s)"
+    )
+    folds: int = Field(
+        default=4,
+        ge=1,
+        description="stretches of the recording; the prior that is worth most on each was fitted without it",
+    )
+
+
 class ModelConfig(StrictModel):
     """What every model file has. A model's own configuration adds its blocks; a block that it does not have is refused."""
 
@@ -69,6 +86,7 @@ class ModelConfig(StrictModel):
     kind: str = Field(description="which model it is")
     history: float = Field(gt=0, description="length of the history window (s)")
     training: SplitConfig
+    online: OnlineConfig | None = Field(default=None, description="null: none")
 
     def rows(self, T_s: float) -> int:
         """H, rows of the history window at the sampling time ``T_s`` (s)."""
@@ -91,8 +109,8 @@ class ModelConfig(StrictModel):
 
     @property
     def parts(self) -> int:
-        """Parts of the recording that further models are trained without, to fit the stated variance; 0: none."""
-        return 0
+        """Parts of the recording that further models are trained without, to fit what judges predictions; 0: none."""
+        return self.online.folds if self.online else 0
 
     def with_training(self, **changes: Any) -> Self:
         """The same model with other training settings; those that it does not have are left out."""
@@ -113,11 +131,13 @@ class TrainableModel(nn.Module):
         KIND: by which model files and cards name it.
         CONFIG: its configuration.
         EXTRA_ROWS: rows before the window that its loss reads as well.
+        LEARNS: whether it predicts more than the calibrated physics.
     """
 
     KIND: ClassVar[str] = ""
     CONFIG: ClassVar[type[ModelConfig]] = ModelConfig
     EXTRA_ROWS: ClassVar[int] = 0
+    LEARNS: ClassVar[bool] = True
 
     def __init__(self, config: Any, vehicle: Vehicle, normalisation: Normalisation) -> None:
         super().__init__()
@@ -141,13 +161,8 @@ class TrainableModel(nn.Module):
     def post_fit(self, validation: TrainingWindows) -> None:
         """Fits what is fitted on validation windows once the weights are found."""
 
-    def held_out_errors(self, window: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """In-window errors ``(N, steps, 3)`` and errors of the predictions ``(N, 3)`` on windows that are held out."""
-        raise NotImplementedError
-
-    def fit_variance(self, past: Tensor, errors: Tensor) -> None:
-        """Fits the stated variance to what :meth:`held_out_errors` gives; see :attr:`ModelConfig.parts`."""
-        raise NotImplementedError
+    def fit_on_left_out(self, left_out: list[tuple[Any, TrainingWindows]]) -> None:
+        """Fits what is fitted on parts of the recording, each with a model of this kind that was trained without it."""
 
     def for_deployment(self) -> Self:
         """Prepares a copy of the model for export; returns itself."""

@@ -12,6 +12,7 @@ from dynssm_ros.learning.models.ddm import DDM
 from dynssm_ros.learning.models.dynssm.network import DynSSM
 from dynssm_ros.learning.models.fthd import FTHD
 from dynssm_ros.learning.models.ridge import Ridge
+from dynssm_ros.learning.models.rls import Rls
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
 
@@ -33,7 +34,7 @@ def register_model(model: type[TrainableModel]) -> type[TrainableModel]:
     return model
 
 
-for _model in (DynSSM, Ridge, DDM, FTHD):
+for _model in (DynSSM, Rls, Ridge, DDM, FTHD):
     register_model(_model)
 
 

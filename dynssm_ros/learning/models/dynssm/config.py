@@ -181,9 +181,9 @@ class DynssmConfig(ModelConfig):
 
     @property
     def parts(self) -> int:
-        """As ``in_window_errors.folds`` says."""
+        """As ``in_window_errors.folds`` or the online layer says."""
         judge = self.in_window_errors
-        return judge.folds if judge and judge.uncertainty and judge.folds > 1 else 0
+        return judge.folds if judge and judge.uncertainty and judge.folds > 1 else super().parts
 
     def modelled_vehicle(self, vehicle: Vehicle) -> Vehicle:
         """Without load transfer, if the physics has none."""

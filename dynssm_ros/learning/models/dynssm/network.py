@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -244,6 +244,12 @@ class DynSSM(TrainableModel):
         """In-window errors ``(N, steps, 3)`` and errors of the predictions ``(N, 3)`` on windows and measured increments."""
         retrospective, happened = self._retrospective(window)
         return (retrospective - happened) * self.increment_scale, self.eval()(window).increment - target
+
+    def fit_on_left_out(self, left_out: list[tuple[Any, TrainingWindows]]) -> None:
+        """Fits the variance to the errors on parts that were left out, if that is asked for."""
+        if self.config.in_window_errors and self.config.in_window_errors.uncertainty:
+            errors = [without.held_out_errors(*windows.batch(slice(None))) for without, windows in left_out]
+            self.fit_variance(*(torch.cat(each) for each in zip(*errors, strict=True)))
 
     @torch.no_grad()
     def fit_variance(self, past: Tensor, errors: Tensor) -> None:

@@ -1,0 +1,191 @@
+"""The online layer's features as a torch module, and its prior from training laps.
+
+The features of a channel are linear in what it may learn: the physics' increments, the network's, what was measured lately,
+how the inputs change, where the car is. All are in units that make one the usual size.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.errors import ConfigurationError, RecordingError
+from dynssm_ros.learning.losses import Output
+from dynssm_ros.learning.models.base import OnlineConfig, steps_of
+from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
+from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.runtime.online import CHANNELS, OnlineLayer, OnlineLayerCard, Seen
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.vehicle import Vehicle
+
+_PRIOR_ROWS = (10.0, 40.0, 160.0)
+_TOLERANCE = 0.01  # of the RMSE on left-out parts
+_RIDGE = 1e-4  # of a feature's mean square: draws weights that the laps leave open to the physics alone
+_SMALLEST = 1e-12  # noise variance of data without noise, in units of s_delta squared
+
+
+class OnlineFeatures(nn.Module):
+    """Maps raw windows and a model's output to features ``(B, 3, n)``, in the order of :attr:`names`."""
+
+    mean: Tensor
+    std: Tensor
+    increment_scale: Tensor
+    input_scale: Tensor
+    nominal: Tensor
+
+    def __init__(
+        self,
+        config: OnlineConfig,
+        vehicle: Vehicle,
+        physics: PhysicsConfig,
+        scale: Normalisation,
+        H: int,
+        network: bool,
+    ) -> None:
+        super().__init__()
+        if H < 3:
+            raise ConfigurationError(f"online: a window of {H} rows; expected at least 3 to see how it changes")
+        self.physics = PhysicsLayer(vehicle, physics)
+        self.register_buffer("nominal", physics.theta_0(vehicle))
+        self.register_buffer("mean", torch.tensor(scale.input_mean))
+        self.register_buffer("std", torch.tensor(scale.input_std))
+        self.register_buffer("increment_scale", torch.tensor(scale.increment_scale))
+        self.register_buffer("input_scale", 0.1 * self.std[3:5])  # what an input changes in a step, about
+        self.network = network
+        self.lags = min(config.lags, H - 1)
+        self.other_lags = min(config.other_lags, H - 1)
+        self.input_lags = min(config.input_lags, H - 1)
+        self.errors = min(steps_of(config.error_average, vehicle.sampling_time), H - 1)
+        self.names = self._names()
+
+    def _names(self) -> tuple[str, ...]:
+        lags, others = range(self.lags), range(self.other_lags)
+        changes = [f"change of {name}, {k} steps ago" for k in range(self.input_lags) for name in ("r", "delta")]
+        return (
+            "physics", "physics, next channel", "physics, channel after",
+            *(["network"] if self.network else []),
+            *(f"increment, {k + 1} steps ago" for k in lags),
+            *(f"increment of the {which}, {k + 1} steps ago" for k in others for which in ("next", "one after")),
+            *changes, *STATE_SIGNALS, "r_fb", "delta_fb", "mean error of the physics", "one",
+        )  # fmt: skip
+
+    def forward(self, window: Tensor, output: Output) -> tuple[Tensor, Tensor]:
+        """Windows ``(B, H, 7)`` to features ``(B, 3, n)`` and the physics' increments ``(B, 3)`` (m/s, m/s, rad/s)."""
+        increments = (window[:, 1:, :CHANNELS] - window[:, :-1, :CHANNELS]) / self.increment_scale
+        physics = self.physics(window[:, -self.errors - 1 :], self.nominal) / self.increment_scale
+        now = physics[:, -1]
+        own = [now, _next(now), _next(_next(now))]
+        if self.network:
+            own.append(output.increment / self.increment_scale)
+        recent = increments[:, -max(self.lags, self.other_lags) :].flip(1)
+        own += [recent[:, k] for k in range(self.lags)]
+        for k in range(self.other_lags):
+            own += [_next(recent[:, k]), _next(_next(recent[:, k]))]
+        mean_error = (increments[:, -self.errors :] - physics[:, :-1]).mean(1)
+        applied = window[:, -self.input_lags - 1 :, 3:5] + window[:, -self.input_lags - 1 :, 5:7]
+        changes = ((applied[:, 1:] - applied[:, :-1]) / self.input_scale).flip(1).flatten(1)
+        level = (window[:, -1, :5] - self.mean[:5]) / self.std[:5]
+        shared = torch.cat([changes, level], -1)[:, None].expand(-1, CHANNELS, -1)
+        rest = torch.stack([mean_error, torch.ones_like(mean_error)], -1)
+        return torch.cat([torch.stack(own, -1), shared, rest], -1), now * self.increment_scale
+
+
+def _next(values: Tensor) -> Tensor:
+    """Values ``(B, 3)`` of the channel after each, in a circle."""
+    return torch.cat([values[:, 1:], values[:, :1]], -1)
+
+
+class Drive(NamedTuple):
+    """What the prior is fitted to: what the layer sees of a recording's windows, and what happened next."""
+
+    seen: Seen
+    increments: Vector
+    """Measured, ``(N, 3)`` (m/s, m/s, rad/s)."""
+    ends: Indices
+    """Rows, ascending."""
+
+
+def joined(drives: list[Drive]) -> Drive:
+    """Drives one after the other."""
+    seen = Seen(*(np.concatenate(parts) for parts in zip(*(drive.seen for drive in drives), strict=True)))
+    return Drive(seen, *(np.concatenate([drive[k] for drive in drives]) for k in (1, 2)))
+
+
+def fit_layer(
+    parts: list[Drive], names: tuple[str, ...], memory: float, scale: Normalisation, vehicle: Vehicle
+) -> OnlineLayer:
+    """The layer with its prior: mean and covariance of the weights.
+
+    The prior's mean is the least-squares solution on the training laps. Its covariance is that of so many rows of them.
+    The number of rows is the least of :data:`_PRIOR_ROWS` with which the layer predicts parts of the laps, each with a
+    prior that was fitted without it, at most 1 % worse than with the best: another track asks for a weaker prior than
+    another part of the same one.
+
+    Args:
+        parts: of the training laps; their network features by models that do not know them.
+        names: of the features.
+        memory: time constant with which weights return to the prior (s).
+        scale: gives s_delta.
+        vehicle: sampling time and minimum speed.
+
+    Raises:
+        RecordingError: there are no windows to fit it to.
+    """
+    if not parts:
+        raise RecordingError(
+            "online: no window at the vehicle's minimum speed or more; expected some to fit the prior to"
+        )
+    s_delta: Vector = np.array(scale.increment_scale)
+    left_out = [
+        (part, _least_squares(joined([*parts[:k], *parts[k + 1 :]]) if len(parts) > 1 else part, s_delta))
+        for k, part in enumerate(parts)
+    ]
+
+    def layer(prior: _Prior, rows: float) -> OnlineLayer:
+        card = OnlineLayerCard(features=names, memory=memory, prior_rows=rows)
+        covariance = (np.linalg.inv(prior.gram) / rows).astype(np.float64)
+        return OnlineLayer(
+            card, prior.mean, covariance, prior.noise, prior.physics, np.ones(CHANNELS), s_delta, vehicle.sampling_time,
+            vehicle.minimum_speed,
+        )  # fmt: skip
+
+    losses = {}
+    for rows in _PRIOR_ROWS:
+        errors = np.concatenate([_errors(layer(prior, rows), part) for part, prior in left_out])
+        losses[rows] = float(0.5 * np.log(np.mean(errors**2, axis=0) + _SMALLEST).mean())
+    least = min(losses.values())
+    chosen = next(rows for rows in _PRIOR_ROWS if losses[rows] <= least + np.log1p(_TOLERANCE))
+    return layer(_least_squares(joined(parts), s_delta), chosen)
+
+
+class _Prior(NamedTuple):
+    mean: Vector
+    gram: Vector
+    noise: Vector
+    physics: Vector
+
+
+def _least_squares(drive: Drive, s_delta: Vector) -> _Prior:
+    """Weights by least squares on a drive, drawn to the physics alone; the mean Gram matrix, mean square errors."""
+    F, y = drive.seen.features, drive.increments / s_delta
+    alone = np.zeros(F.shape[1:])
+    alone[:, 0] = 1.0
+    gram = np.einsum("kci,kcj->cij", F, F, optimize=True) / len(F)
+    ridge = _RIDGE * np.einsum("cii->ci", gram) + _SMALLEST
+    gram[:, range(F.shape[2]), range(F.shape[2])] += ridge
+    left: Vector = y - np.einsum("kci,ci->kc", F, alone)
+    mean: Vector = alone + np.linalg.solve(gram, (np.einsum("kci,kc->ci", F, left) / len(F))[..., None])[..., 0]
+    noise = np.mean((y - np.einsum("kci,ci->kc", F, mean)) ** 2, axis=0)
+    physics = np.mean((y - drive.seen.physics / s_delta) ** 2, axis=0)
+    return _Prior(mean, gram, np.maximum(noise, _SMALLEST), physics)
+
+
+def _errors(layer: OnlineLayer, drive: Drive) -> Vector:
+    """One-step errors over a drive, ``(N, 3)``, in units of s_delta."""
+    learned = layer.drive(*drive)
+    errors: Vector = (layer.increments(drive.seen.features, learned.weights) - drive.increments) / layer.scale
+    return errors

@@ -1,0 +1,267 @@
+"""The online layer: a Bayesian linear last layer that keeps learning over the whole drive.
+
+For each channel the next increment is a linear function of features of the window: what the physics and the network predict,
+what was measured lately, how the inputs change. Its weights follow an Ornstein-Uhlenbeck process whose stationary
+distribution is the prior that training found; a Kalman filter estimates them from one measured increment after the other.
+This is recursive least squares that forgets towards the prior. It learns in the same way as the last layers of ALPaCA
+(Harrison et al. 2018) and Neural-Fly (O'Connell et al. 2022).
+
+The features are stateless and computed by the model's graph. What is learned is one small :class:`OnlineState`, in numpy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.configuration import StrictModel
+from dynssm_ros.errors import ArtifactError
+from dynssm_ros.files import replacing
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+
+CHANNELS = 3
+_OUTLIER = 4.0  # errors beyond this many standard deviations weigh less (Huber)
+_LARGEST = 10.0  # no innovation moves the noise estimate by more than this many standard deviations
+_NOISE_MEMORY_S = 8.0  # over which the noise and the physics' errors are averaged
+_COVERED, _QUANTILE = 0.9, 1.6448536  # stated intervals are to cover this share of errors
+_WIDTH_RATE = 0.02  # of the stated interval's adaptation, per step
+_ROLLOUT_LIMIT = 3.0  # correction in a rollout, in root mean squares of the physics' recent errors
+_SMALLEST = 1e-9  # noise, in units of s_delta
+
+
+class OnlineLayerCard(StrictModel):
+    """What ``model.yaml`` says of the online layer."""
+
+    features: tuple[str, ...] = Field(min_length=1, description="names of the features of a channel, in order")
+    memory: float = Field(gt=0, description="time constant with which weights return to the prior (s)")
+    prior_rows: float = Field(gt=0, description="rows of driving that the prior is worth")
+
+
+class Seen(NamedTuple):
+    """What the layer sees of ``N`` windows."""
+
+    features: Vector
+    """``(N, 3, n)``, in units that make one the usual size."""
+    physics: Vector
+    """Increments of the physics with nominal coefficients, ``(N, 3)`` (m/s, m/s, rad/s)."""
+
+
+class Learned(NamedTuple):
+    """What an :class:`OnlineState` knows at each of ``N`` rows: all that a prediction from there needs."""
+
+    weights: Vector
+    """``(N, 3, n)``, in units of s_delta."""
+    variance: Vector
+    """Of the error of the next prediction, ``(N, 3)``, in units of s_delta squared."""
+    limit: Vector
+    """Largest correction of the physics in a rollout, ``(N, 3)``, in units of s_delta."""
+
+    def at(self, rows: Indices) -> Learned:
+        """What was known at ``rows``."""
+        return Learned(self.weights[rows], self.variance[rows], self.limit[rows])
+
+
+@dataclass(frozen=True)
+class OnlineLayer:
+    """The layer as it was trained.
+
+    Attributes:
+        card: names and time constants.
+        mean: prior mean of the weights ``(3, n)``.
+        covariance: prior covariance of the weights over the noise's variance, ``(3, n, n)``.
+        noise: variance of one-step errors on the training laps, ``(3,)``, in units of s_delta squared.
+        physics: mean square of the physics' one-step errors there, ``(3,)``, in the same units.
+        width: factor of the stated standard deviation that covers 90 % there, ``(3,)``.
+        scale: s_delta (m/s, m/s, rad/s), ``(3,)``.
+        T_s: length of a step (s).
+        minimum_speed: below it the layer neither learns nor corrects (m/s).
+    """
+
+    card: OnlineLayerCard
+    mean: Vector
+    covariance: Vector
+    noise: Vector
+    physics: Vector
+    width: Vector
+    scale: Vector
+    T_s: float
+    minimum_speed: float
+
+    def start(self) -> OnlineState:
+        """The state at the beginning of a drive: the prior."""
+        return OnlineState(self)
+
+    def increments(self, features: Vector, weights: Vector) -> Vector:
+        """Increments ``(N, 3)`` (m/s, m/s, rad/s) of features ``(N, 3, n)`` with weights ``(N, 3, n)``."""
+        predicted: Vector = np.einsum("kci,kci->kc", features, weights) * self.scale
+        return predicted
+
+    def bounded(self, increments: Vector, physics: Vector, limit: Vector) -> Vector:
+        """Increments within ``limit`` (units of s_delta) of the physics' ones, so that rollouts stay bounded as those do."""
+        return physics + np.clip(increments - physics, -limit * self.scale, limit * self.scale)
+
+    def drive(self, seen: Seen, increments: Vector, ends: Indices) -> Learned:
+        """Learns over a recording, row after row, and notes what was known at each.
+
+        Args:
+            seen: of the windows that end at ``ends``.
+            increments: measured from these rows to the next (m/s, m/s, rad/s), ``(N, 3)``.
+            ends: row numbers, ascending. The layer learns a step once the row after it is one of them.
+        """
+        state = self.start()
+        count, n = len(ends), self.mean.shape[1]
+        learned = Learned(np.empty((count, CHANNELS, n)), np.empty((count, CHANNELS)), np.empty((count, CHANNELS)))
+        for k, row in enumerate(ends):
+            if k and ends[k - 1] == row - 1:
+                state.update(seen.features[k - 1], increments[k - 1], seen.physics[k - 1])
+            learned.weights[k] = state.mean
+            learned.variance[k] = state.variance(seen.features[k])
+            learned.limit[k] = state.limit
+        return learned
+
+
+class OnlineState:
+    """Weights, their covariance and the noise, as estimated so far."""
+
+    def __init__(self, layer: OnlineLayer) -> None:
+        self.layer = layer
+        self.retained = math.exp(-layer.T_s / layer.card.memory)
+        self._forget = min(1.0, layer.T_s / _NOISE_MEMORY_S)
+        self._returning = (1 - self.retained) * layer.mean
+        self._widening = (1 - self.retained**2) * layer.covariance
+        self.reset()
+
+    def reset(self) -> None:
+        """Returns to the prior."""
+        layer = self.layer
+        self.mean = layer.mean.copy()
+        self.covariance = layer.covariance.copy()
+        self.noise = layer.noise.copy()
+        self.physics = layer.physics.copy()
+        self.width = layer.width.copy()
+        self.steps = 0
+
+    @property
+    def limit(self) -> Vector:
+        """See :attr:`Learned.limit`."""
+        limit: Vector = _ROLLOUT_LIMIT * np.sqrt(self.physics)
+        return limit
+
+    def increment(self, features: Vector) -> Vector:
+        """Predicted increment ``(3,)`` (m/s, m/s, rad/s) from features ``(3, n)``."""
+        predicted: Vector = (self.mean * features).sum(axis=1) * self.layer.scale
+        return predicted
+
+    def variance(self, features: Vector) -> Vector:
+        """Variance of the prediction's error ``(3,)``, in units of s_delta squared, from weights, noise and coverage."""
+        spread = (self.covariance @ features[:, :, None])[:, :, 0]
+        stated: Vector = self.width * self.width * self.noise * (1.0 + (spread * features).sum(axis=1))
+        return stated
+
+    def update(self, features: Vector, increment: Vector, physics: Vector) -> None:
+        """Learns from a step: features before it ``(3, n)``, measured and physics' increment ``(3,)`` (m/s, m/s, rad/s).
+
+        A step that is not finite teaches nothing.
+        """
+        scale = self.layer.scale
+        target = increment / scale
+        if not math.isfinite(float(target.sum() + features.sum())):
+            return
+        mean = self.retained * self.mean + self._returning
+        P = self.retained**2 * self.covariance + self._widening
+        spread = (P @ features[:, :, None])[:, :, 0]
+        error = target - (mean * features).sum(axis=1)
+        predicted = (spread * features).sum(axis=1)
+        size = np.abs(error) / np.sqrt(self.noise * (1.0 + predicted))
+        inflation = np.maximum(1.0, size / _OUTLIER)
+        gain = spread / (predicted + inflation)[:, None]
+        self.mean = mean + gain * error[:, None]
+        self.covariance = P - gain[:, :, None] * spread[:, None, :]
+        # stochastic approximation of the 90 % quantile (adaptive conformal inference, Gibbs and Candes 2021)
+        missed = size > _QUANTILE * self.width
+        self.width = self.width * np.exp(_WIDTH_RATE * (missed - (1.0 - _COVERED)))
+        square = np.minimum(error * error / (1.0 + predicted), _LARGEST**2 * self.noise)
+        self.noise = np.maximum(self.noise + self._forget * (square - self.noise), _SMALLEST**2)
+        of_physics = ((increment - physics) / scale) ** 2
+        self.physics = self.physics + self._forget * (of_physics - self.physics)
+        self.steps += 1
+
+    def save(self, path: Path, owner: str) -> None:
+        """Writes what was learned to ``path``, atomically; ``owner`` names the prior that it belongs to."""
+        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _SAVED}
+        with replacing(path) as aside:
+            save_file(arrays, aside, {"prior": owner, "steps": str(self.steps)})
+
+    def load(self, path: Path, owner: str) -> None:
+        """Goes on from what :meth:`save` wrote.
+
+        Raises:
+            ArtifactError: unreadable, not finite, or learned by another model.
+        """
+        from safetensors import safe_open
+
+        try:
+            with safe_open(path, framework="numpy") as content:
+                about = content.metadata() or {}
+            arrays = load_file(path)
+        except (SafetensorError, OSError) as error:
+            raise ArtifactError(f"{path}: not a readable online state ({error})") from error
+        if about.get("prior") != owner:
+            raise ArtifactError(f"{path}: was learned by another model; expected the state of prior {owner[:12]}")
+        for name in _SAVED:
+            value, expected = arrays.get(name), getattr(self, name)
+            if value is None or value.shape != expected.shape or not np.isfinite(value).all():
+                raise ArtifactError(f"{path}: {name} is missing, of another shape or not finite")
+        for name in _SAVED:
+            setattr(self, name, arrays[name])
+        self.steps = int(about.get("steps", "0"))
+
+
+_SAVED = ("mean", "covariance", "noise", "physics", "width")
+_PRIOR = ("mean", "covariance", "noise", "physics", "width")
+
+
+def save_layer(layer: OnlineLayer, path: Path) -> None:
+    """Writes the numbers of a layer; names and time constants are in the card."""
+    save_file({name: np.ascontiguousarray(getattr(layer, name)) for name in _PRIOR}, path)
+
+
+def load_layer(path: Path, card: OnlineLayerCard, scale: Vector, T_s: float, minimum_speed: float) -> OnlineLayer:
+    """Reads what :func:`save_layer` wrote.
+
+    Raises:
+        ArtifactError: unreadable, or of other sizes than the card says.
+    """
+    try:
+        arrays = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise ArtifactError(f"{path}: not a readable online layer ({error})") from error
+    n = len(card.features)
+    shapes = {"mean": (CHANNELS, n), "covariance": (CHANNELS, n, n)}
+    for name in _PRIOR:
+        value = arrays.get(name)
+        if value is None or value.shape != shapes.get(name, (CHANNELS,)) or not np.isfinite(value).all():
+            raise ArtifactError(
+                f"{path}: {name} is missing, not finite, or not of the {n} features that the card names"
+            )
+    prior = {name: arrays[name] for name in _PRIOR}
+    return OnlineLayer(card, **prior, scale=scale, T_s=T_s, minimum_speed=minimum_speed)
+
+
+def expert_weights(layer: OnlineLayer, weights: Vector) -> dict[str, float]:
+    """Weights ``(3, n)`` of what the physics and the network predict of a channel itself, by words."""
+    names = layer.card.features
+    return {
+        f"{expert}, {channel}": float(weights[c, names.index(expert)])
+        for expert in ("physics", "network")
+        if expert in names
+        for c, channel in enumerate(STATE_SIGNALS)
+    }

@@ -1,0 +1,199 @@
+"""The online layer from training to prediction: exact cars stay exact, live equals evaluation, changed cars are learned."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dynssm_ros.errors import ArtifactError
+from dynssm_ros.evaluation.metrics import learned_while_driving, predict_rows
+from dynssm_ros.evaluation.open_loop import evaluate
+from dynssm_ros.learning.dataset import all_windows
+from dynssm_ros.learning.export import save_artifact
+from dynssm_ros.learning.online import OnlineFeatures
+from dynssm_ros.learning.stages import train
+from dynssm_ros.runtime.models import OnnxModel, SingleTrack
+from dynssm_ros.runtime.predictor import Prediction, Predictor
+from dynssm_ros.signals.history import Refusal
+from dynssm_ros.signals.signal_map import load_signal_map
+
+SIGNALS = load_signal_map("default").with_commands("none")
+
+
+@pytest.fixture(scope="module")
+def noisy_laps(laps):
+    rng = np.random.default_rng(0)
+    noise = {"v_x": 0.01, "v_y": 0.01, "omega": 0.03}
+    columns = {n: v + noise.get(n, 0.0) * rng.standard_normal(len(v)) for n, v in laps.columns.items()}
+    return replace(laps, columns=columns).with_commands("none")
+
+
+@pytest.fixture(scope="module")
+def noisy_model(noisy_laps, orca, make_config, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("online")
+    trained = train(noisy_laps, make_config(kind="rls", history=0.3), orca, folder / "c.pt")
+    return OnnxModel(save_artifact(trained, folder / "model"))
+
+
+def test_on_exact_laps_of_the_known_car_it_is_the_true_model(laps, orca, make_config, tmp_path: Path):
+    trained = train(laps, make_config(kind="rls", history=0.3), orca, tmp_path / "c.pt")
+    model = OnnxModel(save_artifact(trained, tmp_path / "model"))
+    score = evaluate(laps, {"rls": model, "true": SingleTrack(orca)}, calls=1).scores["rls"]
+    assert np.all(score.rmse < 1e-5)
+    assert score.rollout.ade < 1e-5
+
+
+def test_with_sensor_noise_it_beats_the_physics_that_it_starts_from(noisy_laps, noisy_model):
+    scores = evaluate(noisy_laps, {"on": noisy_model, "off": noisy_model.offline()}, calls=1).scores
+    assert np.all(scores["on"].rmse < scores["off"].rmse)
+    assert scores["on"].rollout.ade < scores["off"].rollout.ade
+    assert np.all(np.abs(scores["on"].coverage_90 - 0.9) < 0.03)
+
+
+def test_a_networks_increment_is_an_expert_of_its_own(noisy_laps, orca, make_config, tmp_path: Path):
+    config = make_config(online={"folds": 2})
+    trained = train(noisy_laps, config, orca, tmp_path / "c.pt")
+    assert "network" in trained.features.names
+    model = OnnxModel(save_artifact(trained, tmp_path / "model"))
+    window, _ = all_windows(noisy_laps, trained.H, orca.minimum_speed).batch(slice(0, 20))
+    output = trained.model(window)
+    seen = model.predict(window.numpy().astype(float)).seen.features
+    own = trained.features.names.index("network")
+    expected = (output.increment / torch.tensor(trained.normalisation.increment_scale)).detach().numpy()
+    np.testing.assert_allclose(seen[:, :, own], expected, atol=1e-4)
+
+
+def test_features_are_what_their_names_say(noisy_laps, orca, noisy_model):
+    names, scale = noisy_model.online.card.features, noisy_model.online.scale
+    rows = np.arange(100, 110)
+    windows = np.stack([noisy_laps.matrix[k - noisy_model.H + 1 : k + 1] for k in rows])
+    features = noisy_model.predict(windows).seen.features
+    increments = np.diff(windows[:, :, :3], axis=1) / scale
+    car = SingleTrack(noisy_model.vehicle)
+    physics = (car.predict(windows).state - windows[:, -1, :3]) / scale
+    at = {name: features[:, :, k] for k, name in enumerate(names)}
+    np.testing.assert_allclose(at["physics"], physics, atol=1e-4)
+    np.testing.assert_allclose(at["physics, next channel"], np.roll(physics, -1, axis=1), atol=1e-4)
+    np.testing.assert_allclose(at["increment, 1 steps ago"], increments[:, -1], atol=1e-4)
+    np.testing.assert_allclose(at["increment, 4 steps ago"], increments[:, -4], atol=1e-4)
+    np.testing.assert_allclose(
+        at["increment of the one after, 2 steps ago"], np.roll(increments[:, -2], -2, axis=1), atol=1e-4
+    )
+    np.testing.assert_allclose(at["one"], 1.0)
+    past = (car.predict(windows[:, :-1].reshape(-1, 1, 7)).state).reshape(len(rows), -1, 3) - windows[:, :-1, :3]
+    np.testing.assert_allclose(at["mean error of the physics"], (increments - past / scale).mean(1), atol=1e-3)
+
+
+def feed(predictor, recording, rows, every=1, start=0):
+    """Plays rows as messages, with ``every`` - 1 messages between two rows; the predictions at the rows."""
+    found = {}
+    T = recording.T_s
+    time = start + np.arange(rows[0] * every, rows[-1] * every + 1) * round(T * 1e9 / every)
+    columns = {
+        n: np.interp(time, start + np.arange(len(recording)) * round(T * 1e9), v) for n, v in recording.columns.items()
+    }
+    for k, stamp in enumerate(time.tolist()):
+        predictor.observe(
+            stamp, {f"{n}_feedback": columns[c][k] for n, c in (("throttle", "r_fb"), ("steering", "delta_fb"))}
+        )
+        outcome = predictor.predict(stamp, {n: columns[n][k] for n in ("v_x", "v_y", "omega")})
+        if k % every == 0 and isinstance(outcome, Prediction):
+            found[rows[0] + k // every] = outcome
+    return found
+
+
+def test_live_predictions_are_those_of_the_evaluation(noisy_laps, noisy_model):
+    rows = np.arange(0, 400)
+    part = noisy_laps.select(rows)
+    predictor = Predictor(noisy_model, SIGNALS)
+    found = feed(predictor, part, rows)
+    ends, learned = learned_while_driving(noisy_model, part)
+    shared = [k for k in ends if k in found]
+    assert len(shared) > 300
+    batch = predict_rows(noisy_model, part.matrix, np.array(shared), learned=learned.at(np.searchsorted(ends, shared)))
+    np.testing.assert_allclose([found[k].state for k in shared], batch.state, atol=1e-5)
+    np.testing.assert_allclose([found[k].variance for k in shared], batch.variance, rtol=1e-3)
+
+
+def test_odometry_at_four_times_the_rate_teaches_each_step_once(noisy_laps, noisy_model):
+    rows = np.arange(0, 300)
+    part = noisy_laps.select(rows)
+    slow, fast = (Predictor(noisy_model, SIGNALS) for _ in range(2))
+    feed(slow, part, rows)
+    feed(fast, part, rows, every=4)
+    assert abs(fast.online.steps - slow.online.steps) <= 1
+    np.testing.assert_allclose(fast.online.mean, slow.online.mean, atol=0.02)
+
+
+def test_odometry_that_misses_the_grid_teaches_as_many_steps(noisy_laps, noisy_model):
+    part = noisy_laps.select(np.arange(0, 300))
+    predictor = Predictor(noisy_model, SIGNALS)
+    T = part.T_s
+    grid = np.arange(300) * T
+    for t in np.arange(0.0, grid[-1], 0.0271):  # 37 Hz, where T_s asks for 50
+        now = {n: float(np.interp(t, grid, v)) for n, v in part.columns.items()}
+        predictor.observe(round(t * 1e9), {"throttle_feedback": now["r_fb"], "steering_feedback": now["delta_fb"]})
+        predictor.predict(round(t * 1e9), {n: now[n] for n in ("v_x", "v_y", "omega")})
+    assert predictor.online.steps > 0.9 * (300 - noisy_model.H)
+
+
+def test_it_is_kept_over_a_gap_and_forgotten_when_time_jumps_back(noisy_laps, noisy_model):
+    rows = np.arange(0, 200)
+    part = noisy_laps.select(rows)
+    predictor = Predictor(noisy_model, SIGNALS)
+    feed(predictor, part, rows)
+    steps, mean = predictor.online.steps, predictor.online.mean.copy()
+    assert steps > 100
+    for stamp in (20_000_000_000, 20_020_000_000):  # a gap of 16 s
+        assert isinstance(predictor.predict(stamp, {"v_x": 2.0, "v_y": 0.0, "omega": 0.0}), Refusal)
+    np.testing.assert_array_equal(predictor.online.mean, mean)
+    assert predictor.predict(0, {"v_x": 2.0, "v_y": 0.0, "omega": 0.0}) is Refusal.JUMPED_BACK
+    assert predictor.online.steps == 0
+
+
+def test_a_second_stint_starts_where_the_first_ended(noisy_laps, noisy_model, tmp_path: Path):
+    rows = np.arange(0, 200)
+    part = noisy_laps.select(rows)
+    first, second = (Predictor(noisy_model, SIGNALS) for _ in range(2))
+    feed(first, part, rows)
+    first.save_online(tmp_path / "state")
+    second.load_online(tmp_path / "state")
+    np.testing.assert_array_equal(second.online.mean, first.online.mean)
+    with pytest.raises(ArtifactError, match="switched off"):
+        Predictor(noisy_model, SIGNALS, online=False).load_online(tmp_path / "state")
+
+
+def test_a_swap_keeps_what_was_learned_only_for_the_same_prior(
+    noisy_laps, noisy_model, orca, make_config, tmp_path: Path
+):
+    rows = np.arange(0, 200)
+    predictor = Predictor(noisy_model, SIGNALS)
+    feed(predictor, noisy_laps.select(rows), rows)
+    state = predictor.online
+    predictor.swap(OnnxModel(noisy_model.artifact))
+    assert predictor.online is state
+    trained = train(noisy_laps.select(np.arange(800)), make_config(kind="rls", history=0.3), orca, tmp_path / "c.pt")
+    predictor.swap(OnnxModel(save_artifact(trained, tmp_path / "other")))
+    assert (predictor.online is state, predictor.online.steps) == (False, 0)
+
+
+def test_a_damaged_layer_is_found_when_the_folder_is_opened(noisy_laps, orca, make_config, tmp_path: Path):
+    trained = train(noisy_laps, make_config(kind="rls", history=0.3), orca, tmp_path / "c.pt")
+    artifact = save_artifact(trained, tmp_path / "model")
+    (artifact.path / "online.safetensors").unlink()
+    from dynssm_ros.runtime.artifact import open_artifact
+
+    with pytest.raises(ArtifactError, match=r"incomplete model folder, online\.safetensors is missing"):
+        open_artifact(artifact.path)
+
+
+def test_features_fit_into_a_short_window(orca, noisy_model):
+    from dynssm_ros.learning.models.base import OnlineConfig
+    from dynssm_ros.learning.models.physics import PhysicsConfig
+
+    features = OnlineFeatures(OnlineConfig(), orca, PhysicsConfig(), noisy_model.card.normalisation, 5, False)
+    seen, physics = features(torch.rand(7, 5, 7) + 1.0, None)
+    assert seen.shape == (7, 3, len(features.names))
+    assert physics.shape == (7, 3)
