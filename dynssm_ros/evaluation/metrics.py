@@ -100,7 +100,7 @@ def learned_while_driving(
         parts.append(predicted.seen)
     seen = Seen(*(np.concatenate(each) for each in zip(*parts, strict=True)))
     following = np.minimum(ends + 1, len(matrix) - 1)
-    return ends, layer.drive(seen, matrix[following, :3] - matrix[ends, :3], ends)
+    return ends, layer.drive(seen, matrix[ends], matrix[following, :3] - matrix[ends, :3], ends)
 
 
 def rmse(errors: Vector) -> Vector:

@@ -132,6 +132,7 @@ def _metrics(trained: Trained) -> dict[str, Any]:
         "validation_rmse": dict(zip(("v_x", "v_y", "omega"), trained.validation_rmse, strict=True)),
         "windows": dict(zip(("training", "validation"), trained.windows, strict=True)),
         "best_epoch": trained.best_epoch,
+        "network_gain": trained.network_gain,
         "history": trained.history,
     }
 

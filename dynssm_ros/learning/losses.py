@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import torch
@@ -40,6 +41,12 @@ class LossConfig(StrictModel):
     )
     robust: float = Field(default=0.0, ge=0, description="Huber threshold in units of the scale; 0: squared error")
     parameters: float = Field(ge=0, description="lambda_theta")
+    rollout: float = Field(
+        default=0.0,
+        ge=0,
+        description="beyond the paper: length of the rollouts whose errors count (s), one step at first, all of it from the "
+        "last quarter of the epochs on; 0: one step ahead",
+    )
     correction: float = Field(default=0.0, ge=0, description="lambda_corr; 0 switches the residual penalty off")
     physics: float = Field(default=0.0, ge=0, description="lambda_phy; 0 switches the physics anchor off")
 
@@ -52,6 +59,33 @@ def scales(config: LossConfig, normalisation: Normalisation) -> Scales:
     """``(s_y, s_delta)`` of shape ``(3,)`` as the configuration defines them."""
     units = {"target": normalisation.state_scale, "increment": normalisation.increment_scale, "none": (1.0, 1.0, 1.0)}
     return torch.tensor(units[config.scale]), torch.tensor(normalisation.increment_scale)
+
+
+def rollout_objective(
+    model: Callable[[Tensor], Output], rows: Tensor, target: Tensor, steps: int, config: LossConfig, by: Scales
+) -> dict[str, Tensor]:
+    """The mean over a rollout of :func:`objective`, where the error of a state ``k`` steps ahead counts over ``k``.
+
+    Args:
+        model: from windows to outputs.
+        rows: measured, ``(B, H + steps - 1, 7)``: the window, and the rows through which the rollout leads.
+        target: measured increment from the last of them, ``(B, 3)``.
+        steps: length of the rollout.
+        config: weights and switches.
+        by: ``(s_y, s_delta)``.
+    """
+    H = rows.shape[1] - steps + 1
+    following = torch.cat([rows[:, H:, :3], rows[:, -1:, :3] + target[:, None]], dim=1)
+    window = rows[:, :H]
+    each = []
+    for k in range(steps):
+        output, now = model(window), window[:, -1, :3]
+        # as an increment that ends where the measured path does
+        each.append(objective(output, following[:, k] - now, config, (by[0] * (k + 1), by[1])))
+        if k + 1 < steps:
+            row = torch.cat([now + output.increment, rows[:, H + k, 3:]], dim=-1)
+            window = torch.cat([window[:, 1:], row[:, None]], dim=1)
+    return {name: torch.stack([terms[name] for terms in each]).mean() for name in COMPONENTS}
 
 
 def objective(output: Output, target: Tensor, config: LossConfig, by: Scales) -> dict[str, Tensor]:

@@ -18,6 +18,7 @@ from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import OnlineConfig, steps_of
 from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
 from dynssm_ros.runtime.online import CHANNELS, OnlineLayer, OnlineLayerCard, Seen
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
@@ -76,7 +77,7 @@ class OnlineFeatures(nn.Module):
     def forward(self, window: Tensor, output: Output) -> tuple[Tensor, Tensor]:
         """Windows ``(B, H, 7)`` to features ``(B, 3, n)`` and the physics' increments ``(B, 3)`` (m/s, m/s, rad/s)."""
         increments = (window[:, 1:, :CHANNELS] - window[:, :-1, :CHANNELS]) / self.increment_scale
-        physics = self.physics(window[:, -self.errors - 1 :], self.nominal) / self.increment_scale
+        physics = self.physics.over(window, self.nominal, self.errors + 1) / self.increment_scale
         now = physics[:, -1]
         own = [now, _next(now), _next(_next(now))]
         if self.network:
@@ -103,6 +104,8 @@ class Drive(NamedTuple):
     """What the prior is fitted to: what the layer sees of a recording's windows, and what happened next."""
 
     seen: Seen
+    rows: Vector
+    """``(N, 7)``."""
     increments: Vector
     """Measured, ``(N, 3)`` (m/s, m/s, rad/s)."""
     ends: Indices
@@ -112,13 +115,13 @@ class Drive(NamedTuple):
 def joined(drives: list[Drive]) -> Drive:
     """Drives one after the other."""
     seen = Seen(*(np.concatenate(parts) for parts in zip(*(drive.seen for drive in drives), strict=True)))
-    return Drive(seen, *(np.concatenate([drive[k] for drive in drives]) for k in (1, 2)))
+    return Drive(seen, *(np.concatenate([drive[k] for drive in drives]) for k in (1, 2, 3)))
 
 
 def fit_layer(
-    parts: list[Drive], names: tuple[str, ...], memory: float, scale: Normalisation, vehicle: Vehicle
-) -> OnlineLayer:
-    """The layer with its prior: mean and covariance of the weights.
+    parts: list[Drive], features: OnlineFeatures, scale: Normalisation, config: OnlineConfig
+) -> tuple[OnlineLayer, float]:
+    """The layer with its prior, and its error on parts of the laps that the prior was fitted without.
 
     The prior's mean is the least-squares solution on the training laps. Its covariance is that of so many rows of them.
     The number of rows is the least of :data:`_PRIOR_ROWS` with which the layer predicts parts of the laps, each with a
@@ -127,10 +130,12 @@ def fit_layer(
 
     Args:
         parts: of the training laps; their network features by models that do not know them.
-        names: of the features.
-        memory: time constant with which weights return to the prior (s).
+        features: that it sees.
         scale: gives s_delta.
-        vehicle: sampling time and minimum speed.
+        config: of the layer.
+
+    Returns:
+        The layer; the geometric mean over the channels of its RMSE on those parts, in units of s_delta.
 
     Raises:
         RecordingError: there are no windows to fit it to.
@@ -145,21 +150,27 @@ def fit_layer(
         for k, part in enumerate(parts)
     ]
 
-    def layer(prior: _Prior, rows: float) -> OnlineLayer:
-        card = OnlineLayerCard(features=names, memory=memory, prior_rows=rows)
+    vehicle, physics = features.physics.vehicle, features.physics.config
+    stepping = physics.integrator, physics.substeps
+    nothing = BlockErrors(np.ones(CHANNELS), np.ones(CHANNELS))
+    whole = joined(parts)
+    usual = CoefficientEstimator(vehicle, s_delta, nothing, *stepping, config.spread).usual_errors(*whole[1:])
+
+    def layer(prior: _Prior, rows: float, spread: dict[str, float]) -> OnlineLayer:
+        card = OnlineLayerCard(features=features.names, memory=config.memory, prior_rows=rows, spread=spread)
         covariance = (np.linalg.inv(prior.gram) / rows).astype(np.float64)
         return OnlineLayer(
-            card, prior.mean, covariance, prior.noise, prior.physics, np.ones(CHANNELS), s_delta, vehicle.sampling_time,
-            vehicle.minimum_speed,
+            card, prior.mean, covariance, prior.noise, prior.physics, np.ones(CHANNELS), usual.noise, usual.slow, s_delta,
+            vehicle, *stepping,
         )  # fmt: skip
 
     losses = {}
     for rows in _PRIOR_ROWS:
-        errors = np.concatenate([_errors(layer(prior, rows), part) for part, prior in left_out])
+        errors = np.concatenate([_errors(layer(prior, rows, {}), part) for part, prior in left_out])
         losses[rows] = float(0.5 * np.log(np.mean(errors**2, axis=0) + _SMALLEST).mean())
     least = min(losses.values())
     chosen = next(rows for rows in _PRIOR_ROWS if losses[rows] <= least + np.log1p(_TOLERANCE))
-    return layer(_least_squares(joined(parts), s_delta), chosen)
+    return layer(_least_squares(whole, s_delta), chosen, config.spread), float(np.exp(losses[chosen]))
 
 
 class _Prior(NamedTuple):

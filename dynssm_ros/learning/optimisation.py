@@ -18,7 +18,7 @@ from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.files import replacing
 from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.dataset import TrainingWindows
-from dynssm_ros.learning.losses import COMPONENTS, LossConfig, Scales, scales
+from dynssm_ros.learning.losses import COMPONENTS, LossConfig, Scales, rollout_objective, scales
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel, TrainingConfig
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
@@ -74,6 +74,7 @@ class Optimisation:
         self.config = config
         self.loss: LossConfig = config.loss
         self.settings = config.training
+        self.steps = rollout_steps(config, vehicle)
         self.model = model.to(device)
         s_y, s_delta = scales(config.loss, scale)
         self.scales: Scales = (s_y.to(device), s_delta.to(device))
@@ -139,9 +140,10 @@ class Optimisation:
         order = torch.randperm(len(self.training), generator=self.shuffle).to(self.training.ends.device)
         batches = torch.split(order, self.settings.batch_size)
         totals = dict.fromkeys(COMPONENTS, 0.0)
+        steps = self._ramped()
         for index in batches:
             window, target = self.augmentation(*self.training.batch(index))
-            terms = self._terms(window, target)
+            terms = self._terms(window, target, steps)
             loss = torch.stack(list(terms.values())).sum()
             self.optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
@@ -156,10 +158,20 @@ class Optimisation:
     def _validate(self) -> dict[str, float]:
         self.model.eval()
         window, target = self.validation.batch(slice(None))
-        return {term: value.item() for term, value in self._terms(window, target).items()}
+        return {term: value.item() for term, value in self._terms(window, target, self.steps).items()}
 
-    def _terms(self, window: Tensor, target: Tensor) -> dict[str, Tensor]:
-        return self.model.terms(window, target, self.loss, self.scales)
+    def _terms(self, window: Tensor, target: Tensor, steps: int) -> dict[str, Tensor]:
+        if self.steps == 1:
+            return self.model.terms(window, target, self.loss, self.scales)
+        longer = self.steps - steps  # rows that this rollout does not reach
+        if longer:
+            window, target = window[:, :-longer], window[:, -longer, :3] - window[:, -longer - 1, :3]
+        return rollout_objective(self.model, window, target, steps, self.loss, self.scales)
+
+    def _ramped(self) -> int:
+        """Steps of the rollouts in this epoch: one until half of the epochs are done, all in the last quarter."""
+        share = (self.state.epoch / max(self.settings.epochs, 1) - 0.5) / 0.25
+        return 1 + round((self.steps - 1) * float(min(max(share, 0.0), 1.0)))
 
     def _save(self) -> None:
         content: dict[str, Any] = vars(self.state) | {
@@ -190,6 +202,12 @@ class Optimisation:
         self.shuffle.set_state(content["shuffle"].cpu())
         self.state = _TrainingState(**{name: content[name] for name in vars(self.state)})
         return self.state.epoch
+
+
+def rollout_steps(config: Any, vehicle: Vehicle) -> int:
+    """Steps of the rollouts whose errors are minimised; 1 without."""
+    loss: LossConfig | None = getattr(config, "loss", None)
+    return 1 if loss is None or loss.rollout == 0 else max(1, round(loss.rollout / vehicle.sampling_time))
 
 
 def _schedule(settings: TrainingConfig, optimiser: torch.optim.Optimizer) -> torch.optim.lr_scheduler.LRScheduler:

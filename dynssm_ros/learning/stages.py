@@ -11,11 +11,11 @@ import torch
 
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.learning.dataset import TrainingWindows, all_windows, normalisation, split_windows
-from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
+from dynssm_ros.learning.models.base import ModelConfig, OnlineConfig, TrainableModel
 from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.models.registry import build_model
 from dynssm_ros.learning.online import Drive, OnlineFeatures, fit_layer
-from dynssm_ros.learning.optimisation import History, Optimisation, OptimisationResult
+from dynssm_ros.learning.optimisation import History, Optimisation, OptimisationResult, rollout_steps
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.online import OnlineLayer, Seen
@@ -25,6 +25,8 @@ from dynssm_ros.vehicle import Vehicle
 Calibrate = Callable[[Recording, Vehicle], Vehicle]
 """Fits the nominal values of a vehicle to a recording."""
 
+NETWORK_GAIN_WANTED = 0.01
+"""A network that takes away less of the online layer's error is left out of it."""
 _BATCH = 4096  # windows
 _SHORTER = 4  # how many times fewer epochs the models have that only tell how large errors are on unknown laps
 
@@ -52,6 +54,8 @@ class Trained:
     features: OnlineFeatures | None = None
     """What the online layer sees; ``None`` without one, as the next."""
     online: OnlineLayer | None = None
+    network_gain: float | None = None
+    """Share of the online layer's one-step error on left-out parts that the network takes away; ``None`` without either."""
 
     @property
     def H(self) -> int:
@@ -131,24 +135,30 @@ def _with_layer(trained: Trained, left_out: list[tuple[TrainableModel, Recording
         left_out: parts of the recording, each with a model that was trained without it. If there are none, the prior is
             fitted to what the model itself says of the recording.
     """
-    config, vehicle = trained.config, trained.vehicle
+    config = trained.config
     if config.online is None:
         return trained
-    integrator, substeps = config.stepping
-    features = OnlineFeatures(
-        config.online, vehicle, PhysicsConfig(integrator=integrator, substeps=substeps), trained.normalisation, trained.H,
-        trained.model.LEARNS,
-    )  # fmt: skip
     known = left_out or [(trained.model, trained.recording)]
-    drives = [_drive(features, model, part, trained.H, vehicle.minimum_speed) for model, part in known]
-    layer = fit_layer(
-        [each for each in drives if len(each.ends)],
-        features.names,
-        config.online.memory,
-        trained.normalisation,
-        vehicle,
-    )
-    return replace(trained, features=features, online=layer)
+    features, layer, error = _layer(trained, config.online, known, trained.model.LEARNS)
+    if not trained.model.LEARNS:
+        return replace(trained, features=features, online=layer)
+    plain, layer_alone, error_alone = _layer(trained, config.online, known, False)
+    gain = 1.0 - error / error_alone
+    if gain < NETWORK_GAIN_WANTED:
+        features, layer = plain, layer_alone
+    return replace(trained, features=features, online=layer, network_gain=gain)
+
+
+def _layer(
+    trained: Trained, online: OnlineConfig, known: list[tuple[TrainableModel, Recording]], network: bool
+) -> tuple[OnlineFeatures, OnlineLayer, float]:
+    """The online layer's features, the layer, and its error on parts of the laps that its prior was fitted without."""
+    integrator, substeps = trained.config.stepping
+    physics = PhysicsConfig(integrator=integrator, substeps=substeps)
+    features = OnlineFeatures(online, trained.vehicle, physics, trained.normalisation, trained.H, network)
+    drives = [_drive(features, model, part, trained.H, trained.vehicle.minimum_speed) for model, part in known]
+    layer, error = fit_layer([each for each in drives if len(each.ends)], features, trained.normalisation, online)
+    return features, layer, error
 
 
 @torch.no_grad()
@@ -160,7 +170,8 @@ def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording
         window, target = windows.batch(slice(begin, begin + _BATCH))
         parts.append((*features(window, model.eval()(window)), target))
     seen, physics, increments = (torch.cat(each).double().numpy() for each in zip(*parts, strict=True))
-    return Drive(Seen(seen, physics), increments, windows.ends.numpy())
+    ends = windows.ends.numpy()
+    return Drive(Seen(seen, physics), recording.matrix[ends], increments, ends)
 
 
 def checkpoints(config: ModelConfig, checkpoint: Path) -> list[Path]:
@@ -232,7 +243,12 @@ def _train(
     plain, _ = _split(recording, config, vehicle)
     scale = normalisation(recording, plain) if start is None else start.normalisation
     model = build_model(config, vehicle, scale)
-    training, validation = _split(recording, config, vehicle, model.EXTRA_ROWS)
+    ahead = rollout_steps(config, vehicle) - 1
+    if ahead and model.EXTRA_ROWS:
+        raise ConfigurationError(
+            f"model {config.name}: loss.rollout: kind {config.kind} has a loss of its own; expected 0"
+        )
+    training, validation = _split(recording, config, vehicle, model.EXTRA_ROWS + ahead)
     if start is not None:
         model.take_over(start.model)
     if model.fit(training):

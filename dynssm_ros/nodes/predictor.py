@@ -130,6 +130,7 @@ class PredictorNode(Node):
         if prediction.theta is not None:
             self._adapted.header.stamp = odometry.header.stamp
             self._adapted.position = prediction.theta.tolist()
+            self._adapted.effort = [] if prediction.theta_std is None else prediction.theta_std.tolist()
             self._publish_parameters(self._adapted)
         if self._horizon > 0:
             self._publish_horizon(self._path(prediction))

@@ -110,7 +110,7 @@ class Artifact:
         if card.online is None:
             return None
         scale = np.array(card.normalisation.increment_scale)
-        return load_layer(self.path / ONLINE, card.online, scale, card.sampling_time, card.vehicle.minimum_speed)
+        return load_layer(self.path / ONLINE, card.online, scale, card.vehicle, card.integrator, card.substeps)
 
 
 def open_artifact(path: str | Path) -> Artifact:

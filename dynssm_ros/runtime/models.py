@@ -18,7 +18,10 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle import Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.single_track import Integrator, step_with_effect_states
+from dynssm_ros.vehicle.single_track import Integrator, increments_along, step_with_effect_states
+
+CARRIED_S = 0.64
+"""Length of the window over which effect states are carried (s); lags are far shorter."""
 
 
 class WindowPrediction(NamedTuple):
@@ -55,7 +58,7 @@ def corrected(
         increments = layer.bounded(increments, prediction.seen.physics, learned.limit)
     fast = (now[:, :1] >= layer.minimum_speed) | (layer.minimum_speed == 0.0)
     state = np.where(fast, now + increments, prediction.state)
-    return prediction._replace(state=state, variance=learned.variance * layer.scale**2)
+    return prediction._replace(state=state, variance=learned.variance * layer.scale**2, theta=learned.theta)
 
 
 class WindowModel(Protocol):
@@ -110,10 +113,13 @@ class Persistence:
 
 
 class SingleTrack:
-    """The nominal single-track model of a vehicle file, without learning."""
+    """The nominal single-track model of a vehicle file, without learning.
+
+    Where effects of the vehicle have states (a lagging steering, relaxing tyres), these are carried over a window of
+    ``CARRIED_S``.
+    """
 
     name = "single_track"
-    H = 1
     commands: Commands | None = None
     online: OnlineLayer | None = None
     card: ModelCard | None = None
@@ -124,8 +130,10 @@ class SingleTrack:
         self.T_s = vehicle.sampling_time
         self._theta = vehicle.nominal
         self._effects = vehicle.active_effects
+        self._carries = any(effect.carries for effect in self._effects)
         self._integrator: Integrator = integrator
         self._substeps = substeps
+        self.H = 1 + (round(CARRIED_S / self.T_s) if self._carries else 0)
         self.flops = count_operations(self.predict, np.ones((1, self.H, len(WINDOW_COLUMNS))))
 
     @property
@@ -135,26 +143,28 @@ class SingleTrack:
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Steps the physics from the last row of each window."""
-        predicted = self._following(windows[:, -1, :])
+        predicted = self._following(windows, 1)[:, 0]
         return WindowPrediction(predicted, np.tile(self._theta, (len(windows), 1)), predicted)
 
-    def _following(self, rows: Vector) -> Vector:
-        """Next states ``(N, 3)`` of single rows ``(N, 7)``."""
-        now = rows.T
+    def _following(self, windows: Vector, latest: int) -> Vector:
+        """Next states ``(N, latest, 3)`` from the latest rows of windows ``(N, H, 7)``."""
+        theta = Coefficients(*self._theta)
+        if self._carries:
+            rows = [windows[:, k].T for k in range(windows.shape[1])]
+            moved = increments_along(
+                np, [State(*row[:3]) for row in rows], [applied_inputs(row) for row in rows],
+                initial_effect_states(self._effects, rows[0][3], rows[0][4]), theta,
+                self.vehicle.constants, self.T_s, self._effects, self._integrator, self._substeps,
+            )[-latest:]  # fmt: skip
+            increments = np.stack([np.stack(each, axis=-1) for each in moved], axis=1)
+            return np.asarray(windows[:, -latest:, :3] + increments)
+        now = np.moveaxis(windows[:, -latest:], -1, 0)
         effect_states = initial_effect_states(self._effects, now[3], now[4])
         state, _ = step_with_effect_states(
-            np,
-            State(*now[:3]),
-            effect_states,
-            applied_inputs(now),
-            Coefficients(*self._theta),
-            self.vehicle.constants,
-            self.T_s,
-            self._effects,
-            self._integrator,
-            self._substeps,
-        )
-        return np.stack(state, axis=1)
+            np, State(*now[:3]), effect_states, applied_inputs(now), theta, self.vehicle.constants, self.T_s,
+            self._effects, self._integrator, self._substeps,
+        )  # fmt: skip
+        return np.stack(state, axis=-1)
 
 
 class SingleTrackEwma(SingleTrack):
@@ -165,15 +175,20 @@ class SingleTrackEwma(SingleTrack):
     """
 
     name = "single_track_ewma"
-    H = 31
+    rows = 31
     decay = 0.9
+
+    def __init__(self, vehicle: Vehicle, integrator: Integrator = "euler", substeps: int = 1) -> None:
+        super().__init__(vehicle, integrator, substeps)
+        self.H += self.rows - 1
+        self.flops = count_operations(self.predict, np.ones((1, self.H, len(WINDOW_COLUMNS))))
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Steps the physics from the last row and corrects it by the mean of its errors over the window."""
-        count, H, columns = windows.shape
-        following = self._following(windows.reshape(-1, columns)).reshape(count, H, 3)
-        errors = following[:, :-1] - windows[:, 1:, :3]
-        weights = self.decay ** np.arange(H - 2, -1, -1.0)
+        following = self._following(windows, min(self.rows, windows.shape[1]))
+        count, rows, _ = following.shape
+        errors = following[:, :-1] - windows[:, windows.shape[1] - rows + 1 :, :3]
+        weights = self.decay ** np.arange(rows - 2, -1, -1.0)
         physics = following[:, -1]
         corrected = physics - ((weights / weights.sum())[:, None] * errors).sum(axis=1)
         return WindowPrediction(corrected, np.tile(self._theta, (count, 1)), physics)

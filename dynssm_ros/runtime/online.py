@@ -6,6 +6,9 @@ distribution is the prior that training found; a Kalman filter estimates them fr
 This is recursive least squares that forgets towards the prior. It learns in the same way as the last layers of ALPaCA
 (Harrison et al. 2018) and Neural-Fly (O'Connell et al. 2022).
 
+Beside the layer, the physics' coefficients are followed (:mod:`dynssm_ros.runtime.coefficients`). They are published, and do
+not enter the prediction: the layer takes the same errors off, and more of them.
+
 The features are stateless and computed by the model's graph. What is learned is one small :class:`OnlineState`, in numpy.
 """
 
@@ -25,7 +28,10 @@ from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import replacing
+from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.single_track import Integrator
 
 CHANNELS = 3
 _OUTLIER = 4.0  # errors beyond this many standard deviations weigh less (Huber)
@@ -43,6 +49,9 @@ class OnlineLayerCard(StrictModel):
     features: tuple[str, ...] = Field(min_length=1, description="names of the features of a channel, in order")
     memory: float = Field(gt=0, description="time constant with which weights return to the prior (s)")
     prior_rows: float = Field(gt=0, description="rows of driving that the prior is worth")
+    spread: dict[str, float] = Field(
+        description="how far coefficients change, as in an OnlineConfig; empty: not at all"
+    )
 
 
 class Seen(NamedTuple):
@@ -63,10 +72,12 @@ class Learned(NamedTuple):
     """Of the error of the next prediction, ``(N, 3)``, in units of s_delta squared."""
     limit: Vector
     """Largest correction of the physics in a rollout, ``(N, 3)``, in units of s_delta."""
+    theta: Vector
+    """Coefficients, ``(N, 17)``."""
 
     def at(self, rows: Indices) -> Learned:
         """What was known at ``rows``."""
-        return Learned(self.weights[rows], self.variance[rows], self.limit[rows])
+        return Learned(*(part[rows] for part in self))
 
 
 @dataclass(frozen=True)
@@ -80,9 +91,12 @@ class OnlineLayer:
         noise: variance of one-step errors on the training laps, ``(3,)``, in units of s_delta squared.
         physics: mean square of the physics' one-step errors there, ``(3,)``, in the same units.
         width: factor of the stated standard deviation that covers 90 % there, ``(3,)``.
+        block_noise: variance of the physics' mean errors over blocks of rows, ``(3,)``, in the same units.
+        block_slow: the part of it that a block shares with the one before.
         scale: s_delta (m/s, m/s, rad/s), ``(3,)``.
-        T_s: length of a step (s).
-        minimum_speed: below it the layer neither learns nor corrects (m/s).
+        vehicle: the calibrated car. Below its minimum speed the layer neither learns nor corrects.
+        integrator: of the physics.
+        substeps: integration steps per sampling time.
     """
 
     card: OnlineLayerCard
@@ -91,9 +105,27 @@ class OnlineLayer:
     noise: Vector
     physics: Vector
     width: Vector
+    block_noise: Vector
+    block_slow: Vector
     scale: Vector
-    T_s: float
-    minimum_speed: float
+    vehicle: Vehicle
+    integrator: Integrator = "euler"
+    substeps: int = 1
+
+    @property
+    def T_s(self) -> float:
+        """Length of a step (s)."""
+        return self.vehicle.sampling_time
+
+    @property
+    def minimum_speed(self) -> float:
+        """Below it the layer neither learns nor corrects (m/s)."""
+        return self.vehicle.minimum_speed
+
+    def estimator(self) -> CoefficientEstimator:
+        """What follows the coefficients, as it begins."""
+        errors = BlockErrors(self.block_noise, self.block_slow)
+        return CoefficientEstimator(self.vehicle, self.scale, errors, self.integrator, self.substeps, self.card.spread)
 
     def start(self) -> OnlineState:
         """The state at the beginning of a drive: the prior."""
@@ -108,23 +140,27 @@ class OnlineLayer:
         """Increments within ``limit`` (units of s_delta) of the physics' ones, so that rollouts stay bounded as those do."""
         return physics + np.clip(increments - physics, -limit * self.scale, limit * self.scale)
 
-    def drive(self, seen: Seen, increments: Vector, ends: Indices) -> Learned:
+    def drive(self, seen: Seen, rows: Vector, increments: Vector, ends: Indices) -> Learned:
         """Learns over a recording, row after row, and notes what was known at each.
 
         Args:
             seen: of the windows that end at ``ends``.
-            increments: measured from these rows to the next (m/s, m/s, rad/s), ``(N, 3)``.
+            rows: those rows, ``(N, 7)``.
+            increments: measured from them to the next (m/s, m/s, rad/s), ``(N, 3)``.
             ends: row numbers, ascending. The layer learns a step once the row after it is one of them.
         """
         state = self.start()
         count, n = len(ends), self.mean.shape[1]
-        learned = Learned(np.empty((count, CHANNELS, n)), np.empty((count, CHANNELS)), np.empty((count, CHANNELS)))
+        learned = Learned(*(np.empty((count, *shape)) for shape in ((CHANNELS, n), (CHANNELS,), (CHANNELS,), (17,))))
         for k, row in enumerate(ends):
             if k and ends[k - 1] == row - 1:
-                state.update(seen.features[k - 1], increments[k - 1], seen.physics[k - 1])
+                state.update(Seen(seen.features[k - 1], seen.physics[k - 1]), rows[k - 1], increments[k - 1])
+            else:
+                state.interrupt()
             learned.weights[k] = state.mean
             learned.variance[k] = state.variance(seen.features[k])
             learned.limit[k] = state.limit
+            learned.theta[k] = state.coefficients.theta
         return learned
 
 
@@ -133,6 +169,7 @@ class OnlineState:
 
     def __init__(self, layer: OnlineLayer) -> None:
         self.layer = layer
+        self.coefficients = layer.estimator()
         self.retained = math.exp(-layer.T_s / layer.card.memory)
         self._forget = min(1.0, layer.T_s / _NOISE_MEMORY_S)
         self._returning = (1 - self.retained) * layer.mean
@@ -147,7 +184,12 @@ class OnlineState:
         self.noise = layer.noise.copy()
         self.physics = layer.physics.copy()
         self.width = layer.width.copy()
+        self.coefficients.reset()
         self.steps = 0
+
+    def interrupt(self) -> None:
+        """The next step does not follow on the last one."""
+        self.coefficients.interrupt()
 
     @property
     def limit(self) -> Vector:
@@ -166,12 +208,15 @@ class OnlineState:
         stated: Vector = self.width * self.width * self.noise * (1.0 + (spread * features).sum(axis=1))
         return stated
 
-    def update(self, features: Vector, increment: Vector, physics: Vector) -> None:
-        """Learns from a step: features before it ``(3, n)``, measured and physics' increment ``(3,)`` (m/s, m/s, rad/s).
+    def update(self, seen: Seen, row: Vector, increment: Vector) -> None:
+        """Learns from a step; one that is not finite teaches nothing.
 
-        A step that is not finite teaches nothing.
+        Args:
+            seen: before it, features ``(3, n)`` and physics ``(3,)``.
+            row: measured, before it, ``(7,)``.
+            increment: measured (m/s, m/s, rad/s), ``(3,)``.
         """
-        scale = self.layer.scale
+        scale, (features, physics) = self.layer.scale, seen
         target = increment / scale
         if not math.isfinite(float(target.sum() + features.sum())):
             return
@@ -192,11 +237,13 @@ class OnlineState:
         self.noise = np.maximum(self.noise + self._forget * (square - self.noise), _SMALLEST**2)
         of_physics = ((increment - physics) / scale) ** 2
         self.physics = self.physics + self._forget * (of_physics - self.physics)
+        self.coefficients.step(row, increment)
         self.steps += 1
 
     def save(self, path: Path, owner: str) -> None:
         """Writes what was learned to ``path``, atomically; ``owner`` names the prior that it belongs to."""
         arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _SAVED}
+        arrays |= {f"coefficients.{name}": value for name, value in self.coefficients.kept().items()}
         with replacing(path) as aside:
             save_file(arrays, aside, {"prior": owner, "steps": str(self.steps)})
 
@@ -216,17 +263,20 @@ class OnlineState:
             raise ArtifactError(f"{path}: not a readable online state ({error})") from error
         if about.get("prior") != owner:
             raise ArtifactError(f"{path}: was learned by another model; expected the state of prior {owner[:12]}")
-        for name in _SAVED:
-            value, expected = arrays.get(name), getattr(self, name)
+        estimator = self.coefficients.kept()
+        for name in (*_SAVED, *(f"coefficients.{name}" for name in estimator)):
+            value = arrays.get(name)
+            expected = getattr(self, name) if name in _SAVED else estimator[name.removeprefix("coefficients.")]
             if value is None or value.shape != expected.shape or not np.isfinite(value).all():
                 raise ArtifactError(f"{path}: {name} is missing, of another shape or not finite")
         for name in _SAVED:
             setattr(self, name, arrays[name])
+        self.coefficients.restore({name: arrays[f"coefficients.{name}"] for name in estimator})
         self.steps = int(about.get("steps", "0"))
 
 
 _SAVED = ("mean", "covariance", "noise", "physics", "width")
-_PRIOR = ("mean", "covariance", "noise", "physics", "width")
+_PRIOR = (*_SAVED, "block_noise", "block_slow")
 
 
 def save_layer(layer: OnlineLayer, path: Path) -> None:
@@ -234,7 +284,9 @@ def save_layer(layer: OnlineLayer, path: Path) -> None:
     save_file({name: np.ascontiguousarray(getattr(layer, name)) for name in _PRIOR}, path)
 
 
-def load_layer(path: Path, card: OnlineLayerCard, scale: Vector, T_s: float, minimum_speed: float) -> OnlineLayer:
+def load_layer(
+    path: Path, card: OnlineLayerCard, scale: Vector, vehicle: Vehicle, integrator: Integrator, substeps: int
+) -> OnlineLayer:
     """Reads what :func:`save_layer` wrote.
 
     Raises:
@@ -253,7 +305,7 @@ def load_layer(path: Path, card: OnlineLayerCard, scale: Vector, T_s: float, min
                 f"{path}: {name} is missing, not finite, or not of the {n} features that the card names"
             )
     prior = {name: arrays[name] for name in _PRIOR}
-    return OnlineLayer(card, **prior, scale=scale, T_s=T_s, minimum_speed=minimum_speed)
+    return OnlineLayer(card, **prior, scale=scale, vehicle=vehicle, integrator=integrator, substeps=substeps)
 
 
 def expert_weights(layer: OnlineLayer, weights: Vector) -> dict[str, float]:

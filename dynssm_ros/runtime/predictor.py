@@ -17,7 +17,7 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.models import OnnxModel, WindowPrediction
-from dynssm_ros.runtime.online import OnlineState
+from dynssm_ros.runtime.online import OnlineState, Seen
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.signal_map import SignalMap
 from dynssm_ros.vehicle import State
@@ -33,6 +33,7 @@ class Prediction:
         state: predicted ``v_x, v_y, omega``, shape ``(3,)``.
         pose: propagated ``x, y, theta`` in the odometry frame; ``None`` if the pose is not mapped.
         theta: adapted coefficients in the order of ``COEFFICIENTS``, shape ``(17,)``; ``None`` if the model has none.
+        theta_std: their standard deviations, shape ``(17,)``; ``None`` if nothing follows the coefficients.
         variance: stated one-step error variances of the state, shape ``(3,)``; ``None`` if the model states none.
         residual_share: part of the increment that the residual adds to the physics, in [0, 1]; 0 without physics.
     """
@@ -41,6 +42,7 @@ class Prediction:
     state: Vector
     pose: Pose | None
     theta: Vector | None
+    theta_std: Vector | None
     variance: Vector | None
     residual_share: float
 
@@ -144,6 +146,7 @@ class Predictor:
             state[0],
             propagate_pose(values, now, following, self.model.T_s),
             None if theta is None else theta[0],
+            None if self.online is None else self.online.coefficients.std,
             None if variance is None else variance[0],
             0.0 if physics is None else self._residual_share(now, following, physics[0].tolist()),
         )
@@ -197,6 +200,8 @@ class Predictor:
             )
         if kept is not None:
             window[...] = kept
+        if row is None:
+            self.online.interrupt()
         self._row = row or _row_of(stamp, window, predicted, self.online.layer.minimum_speed)
 
     def _learned_row(self, before: _Row, stamp: int, window: Vector, predicted: WindowPrediction) -> _Row | None:
@@ -204,7 +209,7 @@ class Predictor:
         assert self.online is not None
         row = _row_of(stamp, window, predicted, self.online.layer.minimum_speed)
         if row is not None:
-            self.online.update(before.features, window[-1, :3] - window[-2, :3], before.physics)
+            self.online.update(before.seen, before.values, window[-1, :3] - window[-2, :3])
         return row
 
     def _corrected(self, predicted: WindowPrediction, window: Vector, in_rollout: bool = False) -> WindowPrediction:
@@ -219,7 +224,8 @@ class Predictor:
         if in_rollout:
             moved = layer.bounded(moved, predicted.seen.physics[0], online.limit)
         variance = online.variance(features) * layer.scale**2
-        return predicted._replace(state=(now + moved)[None], variance=variance[None])
+        theta = online.coefficients.theta
+        return predicted._replace(state=(now + moved)[None], variance=variance[None], theta=theta[None])
 
     def _residual_share(self, now: list[float], following: list[float], physics: list[float]) -> float:
         residual = sum(abs(a - b) / s for a, b, s in zip(following, physics, self._scale, strict=True))
@@ -231,8 +237,8 @@ class _Row(NamedTuple):
     """A row that the online layer has yet to see the next one of."""
 
     stamp: int
-    features: Vector
-    physics: Vector
+    seen: Seen
+    values: Vector
 
 
 def _row_of(stamp: int, window: Vector, predicted: WindowPrediction, minimum_speed: float) -> _Row | None:
@@ -240,7 +246,7 @@ def _row_of(stamp: int, window: Vector, predicted: WindowPrediction, minimum_spe
     assert predicted.seen is not None
     if not window[:, 0].min() >= minimum_speed:
         return None
-    return _Row(stamp, predicted.seen.features[0], predicted.seen.physics[0])
+    return _Row(stamp, Seen(predicted.seen.features[0], predicted.seen.physics[0]), window[-1].copy())
 
 
 def live_signal_map(model: OnnxModel, signal_map: SignalMap) -> SignalMap:

@@ -102,7 +102,7 @@ def replay_to_bag(
             sink.write(PREDICTION_TOPIC, log_time, message)
             if outcome.theta is not None:
                 values = dict(zip(COEFFICIENTS, outcome.theta.tolist(), strict=True))
-                sink.write(PARAMETERS_TOPIC, log_time, joint_state(outcome.stamp, values))
+                sink.write(PARAMETERS_TOPIC, log_time, joint_state(outcome.stamp, values, outcome.theta_std))
         if with_inputs:
             copy_topics(source, sink)
             for message in source.messages(list(source.types)):

@@ -56,10 +56,12 @@ def odometry(
     )
 
 
-def joint_state(stamp: int, values: Mapping[str, float]) -> Any:
-    """A JointState message with a position for each name; ``stamp`` in ns."""
+def joint_state(stamp: int, values: Mapping[str, float], effort: Vector | None = None) -> Any:
+    """A JointState message with a position for each name, and an effort if given; ``stamp`` in ns."""
     position = np.array(list(values.values()), dtype=np.float64)
-    return _TYPES[JOINT_STATE](_header(stamp, ""), list(values), position, np.zeros(0), np.zeros(0))
+    return _TYPES[JOINT_STATE](
+        _header(stamp, ""), list(values), position, np.zeros(0), np.zeros(0) if effort is None else effort
+    )
 
 
 def _header(stamp: int, frame_id: str) -> Any:

@@ -54,3 +54,33 @@ def test_a_window_without_the_signal_that_an_effect_needs_is_one_clear_line(name
         ConfigurationError, match=rf"^effect {name} needs the signal \w+ .*, which is not known here \(none\)$"
     ):
         SingleTrack(car).predict(rows()[:, None])
+
+
+CARRYING = sorted(name for name in ANYWHERE if EFFECTS[name](**{}).EFFECT_STATES)
+
+
+@pytest.mark.parametrize("name", CARRYING)
+def test_the_layer_carries_effect_states_over_a_window_as_the_baseline_does(name: str, acting: Acting) -> None:
+    car = with_effect(name, acting)
+    model = SingleTrack(car, "rk4", 2)
+    smooth = np.cumsum(rows(model.H * 4).reshape(4, model.H, 7) - rows(1), axis=1) * 0.002 + [30, 0, 0, 0.2, 0, 0, 0]
+    layer = PhysicsLayer(car, PhysicsConfig(integrator="rk4", substeps=2))
+    found = layer.over(torch.from_numpy(smooth), torch.tensor(car.nominal), 1)[:, 0].numpy()
+    np.testing.assert_allclose(found, model.predict(smooth).state - smooth[:, -1, :3], atol=1e-12)
+    settled = layer(torch.from_numpy(smooth[:, -1]), torch.tensor(car.nominal)).numpy()
+    assert np.abs(found - settled).max() > 1e-5
+
+
+@pytest.mark.parametrize(
+    "effect", [{"steering_lag": {"time_constant": 0.05}}, {"yaw_rate_lag": {"time_constant": 0.05}}]
+)
+def test_a_vehicle_file_with_the_lag_predicts_what_one_without_it_cannot(effect: dict[str, dict[str, float]]) -> None:
+    import dynssm_ros
+
+    laps = dynssm_ros.recorded(dynssm_ros.simulate("orca", "club", duration=20.0, aggressiveness=0.6, effects=effect))
+    with_lag = load_vehicle("orca").with_effects(effect.items())
+    rmse = [
+        dynssm_ros.evaluate(laps, {"car": SingleTrack(car)}).scores["car"].rmse
+        for car in (with_lag, load_vehicle("orca"))
+    ]
+    assert np.all(rmse[0] < 0.2 * rmse[1])

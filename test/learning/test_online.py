@@ -52,10 +52,15 @@ def test_with_sensor_noise_it_beats_the_physics_that_it_starts_from(noisy_laps, 
     assert np.all(np.abs(scores["on"].coverage_90 - 0.9) < 0.03)
 
 
-def test_a_networks_increment_is_an_expert_of_its_own(noisy_laps, orca, make_config, tmp_path: Path):
-    config = make_config(online={"folds": 2})
-    trained = train(noisy_laps, config, orca, tmp_path / "c.pt")
-    assert "network" in trained.features.names
+def test_a_network_that_earns_nothing_is_left_out_of_the_layer(noisy_laps, orca, make_config, tmp_path: Path):
+    trained = train(noisy_laps, make_config(online={"folds": 2}), orca, tmp_path / "c.pt")
+    assert trained.network_gain < 0.01
+    assert "network" not in trained.features.names
+
+
+def test_a_networks_increment_is_an_expert_of_its_own(noisy_laps, orca, make_config, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("dynssm_ros.learning.stages.NETWORK_GAIN_WANTED", -1.0)
+    trained = train(noisy_laps, make_config(online={"folds": 2}), orca, tmp_path / "c.pt")
     model = OnnxModel(save_artifact(trained, tmp_path / "model"))
     window, _ = all_windows(noisy_laps, trained.H, orca.minimum_speed).batch(slice(0, 20))
     output = trained.model(window)

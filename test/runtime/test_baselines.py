@@ -64,7 +64,7 @@ def test_a_changing_bias_is_followed_within_the_memory_of_the_average() -> None:
 
 
 def test_baselines_state_no_variances() -> None:
-    given, _ = windows(drive(np.zeros(3)), SingleTrackEwma.H)
+    given, _ = windows(drive(np.zeros(3)), SingleTrackEwma(CAR).H)
     for model in (Persistence(), SingleTrack(CAR), SingleTrackEwma(CAR)):
         assert model.predict(given).variance is None
 

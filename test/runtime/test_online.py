@@ -6,23 +6,32 @@ import numpy as np
 import pytest
 
 from dynssm_ros.errors import ArtifactError
+from dynssm_ros.runtime.coefficients import SPREAD
 from dynssm_ros.runtime.online import OnlineLayer, OnlineLayerCard, Seen
+from dynssm_ros.vehicle import load_vehicle
 
 N = 4
 SCALE = np.array([0.1, 0.02, 0.3])
+ROWS = np.tile([1.5, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0], (5000, 1))
 
 
 def make_layer(memory=1e12, prior_rows=10.0, noise=1e-2, mean=None):
-    card = OnlineLayerCard(features=("physics", "a", "b", "one"), memory=memory, prior_rows=prior_rows)
+    card = OnlineLayerCard(features=("physics", "a", "b", "one"), memory=memory, prior_rows=prior_rows, spread=SPREAD)
     prior = np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)) if mean is None else mean
     covariance = np.tile(np.eye(N) / prior_rows, (3, 1, 1))
-    return OnlineLayer(card, prior, covariance, np.full(3, noise), np.ones(3), np.ones(3), SCALE, 0.02, 0.5)
+    one = np.ones(3)
+    return OnlineLayer(card, prior, covariance, np.full(3, noise), one, one, one, one, SCALE, load_vehicle("orca"))
 
 
 def drive(layer, features, weights, noise, rng):
     targets = np.einsum("kci,ci->kc", features, weights) + noise * rng.standard_normal((len(features), 3))
     seen = Seen(features, features[:, :, 0] * SCALE)
-    return layer.drive(seen, targets * SCALE, np.arange(len(features))), targets
+    return layer.drive(seen, ROWS[: len(features)], targets * SCALE, np.arange(len(features))), targets
+
+
+def learn(state, features, target):
+    """One step with features ``(3, n)`` and a target in units of s_delta."""
+    state.update(Seen(features, features[:, 0] * SCALE), ROWS[0], target * SCALE)
 
 
 def test_without_forgetting_it_is_the_bayesian_regression_of_all_rows():
@@ -31,7 +40,7 @@ def test_without_forgetting_it_is_the_bayesian_regression_of_all_rows():
     targets = np.einsum("kci,i->kc", features, [0.5, 1.0, -1.0, 0.2]) + 0.1 * rng.standard_normal((60, 3))
     state = layer.start()
     for row, target in zip(features, targets, strict=True):
-        state.update(row, target * SCALE, row[:, 0] * SCALE)
+        learn(state, row, target)
     for c in range(3):
         X = features[:, c]
         precision = X.T @ X + 10.0 * np.eye(N)
@@ -51,7 +60,7 @@ def test_it_finds_planted_weights_and_changed_ones():
     for weights, part in ((before, features[:2000]), (after, features[2000:])):
         for row in part:
             target = (row * weights).sum(1) + 0.1 * rng.standard_normal(3)
-            state.update(row, target * SCALE, row[:, 0] * SCALE)
+            learn(state, row, target)
     np.testing.assert_allclose(state.mean, after, atol=0.06)
 
 
@@ -60,10 +69,10 @@ def test_without_excitation_it_returns_to_the_prior():
     layer = make_layer(memory=2.0)
     state = layer.start()
     for row in rng.standard_normal((200, 3, N)):
-        state.update(row, np.zeros(3), row[:, 0] * SCALE)
+        learn(state, row, np.zeros(3))
     assert np.abs(state.mean - layer.mean).max() > 0.5
     for _ in range(2000):
-        state.update(np.zeros((3, N)), np.zeros(3), np.zeros(3))
+        learn(state, np.zeros((3, N)), np.zeros(3))
     np.testing.assert_allclose(state.mean, layer.mean, atol=1e-6)
     np.testing.assert_allclose(state.covariance, layer.covariance, atol=1e-6)
 
@@ -73,14 +82,14 @@ def test_an_outlier_moves_the_weights_little_and_no_nan_gets_in():
     layer = make_layer()
     state = layer.start()
     for row in rng.standard_normal((300, 3, N)):
-        state.update(row, (row[:, 0] + 0.1 * rng.standard_normal(3)) * SCALE, row[:, 0] * SCALE)
+        learn(state, row, row[:, 0] + 0.1 * rng.standard_normal(3))
     kept = state.mean.copy()
     row = rng.standard_normal((3, N))
-    state.update(row, np.full(3, 100.0), row[:, 0] * SCALE)
+    learn(state, row, np.full(3, 100.0) / SCALE)
     assert np.abs(state.mean - kept).max() < 0.02
     for bad in (np.nan, np.inf):
         kept, steps = state.mean.copy(), state.steps
-        state.update(row, np.array([0.0, bad, 0.0]), row[:, 0])
+        learn(state, row, np.array([0.0, bad, 0.0]))
         assert (state.steps, np.array_equal(kept, state.mean)) == (steps, True)
 
 
@@ -93,7 +102,7 @@ def test_its_90_percent_intervals_cover_90_percent(heavy):
     targets = (
         features[:, :, 0] + errors * np.linspace(0.02, 0.2, 5000)[:, None]
     )  # noise that grows tenfold, prior wrong
-    learned = layer.drive(Seen(features, features[:, :, 0] * SCALE), targets * SCALE, np.arange(5000))
+    learned = layer.drive(Seen(features, features[:, :, 0] * SCALE), ROWS, targets * SCALE, np.arange(5000))
     missed = targets - np.einsum("kci,kci->kc", features, learned.weights)
     covered = np.mean(np.abs(missed) <= 1.6448536 * np.sqrt(learned.variance), axis=0)
     assert np.all(np.abs(covered - 0.9) < 0.02)
@@ -103,8 +112,8 @@ def test_what_was_known_at_a_row_does_not_depend_on_what_came_after():
     rng = np.random.default_rng(5)
     layer, features = make_layer(), rng.standard_normal((50, 3, N))
     increments = rng.standard_normal((50, 3))
-    whole = layer.drive(Seen(features, increments), increments, np.arange(50))
-    half = layer.drive(Seen(features[:25], increments[:25]), increments[:25], np.arange(25))
+    whole = layer.drive(Seen(features, increments), ROWS[:50], increments, np.arange(50))
+    half = layer.drive(Seen(features[:25], increments[:25]), ROWS[:25], increments[:25], np.arange(25))
     np.testing.assert_array_equal(whole.weights[:25], half.weights)
     np.testing.assert_array_equal(whole.variance[:25], half.variance)
 
@@ -112,7 +121,7 @@ def test_what_was_known_at_a_row_does_not_depend_on_what_came_after():
 def test_a_step_across_a_gap_is_not_learned():
     rng = np.random.default_rng(6)
     layer, features = make_layer(), rng.standard_normal((3, 3, N))
-    learned = layer.drive(Seen(features, np.ones((3, 3))), np.ones((3, 3)), np.array([4, 7, 8]))
+    learned = layer.drive(Seen(features, np.ones((3, 3))), ROWS[:3], np.ones((3, 3)), np.array([4, 7, 8]))
     np.testing.assert_array_equal(learned.weights[1], layer.mean)
     assert not np.array_equal(learned.weights[2], layer.mean)
 
@@ -121,7 +130,7 @@ def test_in_rollouts_it_adds_no_more_than_the_physics_erred_lately():
     layer = make_layer()
     state = layer.start()
     for _ in range(8000):
-        state.update(np.zeros((3, N)), np.full(3, 0.01) * SCALE, np.zeros(3))
+        learn(state, np.zeros((3, N)), np.full(3, 0.01))
     np.testing.assert_allclose(state.limit, 0.03, rtol=0.01)
     bounded = layer.bounded(np.array([[9.0, -9.0, 0.001]]), np.zeros((1, 3)), state.limit)
     np.testing.assert_allclose(bounded, [[0.03 * 0.1, -0.03 * 0.02, 0.001]], rtol=0.01)
@@ -132,7 +141,7 @@ def test_what_was_learned_is_kept_and_belongs_to_its_prior(tmp_path):
     layer, file = make_layer(), tmp_path / "state"
     state = layer.start()
     for row in rng.standard_normal((30, 3, N)):
-        state.update(row, row[:, 1] * SCALE, row[:, 0] * SCALE)
+        learn(state, row, row[:, 1])
     state.save(file, "mine")
     other = layer.start()
     other.load(file, "mine")

@@ -18,6 +18,7 @@ from dynssm_ros.configuration import StrictModel
 from dynssm_ros.learning.dataset import SplitConfig, TrainingWindows
 from dynssm_ros.learning.losses import LossConfig, Output, Scales, objective
 from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.runtime.coefficients import SPREAD
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.single_track import Integrator
 
@@ -71,6 +72,11 @@ class OnlineConfig(StrictModel):
     error_average: float = Field(default=0.6, gt=0, description="the physics' mean error is that over so long (s)")
     memory: float = Field(
         default=1000.0, gt=0, description="time constant with which weights return to their prior (s)"
+    )
+    spread: dict[str, float] = Field(
+        default_factory=lambda: dict(SPREAD),
+        description="standard deviation of each coefficient's change from one day to another, as a share of its nominal "
+        "value, for shifts of slip angles in rad; those not named stay as calibrated",
     )
     folds: int = Field(
         default=4,

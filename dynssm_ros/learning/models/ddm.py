@@ -88,5 +88,5 @@ class DDM(TrainableModel):
         """Raw windows ``(B, H, 7)`` to predictions that are all physics."""
         remembered, _ = self.gru((window - self.mean) / self.std)
         theta = self.lower + torch.sigmoid(self.dense(remembered.flatten(1))) * self.admissible
-        increment = self.physics(window[:, -1], theta)
+        increment = self.physics.over(window, theta[:, None], 1)[:, 0]
         return Output(increment, increment, theta, None, None)

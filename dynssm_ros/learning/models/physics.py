@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from pydantic import Field
@@ -12,7 +12,7 @@ from dynssm_ros.configuration import StrictModel
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.single_track import Integrator, increment
+from dynssm_ros.vehicle.single_track import Integrator, increment, increments_along
 
 INPUTS = len(WINDOW_COLUMNS)
 
@@ -66,9 +66,13 @@ class PhysicsLayer(nn.Module):
         self.vehicle = vehicle
         self.config = config
         self.effects = vehicle.active_effects
+        self.carries = any(effect.carries for effect in self.effects)
 
     def forward(self, latest: Tensor, theta: Tensor) -> Tensor:
-        """Raw rows ``(..., 7)`` and coefficients, broadcastable to ``(..., 17)``, to increments ``(..., 3)``."""
+        """Raw rows ``(..., 7)`` and coefficients, broadcastable to ``(..., 17)``, to increments ``(..., 3)``.
+
+        States of effects are settled at these rows; :meth:`over` carries them.
+        """
         # columns of shape (B, 1), which the deployed graph need not squeeze and stack again
         rows = torch.split(latest, 1, dim=-1)
         moved, _ = increment(
@@ -84,3 +88,29 @@ class PhysicsLayer(nn.Module):
             self.config.substeps,
         )
         return torch.cat(list(moved), dim=-1)
+
+    def over(self, window: Tensor, theta: Tensor, latest: int) -> Tensor:
+        """Increments ``(B, latest, ..., 3)`` from the latest rows of windows ``(B, H, ..., 7)``, in order of time.
+
+        Args:
+            window: raw rows. Where effects have states, these are carried from the first row on.
+            theta: coefficients ``(17,)``, or ``(B, 1, ..., 17)`` with the same over the window.
+            latest: rows wanted, at most H.
+        """
+        if not self.carries:
+            return cast(Tensor, self(window[:, window.shape[1] - latest :], theta))
+        rows = [torch.split(row, 1, dim=-1) for row in torch.unbind(window, dim=1)]
+        each = theta if theta.dim() == 1 else theta[:, 0]
+        moved = increments_along(
+            _XP,
+            [State(*row[:3]) for row in rows],
+            [applied_inputs(row) for row in rows],
+            initial_effect_states(self.effects, rows[0][3], rows[0][4]),
+            Coefficients(*torch.split(each, 1, dim=-1)),
+            self.vehicle.constants,
+            self.vehicle.sampling_time,
+            self.effects,
+            self.config.integrator,
+            self.config.substeps,
+        )[-latest:]
+        return torch.stack([torch.cat(list(increments), dim=-1) for increments in moved], dim=1)

@@ -57,7 +57,7 @@ class Rls(TrainableModel):
 
     def forward(self, window: Tensor) -> Output:
         """Raw windows ``(B, H, 7)`` to predictions."""
-        moved = self.physics(window[:, -1], self.nominal)
+        moved = self.physics.over(window, self.nominal, 1)[:, 0]
         return Output(moved, moved, self.nominal.expand(window.shape[0], -1), None, None)
 
     def fit(self, training: TrainingWindows) -> bool:

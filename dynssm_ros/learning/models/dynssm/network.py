@@ -166,9 +166,11 @@ class DynSSM(TrainableModel):
         physics = self.physics
         assert physics is not None
         steps = self.estimation.steps
-        rows = window[:, -steps - 1 : -1, None]
+        rows = window[:, :-1, None]
         theta: Tensor = self.estimation(
-            increments[:, -steps:], lambda cars: physics(rows, cars[:, None]) / self.increment_scale, self.nominal
+            increments[:, -steps:],
+            lambda cars: physics.over(rows, cars[:, None], steps) / self.increment_scale,
+            self.nominal,
         )
         return theta
 
@@ -178,7 +180,9 @@ class DynSSM(TrainableModel):
         rows = self.changes(window, increments) if changes else (window - self.mean) / self.std
         if errors:
             assert self.physics is not None
-            past = increments - self.physics(window[:, :-1], self.nominal) / self.increment_scale
+            past = (
+                increments - self.physics.over(window[:, :-1], self.nominal, window.shape[1] - 1) / self.increment_scale
+            )
             rows = torch.cat([rows[:, -past.shape[1] :], limited(centred(past))], dim=-1)
         return rows[:, -self._read :]
 
@@ -187,10 +191,10 @@ class DynSSM(TrainableModel):
         if self.physics is None or theta is None:
             return _Step()
         if self.innovation is None:
-            physics = self.physics(window[:, -1], theta)
+            physics = self.physics.over(window, theta[:, None] if theta.dim() > 1 else theta, 1)[:, 0]
             return _Step(physics, physics)
         # the car as it is taken to be now, over the whole window: its errors are those of these coefficients
-        over = self.physics(window, theta[:, None]) / self.increment_scale
+        over = self.physics.over(window, theta[:, None], window.shape[1]) / self.increment_scale
         steps = self.in_window.steps if self.in_window is not None else 0
         q, error, mean = self.innovation(increments, over, steps)
         physics = over[:, -1]
