@@ -33,16 +33,12 @@ PAIR = ("--effect", "steering_offset:offset=0.02", "--effect", "rear_grip:factor
 # the model files of 0.1.0, as changes of those that are shipped
 MODELS: dict[str, dict[str, Any]] = {
     "dynssm_av21": {"base": "dynssm", "training": {"validation_block": 10.0}},
-    "dynssm_av21_adaptive": {"base": "dynssm_adaptive", "training": {"validation_block": 10.0}},
     "dynssm_orca": {
         "base": "dynssm_paper_orca", "physics": {"nominal": "calibrated"}, "residual": {"inputs": "normalised"},
         "loss": {"scale": "increment"},
     },
-    "dynssm_orca_adaptive": {
-        "base": "dynssm_orca", "in_window_estimation": {
-            "spread": {"D_f": 0.05 / 0.8, "D_r": 0.05 / 0.8, "S_hf": 0.02 / 0.04}, "noise": 0.05, "history": 0.2,
-        },
-    },
+    "rls_av21": {"base": "rls"},
+    "rls_orca": {"base": "rls"},
     "ridge_av21": {"base": "ridge", "training": {"validation_block": 10.0}},
     "ridge_orca": {"base": "ridge", "history": 0.3, "training": {"validation_block": 1.0}},
 }  # fmt: skip
@@ -78,7 +74,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str], list[Path]]]:
                 [vehicle, result],
             )  # fmt: skip
         log = folder / f"{car}_euler.parquet"
-        for model in (f"dynssm_{car}", f"ddm_{car}", f"ridge_{car}", f"dynssm_{car}_adaptive"):
+        for model in (f"dynssm_{car}", f"ddm_{car}", f"ridge_{car}", f"rls_{car}"):
             out = folder / model
             yield (
                 f"{car}/train/{model}",
@@ -87,9 +83,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str], list[Path]]]:
                  "--out", f"{out}"],
                 [out / "metrics.json"],
             )  # fmt: skip
-        models = [
-            f"{folder / name}" for name in (f"dynssm_{car}", f"ddm_{car}", f"ridge_{car}", f"dynssm_{car}_adaptive")
-        ]
+        models = [f"{folder / name}" for name in (f"dynssm_{car}", f"ddm_{car}", f"ridge_{car}", f"rls_{car}")]
         rivals = [*models, "persistence", "single_track", "single_track_ewma"]
         out = folder / f"{car}_evaluate"
         yield (

@@ -247,28 +247,28 @@ def checkpoint_of(out: Path) -> Path:
 
 
 def evaluate(
-    recording: Log,
+    recordings: Log | Sequence[Log],
     models: Sequence[WindowModel | PathLike] | Mapping[str, WindowModel],
     vehicle: Vehicle | PathLike | None = None,
     holdout: float | None = None,
     commands: Commands | None = None,
     min_speed: float | None = None,
-    horizon: float | None = None,
+    horizon: float = 0.6,
     stride: int = 1,
     track: Track | PathLike | None = None,
     on_progress: Progress | None = None,
     name: str = "",
 ) -> Evaluation:
-    """Scores models on a recording: one-step errors, rollouts, displacement, coverage, latency.
+    """Scores models on recordings: one-step errors, rollouts, displacement, coverage, latency.
 
     Args:
-        recording: to score on.
+        recordings: to score on, of one car, in the order of driving; online layers learn on from one to the next.
         models: folders, names of baselines, or models.
         vehicle: of the single-track baselines.
         holdout: score only this last fraction of the recording.
         commands: protocol; if not given, that of the models' training.
         min_speed: stretches below are left out (m/s); the largest ``minimum_speed`` of the models' cars if not given.
-        horizon: length of the rollouts (s); if not given, 0.3 up to T_s = 0.02 s, else 0.6.
+        horizon: length of the rollouts (s).
         stride: a rollout starts at every ``stride``-th row.
         track: on which errors are placed; if not given, the first full lap of the recording.
         on_progress: called with predictions made.
@@ -284,7 +284,7 @@ def evaluate(
     from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
     from dynssm_ros.track.lap_position import first_lap
 
-    log = _recording(recording)
+    log = _joined(recordings, None, 0.0)
     opened = models if isinstance(models, Mapping) else open_models(models, vehicle)
     line = first_lap(log) if track is None else _centre_line(track, log)
     log = log.with_commands(commands or shared_commands(opened))
@@ -294,8 +294,8 @@ def evaluate(
         if holdout <= 0:
             raise ConfigurationError(f"--holdout {holdout:g}: expected a fraction above 0 and up to 1")
         log, split = log.split_last(holdout)[1], f"last {100 * holdout:.3g} % of the recording, as one block"
-    if not name and isinstance(recording, (str, Path)):
-        name = Path(recording).name
+    if not name:
+        name = ", ".join(Path(each).name for each in _several(recordings) if isinstance(each, (str, Path)))
     return evaluate(log, opened, name, split, min_speed, horizon, stride, line=line, progress=on_progress)
 
 
@@ -510,8 +510,11 @@ def _recording(log: Log) -> Recording:
 
 def _joined(logs: Log | Sequence[Log], commands: Commands | None, holdout: float) -> Recording:
     """Recordings one after the other, each without its last fraction ``holdout``."""
-    several = [logs] if isinstance(logs, (Recording, str, Path)) else list(logs)
-    return concatenate([_recording(log).with_commands(commands).split_last(holdout)[0] for log in several])
+    return concatenate([_recording(log).with_commands(commands).split_last(holdout)[0] for log in _several(logs)])
+
+
+def _several(logs: Log | Sequence[Log]) -> list[Log]:
+    return [logs] if isinstance(logs, (Recording, str, Path)) else list(logs)
 
 
 def _track(track: Track | PathLike) -> Track:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ from dynssm_ros.vehicle.effects import parse_effect
 
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
+_LINE_EVERY_S = 10.0
 
 VehicleOption = Annotated[
     str, typer.Option("--vehicle", help="Vehicle: name of a shipped one (orca, av21, ...) or a file.")
@@ -71,9 +73,28 @@ class Update(Protocol):
         """Shows how much is done, of how much, and a few words about it."""
 
 
+def _progress_lines(description: str) -> Update:
+    """Writes how much is done at most every :data:`_LINE_EVERY_S`; nothing for what is done sooner."""
+    last = time.monotonic()
+
+    def update(done: int, total: int, words: str = "") -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= _LINE_EVERY_S:
+            last = now
+            errors.print(
+                f"{description}: {100 * done / max(total, 1):.0f} % {words}".rstrip(), markup=False, soft_wrap=True
+            )
+
+    return update
+
+
 @contextmanager
 def progress_bar(description: str) -> Iterator[Update]:
-    """Shows a progress bar on stderr if that is a terminal; yields the function that moves it."""
+    """Shows a progress bar on stderr, or a line now and then if that is no terminal; yields the function that moves it."""
+    if not errors.is_terminal:
+        yield _progress_lines(description)
+        return
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -82,7 +103,7 @@ def progress_bar(description: str) -> Iterator[Update]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
+    with Progress(*columns, console=errors, transient=True) as progress:
         task = progress.add_task(description, total=None, words="")
 
         def update(done: int, total: int, words: str = "") -> None:

@@ -30,7 +30,10 @@ TrackOption = Annotated[
 
 
 def evaluate(
-    recording: Annotated[Path, typer.Argument(help="Recording to score on (Parquet).", metavar="R.parquet")],
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(help="Recordings of one car to score on, in the order of driving.", metavar="R.parquet..."),
+    ],
     model: Annotated[
         list[str],
         typer.Option(
@@ -47,10 +50,7 @@ def evaluate(
     ] = None,
     commands: CommandsOption = None,
     min_speed: MinSpeedOption = None,
-    horizon: Annotated[
-        float | None,
-        typer.Option(help="Length of the rollouts (s).", show_default="0.3 up to T_s = 0.02 s, else 0.6", min=0.0),
-    ] = None,
+    horizon: Annotated[float, typer.Option(help="Length of the rollouts (s).", min=0.0)] = 0.6,
     stride: Annotated[int, typer.Option(help="Start a rollout at every n-th row.", min=1)] = 1,
     track: TrackOption = None,
     json: JsonOption = None,
@@ -64,15 +64,17 @@ def evaluate(
     from dynssm_ros.reporting.evaluation_report import markdown, open_loop_report, summary_table, verdict
 
     models = api.open_models(list(model), vehicle)
-    log = Recording.load(recording)
-    if commands is None and (wanted := shared_commands(models)) not in (None, log.info.commands):
-        console.print(
-            f"note: commands '{wanted}' as the models were trained, not the recording's '{log.info.commands}'"
-        )
+    logs = [Recording.load(recording) for recording in recordings]
+    for log in logs:
+        if commands is None and (wanted := shared_commands(models)) not in (None, log.info.commands):
+            console.print(
+                f"note: commands '{wanted}' as the models were trained, not the recording's '{log.info.commands}'"
+            )
     with progress_bar("evaluating") as progress:
         evaluation = api.evaluate(
-            log, models, vehicle, holdout, commands, min_speed, horizon, stride, track, progress, recording.name
-        )
+            logs, models, vehicle, holdout, commands, min_speed, horizon, stride, track, progress,
+            ", ".join(recording.name for recording in recordings),
+        )  # fmt: skip
     open_loop_report(evaluation).save(out / "report.html")
     with replacing(out / "results.md") as aside:
         aside.write_text(markdown(evaluation), encoding="utf-8")

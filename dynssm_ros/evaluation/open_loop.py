@@ -27,7 +27,7 @@ from dynssm_ros.evaluation.metrics import (
     rmse,
 )
 from dynssm_ros.evaluation.regimes import Regime, driving_regimes, regime_rmse
-from dynssm_ros.evaluation.rollout import default_horizon, score_rollouts
+from dynssm_ros.evaluation.rollout import HORIZON_S, score_rollouts
 from dynssm_ros.evaluation.score import Group, Score, grouped
 from dynssm_ros.runtime.models import WindowModel
 from dynssm_ros.runtime.online import Learned
@@ -122,7 +122,7 @@ def evaluate(
     name: str = "",
     split: str = "whole recording",
     min_speed: float | None = None,
-    horizon_s: float | None = None,
+    horizon_s: float = HORIZON_S,
     stride: int = 1,
     batch: int = BATCH,
     calls: int = 200,
@@ -137,7 +137,7 @@ def evaluate(
         name: of the recording, for people; its sources if empty.
         split: which part of it this is, for people.
         min_speed: stretches below are left out (m/s); if ``None``, the largest ``minimum_speed`` of the models' cars.
-        horizon_s: length of the rollouts (s); :func:`default_horizon` if ``None``.
+        horizon_s: length of the rollouts (s).
         stride: a rollout starts at every ``stride``-th usable row.
         batch: windows per call of a model.
         calls: single predictions timed per model.
@@ -150,7 +150,7 @@ def evaluate(
     """
     for model in models.values():
         check_fit(model, recording)
-    steps = horizon_steps(default_horizon(recording.T_s) if horizon_s is None else horizon_s, recording.T_s)
+    steps = horizon_steps(horizon_s, recording.T_s)
     H = max(model.H for model in models.values())
     speed = _minimum_speed(models.values()) if min_speed is None else min_speed
     rows = recording.window_ends(H, 1, speed)

@@ -20,6 +20,9 @@ from dynssm_ros.runtime.models import WindowModel, corrected
 from dynssm_ros.runtime.online import Learned
 from dynssm_ros.vehicle.kinematics import world_velocity
 
+HORIZON_S = 0.6
+"""How far a controller looks ahead with a model, about; the default length of rollouts for every car."""
+
 
 @dataclass(frozen=True)
 class Rollout:
@@ -51,11 +54,6 @@ class Rollout:
     def fde(self) -> float:
         """Final displacement error, at the end of the horizon (m)."""
         return float(self.displacement[-1])
-
-
-def default_horizon(T_s: float) -> float:
-    """The literature's horizon (s): 0.3 for small cars sampled at 50 Hz or faster, 0.6 for full-size ones."""
-    return 0.3 if T_s <= 0.02 + 1e-9 else 0.6
 
 
 def roll_out(model: WindowModel, stretches: Vector, steps: int, learned: Learned | None = None) -> Vector:

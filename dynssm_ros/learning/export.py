@@ -53,7 +53,6 @@ def deployed_outputs(output: Output) -> dict[str, Tensor]:
         "increment": output.increment,
         "theta": output.theta,
         "physics": output.physics,
-        "variance": output.variance,
     }
     return {name: value for name, value in named.items() if value is not None}
 

@@ -27,8 +27,6 @@ class Output(NamedTuple):
     """Normalised parameter deviation, Eq. (20), ``(B, 17)``."""
     correction: Tensor | None
     """Normalised output of the residual network, Eq. (28), ``(B, 3)``."""
-    variance: Tensor | None = None
-    """Stated variance of the prediction's error, ``(B, 3)``; ``None``: constant."""
 
 
 class LossConfig(StrictModel):

@@ -85,9 +85,7 @@ class Optimisation:
         )
         self.schedule = _schedule(config.training, self.optimiser)
         self.shuffle = torch.Generator().manual_seed(config.training.seed)
-        self.augmentation = Augmentation(
-            config.training.augmentation, vehicle.sampling_time, self.scales[1], self.shuffle
-        )
+        self.augmentation = Augmentation(config.training.augmentation, self.shuffle)
         self.checkpoint = checkpoint
         self.identity = _identity(config, vehicle, training)
         self.state = _TrainingState(

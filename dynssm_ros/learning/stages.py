@@ -75,7 +75,7 @@ def train(
     """Trains a model; ``checkpoint`` is kept up to date and continued from if it belongs to the same training.
 
     Some trainings have several stages with a checkpoint each, see :func:`checkpoints`: fine-tuning, and the models whose
-    errors on a part that they do not know say how far the prediction can be trusted. A stage that is done is not repeated.
+    predictions of a part that they do not know say what the network is worth. A stage that is done is not repeated.
 
     Args:
         recording: training data; validation windows are taken out of it.
@@ -91,61 +91,69 @@ def train(
         RecordingError: another sampling time than the vehicle's, or too little data.
         ConfigurationError: the training diverges at once.
     """
-    files = checkpoints(config, checkpoint)
+    files = checkpoints(config, checkpoint)[-1 - config.parts :]
+    shorter = config.with_training(epochs=max(1, config.training.effort[0] // _SHORTER))
+    parts = [np.arange(len(recording)) * config.parts // len(recording) == k for k in range(config.parts)]
+    left_out = [recording.select(part) for part in parts]
+    rests = [recording.select(~part) for part in parts]
+    if not all(_can_be_trained_on(rest, config, vehicle) for rest in rests):
+        rests = []
 
-    def run(
-        data: Recording, of: ModelConfig, file: Path, progress: NamedProgress | None, start: Trained | None = None
-    ) -> Trained:
+    stages = (_epochs(config), *(_epochs(shorter) for _ in rests))
+
+    def run(data: Recording, of: ModelConfig, stage: int, name: str) -> Trained:
+        """One stage, from what the model starts from on."""
         wanted = calibrate is not None and (of.calibrates or of.online is not None)
         car = calibrate(data, vehicle) if calibrate is not None and wanted else vehicle
-        return _train(data, of, car, file, device, progress, start)
+        report, file, start = _stage(progress, name, stage, stages), files[stage], None
+        if len(stages) == 1 and of.start is None:
+            report = progress
+        if of.start is not None:
+            first = _stage(progress, of.start.name if name == of.name else f"{name}: {of.start.name}", stage, stages)
+            start = _train(data, of.start, car, _start_of(file), device, first)
+            report = _stage(progress, name, stage, stages, start.config.training.effort[0])
+        return _train(data, of, car, file, device, report, start)
 
-    if config.start is not None:
-        stages: tuple[int, ...] = (config.start.training.effort[0], config.training.effort[0])
-        first = run(recording, config.start, files[0], _stage(progress, config.start.name, 0, stages))
-        return _with_layer(run(recording, config, files[1], _stage(progress, config.name, 1, stages), first), [])
-    parts = [np.arange(len(recording)) * config.parts // len(recording) == k for k in range(config.parts)]
-    rests = [recording.select(~part) for part in parts]
-    left_out = [recording.select(part) for part in parts]
-    if not rests or not all(_can_be_trained_on(rest, config, vehicle) for rest in rests):
-        return _with_layer(run(recording, config, checkpoint, progress), [])
-    shorter = config.with_training(epochs=max(1, config.training.effort[0] // _SHORTER))
-    stages = (config.training.effort[0], *[shorter.training.effort[0]] * len(parts))
-    trained = run(recording, config, checkpoint, _stage(progress, config.name, 0, stages))
+    trained = run(recording, config, 0, config.name)
+    if config.online is None:
+        return trained
     if not trained.model.LEARNS:
         return _with_layer(trained, [(trained.model, part) for part in left_out])
-    others = []
-    for k, (rest, file) in enumerate(zip(rests, files[1:], strict=True), 1):
-        report = _stage(progress, f"{config.name} without part {k} of {len(parts)}", k, stages)
-        others.append(run(rest, shorter, file, report).model)
-    trained.model.fit_on_left_out(
-        [
-            (without, all_windows(part, trained.H, vehicle.minimum_speed))
-            for without, part in zip(others, left_out, strict=True)
-        ]
-    )
-    return _with_layer(trained, list(zip(others, left_out, strict=True)))
+    others = [
+        run(rest, shorter, k, f"{config.name} without part {k} of {len(parts)}").model
+        for k, rest in enumerate(rests, 1)
+    ]
+    return _with_layer(trained, list(zip(others, left_out, strict=False)))
+
+
+def _epochs(config: ModelConfig) -> int:
+    """Epochs of a stage at most, with those of the model that it starts from."""
+    return config.training.effort[0] + (config.start.training.effort[0] if config.start else 0)
+
+
+def _start_of(checkpoint: Path) -> Path:
+    """The checkpoint of the model that another one starts from."""
+    return checkpoint.with_suffix(".start.pt")
 
 
 def _with_layer(trained: Trained, left_out: list[tuple[TrainableModel, Recording]]) -> Trained:
-    """The model with its online layer, if it is to have one.
+    """The model with its online layer.
 
     Args:
         trained: the model.
-        left_out: parts of the recording, each with a model that was trained without it. If there are none, the prior is
-            fitted to what the model itself says of the recording.
+        left_out: parts of the recording, each with a model that was trained without it. Without any there is no evidence
+            for the network, and the layer rests on the physics alone.
     """
     config = trained.config
-    if config.online is None:
-        return trained
+    assert config.online is not None
     known = left_out or [(trained.model, trained.recording)]
-    features, layer, error = _layer(trained, config.online, known, trained.model.LEARNS)
-    if not trained.model.LEARNS:
-        return replace(trained, features=features, online=layer)
-    plain, layer_alone, error_alone = _layer(trained, config.online, known, False)
-    gain = 1.0 - error / error_alone
-    if gain < NETWORK_GAIN_WANTED:
-        features, layer = plain, layer_alone
+    features, layer, error_alone = _layer(trained, config.online, known, False)
+    gain = None
+    if trained.model.LEARNS and left_out:
+        with_network, layer_with, error = _layer(trained, config.online, known, True)
+        gain = 1.0 - error / error_alone
+        if gain >= NETWORK_GAIN_WANTED:
+            features, layer = with_network, layer_with
     return replace(trained, features=features, online=layer, network_gain=gain)
 
 
@@ -175,10 +183,9 @@ def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording
 
 
 def checkpoints(config: ModelConfig, checkpoint: Path) -> list[Path]:
-    """The files that a training with ``checkpoint`` keeps, in the order of its stages."""
-    if config.start is not None:
-        return [checkpoint.with_suffix(".start.pt"), checkpoint]
-    return [checkpoint, *[checkpoint.with_suffix(f".part{k + 1}.pt") for k in range(config.parts)]]
+    """The files that a training with ``checkpoint`` keeps: of the model, then of those without a part of the laps."""
+    stages = [checkpoint, *[checkpoint.with_suffix(f".part{k + 1}.pt") for k in range(config.parts)]]
+    return stages if config.start is None else [*map(_start_of, stages), *stages]
 
 
 def check_device(device: str) -> None:
@@ -217,11 +224,13 @@ def _can_be_trained_on(recording: Recording, config: ModelConfig, vehicle: Vehic
     return True
 
 
-def _stage(progress: NamedProgress | None, name: str, stage: int, epochs: tuple[int, ...]) -> NamedProgress | None:
-    """Progress of one of several stages, in epochs of all."""
+def _stage(
+    progress: NamedProgress | None, name: str, stage: int, epochs: tuple[int, ...], done_before: int = 0
+) -> NamedProgress | None:
+    """Progress of one of several stages, in epochs of all; ``done_before`` within the stage."""
     if progress is None:
         return None
-    before = sum(epochs[:stage])
+    before = sum(epochs[:stage]) + done_before
     return lambda done, _, words: progress(before + done, sum(epochs), f"{name}: {words}")
 
 
@@ -260,7 +269,6 @@ def _train(
         run = optimisation.run(progress)
     model = run.model.cpu().eval()
     held = replace(validation, H=H)
-    model.post_fit(held)
     return Trained(
         config, vehicle, recording, model, scale, run.history, run.best_epoch, validation_rmse(model, held),
         (len(training), len(validation)), run.resumed_from + (start.resumed_from if start else 0), start,

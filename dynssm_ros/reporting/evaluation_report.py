@@ -38,14 +38,14 @@ _REGIMES_IN_WORDS = {
 
 
 def summary_table(evaluation: Evaluation) -> Table:
-    """One row per model: one-step errors, displacement over the horizon, size and speed."""
+    """One row per model: displacement over the horizon, one-step errors, size and speed."""
     units = evaluation_figures.UNITS
     columns = (
         Column("model", brief=True),
+        Column("ADE", "m", "path", "min", brief=True),
+        Column("FDE", "m", "path", "min", brief=True),
         *(Column(_TITLES[c], units[c], "RMSE", "min", brief=True) for c in STATE_SIGNALS),
         *(Column(_TITLES[c], units[c], "largest error", "min") for c in STATE_SIGNALS),
-        Column("ADE", "m", "path", "min", brief=True),
-        Column("FDE", "m", "path", "min"),
         Column("parameters"),
         Column("FLOPs"),
         Column("p50", "µs", "latency", brief=True),
@@ -54,9 +54,9 @@ def summary_table(evaluation: Evaluation) -> Table:
     rows: list[list[Value]] = [
         [
             name,
+            *group.spreads(lambda score: [score.rollout.ade, score.rollout.fde]),
             *group.spreads(lambda score: score.rmse),
             *group.spreads(lambda score: score.max_error),
-            *group.spreads(lambda score: [score.rollout.ade, score.rollout.fde]),
             group.first.model.parameters,
             group.first.model.flops,
             *group.spreads(lambda score: [score.latency_p50, score.latency_p99]),
@@ -131,7 +131,7 @@ def coefficient_table(group: Group) -> Table | None:
 
 
 def verdict(evaluation: Evaluation) -> str:
-    """The result in a sentence: the best model of each channel, against persistence."""
+    """The result in a sentence: the best path over the horizon, then the best model of each channel one step ahead."""
     rmse = {name: group.mean(lambda score: score.rmse) for name, group in evaluation.groups.items()}
     parts = []
     for k, channel in enumerate(STATE_SIGNALS):
@@ -145,7 +145,26 @@ def verdict(evaluation: Evaluation) -> str:
             change = reached[best] / reference - 1
             value += f", {percent(abs(change))} {'below' if change < 0 else 'above'} persistence"
         parts.append(f"{_TITLES[channel]} by {value})")
-    return f"Predicted best one step ahead: {'; '.join(parts)}." if parts else "No model gave finite predictions."
+    if not parts:
+        return "No model gave finite predictions."
+    return f"{_best_path(evaluation)}Predicted best one step ahead: {'; '.join(parts)}."
+
+
+def _best_path(evaluation: Evaluation) -> str:
+    """A sentence on the displacement over the horizon; empty if no rollout is finite."""
+    ade = {
+        name: float(group.mean(lambda score: np.array(score.rollout.ade))) for name, group in evaluation.groups.items()
+    }
+    ade = {name: value for name, value in ade.items() if np.isfinite(value)}
+    if not ade:
+        return ""
+    best = min(ade, key=lambda name: ade[name])
+    words = f"Best path over {evaluation.horizon_s:g} s: {best} (ADE {text(ade[best])} m"
+    others = {name: value for name, value in ade.items() if name != best}
+    if others:
+        next_best = min(others, key=lambda name: others[name])
+        words += f"; next {next_best}, {text(others[next_best])} m"
+    return words + "). "
 
 
 def open_loop_report(evaluation: Evaluation) -> Report:

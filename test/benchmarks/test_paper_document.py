@@ -16,12 +16,12 @@ from dynssm_ros.vehicle import COEFFICIENTS
 STATE_SIGNALS = ("v_x", "v_y", "omega")
 SPLITS = {"slow": "slow to fast", "right": "right to left", "straight": "straight to corner"}
 MODELS = (
-    "persistence", "single_track", "ddm_av21", "dynssm_av21_paper", "dynssm_av21", "dynssm_av21_no_ssm",
-    "dynssm_av21_no_shrinkage",
+    "persistence", "single_track", "ddm_av21", "dynssm_av21_paper", "dynssm_av21", "dynssm_av21_no_mirror",
+    "dynssm_av21_no_online",
 )  # fmt: skip
 LEVELS = {
     "persistence": 1.0, "single_track": 0.8, "ddm_av21": 0.6, "dynssm_av21_paper": 0.4, "dynssm_av21": 0.3,
-    "dynssm_av21_no_ssm": 0.5, "dynssm_av21_no_shrinkage": 0.31,
+    "dynssm_av21_no_mirror": 0.5, "dynssm_av21_no_online": 0.31,
 }  # fmt: skip
 UNTRAINED = ("persistence", "single_track")
 
@@ -139,12 +139,12 @@ def test_a_model_appears_only_with_results_on_every_test(make, scores):
     (comparison,) = make().comparisons
     assert "ddm_av21" not in comparison.models
     assert comparison.seeds("dynssm_av21") == 1
-    assert comparison.seeds("dynssm_av21_no_ssm") == 3
+    assert comparison.seeds("dynssm_av21_no_mirror") == 3
 
 
 def test_ablations_are_told_from_the_paper_s_configuration(make):
     (comparison,) = make().comparisons
-    assert comparison.ablations == {"no_ssm": "dynssm_av21_no_ssm", "no_shrinkage": "dynssm_av21_no_shrinkage"}
+    assert comparison.ablations == {"no_mirror": "dynssm_av21_no_mirror", "no_online": "dynssm_av21_no_online"}
     assert comparison.compared == ("persistence", "single_track", "ddm_av21", "dynssm_av21_paper", "dynssm_av21")
 
 
@@ -176,8 +176,7 @@ def test_factors_are_over_the_best_of_the_paper(make):
 def test_the_paper_s_numbers_stand_beside_and_are_never_the_best(make):
     results = make()
     table = tables.ablation_table(results.comparisons[0], results)
-    assert cells(table, "w/o SSM encoder")[1:6:2] == ["0.0286", "0.0258", "0.0360"]
-    assert cells(table, "w/o online shrinkage")[1:6:2] == ["–"] * 3
+    assert cells(table, "w/o online layer")[1:6:2] == ["–"] * 3
     assert cells(table, "full model")[:6:2] == ["0.303 ± 0.003"] * 3
     assert cells(table, "physics only, calibrated")[:2] == ["0.800", "0.0350"]
     best = {(row[0].text, k) for row in table.cells for k, cell in enumerate(row) if cell.best}
@@ -192,14 +191,14 @@ def test_the_paper_s_numbers_stand_beside_and_are_never_the_best(make):
     [
         (0.31, "No ablation is better than the full model beyond the spread over seeds."),
         (0.2995, "No ablation is better than the full model beyond the spread over seeds."),
-        (0.20, "Better than the full model beyond the spread over seeds: w/o online shrinkage in v_x by 33.3 %, "
-               "w/o online shrinkage in v_y by 33.3 %, w/o online shrinkage in ω by 33.3 %."),
+        (0.20, "Better than the full model beyond the spread over seeds: w/o online layer in v_x by 33.3 %, "
+               "w/o online layer in v_y by 33.3 %, w/o online layer in ω by 33.3 %."),
     ],
 )  # fmt: skip
 def test_an_ablation_that_beats_the_full_model_is_named(make, scores, level, sentence):
     for content in scores.values():
         for test in content["tests"].values():
-            test["models"]["dynssm_av21_no_shrinkage"] = [entry(level * (1 + 0.01 * s), s) for s in (0, 1, 2)]
+            test["models"]["dynssm_av21_no_online"] = [entry(level * (1 + 0.01 * s), s) for s in (0, 1, 2)]
     (comparison,) = make().comparisons
     assert tables.better_ablations(comparison) == sentence
 
@@ -208,8 +207,8 @@ def test_an_ablation_that_beats_the_full_model_is_named(make, scores, level, sen
 def test_a_variant_that_was_trained_once_is_taken_to_vary_as_the_full_model_does(make, scores, level, named):
     for content in scores.values():
         for test in content["tests"].values():
-            test["models"]["dynssm_av21_no_shrinkage"] = [entry(level, 0)]
-    assert ("w/o online shrinkage" in tables.better_ablations(make().comparisons[0])) == named
+            test["models"]["dynssm_av21_no_online"] = [entry(level, 0)]
+    assert ("w/o online layer" in tables.better_ablations(make().comparisons[0])) == named
 
 
 def test_one_training_of_the_full_model_says_nothing_about_the_spread(make, scores):
@@ -244,7 +243,7 @@ def test_coverage_is_in_percent_and_the_cost_leaves_ablations_out(make):
     assert tables.coverage_table(results.comparisons).rows[1][2].mean == pytest.approx(90.0)
     names = [row[0] for row in tables.cost_table(results).rows]
     assert "`dynssm_av21`" in names
-    assert "`dynssm_av21_no_ssm`" not in names
+    assert "`dynssm_av21_no_mirror`" not in names
     assert cells(tables.cost_table(results), "DynSSM, AV-21, the paper's")[:3] == ["81,000", "180,000", "2,000"]
 
 

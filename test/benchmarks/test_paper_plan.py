@@ -64,7 +64,7 @@ def test_every_shipped_model_is_in_the_plan_and_every_change_fits(plan):
     shipped = {path.stem for path in (config_root() / "models").glob("*.yaml")}
     assert shipped <= used
     assert {name: plan.configured(name).name for name in plan.models} == {name: name for name in plan.models}
-    assert plan.configured("dynssm_av21_no_ssm").ssm is None
+    assert plan.configured("dynssm_av21_no_online").online is None
     assert plan.configured("dynssm_orca_no_gru").physics.nominal == "calibrated"
 
 

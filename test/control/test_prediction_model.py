@@ -19,11 +19,14 @@ class Speaking(SingleTrack):
     """Says coefficients and a residual that tell which window was read."""
 
     name = "speaking"
-    H = 4
     commands = "topics"
 
+    def __init__(self, vehicle):
+        super().__init__(vehicle)
+        self.H = 4
+
     def predict(self, windows):
-        physics = self._following(windows[:, -1, :])
+        physics = self._following(windows, 1)[:, 0]
         theta = np.tile(self._theta, (len(windows), 1)) * (1 + 0.01 * windows[:, :1, 0])
         return WindowPrediction(physics + windows[:, -1, 3:6], theta, physics)
 

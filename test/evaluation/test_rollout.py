@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.evaluation.rollout import branches, default_horizon, path, roll_out, score_rollouts
+from dynssm_ros.evaluation.rollout import branches, path, roll_out, score_rollouts
 from dynssm_ros.runtime.models import Persistence, WindowPrediction
 from dynssm_ros.runtime.predictor import propagate_pose
 
@@ -124,8 +124,3 @@ def test_path_follows_the_live_predictor_s_rule():
         start = dict(zip(("x", "y", "theta"), pose, strict=True))
         pose = propagate_pose(start, velocities[k], velocities[k + 1], T_s)
         np.testing.assert_allclose(driven, pose[:2], atol=1e-14)
-
-
-@pytest.mark.parametrize(("sampling_time", "horizon"), [(0.01, 0.3), (0.02, 0.3), (0.04, 0.6)])
-def test_default_horizon_is_the_literature_s(sampling_time, horizon):
-    assert default_horizon(sampling_time) == horizon

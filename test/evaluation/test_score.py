@@ -115,7 +115,8 @@ def test_tables_show_mean_spread_and_number_of_seeds(recording, trained):
     assert f"{small[1].value} ± " in markdown(evaluation)
     assert [len(row) for row in coefficient_table(evaluation.groups["small"]).rows] == [9] * 17
     assert coefficient_table(evaluation.groups["still"]) is None
-    assert verdict(evaluation).startswith("Predicted best one step ahead: v_x by ")
+    assert verdict(evaluation).startswith("Best path over ")
+    assert "Predicted best one step ahead: v_x by " in verdict(evaluation)
 
 
 def test_grouping_keeps_the_order_of_first_appearance(recording, trained):

@@ -27,15 +27,6 @@ class AugmentationConfig(StrictModel):
     """Beyond the paper: training windows changed at random, so that the model does not rely on what another track changes."""
 
     mirror: bool = Field(default=False, description="half of the windows with left and right exchanged")
-    bank: float = Field(
-        default=0.0, ge=0, description="constant disturbance of each state's increments: its spread in units of s_delta"
-    )
-    offset: float = Field(default=0.0, ge=0, description="spread of a constant offset of the steering (rad)")
-    grip: float = Field(
-        default=0.0,
-        ge=0,
-        description="spread of a change of the lateral forces, as a share of the lateral acceleration",
-    )
 
 
 class TrainingConfig(SplitConfig):
@@ -115,7 +106,7 @@ class ModelConfig(StrictModel):
 
     @property
     def parts(self) -> int:
-        """Parts of the recording that further models are trained without, to fit what judges predictions; 0: none."""
+        """Parts of the recording that further models are trained without, to see what the network is worth; 0: none."""
         return self.online.folds if self.online else 0
 
     def with_training(self, **changes: Any) -> Self:
@@ -163,12 +154,6 @@ class TrainableModel(nn.Module):
     def take_over(self, start: TrainableModel) -> None:
         """Starts from a trained model; see :attr:`ModelConfig.start`."""
         raise NotImplementedError
-
-    def post_fit(self, validation: TrainingWindows) -> None:
-        """Fits what is fitted on validation windows once the weights are found."""
-
-    def fit_on_left_out(self, left_out: list[tuple[Any, TrainingWindows]]) -> None:
-        """Fits what is fitted on parts of the recording, each with a model of this kind that was trained without it."""
 
     def for_deployment(self) -> Self:
         """Prepares a copy of the model for export; returns itself."""

@@ -1,4 +1,4 @@
-"""Beyond the paper: what the window tells of the present error of the physics, and of the error of a prediction.
+"""Beyond the paper: what the window tells of the present error of the physics.
 
 On another track or with another set-up, speeds and forces leave the range of the training laps, and the physics errs in a new
 way: a banked turn, an offset of the steering. Two things stay as they were. Increments have the same size, and an error
@@ -11,17 +11,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dynssm_ros.learning.models.dynssm.config import InnovationConfig, InWindowConfig
+from dynssm_ros.learning.models.dynssm.config import InnovationConfig
 from dynssm_ros.runtime.artifact import Normalisation
 
 CHANNELS = 3
 _INCREMENT_LIMIT = 4.0  # in units of s_delta; beyond it the encoders learn nothing more from the size
 _INPUT_CHANGE_SHARE = 0.1  # what an input changes in a step, as a share of its standard deviation
-_LARGEST_FACTOR = 1.2
-_WEIGHTS = 8  # shrinkage weights to choose from, each three times the one before
-_NO_SHRINKAGE = 1e12  # a weight that no evidence moves
-_VALIDATION_RMSE_TOLERANCE = 0.01  # relative; what shrinkage may cost on data like the training data
-_COVERED, _QUANTILE = 0.9, 1.6448536  # the share of errors within this many standard deviations
 
 
 def limited(value: Tensor, limit: Tensor | float = _INCREMENT_LIMIT) -> Tensor:
@@ -99,115 +94,19 @@ class InnovationFilter(nn.Module):
         """Computes the kernels once and for all, for deployment."""
         self.frozen = self.kernels()
 
-    def forward(self, increments: Tensor, physics: Tensor, retrospective: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Predictions from the last row and, retrospectively, from the ``retrospective`` rows before it.
+    def forward(self, increments: Tensor, physics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Predictions from the last row of a window.
 
         Args:
             increments: measured ``d``, ``(B, H - 1, 3)``.
             physics: ``p`` from every row, ``(B, H, 3)``.
-            retrospective: rows before the last one to predict from as well.
 
         Returns:
-            ``q`` ``(B, retrospective + 1, 3)``, the last error ``e`` ``(B, 3)`` and its mean ``m`` ``(B, 3)``.
+            ``q`` ``(B, 3)``, the last error ``e`` ``(B, 3)`` and its mean ``m`` ``(B, 3)``.
         """
         direct, g, kernel = self.kernels()
         errors = increments - physics[:, :-1]
-        recent = torch.cat([increments, errors], dim=-1)[:, -(self.taps + retrospective) :]
-        remembered = functional.conv1d(recent.transpose(1, 2), kernel).transpose(1, 2)
-        q = physics[:, -(retrospective + 1) :] @ direct.T + remembered
+        recent = torch.cat([increments, errors], dim=-1)[:, -self.taps :]
+        remembered = functional.conv1d(recent.transpose(1, 2), kernel)[:, :, 0]
+        q = physics[:, -1] @ direct.T + remembered
         return q, errors[:, -1], (errors[:, -self.taps :] * g).sum(dim=1)
-
-
-class InWindowErrors(nn.Module):
-    """Judges a prediction by the one-step errors that the model would have made over the last steps of the window.
-
-    *Shrinkage* scales each channel's increment by the regression of what happened on what was predicted, drawn towards one:
-    an increment that could not be predicted lately shrinks towards "no change". *Limit*: the residual is limited to the
-    size of the errors that it is to correct. *Variance*: a constant and a share of the recent squared errors. The
-    shrinkage weight is fitted on validation data such that shrinkage costs at most 1 % there. The variance is fitted on
-    data that the model knows as little as the next lap, so that 90 % intervals cover 90 % there.
-    """
-
-    weight: Tensor
-    variance: Tensor
-
-    def __init__(self, config: InWindowConfig, steps: int) -> None:
-        super().__init__()
-        self.config = config
-        self.steps = steps
-        # in squared increments of size s_delta, for each channel
-        self.register_buffer("weight", torch.full((CHANNELS,), config.shrinkage_weight))
-        # variance = constant + share * mean squared error of the in-window errors, for each channel
-        self.register_buffer("variance", torch.stack([torch.ones(CHANNELS), torch.zeros(CHANNELS)]))
-
-    def shrinkage(self, predicted: Tensor, happened: Tensor) -> Tensor:
-        """Factor of the prediction ``(B, 3)`` from retrospective predictions and what happened, each ``(B, steps, 3)``."""
-        return _regression(predicted, happened, self.weight)
-
-    def limited(self, residual: Tensor, predicted: Tensor, happened: Tensor) -> Tensor:
-        """``residual`` ``(B, 3)`` squeezed smoothly below the in-window errors, all in units of ``s_delta``."""
-        if self.config.limit is None:
-            return residual
-        errors = torch.sqrt(_mean_square(predicted - happened) + torch.finfo(residual.dtype).tiny)
-        return limited(residual, self.config.limit * errors)
-
-    def no_shrinkage(self) -> None:
-        """Leaves the predictions as they are."""
-        self.weight.fill_(_NO_SHRINKAGE)
-
-    def spread(self, predicted: Tensor, happened: Tensor) -> Tensor:
-        """Variance of the prediction's error ``(B, 3)``, in units of ``s_delta`` squared."""
-        spread: Tensor = self.variance[0] + self.variance[1] * _mean_square(predicted - happened)
-        return spread
-
-    @torch.no_grad()
-    def fit_shrinkage(self, retrospective: Tensor, happened: Tensor, predicted: Tensor, target: Tensor) -> None:
-        """Picks for each channel the least shrinkage weight that costs next to nothing on data like the training data.
-
-        The lower the weight, the more of a wrong prediction elsewhere is taken back.
-
-        Args:
-            retrospective: predictions of the last steps, ``(N, steps, 3)``.
-            happened: the measured increments that they are of.
-            predicted: the predictions that shrinkage is to scale, ``(N, 3)``.
-            target: the measured increments that they are of.
-        """
-        candidates = [self.config.shrinkage_weight * 3.0**power for power in range(_WEIGHTS)]
-        errors = []
-        for weight in candidates:
-            factor = _regression(retrospective, happened, torch.full_like(self.weight, weight))
-            errors.append((factor * predicted - target).square().mean(dim=0).sqrt())
-        rmse = torch.stack(errors)
-        affordable = rmse <= (1 + _VALIDATION_RMSE_TOLERANCE) * rmse.min(dim=0).values
-        self.weight.copy_(torch.tensor(candidates)[affordable.int().argmax(dim=0)])
-
-    @torch.no_grad()
-    def fit_variance(self, past: Tensor, errors: Tensor) -> None:
-        """Fits the variance: the most likely mixture of a constant and the recent errors, scaled to cover 90 %.
-
-        Args:
-            past: in-window errors ``(N, steps, 3)``.
-            errors: of the predictions themselves, ``(N, 3)``.
-        """
-        square, recent = errors.square(), _mean_square(past)
-        tiny = torch.finfo(square.dtype).tiny
-        mean, of_recent = square.mean(dim=0).clamp(min=tiny), recent.mean(dim=0).clamp(min=tiny)
-        shares = torch.linspace(0.0, 0.95, 20)
-        variances = [mean * ((1 - share) + share * recent / of_recent) for share in shares]
-        likelihoods = torch.stack([-(variance.log() + square / variance).mean(dim=0) for variance in variances])
-        share = shares[likelihoods.argmax(dim=0)]
-        mixture = torch.stack([mean * (1 - share), mean * share / of_recent])
-        ratio = square / (mixture[0] + mixture[1] * recent)
-        scale = torch.quantile(ratio, _COVERED, dim=0) / _QUANTILE**2
-        self.variance.copy_(mixture * scale)
-
-
-def _regression(predicted: Tensor, happened: Tensor, weight: Tensor) -> Tensor:
-    """Slope of ``happened`` on ``predicted`` over ``(B, steps, 3)``, drawn towards one by ``weight`` ``(3,)``."""
-    agreed = (predicted * happened).sum(dim=1) + weight
-    full = (predicted * predicted).sum(dim=1) + weight
-    return torch.clamp(agreed / full, 0.0, _LARGEST_FACTOR)
-
-
-def _mean_square(errors: Tensor) -> Tensor:
-    return torch.mean(errors * errors, dim=1)

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import TrainableModel, scale_buffers, steps_of
 from dynssm_ros.learning.models.dynssm.config import DynssmConfig
 from dynssm_ros.learning.models.dynssm.encoders import Fusion
-from dynssm_ros.learning.models.dynssm.in_window import InWindowEstimation
 from dynssm_ros.learning.models.dynssm.innovation import (
     Increments,
     InnovationFilter,
-    InWindowErrors,
     centred,
     limited,
 )
@@ -80,8 +77,8 @@ class DynSSM(TrainableModel):
     """The whole model; components whose configuration is left out are absent (the paper's ablations).
 
     The paper's model sees normalised states and adds the residual to the physics. Beyond it, each a switch: the encoders
-    see increments and the physics' past errors (``inputs``), the physics carries its recent errors forward (``innovation``),
-    and in-window errors scale the prediction and state its variance (``in_window_errors``).
+    see increments and the physics' past errors (``inputs``), and the physics carries its recent errors forward
+    (``innovation``).
     """
 
     KIND = "dynssm"
@@ -105,18 +102,8 @@ class DynSSM(TrainableModel):
         self.fusion = Fusion(width, config.ssm, config.gru, config.fusion)
         self.physics = PhysicsLayer(vehicle, config.physics) if config.physics else None
         self.head = ParameterHead(config, vehicle, latent + width) if config.adaptation else None
-        self.estimation = (
-            InWindowEstimation(config.in_window_estimation, steps_of(config.in_window_estimation.history, T_s), vehicle)
-            if config.in_window_estimation
-            else None
-        )
         self.innovation = (
             InnovationFilter(config.innovation, steps_of(config.innovation.history, T_s)) if config.innovation else None
-        )
-        self.in_window = (
-            InWindowErrors(config.in_window_errors, steps_of(config.in_window_errors.history, T_s))
-            if config.in_window_errors
-            else None
         )
         conditioned = config.adaptation.hidden if config.adaptation else latent
         self.residual = None
@@ -136,43 +123,18 @@ class DynSSM(TrainableModel):
         conditioned = self.fusion(seen)
         theta = deviation = None
         if self.head is not None:
-            theta, deviation, conditioned = self.head(conditioned, latest, self._nominal(window, increments))
+            theta, deviation, conditioned = self.head(conditioned, latest, self.nominal)
         elif self.physics is not None:
             theta = self.nominal.expand(window.shape[0], -1)  # not len(), which an export would freeze
         step = self._step(window, increments, theta)
-        # the network must not learn to lean on them, so training does without
-        judge, retrospective = None if self.training else self.in_window, step.retrospective
         correction = None
         moved = step.expected
         if self.residual is not None:
             scaled, correction = self.residual(self._residual_input(conditioned, deviation, window, latest, step))
-            if judge is not None and retrospective is not None:
-                scaled = judge.limited(scaled, *retrospective)
             added = self.increment_scale * scaled
             moved = added if moved is None else moved + added
         assert moved is not None
-        variance = None
-        if self.in_window is not None and retrospective is not None:
-            if judge is not None and judge.config.shrinkage:
-                moved = moved * judge.shrinkage(*retrospective)
-            if self.in_window.config.uncertainty:
-                variance = self.in_window.spread(*retrospective) * self.increment_scale.square()
-        return Output(moved, step.physics, theta, deviation, correction, variance)
-
-    def _nominal(self, window: Tensor, increments: Tensor) -> Tensor:
-        """theta_0, which adaptation starts from: ``(17,)``, or as the window tells it ``(B, 17)``."""
-        if self.estimation is None:
-            return self.nominal
-        physics = self.physics
-        assert physics is not None
-        steps = self.estimation.steps
-        rows = window[:, :-1, None]
-        theta: Tensor = self.estimation(
-            increments[:, -steps:],
-            lambda cars: physics.over(rows, cars[:, None], steps) / self.increment_scale,
-            self.nominal,
-        )
-        return theta
+        return Output(moved, step.physics, theta, deviation, correction)
 
     def _seen(self, window: Tensor, increments: Tensor) -> Tensor:
         """What the encoders read, ``(B, rows, features)``."""
@@ -195,13 +157,11 @@ class DynSSM(TrainableModel):
             return _Step(physics, physics)
         # the car as it is taken to be now, over the whole window: its errors are those of these coefficients
         over = self.physics.over(window, theta[:, None], window.shape[1]) / self.increment_scale
-        steps = self.in_window.steps if self.in_window is not None else 0
-        q, error, mean = self.innovation(increments, over, steps)
+        q, error, mean = self.innovation(increments, over)
         physics = over[:, -1]
         return _Step(
             physics * self.increment_scale,
-            q[:, -1] * self.increment_scale,
-            (q[:, :-1], increments[:, -steps:]) if steps else None,
+            q * self.increment_scale,
             torch.cat([physics + mean, error - mean], dim=-1),
         )
 
@@ -227,47 +187,6 @@ class DynSSM(TrainableModel):
             parts += [following, step.physics / self.increment_scale]
         return torch.cat(parts, dim=-1)
 
-    def post_fit(self, validation: TrainingWindows) -> None:
-        """Fits shrinkage and variance to the errors on validation windows."""
-        if self.in_window is not None:
-            held = validation.batch(slice(None))
-            self.fit_shrinkage(*held)
-            self.fit_variance(*self.held_out_errors(*held))
-
-    @torch.no_grad()
-    def fit_shrinkage(self, window: Tensor, target: Tensor) -> None:
-        """Fits the shrinkage to validation windows ``(N, H, 7)`` and their measured increments ``(N, 3)``."""
-        assert self.in_window is not None
-        retrospective, happened = self._retrospective(window)
-        self.in_window.no_shrinkage()
-        freely = self.eval()(window).increment / self.increment_scale
-        self.in_window.fit_shrinkage(retrospective, happened, freely, target / self.increment_scale)
-
-    @torch.no_grad()
-    def held_out_errors(self, window: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """In-window errors ``(N, steps, 3)`` and errors of the predictions ``(N, 3)`` on windows and measured increments."""
-        retrospective, happened = self._retrospective(window)
-        return (retrospective - happened) * self.increment_scale, self.eval()(window).increment - target
-
-    def fit_on_left_out(self, left_out: list[tuple[Any, TrainingWindows]]) -> None:
-        """Fits the variance to the errors on parts that were left out, if that is asked for."""
-        if self.config.in_window_errors and self.config.in_window_errors.uncertainty:
-            errors = [without.held_out_errors(*windows.batch(slice(None))) for without, windows in left_out]
-            self.fit_variance(*(torch.cat(each) for each in zip(*errors, strict=True)))
-
-    @torch.no_grad()
-    def fit_variance(self, past: Tensor, errors: Tensor) -> None:
-        """Fits the stated variance to what :meth:`held_out_errors` gives."""
-        assert self.in_window is not None
-        self.in_window.fit_variance(past / self.increment_scale, errors / self.increment_scale)
-
-    def _retrospective(self, window: Tensor) -> tuple[Tensor, Tensor]:
-        """Predictions of the last steps of windows and what happened, each ``(N, steps, 3)`` in units of ``s_delta``."""
-        increments = self.changes.states(window)
-        retrospective = self._step(window, increments, self.eval()(window).theta).retrospective
-        assert retrospective is not None
-        return retrospective
-
     def for_deployment(self) -> Self:
         """Switches the state-space layers to their recurrence and freezes what does not change; returns itself."""
         if self.fusion.ssm is not None:
@@ -284,7 +203,5 @@ class _Step(NamedTuple):
     """Its increment ``(B, 3)``."""
     expected: Tensor | None = None
     """The same with its innovation filter, if it has one."""
-    retrospective: tuple[Tensor, Tensor] | None = None
-    """The last steps as predicted in retrospective and as they happened, each ``(B, steps, 3)`` in units of ``s_delta``."""
     features: Tensor | None = None
     """Physics with its mean error, and the last error about that mean, ``(B, 6)`` in units of ``s_delta``."""

@@ -1,0 +1,98 @@
+"""The generalisation matrix as doit's tasks: ``python -m doit -n 2 -f benchmarks/generalisation/dodo.py``.
+
+Variables: ``out`` (folder), ``page`` (folder of the page and its figure), ``data`` (folder of the real logs), ``only`` (words
+that names of trainings must begin with, separated by commas), ``part`` (``development``, the default, or ``all``: test cells
+too), ``ablations`` (1: further models). What is done is kept; a kill costs the task under way.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from doit import get_var
+from doit.tools import config_changed
+
+from benchmarks.generalisation.cells import cells
+from benchmarks.generalisation.page import FIGURE, PAGE, heat_map, page, summary
+from benchmarks.generalisation.run import (
+    cell_file,
+    drive,
+    drive_file,
+    model_folder,
+    models_of,
+    read_cell,
+    score_cell,
+    train_model,
+)
+from benchmarks.tasks import doit_config
+from dynssm_ros.errors import UserError
+from dynssm_ros.files import replacing, write_json
+from dynssm_ros.runtime.artifact import CARD
+
+OUT = Path(get_var("out", "out/generalisation"))
+PAGE_FOLDER = Path(get_var("page", str(OUT)))
+DATA = Path(get_var("data", os.environ.get("DYNSSM_DATA", "../shared/data")))
+ONLY = tuple(get_var("only", "").split(","))
+PART = get_var("part", "development")
+ABLATED = get_var("ablations", "0") == "1"
+CELLS = [cell for cell in cells(DATA) if cell.training.name.startswith(ONLY) and (PART == "all" or not cell.is_test)]
+TRAININGS = {cell.training.name: cell.training for cell in CELLS}
+DOIT_CONFIG = doit_config(OUT / "doit.json")
+
+
+def task_drive() -> Iterator[dict[str, Any]]:
+    """Makes the laps of each training."""
+    for training in TRAININGS.values():
+        yield {
+            "name": training.name,
+            "actions": [(drive, [training, OUT, DATA])],
+            "targets": [str(drive_file(training, OUT))],
+            "uptodate": [config_changed(repr(training))],
+        }
+
+
+def task_train() -> Iterator[dict[str, Any]]:
+    """Trains each model on each training."""
+    for training in TRAININGS.values():
+        for name, content in models_of(ABLATED).items():
+            yield {
+                "name": f"{training.name}:{name}",
+                "actions": [(train_model, [training, name, OUT])],
+                "file_dep": [str(drive_file(training, OUT))],
+                "targets": [str(model_folder(training, name, OUT) / CARD)],
+                "uptodate": [config_changed(repr((training, content)))],
+            }
+
+
+def task_score() -> Iterator[dict[str, Any]]:
+    """Scores the models on each cell."""
+    for cell in CELLS:
+        yield {
+            "name": cell.name,
+            "actions": [(score_cell, [cell, OUT, DATA, ABLATED])],
+            "file_dep": [str(model_folder(cell.training, name, OUT) / CARD) for name in models_of(ABLATED)],
+            "targets": [str(cell_file(cell, OUT))],
+            "uptodate": [config_changed(repr((cell, ABLATED)))],
+        }
+
+
+def task_page() -> dict[str, Any]:
+    """Writes the page and the heat map of what is there."""
+    return {"actions": [write_page], "task_dep": ["score"], "uptodate": [False], "verbosity": 2}
+
+
+def write_page() -> None:
+    """The summary as JSON, the heat map and the page."""
+    known = {cell: content for cell in CELLS if (content := read_cell(cell, OUT)) is not None}
+    if not known:
+        raise UserError(f"only={','.join(ONLY)} part={PART}: no cell was scored")
+    write_json(OUT / "summary.json", summary(known))
+    with replacing(PAGE_FOLDER / FIGURE) as aside:
+        heat_map(known).savefig(aside, format="png", dpi=130, metadata={"Software": None})
+    text = page(known, PART, len(CELLS) - len(known))
+    with replacing(PAGE_FOLDER / PAGE) as aside:
+        aside.write_text(text, encoding="utf-8")
+    print(text)

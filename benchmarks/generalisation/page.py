@@ -1,0 +1,162 @@
+"""The generalisation matrix as numbers, a heat map and a page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.generalisation.cells import Cell
+from benchmarks.generalisation.run import BASELINES
+
+PAGE, FIGURE = "generalisation.md", "generalisation.png"
+QUANTITIES = ("v_x", "v_y", "omega", "ADE", "FDE")
+EXACT = 1e-5
+"""Where the best baseline errs less than this, the car is known exactly and ratios mean nothing (m/s, rad/s, m)."""
+
+Known = Mapping[Cell, Mapping[str, Any]]
+
+
+def errors(content: Mapping[str, Any], model: str) -> np.ndarray:
+    """One-step RMSE of each channel, ADE and FDE of a model in a cell."""
+    score = content["scores"][model]
+    return np.array([*score["rmse"], score["ade"], score["fde"]])
+
+
+def ratios(content: Mapping[str, Any], model: str, without: tuple[str, ...] = ()) -> np.ndarray:
+    """Errors of a model over those of the best baseline for each quantity; NaN where that is exact.
+
+    Args:
+        content: of the cell.
+        model: the model.
+        without: baselines that do not count.
+    """
+    best = np.min([errors(content, name) for name in BASELINES if name not in without], axis=0)
+    return np.where(best < EXACT, np.nan, errors(content, model) / np.maximum(best, 1e-300))
+
+
+def summary(known: Known) -> dict[str, Any]:
+    """For development and test cells: each model's geometric means and worst cells, coverage, exact cells."""
+    return {part: _summary({c: v for c, v in known.items() if c.is_test == test}) for part, test in _PARTS.items()}
+
+
+_PARTS = {"development": False, "test": True}
+
+
+def _summary(known: Known) -> dict[str, Any]:
+    if not known:
+        return {"cells": 0}
+    models = list(next(iter(known.values()))["scores"])
+    out: dict[str, Any] = {"cells": len(known), "models": {}}
+    for model in models:
+        entry: dict[str, Any] = {}
+        for label, without in (("over_best", ()), ("over_best_but_rls", ("rls",))):
+            each = np.array([ratios(content, model, without) for content in known.values()])
+            means = np.exp(np.nanmean(np.log(np.maximum(each, 1e-12)), axis=0))
+            worst = np.nanmax(each, axis=0)
+            entry[label] = {
+                "one_step": float(np.exp(np.mean(np.log(means[:3])))),
+                "by_quantity": dict(zip(QUANTITIES, means.tolist(), strict=True)),
+                "worst": dict(zip(QUANTITIES, worst.tolist(), strict=True)),
+                "worst_cell": [list(known)[int(np.nanargmax(each[:, k]))].name for k in range(len(QUANTITIES))],
+            }
+        exact = [
+            float(errors(content, model)[:4].max())
+            for content in known.values()
+            if errors(content, "single_track")[:4].max() < EXACT
+        ]
+        entry["exact_cells"], entry["worst_exact"] = len(exact), max(exact, default=None)
+        covered = [content["scores"][model]["coverage"] for content in known.values()]
+        if all(each is not None for each in covered):
+            entry["coverage"] = [float(np.min(covered)), float(np.mean(covered)), float(np.max(covered))]
+        out["models"][model] = entry
+    gains = [content["network_gain"].get("dynssm") for content in known.values()]
+    known_gains = [gain for gain in gains if gain is not None]
+    out["network_used"] = [sum(gain >= 0.01 for gain in known_gains), len(known_gains)]
+    return out
+
+
+def heat_map(known: Known, model: str = "dynssm") -> Figure:
+    """Ratio of a model's errors to the best baseline's, a row for each cell."""
+    cells = sorted(known, key=lambda cell: (cell.training.simulated is not None, cell.name))
+    values = np.array([ratios(known[cell], model) for cell in cells])
+    figure = Figure(figsize=(6.4, 1.2 + 0.19 * len(cells)), layout="constrained")
+    panel = figure.subplots()
+    shown = panel.imshow(values, cmap="RdBu_r", vmin=0.6, vmax=1.4, aspect="auto")
+    for i, j in np.ndindex(values.shape):
+        exact = not np.isfinite(values[i, j])
+        panel.text(j, i, "exact" if exact else f"{values[i, j]:.2f}", ha="center", va="center", fontsize=6)
+    panel.set_xticks(range(len(QUANTITIES)), QUANTITIES)
+    panel.set_yticks(range(len(cells)), [f"{cell.name}{' *' if cell.is_test else ''}" for cell in cells], fontsize=6)
+    panel.xaxis.tick_top()
+    panel.grid(visible=False)
+    panel.set_title(f"error of {model} over the best baseline's (* test cell)", fontsize=9)
+    figure.colorbar(shown, ax=panel, shrink=0.4)
+    return figure
+
+
+def page(known: Known, part: str, undriven: int) -> str:
+    """The results as Markdown."""
+    return "\n".join(_lines(known, part, undriven)) + "\n"
+
+
+def _lines(known: Known, part: str, undriven: int) -> Iterator[str]:
+    command = (
+        f"python -m doit -n 2 -f benchmarks/generalisation/dodo.py{'' if part == 'development' else f' part={part}'}"
+    )
+    yield "# Generalisation"
+    yield ""
+    yield (
+        f"Made by `{command}`. Every cell is a training and a drive that differs from it: another track, another line, more "
+        "speed, and one hidden change of the car (20 % less grip, a steering offset of 0.01 rad, 10 % more mass, a bank of "
+        "0.05 rad). Cars: 1:43, full size, 1:10, and the real logs; plants: Euler steps as the models step, steps of 1 ms, "
+        "four wheels; sensor noise: none, usual, three times. Rollouts take 0.6 s. What is shown are ratios to the best "
+        f"baseline of each cell and quantity ({', '.join(BASELINES)}): geometric means, and the worst cell. Decisions were "
+        "taken on development cells; a hash of its name says which these are."
+        + (
+            f" {undriven} cells are missing: the changed car leaves the road, or they were not made."
+            if undriven
+            else ""
+        )
+    )
+    for label, content in summary(known).items():
+        if not content["cells"]:
+            continue
+        yield ""
+        yield f"## {label.capitalize()} cells ({content['cells']})"
+        yield ""
+        quantities = " | ".join(QUANTITIES)
+        yield f"| model | one step | {quantities} | worst one step | worst ADE | one step, ADE without `rls` | coverage |"
+        yield f"| --- |{' --- |' * (len(QUANTITIES) + 5)}"
+        for model, entry in content["models"].items():
+            over, other = entry["over_best"], entry["over_best_but_rls"]
+            means = " | ".join(_ratio(over["by_quantity"][name]) for name in QUANTITIES)
+            worst = max(over["worst"][name] for name in QUANTITIES[:3])
+            covered = entry.get("coverage")
+            yield (
+                f"| `{model}` | {_ratio(over['one_step'])} | {means} | {_ratio(worst)} | {_ratio(over['worst']['ADE'])} | "
+                f"{_ratio(other['one_step'])}, {_ratio(other['by_quantity']['ADE'])} | "
+                + ("–" if covered is None else f"{100 * covered[0]:.0f} to {100 * covered[2]:.0f} %")
+                + " |"
+            )
+        best = content["models"]["dynssm"]
+        used, of = content["network_used"]
+        yield ""
+        if best["exact_cells"]:
+            yield (
+                f"In {best['exact_cells']} cells the calibrated car is exact to 1e-5; `dynssm` errs by at most "
+                f"{best['worst_exact']:.1e} there."
+            )
+        worst_cells = ", ".join(f"{q} {c}" for q, c in zip(QUANTITIES, best["over_best"]["worst_cell"], strict=True))
+        yield (
+            f"The network earned its place in the online layer (1 % on left-out laps) in {used} of {of} cells. Worst cells "
+            f"of `dynssm`: {worst_cells}."
+        )
+    yield ""
+    yield f"![Heat map of the cells]({FIGURE})"
+
+
+def _ratio(value: float) -> str:
+    return f"{value:.3f}" if value < 100 else "diverges"

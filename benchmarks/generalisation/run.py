@@ -1,0 +1,110 @@
+"""Training the models of a training, and scoring them on a cell."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import dynssm_ros
+from benchmarks.generalisation.cells import Cell, Training, test_drive, training_drive
+from dynssm_ros.api import with_offline
+from dynssm_ros.evaluation.open_loop import evaluate
+from dynssm_ros.files import write_json
+from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma, WindowModel, load_model
+from dynssm_ros.signals.recording import concatenate
+from dynssm_ros.simulation.laps import SimulationError
+
+MODELS: dict[str, dict[str, Any]] = {"rls": {"base": "rls"}, "ridge": {"base": "ridge"}, "dynssm": {"base": "dynssm"}}
+"""What is trained, as changes of shipped model files."""
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "no_innovation": {"base": "dynssm", "innovation": None},
+    "rollout_loss": {"base": "dynssm", "loss": {"rollout": 0.3}, "training": {"epochs": 20}},
+    "ssm_and_head": {
+        "base": "dynssm", "ssm": {"channels": 24, "states": 8}, "adaptation": {"hidden": 24, "alpha": 0.5},
+        "loss": {"parameters": 0.01},
+    },
+    "no_mirror": {"base": "dynssm", "training": {"augmentation": {"mirror": False}}},
+}  # fmt: skip
+BASELINES = ("persistence", "single_track", "single_track_ewma", "ridge", "rls")
+ROLLOUT_STRIDE = 5
+
+
+def models_of(ablations: bool) -> dict[str, dict[str, Any]]:
+    """What is trained in all."""
+    return MODELS | (ABLATIONS if ablations else {})
+
+
+def model_folder(training: Training, model: str, out: Path) -> Path:
+    """Where a trained model is."""
+    return out / "models" / training.name / model
+
+
+def drive_file(training: Training, out: Path) -> Path:
+    """The laps of a training."""
+    return out / "drives" / f"{training.name}.parquet"
+
+
+def drive(training: Training, out: Path, data: Path) -> None:
+    """Makes the laps of a training."""
+    concatenate(training_drive(training, data)).save(drive_file(training, out))
+
+
+def train_model(training: Training, model: str, out: Path) -> None:
+    """Trains one of :func:`models_of`."""
+    from dynssm_ros.learning.models.registry import load_model_config, merge, parse_model_config
+
+    content = dict(models_of(True)[model])
+    base = load_model_config(content.pop("base")).model_dump(mode="json")
+    config = parse_model_config({**merge(base, content), "name": model}, model)
+    dynssm_ros.train(drive_file(training, out), config, training.vehicle, model_folder(training, model, out))
+
+
+def cell_file(cell: Cell, out: Path) -> Path:
+    """Where the scores of a cell are."""
+    return out / "cells" / f"{cell.name}.json"
+
+
+def score_cell(cell: Cell, out: Path, data: Path, ablations: bool) -> None:
+    """Scores all models on a cell; ``null`` if the changed car cannot be driven."""
+    trained = {name: load_model(model_folder(cell.training, name, out)) for name in models_of(ablations)}
+    car = trained["rls"].vehicle
+    assert car is not None
+    models: dict[str, WindowModel] = {
+        "persistence": Persistence(), "single_track": SingleTrack(car), "single_track_ewma": SingleTrackEwma(car),
+        **with_offline(trained),
+    }  # fmt: skip
+    try:
+        laps = concatenate(test_drive(cell, data))
+    except SimulationError as error:
+        write_json(cell_file(cell, out), {"scores": None, "why": str(error)})
+        return
+    evaluation = evaluate(laps, models, min_speed=car.minimum_speed, stride=ROLLOUT_STRIDE, calls=1)
+    scores = {}
+    for name, score in evaluation.scores.items():
+        covered = score.coverage_90
+        scores[name] = {
+            "rmse": [_number(value) for value in score.rmse],
+            "ade": _number(score.rollout.ade),
+            "fde": _number(score.rollout.fde),
+            "coverage": None if covered is None else [_number(value) for value in covered],
+        }
+    gains = {}
+    for name in trained:
+        metrics = json.loads((model_folder(cell.training, name, out) / "metrics.json").read_text(encoding="utf-8"))
+        gains[name] = metrics.get("network_gain")
+    write_json(cell_file(cell, out), {"scores": scores, "network_gain": gains, "rows": len(evaluation.rows)})
+
+
+def _number(value: float) -> float:
+    """A finite number for JSON: what diverged is very large."""
+    return float(value) if np.isfinite(value) else 1e30
+
+
+def read_cell(cell: Cell, out: Path) -> dict[str, Any] | None:
+    """The scores of a cell; ``None`` if there are none."""
+    file = cell_file(cell, out)
+    content = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {"scores": None}
+    return content if content["scores"] is not None else None
