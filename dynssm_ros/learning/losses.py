@@ -27,6 +27,8 @@ class Output(NamedTuple):
     """Normalised parameter deviation, Eq. (20), ``(B, 17)``."""
     correction: Tensor | None
     """Normalised output of the residual network, Eq. (28), ``(B, 3)``."""
+    nominal: Tensor | None = None
+    """Increments of the physics with nominal coefficients from the latest rows, ``(B, rows, 3)``, for who needs them too."""
 
 
 class LossConfig(StrictModel):

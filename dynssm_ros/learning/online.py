@@ -37,6 +37,8 @@ class OnlineFeatures(nn.Module):
     increment_scale: Tensor
     input_scale: Tensor
     nominal: Tensor
+    one: Tensor
+    places: Tensor
 
     def __init__(
         self,
@@ -61,7 +63,10 @@ class OnlineFeatures(nn.Module):
         self.other_lags = min(config.other_lags, H - 1)
         self.input_lags = min(config.input_lags, H - 1)
         self.errors = min(steps_of(config.error_average, vehicle.sampling_time), H - 1)
+        self.recent = max(self.lags, self.other_lags)
         self.names = self._names()
+        self.register_buffer("one", torch.ones(1, 1))
+        self.register_buffer("places", self._places())
 
     def _names(self) -> tuple[str, ...]:
         lags, others = range(self.lags), range(self.other_lags)
@@ -77,27 +82,49 @@ class OnlineFeatures(nn.Module):
     def forward(self, window: Tensor, output: Output) -> tuple[Tensor, Tensor]:
         """Windows ``(B, H, 7)`` to features ``(B, 3, n)`` and the physics' increments ``(B, 3)`` (m/s, m/s, rad/s)."""
         increments = (window[:, 1:, :CHANNELS] - window[:, :-1, :CHANNELS]) / self.increment_scale
-        physics = self.physics.over(window, self.nominal, self.errors + 1) / self.increment_scale
-        now = physics[:, -1]
-        own = [now, _next(now), _next(_next(now))]
-        if self.network:
-            own.append(output.increment / self.increment_scale)
-        recent = increments[:, -max(self.lags, self.other_lags) :].flip(1)
-        own += [recent[:, k] for k in range(self.lags)]
-        for k in range(self.other_lags):
-            own += [_next(recent[:, k]), _next(_next(recent[:, k]))]
-        mean_error = (increments[:, -self.errors :] - physics[:, :-1]).mean(1)
-        applied = window[:, -self.input_lags - 1 :, 3:5] + window[:, -self.input_lags - 1 :, 5:7]
-        changes = ((applied[:, 1:] - applied[:, :-1]) / self.input_scale).flip(1).flatten(1)
+        over = self.physics.over(window, self.nominal, self.errors + 1) if output.nominal is None else output.nominal
+        over = over[:, -self.errors - 1 :]
+        mean_error = increments[:, -self.errors :].mean(1) - (over[:, :-1].mean(1)) / self.increment_scale
+        inputs = window[:, -self.input_lags - 1 :, 3:7]
+        applied = inputs[..., :2] + inputs[..., 2:]
+        changes = (applied[:, 1:] - applied[:, :-1]) / self.input_scale
         level = (window[:, -1, :5] - self.mean[:5]) / self.std[:5]
-        shared = torch.cat([changes, level], -1)[:, None].expand(-1, CHANNELS, -1)
-        rest = torch.stack([mean_error, torch.ones_like(mean_error)], -1)
-        return torch.cat([torch.stack(own, -1), shared, rest], -1), now * self.increment_scale
+        physics = over[:, -1]
+        parts = [
+            physics / self.increment_scale,
+            increments[:, -self.recent :].flatten(1),
+            changes.flatten(1),
+            level,
+            mean_error,
+        ]
+        if self.network:
+            parts.append(output.increment / self.increment_scale)
+        found = torch.cat([*parts, self.one.expand(window.shape[0], -1)], -1)
+        return found[:, self.places], physics
 
-
-def _next(values: Tensor) -> Tensor:
-    """Values ``(B, 3)`` of the channel after each, in a circle."""
-    return torch.cat([values[:, 1:], values[:, :1]], -1)
+    def _places(self) -> Tensor:
+        """Where the features of each channel stand among those of all, ``(3, n)``."""
+        at, begin = {}, 0
+        sizes = {
+            "physics": CHANNELS, "increments": CHANNELS * self.recent, "changes": 2 * self.input_lags, "level": 5,
+            "error": CHANNELS, "network": CHANNELS if self.network else 0, "one": 1,
+        }  # fmt: skip
+        for name, size in sizes.items():
+            at[name], begin = begin, begin + size
+        rows = []
+        for c in range(CHANNELS):
+            following = [(c + k) % CHANNELS for k in range(CHANNELS)]  # the channel itself, the next, the one after
+            back = [at["increments"] + CHANNELS * (self.recent - 1 - k) for k in range(self.recent)]
+            rows.append([
+                *(at["physics"] + k for k in following),
+                *([at["network"] + c] if self.network else []),
+                *(back[k] + c for k in range(self.lags)),
+                *(back[k] + which for k in range(self.other_lags) for which in following[1:]),
+                *(at["changes"] + 2 * (self.input_lags - 1 - k) + u for k in range(self.input_lags) for u in range(2)),
+                *(at["level"] + k for k in range(5)),
+                at["error"] + c, at["one"],
+            ])  # fmt: skip
+        return torch.tensor(rows)
 
 
 class Drive(NamedTuple):

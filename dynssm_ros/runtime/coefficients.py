@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -116,13 +117,14 @@ class CoefficientEstimator:
         self.evidence = 0.0
         """Logarithm of the likelihood ratio of a changed car and the calibrated one."""
         self._block: list[Vector] = []
+        self._changed()
 
     @property
     def belief(self) -> float:
         """Probability that the car has changed."""
         return 1.0 / (1.0 + math.exp(min(_EVIDENCE_WANTED - self.evidence, 50.0)))
 
-    @property
+    @cached_property
     def theta(self) -> Vector:
         """Coefficients as they are to be taken now, ``(17,)``: within their bounds."""
         theta = self.nominal.copy()
@@ -130,7 +132,7 @@ class CoefficientEstimator:
         limited: Vector = np.clip(theta, self._vehicle.lower, self._vehicle.upper)
         return limited
 
-    @property
+    @cached_property
     def std(self) -> Vector:
         """Their standard deviations, ``(17,)``."""
         n, belief = len(self.adapted), self.belief
@@ -138,6 +140,11 @@ class CoefficientEstimator:
         within = np.diag(self._P)[:n] + (1 - belief) * self._x[:n] ** 2
         std[self.adapted] = np.sqrt((1 - belief) * std[self.adapted] ** 2 + belief * self.spread**2 * within)
         return std
+
+    def _changed(self) -> None:
+        """What was derived from the estimate is to be derived anew."""
+        self.__dict__.pop("theta", None)
+        self.__dict__.pop("std", None)
 
     def step(self, row: Vector, increment: Vector) -> None:
         """Takes a measured row ``(7,)`` and the measured increment ``(3,)`` to the next (m/s, m/s, rad/s)."""
@@ -184,6 +191,7 @@ class CoefficientEstimator:
         self._x, self._P = kept["changes"].copy(), kept["covariance"].copy()
         self._error, self._error_P = kept["error"].copy(), kept["error_covariance"].copy()
         self._noise, self.evidence = kept["noise"].copy(), float(kept["evidence"][0])
+        self._changed()
         self.interrupt()
 
     def interrupt(self) -> None:
@@ -234,6 +242,7 @@ class CoefficientEstimator:
             square = min(max(error**2 - explained, 0.05 * self._noise[c]), 20.0 * self._noise[c])
             self._noise[c] += self._forget * (square - self._noise[c])
         self._x[:n] = np.clip(self._x[:n], -_FARTHEST, _FARTHEST)
+        self._changed()
         self.evidence = min(max(self._evidence_kept * self.evidence + ratio, _LEAST_EVIDENCE), _MOST_EVIDENCE)
 
     def _mean_increments(self, rows: Vector, cars: Vector) -> Vector:

@@ -236,7 +236,7 @@ class OnnxModel:
         if inputs != [("window", [self.H, len(WINDOW_COLUMNS)])] or "increment" not in self._outputs:
             raise ArtifactError(
                 f"{artifact.onnx}: maps {inputs} to {self._outputs}; expected a window of {self.H} rows and "
-                f"{len(WINDOW_COLUMNS)} columns to increment, and theta and physics if it has them"
+                f"{len(WINDOW_COLUMNS)} columns to increment, and theta, physics, variance if it has them"
             )
 
         # a single window, as in the node, always has its place in memory
@@ -264,7 +264,7 @@ class OnnxModel:
         return model
 
     def predict(self, windows: Vector) -> WindowPrediction:
-        """Runs the graph on ``windows``; the stated variances are those of the validation data."""
+        """Runs the graph on ``windows``; without variances of its own it has those of the validation data."""
         if len(windows) == 1:
             self._window[...] = windows
             self._session.run_with_iobinding(self._binding)
@@ -273,11 +273,12 @@ class OnnxModel:
             results = self._session.run(self._outputs, {"window": windows.astype(np.float32)})
         by_name = dict(zip(self._outputs, results, strict=True))
         now, theta, physics = windows[:, -1, :3], by_name.get("theta"), by_name.get("physics")
+        variance = by_name.get("variance")
         return WindowPrediction(
             now + by_name["increment"],
             None if theta is None else theta.astype(np.float64),
             None if physics is None else now + physics,
-            self._validated.repeat(len(windows), axis=0),
+            self._validated.repeat(len(windows), axis=0) if variance is None else variance.astype(np.float64),
             None
             if self.online is None
             else Seen(by_name["features"].astype(np.float64), by_name["nominal_physics"].astype(np.float64)),

@@ -12,6 +12,7 @@ from dynssm_ros.evaluation.metrics import learned_while_driving, predict_rows
 from dynssm_ros.evaluation.open_loop import evaluate
 from dynssm_ros.learning.dataset import all_windows
 from dynssm_ros.learning.export import save_artifact
+from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.online import OnlineFeatures
 from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.models import OnnxModel, SingleTrack
@@ -199,6 +200,6 @@ def test_features_fit_into_a_short_window(orca, noisy_model):
     from dynssm_ros.learning.models.physics import PhysicsConfig
 
     features = OnlineFeatures(OnlineConfig(), orca, PhysicsConfig(), noisy_model.card.normalisation, 5, False)
-    seen, physics = features(torch.rand(7, 5, 7) + 1.0, None)
+    seen, physics = features(torch.rand(7, 5, 7) + 1.0, Output(torch.zeros(7, 3), None, None, None, None))
     assert seen.shape == (7, 3, len(features.names))
     assert physics.shape == (7, 3)

@@ -57,8 +57,9 @@ class Rls(TrainableModel):
 
     def forward(self, window: Tensor) -> Output:
         """Raw windows ``(B, H, 7)`` to predictions."""
-        moved = self.physics.over(window, self.nominal, 1)[:, 0]
-        return Output(moved, moved, self.nominal.expand(window.shape[0], -1), None, None)
+        over = self.physics.over(window, self.nominal, window.shape[1])
+        moved = over[:, -1]
+        return Output(moved, moved, self.nominal.expand(window.shape[0], -1), None, None, over)
 
     def fit(self, training: TrainingWindows) -> bool:
         """There is nothing to fit."""

@@ -50,11 +50,11 @@ def test_past_errors_show_what_was_added(
 ) -> None:
     model = DynSSM(make_config(physics={"nominal": "vehicle"}, inputs={"physics_errors": True}), orca, SCALES)
     given = windows(drive(orca, 100), model.config.rows(0.02))
-    seen = model._seen(given, model.changes.states(given))
+    seen = model._seen(given, model.changes.states(given), model._nominal_increments(given))
     np.testing.assert_allclose(seen[..., 7:].detach(), 0.0, atol=2e-5)
     added = torch.tensor([0.01, -0.02, 0.04])
     given[:, -1, :3] += added
-    errors = model._seen(given, model.changes.states(given))[..., 7:].detach()
+    errors = model._seen(given, model.changes.states(given), model._nominal_increments(given))[..., 7:].detach()
     assert errors.shape[1] == model.config.rows(0.02) - 1
     about_the_mean = torch.tensor([-1.0, -1.0, 2.0])[:, None] / 3 * added / S_DELTA  # of the three steps in the window
     np.testing.assert_allclose(errors, about_the_mean.expand(20, 3, 3), atol=2e-5)
@@ -66,7 +66,7 @@ def test_increments_do_not_depend_on_the_absolute_state(
     model = DynSSM(make_config(inputs={"features": "increments"}), orca, SCALES)
     given = windows(drive(orca, 100), model.config.rows(0.02))
     shifted = given + torch.tensor([3.0, 1.0, -2.0, 0.2, 0.1, 0.0, 0.0])
-    there, here = (model._seen(each, model.changes.states(each)) for each in (shifted, given))
+    there, here = (model._seen(each, model.changes.states(each), None) for each in (shifted, given))
     np.testing.assert_allclose(there.detach(), here.detach(), atol=1e-4)
     assert here.abs().max() <= 4.0
 

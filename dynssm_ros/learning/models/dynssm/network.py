@@ -118,7 +118,8 @@ class DynSSM(TrainableModel):
     def forward(self, window: Tensor) -> Output:
         """Raw windows ``(B, H, 7)`` to predictions."""
         increments = self.changes.states(window)
-        seen = self._seen(window, increments)
+        nominal = self._nominal_increments(window)
+        seen = self._seen(window, increments, nominal)
         latest = seen[:, -1]
         conditioned = self.fusion(seen)
         theta = deviation = None
@@ -126,7 +127,7 @@ class DynSSM(TrainableModel):
             theta, deviation, conditioned = self.head(conditioned, latest, self.nominal)
         elif self.physics is not None:
             theta = self.nominal.expand(window.shape[0], -1)  # not len(), which an export would freeze
-        step = self._step(window, increments, theta)
+        step = self._step(window, increments, nominal, theta)
         correction = None
         moved = step.expected
         if self.residual is not None:
@@ -134,35 +135,38 @@ class DynSSM(TrainableModel):
             added = self.increment_scale * scaled
             moved = added if moved is None else moved + added
         assert moved is not None
-        return Output(moved, step.physics, theta, deviation, correction)
+        return Output(moved, step.physics, theta, deviation, correction, nominal)
 
-    def _seen(self, window: Tensor, increments: Tensor) -> Tensor:
+    def _nominal_increments(self, window: Tensor) -> Tensor | None:
+        """What the physics with nominal coefficients says from every row, ``(B, H, 3)``; ``None`` if nothing reads it."""
+        reads = self.config.inputs.physics_errors or (self.innovation is not None and self.head is None)
+        return self.physics.over(window, self.nominal, window.shape[1]) if self.physics is not None and reads else None
+
+    def _seen(self, window: Tensor, increments: Tensor, nominal: Tensor | None) -> Tensor:
         """What the encoders read, ``(B, rows, features)``."""
-        changes, errors = self.config.inputs.features == "increments", self.config.inputs.physics_errors
+        changes = self.config.inputs.features == "increments"
         rows = self.changes(window, increments) if changes else (window - self.mean) / self.std
-        if errors:
-            assert self.physics is not None
-            past = (
-                increments - self.physics.over(window[:, :-1], self.nominal, window.shape[1] - 1) / self.increment_scale
-            )
+        if self.config.inputs.physics_errors:
+            assert nominal is not None
+            past = increments - nominal[:, :-1] / self.increment_scale
             rows = torch.cat([rows[:, -past.shape[1] :], limited(centred(past))], dim=-1)
         return rows[:, -self._read :]
 
-    def _step(self, window: Tensor, increments: Tensor, theta: Tensor | None) -> _Step:
+    def _step(self, window: Tensor, increments: Tensor, nominal: Tensor | None, theta: Tensor | None) -> _Step:
         """The physics with the coefficients ``theta``, and with its innovation filter if it has one."""
         if self.physics is None or theta is None:
             return _Step()
         if self.innovation is None:
-            physics = self.physics.over(window, theta[:, None] if theta.dim() > 1 else theta, 1)[:, 0]
+            physics = self.physics.over(window, theta[:, None], 1)[:, 0]
             return _Step(physics, physics)
         # the car as it is taken to be now, over the whole window: its errors are those of these coefficients
-        over = self.physics.over(window, theta[:, None], window.shape[1]) / self.increment_scale
+        over = nominal if self.head is None else self.physics.over(window, theta[:, None], window.shape[1])
+        assert over is not None
+        over = over / self.increment_scale
         q, error, mean = self.innovation(increments, over)
         physics = over[:, -1]
         return _Step(
-            physics * self.increment_scale,
-            q * self.increment_scale,
-            torch.cat([physics + mean, error - mean], dim=-1),
+            physics * self.increment_scale, q * self.increment_scale, torch.cat([physics + mean, error - mean], dim=-1)
         )
 
     def _residual_input(
