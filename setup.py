@@ -31,7 +31,7 @@ EXTRAS = {
 
 setup(
     name=NAME,
-    version="0.2.0",
+    version="0.3.0",
     description="Vehicle dynamics for autonomous racing: learned from rosbags, deployed on ROS 2, explained.",
     maintainer="dynssm_ros developers",
     maintainer_email="maintainers@dynssm-ros.invalid",
