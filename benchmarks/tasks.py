@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from doit import get_initial_workdir
 from doit.dependency import JsonDB
 from doit.exceptions import TaskFailed
 from doit.tools import config_changed
@@ -116,6 +117,11 @@ def perform(step: Step, root: Path, before: Iterable[str]) -> TaskFailed | None:
 
 
 def doit_config(state: Path) -> dict[str, Any]:
-    """Settings of doit: where its state is, and to go on with what does not need a task that failed."""
+    """Settings of doit: where its state is, and to go on with what does not need a task that failed.
+
+    Also returns to the folder that doit was called in, which paths are relative to; doit goes to that of the tasks' file.
+    """
+    if (called_in := get_initial_workdir()) is not None:
+        os.chdir(called_in)
     state.parent.mkdir(parents=True, exist_ok=True)
     return {"dep_file": str(state), "backend": "noting", "continue": True, "verbosity": 1}

@@ -38,9 +38,9 @@ DATA = Path(get_var("data", os.environ.get("DYNSSM_DATA", "../shared/data")))
 ONLY = tuple(get_var("only", "").split(","))
 PART = get_var("part", "development")
 ABLATED = get_var("ablations", "0") == "1"
+DOIT_CONFIG = doit_config(OUT / "doit.json")
 CELLS = [cell for cell in cells(DATA) if cell.training.name.startswith(ONLY) and (PART == "all" or not cell.is_test)]
 TRAININGS = {cell.training.name: cell.training for cell in CELLS}
-DOIT_CONFIG = doit_config(OUT / "doit.json")
 
 
 def task_drive() -> Iterator[dict[str, Any]]:

@@ -18,7 +18,7 @@ from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.metrics import BATCH, Tick, gather, silent
 from dynssm_ros.runtime.models import WindowModel, corrected
 from dynssm_ros.runtime.online import Learned
-from dynssm_ros.vehicle.kinematics import world_velocity
+from dynssm_ros.vehicle.kinematics import path
 
 HORIZON_S = 0.6
 """How far a controller looks ahead with a model, about; the default length of rollouts for every car."""
@@ -78,25 +78,6 @@ def roll_out(model: WindowModel, stretches: Vector, steps: int, learned: Learned
             predicted = corrected(predicted, windows, model.online, learned, in_rollout=k > start)
         fed_back[:, k, :3] = predicted.state
     return fed_back[:, start:, :3]
-
-
-def path(velocities: Vector, T_s: float) -> Vector:
-    """Positions driven with the body-frame ``velocities``, from the origin and along the x axis.
-
-    Each step takes the mean of the velocities at its two ends, at the heading in its middle: the live predictor's rule.
-
-    Args:
-        velocities: ``v_x, v_y, omega`` at the grid points, shape ``(..., n + 1, 3)``.
-        T_s: sampling time (s).
-
-    Returns:
-        ``x, y`` after each step, shape ``(..., n, 2)`` (m).
-    """
-    mean = (velocities[..., 1:, :] + velocities[..., :-1, :]) / 2
-    turn = T_s * mean[..., 2]
-    heading = np.cumsum(turn, axis=-1) - turn / 2
-    velocity = world_velocity(np, heading, mean[..., 0], mean[..., 1])
-    return T_s * np.cumsum(np.stack(velocity, axis=-1), axis=-2)
 
 
 def branches(model: WindowModel, matrix: Vector, starts: Indices, steps: int, T_s: float) -> Vector:

@@ -26,7 +26,8 @@ from dynssm_ros.vehicle import Vehicle
 _PRIOR_ROWS = (10.0, 40.0, 160.0)
 _TOLERANCE = 0.01  # of the RMSE on left-out parts
 _RIDGE = 1e-4  # of a feature's mean square: draws weights that the laps leave open to the physics alone
-_SMALLEST = 1e-12  # noise variance of data without noise, in units of s_delta squared
+_SMALLEST = 1e-12  # of a mean square
+_LEAST_NOISE = 1e-4  # variance, in squared s_delta: no car is known better than to a hundredth of an increment
 
 
 class OnlineFeatures(nn.Module):
@@ -145,10 +146,18 @@ def joined(drives: list[Drive]) -> Drive:
     return Drive(seen, *(np.concatenate([drive[k] for drive in drives]) for k in (1, 2, 3)))
 
 
-def fit_layer(
-    parts: list[Drive], features: OnlineFeatures, scale: Normalisation, config: OnlineConfig
-) -> tuple[OnlineLayer, float]:
-    """The layer with its prior, and its error on parts of the laps that the prior was fitted without.
+class FittedLayer(NamedTuple):
+    """The layer with its prior, and what says how good it is."""
+
+    layer: OnlineLayer
+    error: float
+    """Geometric mean over the channels of the RMSE on parts that the prior was fitted without, in units of s_delta."""
+    judged: list[tuple[OnlineLayer, Drive]]
+    """Those parts, each with the layer whose prior was fitted without it."""
+
+
+def fit_layer(parts: list[Drive], features: OnlineFeatures, scale: Normalisation, config: OnlineConfig) -> FittedLayer:
+    """The layer with its prior, judged on parts of the laps that the prior was fitted without.
 
     The prior's mean is the least-squares solution on the training laps. Its covariance is that of so many rows of them.
     The number of rows is the least of :data:`_PRIOR_ROWS` with which the layer predicts parts of the laps, each with a
@@ -161,13 +170,10 @@ def fit_layer(
         scale: gives s_delta.
         config: of the layer.
 
-    Returns:
-        The layer; the geometric mean over the channels of its RMSE on those parts, in units of s_delta.
-
     Raises:
         RecordingError: there are no windows to fit it to.
     """
-    if not parts:
+    if not any(len(part.ends) for part in parts):
         raise RecordingError(
             "online: no window at the vehicle's minimum speed or more; expected some to fit the prior to"
         )
@@ -197,7 +203,10 @@ def fit_layer(
         losses[rows] = float(0.5 * np.log(np.mean(errors**2, axis=0) + _SMALLEST).mean())
     least = min(losses.values())
     chosen = next(rows for rows in _PRIOR_ROWS if losses[rows] <= least + np.log1p(_TOLERANCE))
-    return layer(_least_squares(whole, s_delta), chosen, config.spread), float(np.exp(losses[chosen]))
+    judged = [(layer(prior, chosen, {}), part) for part, prior in left_out]
+    return FittedLayer(
+        layer(_least_squares(whole, s_delta), chosen, config.spread), float(np.exp(losses[chosen])), judged
+    )
 
 
 class _Prior(NamedTuple):
@@ -212,6 +221,9 @@ def _least_squares(drive: Drive, s_delta: Vector) -> _Prior:
     F, y = drive.seen.features, drive.increments / s_delta
     alone = np.zeros(F.shape[1:])
     alone[:, 0] = 1.0
+    if len(F) == 0:
+        one = np.ones(CHANNELS)
+        return _Prior(alone, np.tile(np.eye(F.shape[2]), (CHANNELS, 1, 1)), one, one)
     gram = np.einsum("kci,kcj->cij", F, F, optimize=True) / len(F)
     ridge = _RIDGE * np.einsum("cii->ci", gram) + _SMALLEST
     gram[:, range(F.shape[2]), range(F.shape[2])] += ridge
@@ -219,7 +231,7 @@ def _least_squares(drive: Drive, s_delta: Vector) -> _Prior:
     mean: Vector = alone + np.linalg.solve(gram, (np.einsum("kci,kc->ci", F, left) / len(F))[..., None])[..., 0]
     noise = np.mean((y - np.einsum("kci,ci->kc", F, mean)) ** 2, axis=0)
     physics = np.mean((y - drive.seen.physics / s_delta) ** 2, axis=0)
-    return _Prior(mean, gram, np.maximum(noise, _SMALLEST), physics)
+    return _Prior(mean, gram, np.maximum(noise, _LEAST_NOISE), np.maximum(physics, _LEAST_NOISE))
 
 
 def _errors(layer: OnlineLayer, drive: Drive) -> Vector:

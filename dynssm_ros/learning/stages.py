@@ -10,24 +10,22 @@ import numpy as np
 import torch
 
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.learning.dataset import TrainingWindows, all_windows, normalisation, split_windows
-from dynssm_ros.learning.models.base import ModelConfig, OnlineConfig, TrainableModel
+from dynssm_ros.learning.dataset import TrainingWindows, normalisation, split_windows
+from dynssm_ros.learning.layer import LayerBase, earned_layer
+from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.models.registry import build_model
-from dynssm_ros.learning.online import Drive, OnlineFeatures, fit_layer
+from dynssm_ros.learning.online import OnlineFeatures
 from dynssm_ros.learning.optimisation import History, Optimisation, OptimisationResult, rollout_steps
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
-from dynssm_ros.runtime.online import OnlineLayer, Seen
+from dynssm_ros.runtime.online import OnlineLayer
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 
 Calibrate = Callable[[Recording, Vehicle], Vehicle]
 """Fits the nominal values of a vehicle to a recording."""
 
-NETWORK_GAIN_WANTED = 0.01
-"""A network that takes away less of the online layer's error is left out of it."""
-_BATCH = 4096  # windows
 _SHORTER = 4  # how many times fewer epochs the models have that only tell how large errors are on unknown laps
 
 
@@ -55,7 +53,7 @@ class Trained:
     """What the online layer sees; ``None`` without one, as the next."""
     online: OnlineLayer | None = None
     network_gain: float | None = None
-    """Share of the online layer's one-step error on left-out parts that the network takes away; ``None`` without either."""
+    """Share of the online layer's error on left-out parts that the network takes away; ``None`` without either."""
 
     @property
     def H(self) -> int:
@@ -137,49 +135,13 @@ def _start_of(checkpoint: Path) -> Path:
 
 
 def _with_layer(trained: Trained, left_out: list[tuple[TrainableModel, Recording]]) -> Trained:
-    """The model with its online layer.
-
-    Args:
-        trained: the model.
-        left_out: parts of the recording, each with a model that was trained without it. Without any there is no evidence
-            for the network, and the layer rests on the physics alone.
-    """
-    config = trained.config
-    assert config.online is not None
-    known = left_out or [(trained.model, trained.recording)]
-    features, layer, error_alone = _layer(trained, config.online, known, False)
-    gain = None
-    if trained.model.LEARNS and left_out:
-        with_network, layer_with, error = _layer(trained, config.online, known, True)
-        gain = 1.0 - error / error_alone
-        if gain >= NETWORK_GAIN_WANTED:
-            features, layer = with_network, layer_with
-    return replace(trained, features=features, online=layer, network_gain=gain)
-
-
-def _layer(
-    trained: Trained, online: OnlineConfig, known: list[tuple[TrainableModel, Recording]], network: bool
-) -> tuple[OnlineFeatures, OnlineLayer, float]:
-    """The online layer's features, the layer, and its error on parts of the laps that its prior was fitted without."""
+    """The model with its online layer; ``left_out``: parts of the laps, each with a model that was trained without it."""
+    assert trained.config.online is not None
     integrator, substeps = trained.config.stepping
     physics = PhysicsConfig(integrator=integrator, substeps=substeps)
-    features = OnlineFeatures(online, trained.vehicle, physics, trained.normalisation, trained.H, network)
-    drives = [_drive(features, model, part, trained.H, trained.vehicle.minimum_speed) for model, part in known]
-    layer, error = fit_layer([each for each in drives if len(each.ends)], features, trained.normalisation, online)
-    return features, layer, error
-
-
-@torch.no_grad()
-def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording, H: int, min_speed: float) -> Drive:
-    """What the layer sees of all windows of a recording, with what ``model`` predicts from them."""
-    windows = all_windows(recording, H, min_speed)
-    parts = []
-    for begin in range(0, max(len(windows), 1), _BATCH):
-        window, target = windows.batch(slice(begin, begin + _BATCH))
-        parts.append((*features(window, model.eval()(window)), target))
-    seen, physics, increments = (torch.cat(each).double().numpy() for each in zip(*parts, strict=True))
-    ends = windows.ends.numpy()
-    return Drive(Seen(seen, physics), recording.matrix[ends], increments, ends)
+    base = LayerBase(trained.vehicle, physics, trained.normalisation, trained.H, trained.config.online)
+    features, layer, gain = earned_layer(base, trained.model, trained.recording, left_out)
+    return replace(trained, features=features, online=layer, network_gain=gain)
 
 
 def checkpoints(config: ModelConfig, checkpoint: Path) -> list[Path]:

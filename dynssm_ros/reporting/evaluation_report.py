@@ -11,7 +11,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.coefficients import coefficient_unit
 from dynssm_ros.evaluation.open_loop import Evaluation
 from dynssm_ros.evaluation.regimes import COASTING, QUANTITIES
-from dynssm_ros.evaluation.rollout import branches, path
+from dynssm_ros.evaluation.rollout import branches
 from dynssm_ros.evaluation.score import Group, Score
 from dynssm_ros.reporting import evaluation_figures, track_figures
 from dynssm_ros.reporting.page import Report, Section
@@ -19,6 +19,7 @@ from dynssm_ros.reporting.tables import Column, Table, Value, percent, text
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lap_position import track_position
 from dynssm_ros.vehicle import COEFFICIENTS
+from dynssm_ros.vehicle.kinematics import path
 
 COMMANDS_IN_WORDS = {
     "topics": "topics: the recorded command topics, as increments on the feedback",

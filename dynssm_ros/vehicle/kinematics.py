@@ -6,6 +6,9 @@ import math
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from dynssm_ros.arrays import Vector
 from dynssm_ros.vehicle.single_track import Array, State
 
 # floats through `math` are ten times faster than through numpy; the names are those of numpy
@@ -44,3 +47,23 @@ def advance_pose(xp: Any, pose: Pose, before: State, after: State, T_s: float, s
     turn = omega * T_s
     x, y = world_velocity(xp, pose.theta + share * turn, v_x, v_y)
     return Pose(pose.x + T_s * x, pose.y + T_s * y, pose.theta + turn)
+
+
+def path(velocities: Vector, T_s: float) -> Vector:
+    """Positions driven with the body-frame ``velocities``, from the origin and along the x axis.
+
+    Each step takes the mean of the velocities at its two ends, at the heading in its middle: the live predictor's rule.
+
+    Args:
+        velocities: ``v_x, v_y, omega`` at the grid points, shape ``(..., n + 1, 3)``.
+        T_s: sampling time (s).
+
+    Returns:
+        ``x, y`` after each step, shape ``(..., n, 2)`` (m).
+    """
+    mean = (velocities[..., 1:, :] + velocities[..., :-1, :]) / 2
+    turn = T_s * mean[..., 2]
+    heading = np.cumsum(turn, axis=-1) - turn / 2
+    velocity = world_velocity(np, heading, mean[..., 0], mean[..., 1])
+    positions: Vector = T_s * np.cumsum(np.stack(velocity, axis=-1), axis=-2)
+    return positions

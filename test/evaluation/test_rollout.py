@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.evaluation.rollout import branches, path, roll_out, score_rollouts
+from dynssm_ros.evaluation.rollout import branches, roll_out, score_rollouts
 from dynssm_ros.runtime.models import Persistence, WindowPrediction
 from dynssm_ros.runtime.predictor import propagate_pose
+from dynssm_ros.vehicle.kinematics import path
 
 T_s = 0.04
 

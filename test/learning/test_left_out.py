@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from dynssm_ros.learning.layer import LayerBase
 from dynssm_ros.learning.models.base import ModelConfig
-from dynssm_ros.learning.stages import _layer, checkpoints, train
+from dynssm_ros.learning.models.physics import PhysicsConfig
+from dynssm_ros.learning.stages import checkpoints, train
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 
@@ -28,7 +30,7 @@ WITH_PARTS = {
 def test_the_layer_is_fitted_to_what_models_say_of_parts_that_they_did_not_know(
     drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicle, tmp_path: Path, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr("dynssm_ros.learning.stages.NETWORK_GAIN_WANTED", -10.0)
+    monkeypatch.setattr("dynssm_ros.learning.layer.NETWORK_GAIN_WANTED", -10.0)
     recording = drive(orca, 800)
     config = make_config(**WITH_PARTS)
     trained = train(recording, config, orca, tmp_path / "a.pt")
@@ -39,7 +41,9 @@ def test_the_layer_is_fitted_to_what_models_say_of_parts_that_they_did_not_know(
         known.append(
             (train(recording.select(~part), other, orca, tmp_path / f"{part[0]}.pt").model, recording.select(part))
         )
-    _, layer, _ = _layer(trained, config.online, known, True)
+    physics = PhysicsConfig(integrator=config.stepping[0], substeps=config.stepping[1])
+    base = LayerBase(trained.vehicle, physics, trained.normalisation, trained.H, config.online)
+    layer = base.fitted(base.features(True), known).layer
     np.testing.assert_array_equal(layer.mean, trained.online.mean)
     np.testing.assert_array_equal(layer.covariance, trained.online.covariance)
     # the model itself knows nothing of it

@@ -60,7 +60,7 @@ def test_a_network_that_earns_nothing_is_left_out_of_the_layer(noisy_laps, orca,
 
 
 def test_a_networks_increment_is_an_expert_of_its_own(noisy_laps, orca, make_config, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("dynssm_ros.learning.stages.NETWORK_GAIN_WANTED", -1.0)
+    monkeypatch.setattr("dynssm_ros.learning.layer.NETWORK_GAIN_WANTED", -1.0)
     trained = train(noisy_laps, make_config(online={"folds": 2}), orca, tmp_path / "c.pt")
     model = OnnxModel(save_artifact(trained, tmp_path / "model"))
     window, _ = all_windows(noisy_laps, trained.H, orca.minimum_speed).batch(slice(0, 20))

@@ -1,0 +1,136 @@
+"""The online layer of a trained model: its prior, and whether the network earns a place in it.
+
+The evidence are parts of the training laps, each predicted by a network that was trained without it and a layer whose prior
+was fitted without it: one step ahead, and the path over the horizon of a controller.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.learning.dataset import all_windows
+from dynssm_ros.learning.models.base import OnlineConfig, TrainableModel, steps_of
+from dynssm_ros.learning.models.physics import PhysicsConfig
+from dynssm_ros.learning.online import Drive, FittedLayer, OnlineFeatures, fit_layer
+from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.runtime.online import OnlineLayer, Seen
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.kinematics import path
+
+NETWORK_GAIN_WANTED = 0.01
+"""A network that takes away less of the online layer's error is left out of it."""
+_STRETCHES = 4  # of the laps, for a layer without a network
+_HORIZON_S = 0.6  # of the paths
+_STARTS = 400  # rollouts in a part, at most
+_BATCH = 4096  # windows
+
+Part = tuple[TrainableModel, Recording]
+"""A part of the laps, and a model that does not know it."""
+
+
+class LayerBase(NamedTuple):
+    """What the layer stands on."""
+
+    vehicle: Vehicle
+    physics: PhysicsConfig
+    normalisation: Normalisation
+    H: int
+    """Rows of the model's window."""
+    config: OnlineConfig
+
+    def features(self, network: bool) -> OnlineFeatures:
+        """What the layer sees, with a network's prediction or without."""
+        return OnlineFeatures(self.config, self.vehicle, self.physics, self.normalisation, self.H, network)
+
+    def fitted(self, features: OnlineFeatures, parts: list[Part]) -> FittedLayer:
+        """The layer, its prior fitted to ``parts``."""
+        drives = [_drive(features, model, part, self) for model, part in parts]
+        return fit_layer(drives, features, self.normalisation, self.config)
+
+
+def earned_layer(
+    base: LayerBase, model: TrainableModel, laps: Recording, left_out: list[Part]
+) -> tuple[OnlineFeatures, OnlineLayer, float | None]:
+    """The online layer, with the network if that earns its place.
+
+    The gain of a network is the share of the error that it takes away: the mean of one step and path, or of the path
+    alone if that is less, since a controller needs the path.
+
+    Args:
+        base: what the layer stands on.
+        model: the trained model.
+        laps: that it was trained on.
+        left_out: parts of them; without any there is no evidence, and the layer rests on the physics alone.
+
+    Returns:
+        Features, layer, and the gain; ``None`` if there is no network or no evidence.
+    """
+    alone = base.features(False)
+    stretches = [np.arange(len(laps)) * _STRETCHES // len(laps) == k for k in range(_STRETCHES)]
+    layer = base.fitted(alone, [(model, laps.select(stretch)) for stretch in stretches]).layer
+    if not model.LEARNS or not left_out:
+        return alone, layer, None
+    together = base.features(True)
+    with_network = base.fitted(together, left_out)
+    ratio_step, ratio_path = _errors(base, together, with_network, left_out) / _errors(
+        base, alone, base.fitted(alone, left_out), left_out
+    )
+    gain = float(1.0 - max(np.sqrt(ratio_step * ratio_path), ratio_path))
+    return (together, with_network.layer, gain) if gain >= NETWORK_GAIN_WANTED else (alone, layer, gain)
+
+
+def _errors(base: LayerBase, features: OnlineFeatures, fitted: FittedLayer, parts: list[Part]) -> Vector:
+    """Geometric mean of the one-step errors, and mean distance of the path, on parts that are not known, ``(2,)``."""
+    distances = [
+        _path_error(base, features, layer, drive, model, recording)
+        for (layer, drive), (model, recording) in zip(fitted.judged, parts, strict=True)
+    ]
+    return np.array([fitted.error, np.nanmean(np.concatenate(distances))])
+
+
+@torch.no_grad()
+def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording, base: LayerBase) -> Drive:
+    """What the layer sees of all windows of a recording, with what ``model`` predicts from them."""
+    windows = all_windows(recording, base.H, base.vehicle.minimum_speed)
+    parts = []
+    for begin in range(0, max(len(windows), 1), _BATCH):
+        window, target = windows.batch(slice(begin, begin + _BATCH))
+        parts.append((*features(window, model.eval()(window)), target))
+    seen, physics, increments = (torch.cat(each).double().numpy() for each in zip(*parts, strict=True))
+    ends = windows.ends.numpy()
+    return Drive(Seen(seen, physics), recording.matrix[ends], increments, ends)
+
+
+@torch.no_grad()
+def _path_error(
+    base: LayerBase,
+    features: OnlineFeatures,
+    layer: OnlineLayer,
+    drive: Drive,
+    model: TrainableModel,
+    recording: Recording,
+) -> Vector:
+    """Mean distance (m) of predicted from measured paths, for each of some starts; NaN for what diverges."""
+    steps = steps_of(_HORIZON_S, layer.T_s)
+    starts = recording.window_ends(base.H, steps, base.vehicle.minimum_speed)
+    starts = starts[:: max(1, len(starts) // _STARTS)]
+    if len(starts) == 0:
+        return np.empty(0)
+    known = layer.drive(*drive).at(np.searchsorted(drive.ends, starts))
+    rows = recording.matrix[starts[:, None] + np.arange(1 - base.H, steps + 1)]
+    rolled = rows.copy()
+    for k in range(steps):
+        window = torch.tensor(rolled[:, k : k + base.H], dtype=torch.float32)
+        seen, physics = (each.double().numpy() for each in features(window, model(window)))
+        moved = layer.increments(seen, known.weights)
+        if k:
+            moved = layer.bounded(moved, physics, known.limit)
+        rolled[:, k + base.H, :3] = rolled[:, k + base.H - 1, :3] + moved
+    driven, measured = (path(each[:, base.H - 1 :, :3], layer.T_s) for each in (rolled, rows))
+    distance: Vector = np.linalg.norm(driven - measured, axis=-1).mean(axis=1)
+    return distance
