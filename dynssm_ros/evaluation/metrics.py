@@ -12,6 +12,7 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.runtime.models import WindowModel, WindowPrediction, corrected
 from dynssm_ros.runtime.online import Learned, Seen
+from dynssm_ros.runtime.path_judge import trusted_along
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
@@ -91,7 +92,7 @@ def learned_while_driving(
     if layer is None:
         return None
     matrix = recording.matrix
-    ends = recording.window_ends(model.H, 0, layer.minimum_speed)
+    ends: Indices = recording.window_ends(model.H, 0, layer.minimum_speed)
     parts = []
     for start in range(0, len(ends), batch):
         windows = gather(matrix, ends[start : start + batch], model.H - 1)
@@ -100,7 +101,15 @@ def learned_while_driving(
         parts.append(predicted.seen)
     seen = Seen(*(np.concatenate(each) for each in zip(*parts, strict=True)))
     following = np.minimum(ends + 1, len(matrix) - 1)
-    return ends, layer.drive(seen, matrix[ends], matrix[following, :3] - matrix[ends, :3], ends)
+    learned = layer.drive(seen, matrix[ends], matrix[following, :3] - matrix[ends, :3], ends)
+
+    def see(windows: Vector) -> Seen:
+        found = model.predict(windows).seen
+        assert found is not None
+        return found
+
+    trusted = trusted_along(layer, lambda row: matrix[row - model.H + 1 : row + 1], ends, learned, seen, see)
+    return ends, learned._replace(trusted=trusted)
 
 
 def rmse(errors: Vector) -> Vector:

@@ -69,13 +69,16 @@ def roll_out(model: WindowModel, stretches: Vector, steps: int, learned: Learned
     Returns:
         Predicted states of the rows after the start, shape ``(M, steps, 3)``.
     """
-    fed_back = stretches.copy()
+    fed_back, mean_error = stretches.copy(), None
     start = stretches.shape[1] - steps
     for k in range(start, start + steps):
         windows = fed_back[:, k - model.H : k]
         predicted = model.predict(windows)
         if model.online is not None and learned is not None:
-            predicted = corrected(predicted, windows, model.online, learned, in_rollout=k > start)
+            predicted = corrected(predicted, windows, model.online, learned, mean_error, k - start)
+            if mean_error is None:
+                assert predicted.seen is not None
+                mean_error = model.online.mean_error(predicted.seen.features)
         fed_back[:, k, :3] = predicted.state
     return fed_back[:, start:, :3]
 

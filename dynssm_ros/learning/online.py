@@ -19,7 +19,7 @@ from dynssm_ros.learning.models.base import OnlineConfig, steps_of
 from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
-from dynssm_ros.runtime.online import CHANNELS, OnlineLayer, OnlineLayerCard, Seen
+from dynssm_ros.runtime.online import CHANNELS, MEAN_ERROR, OnlineLayer, OnlineLayerCard, Seen
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 
@@ -77,7 +77,7 @@ class OnlineFeatures(nn.Module):
             *(["network"] if self.network else []),
             *(f"increment, {k + 1} steps ago" for k in lags),
             *(f"increment of the {which}, {k + 1} steps ago" for k in others for which in ("next", "one after")),
-            *changes, *STATE_SIGNALS, "r_fb", "delta_fb", "mean error of the physics", "one",
+            *changes, *STATE_SIGNALS, "r_fb", "delta_fb", MEAN_ERROR, "one",
         )  # fmt: skip
 
     def forward(self, window: Tensor, output: Output) -> tuple[Tensor, Tensor]:

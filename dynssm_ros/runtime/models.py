@@ -40,7 +40,12 @@ class WindowPrediction(NamedTuple):
 
 
 def corrected(
-    prediction: WindowPrediction, windows: Vector, layer: OnlineLayer, learned: Learned, in_rollout: bool = False
+    prediction: WindowPrediction,
+    windows: Vector,
+    layer: OnlineLayer,
+    learned: Learned,
+    mean_error: Vector | None = None,
+    step: int = 0,
 ) -> WindowPrediction:
     """A model's prediction with what its online layer had learned at each window.
 
@@ -49,13 +54,15 @@ def corrected(
         windows: that it is from, ``(N, H, 7)``.
         layer: the model's.
         learned: at the last measured row of each window.
-        in_rollout: whether the last rows are predicted ones; the correction is limited then.
+        mean_error: in a rollout, after its first step: the physics' mean error at the start, ``(N, 3)``.
+        step: steps of the rollout so far.
     """
-    assert prediction.seen is not None
-    now = windows[:, -1, :3]
-    increments = layer.increments(prediction.seen.features, learned.weights)
-    if in_rollout:
-        increments = layer.bounded(increments, prediction.seen.physics, learned.limit)
+    seen, now = prediction.seen, windows[:, -1, :3]
+    assert seen is not None
+    if mean_error is None:
+        increments = layer.increments(seen.features, learned.weights)
+    else:
+        increments = layer.in_rollout(seen, learned, mean_error, step)
     fast = (now[:, :1] >= layer.minimum_speed) | (layer.minimum_speed == 0.0)
     state = np.where(fast, now + increments, prediction.state)
     return prediction._replace(state=state, variance=learned.variance * layer.scale**2, theta=learned.theta)
@@ -262,6 +269,12 @@ class OnnxModel:
         model = copy.copy(self)
         model.name, model.online = f"{self.name} (offline)", None
         return model
+
+    def see(self, windows: Vector) -> Seen:
+        """What its online layer sees of ``windows`` ``(N, H, 7)``."""
+        seen = self.predict(windows).seen
+        assert seen is not None
+        return seen
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Runs the graph on ``windows``; without variances of its own it has those of the validation data."""

@@ -34,6 +34,9 @@ from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.single_track import Integrator
 
 CHANNELS = 3
+PATH_HORIZON_S = 0.6
+"""Over which paths of the layer are judged: a controller's horizon."""
+MEAN_ERROR = "mean error of the physics"
 _OUTLIER = 4.0  # errors beyond this many standard deviations weigh less (Huber)
 _LARGEST = 10.0  # no innovation moves the noise estimate by more than this many standard deviations
 _NOISE_MEMORY_S = 8.0  # over which the noise and the physics' errors are averaged
@@ -74,6 +77,8 @@ class Learned(NamedTuple):
     """Largest correction of the physics in a rollout, ``(N, 3)``, in units of s_delta."""
     theta: Vector
     """Coefficients, ``(N, 17)``."""
+    trusted: Vector
+    """Whether the layer's paths are believed, ``(N,)``; see :mod:`dynssm_ros.runtime.path_judge`."""
 
     def at(self, rows: Indices) -> Learned:
         """What was known at ``rows``."""
@@ -140,6 +145,30 @@ class OnlineLayer:
         """Increments within ``limit`` (units of s_delta) of the physics' ones, so that rollouts stay bounded as those do."""
         return physics + np.clip(increments - physics, -limit * self.scale, limit * self.scale)
 
+    def mean_error(self, features: Vector) -> Vector:
+        """The physics' mean error ``(N, 3)`` (m/s, m/s, rad/s) over the window that features ``(N, 3, n)`` are from."""
+        error: Vector = features[:, :, self.card.features.index(MEAN_ERROR)] * self.scale
+        return error
+
+    def in_rollout(self, seen: Seen, learned: Learned, mean_error: Vector, step: int) -> Vector:
+        """Increments ``(N, 3)`` from rows of a rollout, after its first step.
+
+        Where the layer's paths are believed they are the layer's, within its limit; else the physics' less its mean error.
+        Paths are judged over :data:`PATH_HORIZON_S`; beyond it the correction fades, and after twice as long the physics
+        is alone.
+
+        Args:
+            seen: of the rows.
+            learned: at the start of the rollout.
+            mean_error: of the physics at the start (m/s, m/s, rad/s), ``(N, 3)``.
+            step: steps taken so far.
+        """
+        own = self.bounded(self.increments(seen.features, learned.weights), seen.physics, learned.limit)
+        correction = np.where(learned.trusted[:, None] > 0, own - seen.physics, mean_error)
+        kept = min(max(2.0 - step * self.T_s / PATH_HORIZON_S, 0.0), 1.0)
+        moved: Vector = seen.physics + kept * correction
+        return moved
+
     def drive(self, seen: Seen, rows: Vector, increments: Vector, ends: Indices) -> Learned:
         """Learns over a recording, row after row, and notes what was known at each.
 
@@ -151,7 +180,9 @@ class OnlineLayer:
         """
         state = self.start()
         count, n = len(ends), self.mean.shape[1]
-        learned = Learned(*(np.empty((count, *shape)) for shape in ((CHANNELS, n), (CHANNELS,), (CHANNELS,), (17,))))
+        learned = Learned(
+            *(np.empty((count, *shape)) for shape in ((CHANNELS, n), (CHANNELS,), (CHANNELS,), (17,), ()))
+        )
         for k, row in enumerate(ends):
             if k and ends[k - 1] == row - 1:
                 state.update(Seen(seen.features[k - 1], seen.physics[k - 1]), rows[k - 1], increments[k - 1])
@@ -161,6 +192,7 @@ class OnlineLayer:
             learned.variance[k] = state.variance(seen.features[k])
             learned.limit[k] = state.limit
             learned.theta[k] = state.coefficients.theta
+            learned.trusted[k] = True
         return learned
 
 

@@ -16,8 +16,9 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
-from dynssm_ros.runtime.models import OnnxModel, WindowPrediction
-from dynssm_ros.runtime.online import OnlineState, Seen
+from dynssm_ros.runtime.models import OnnxModel, WindowPrediction, corrected
+from dynssm_ros.runtime.online import Learned, OnlineState, Seen
+from dynssm_ros.runtime.path_judge import PathJudge
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.signal_map import SignalMap
 from dynssm_ros.vehicle import State
@@ -66,6 +67,8 @@ class Predictor:
         self.history = History(self.signal_map, model.T_s, model.H, max_age)
         self.online: OnlineState | None = None
         """What the online layer has learned so far; ``None`` without one."""
+        self.judge: PathJudge | None = None
+        """Whether its paths are believed."""
         self._learns = online
         self.model = model
         self._set_model(model)
@@ -108,9 +111,10 @@ class Predictor:
 
     def _set_model(self, model: OnnxModel) -> None:
         if model.online is None or not self._learns:
-            self.online = None
+            self.online = self.judge = None
         elif self.online is None or self.model.prior != model.prior:
             self.online = model.online.start()
+            self.judge = PathJudge(model.online)
         self._row: _Row | None = None
         self.model = model
         self._scale = model.artifact.card.normalisation.increment_scale
@@ -124,8 +128,9 @@ class Predictor:
         """Takes the odometry sample ``values`` at ``stamp`` (ns) and predicts the instant ``stamp + T_s``."""
         refusal = self.history.add(stamp, values)
         if refusal is not None:
-            if refusal is Refusal.JUMPED_BACK and self.online is not None:
+            if refusal is Refusal.JUMPED_BACK and self.online is not None and self.judge is not None:
                 self.online.reset()
+                self.judge.reset()
                 self._row = None
             return refusal
         if not _finite(values.values()):  # the pose, which is no part of the window
@@ -135,8 +140,11 @@ class Predictor:
             return window
         predicted = self.model.predict(window[None])
         if self.online is not None:
+            assert predicted.seen is not None
             self._learn(stamp, window, predicted)
-            predicted = self._corrected(predicted, window)
+            known = self._known(predicted.seen.features)
+            self._rollout = known, self.online.layer.mean_error(predicted.seen.features)
+            predicted = corrected(predicted, window[None], self.online.layer, known)
         state, theta, physics, variance = predicted[:4]
         now, following = window[-1, :3].tolist(), state[0].tolist()  # a few floats are faster than a small array
         if not (_finite(following) and _finite_row(theta) and _finite_row(variance)):
@@ -161,13 +169,14 @@ class Predictor:
             return []
         window = self.history.current.copy()
         poses, state = [prediction.pose], prediction.state
-        for _ in range(steps - 1):
+        for done in range(1, steps):
             row = window[-1].copy()
             row[:3], row[3:5], row[5:7] = state, row[3:5] + row[5:7], 0.0
             window = np.concatenate([window[1:], row[None]])
             predicted = self.model.predict(window[None])
             if self.online is not None:
-                predicted = self._corrected(predicted, window, in_rollout=True)
+                known, mean_error = self._rollout
+                predicted = corrected(predicted, window[None], self.online.layer, known, mean_error, done)
             following = predicted.state[0]
             pose = advance_pose(SCALAR, poses[-1], State(*state.tolist()), State(*following.tolist()), self.model.T_s)
             if not _finite(pose):
@@ -202,7 +211,18 @@ class Predictor:
             window[...] = kept
         if row is None:
             self.online.interrupt()
-        self._row = row or _row_of(stamp, window, predicted, self.online.layer.minimum_speed)
+            assert self.judge is not None
+            self.judge.interrupt()
+            row = _row_of(stamp, window, predicted, self.online.layer.minimum_speed)
+            if row is not None:
+                self._judge(window, predicted)
+        self._row = row
+
+    def _judge(self, window: Vector, predicted: WindowPrediction) -> None:
+        """Takes the paths that are under way a row further."""
+        assert self.judge is not None
+        assert predicted.seen is not None
+        self.judge.step(window, predicted.seen, self._known(predicted.seen.features), self.model.see)
 
     def _learned_row(self, before: _Row, stamp: int, window: Vector, predicted: WindowPrediction) -> _Row | None:
         """Learns the step that ends with ``window``; returns its last row, ``None`` if the car was too slow there."""
@@ -210,22 +230,21 @@ class Predictor:
         row = _row_of(stamp, window, predicted, self.online.layer.minimum_speed)
         if row is not None:
             self.online.update(before.seen, before.values, window[-1, :3] - window[-2, :3])
+            self._judge(window, predicted)
         return row
 
-    def _corrected(self, predicted: WindowPrediction, window: Vector, in_rollout: bool = False) -> WindowPrediction:
-        """A prediction with what was learned online."""
-        online = self.online
+    def _known(self, features: Vector) -> Learned:
+        """What was learned online, for a prediction from features ``(1, 3, n)``."""
+        online, judge = self.online, self.judge
         assert online is not None
-        assert predicted.seen is not None
-        layer, now, features = online.layer, window[-1, :3], predicted.seen.features[0]
-        if not now[0] >= layer.minimum_speed:
-            return predicted
-        moved = online.increment(features)
-        if in_rollout:
-            moved = layer.bounded(moved, predicted.seen.physics[0], online.limit)
-        variance = online.variance(features) * layer.scale**2
-        theta = online.coefficients.theta
-        return predicted._replace(state=(now + moved)[None], variance=variance[None], theta=theta[None])
+        assert judge is not None
+        return Learned(
+            online.mean[None],
+            online.variance(features[0])[None],
+            online.limit[None],
+            online.coefficients.theta[None],
+            np.array([float(judge.trusted)]),
+        )
 
     def _residual_share(self, now: list[float], following: list[float], physics: list[float]) -> float:
         residual = sum(abs(a - b) / s for a, b, s in zip(following, physics, self._scale, strict=True))

@@ -92,6 +92,17 @@ def test_features_are_what_their_names_say(noisy_laps, orca, noisy_model):
     np.testing.assert_allclose(at["mean error of the physics"], (increments - past / scale).mean(1), atol=1e-3)
 
 
+def test_rollouts_of_a_changed_car_stay_as_bounded_as_the_physics(laps, orca, make_config, drive, tmp_path: Path):
+    trained = train(laps, make_config(kind="rls", history=0.3), orca, tmp_path / "c.pt")
+    model = OnnxModel(save_artifact(trained, tmp_path / "model"))
+    changed = drive(orca.with_effect("front_grip", {"factor": 0.75}))
+    scores = evaluate(changed, {"on": model, "off": model.offline()}, calls=1, horizon_s=5.0, stride=10).scores
+    assert np.all(np.isfinite(scores["on"].rollout.rmse))
+    assert scores["on"].rollout.rmse.max(axis=0) == pytest.approx(scores["off"].rollout.rmse.max(axis=0), rel=1.0)
+    short = evaluate(changed, {"on": model, "off": model.offline()}, calls=1).scores
+    assert short["on"].rollout.ade < short["off"].rollout.ade
+
+
 def feed(predictor, recording, rows, every=1, start=0):
     """Plays rows as messages, with ``every`` - 1 messages between two rows; the predictions at the rows."""
     found = {}
