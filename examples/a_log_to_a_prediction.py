@@ -30,8 +30,8 @@ def main(bag: Path | None, signals: str, vehicle: str, out: Path) -> dict[str, f
     for name in ("D_f", "D_r", "C_m1"):
         print(f"{name}: {found.vehicle.coefficients[name].nominal:.4g} ± {found.vehicle.coefficients[name].std:.1g}")
 
-    # a learned model, and the simplest things beside it, on the last quarter
-    folder = train(laps, "ridge", found.vehicle, out / "model", holdout=0.25).artifact.path
+    # the online layer on the physics, the simplest model that learns; "dynssm" adds a network. Scored on the last quarter
+    folder = train(laps, "rls", found.vehicle, out / "model", holdout=0.25).artifact.path
     scores = evaluate(laps, [folder, "single_track", "persistence"], found.vehicle, holdout=0.25).scores
     for name, score in scores.items():
         print(f"{name}: one-step RMSE of v_y {score.rmse[1]:.4f} m/s, ADE {score.rollout.ade:.4f} m")

@@ -27,6 +27,7 @@ _PRIOR_ROWS = (10.0, 40.0, 160.0)
 _TOLERANCE = 0.01  # of the RMSE on left-out parts
 _RIDGE = 1e-4  # of a feature's mean square: draws weights that the laps leave open to the physics alone
 _SMALLEST = 1e-12  # of a mean square
+_LARGEST_CHANGE = 1.0  # standard deviation of a weight of which the laps say nothing
 _LEAST_NOISE = 1e-4  # variance, in squared s_delta: no car is known better than to a hundredth of an increment
 
 
@@ -159,7 +160,8 @@ class FittedLayer(NamedTuple):
 def fit_layer(parts: list[Drive], features: OnlineFeatures, scale: Normalisation, config: OnlineConfig) -> FittedLayer:
     """The layer with its prior, judged on parts of the laps that the prior was fitted without.
 
-    The prior's mean is the least-squares solution on the training laps. Its covariance is that of so many rows of them.
+    The prior's mean is the least-squares solution on the training laps. Its covariance is that of so many
+    rows of them, and no weight is expected to change by more than one.
     The number of rows is the least of :data:`_PRIOR_ROWS` with which the layer predicts parts of the laps, each with a
     prior that was fitted without it, at most 1 % worse than with the best: another track asks for a weaker prior than
     another part of the same one.
@@ -191,7 +193,8 @@ def fit_layer(parts: list[Drive], features: OnlineFeatures, scale: Normalisation
 
     def layer(prior: _Prior, rows: float, spread: dict[str, float]) -> OnlineLayer:
         card = OnlineLayerCard(features=features.names, memory=config.memory, prior_rows=rows, spread=spread)
-        covariance = (np.linalg.inv(prior.gram) / rows).astype(np.float64)
+        precision = rows * prior.gram / prior.noise[:, None, None] + np.eye(len(features.names)) / _LARGEST_CHANGE**2
+        covariance = np.linalg.inv(precision).astype(np.float64)
         return OnlineLayer(
             card, prior.mean, covariance, prior.noise, prior.physics, np.ones(CHANNELS), usual.noise, usual.slow, s_delta,
             vehicle, *stepping,

@@ -41,7 +41,7 @@ _OUTLIER = 4.0  # errors beyond this many standard deviations weigh less (Huber)
 _LARGEST = 10.0  # no innovation moves the noise estimate by more than this many standard deviations
 _NOISE_MEMORY_S = 8.0  # over which the noise and the physics' errors are averaged
 _COVERED, _QUANTILE = 0.9, 1.6448536  # stated intervals are to cover this share of errors
-_WIDTH_RATE = 0.02  # of the stated interval's adaptation, per step
+_WIDTH_RATE, _WIDEST = 0.02, 5.0  # of the stated interval's adaptation: per step, and the largest factor
 _ROLLOUT_LIMIT = 3.0  # correction in a rollout, in root mean squares of the physics' recent errors
 _SMALLEST = 1e-9  # noise, in units of s_delta
 
@@ -92,7 +92,7 @@ class OnlineLayer:
     Attributes:
         card: names and time constants.
         mean: prior mean of the weights ``(3, n)``.
-        covariance: prior covariance of the weights over the noise's variance, ``(3, n, n)``.
+        covariance: prior covariance of the weights, ``(3, n, n)``.
         noise: variance of one-step errors on the training laps, ``(3,)``, in units of s_delta squared.
         physics: mean square of the physics' one-step errors there, ``(3,)``, in the same units.
         width: factor of the stated standard deviation that covers 90 % there, ``(3,)``.
@@ -237,7 +237,7 @@ class OnlineState:
     def variance(self, features: Vector) -> Vector:
         """Variance of the prediction's error ``(3,)``, in units of s_delta squared, from weights, noise and coverage."""
         spread = (self.covariance @ features[:, :, None])[:, :, 0]
-        stated: Vector = self.width * self.width * self.noise * (1.0 + (spread * features).sum(axis=1))
+        stated: Vector = self.width * self.width * (self.noise + (spread * features).sum(axis=1))
         return stated
 
     def update(self, seen: Seen, row: Vector, increment: Vector) -> None:
@@ -257,15 +257,15 @@ class OnlineState:
         spread = (P @ features[:, :, None])[:, :, 0]
         error = target - (mean * features).sum(axis=1)
         predicted = (spread * features).sum(axis=1)
-        size = np.abs(error) / np.sqrt(self.noise * (1.0 + predicted))
+        size = np.abs(error) / np.sqrt(self.noise + predicted)
         inflation = np.maximum(1.0, size / _OUTLIER)
-        gain = spread / (predicted + inflation)[:, None]
+        gain = spread / (predicted + self.noise * inflation)[:, None]
         self.mean = mean + gain * error[:, None]
         self.covariance = P - gain[:, :, None] * spread[:, None, :]
         # stochastic approximation of the 90 % quantile (adaptive conformal inference, Gibbs and Candes 2021)
         missed = size > _QUANTILE * self.width
-        self.width = self.width * np.exp(_WIDTH_RATE * (missed - (1.0 - _COVERED)))
-        square = np.minimum(error * error / (1.0 + predicted), _LARGEST**2 * self.noise)
+        self.width = np.clip(self.width * np.exp(_WIDTH_RATE * (missed - (1.0 - _COVERED))), 1 / _WIDEST, _WIDEST)
+        square = np.minimum(error * error * self.noise / (self.noise + predicted), _LARGEST**2 * self.noise)
         self.noise = np.maximum(self.noise + self._forget * (square - self.noise), _SMALLEST**2)
         of_physics = ((increment - physics) / scale) ** 2
         self.physics = self.physics + self._forget * (of_physics - self.physics)

@@ -39,12 +39,13 @@ def test_without_forgetting_it_is_the_bayesian_regression_of_all_rows():
     layer, features = make_layer(noise=100.0), rng.standard_normal((60, 3, N))  # no error is an outlier
     targets = np.einsum("kci,i->kc", features, [0.5, 1.0, -1.0, 0.2]) + 0.1 * rng.standard_normal((60, 3))
     state = layer.start()
+    state._forget = 0.0  # the noise stays as it is
     for row, target in zip(features, targets, strict=True):
         learn(state, row, target)
     for c in range(3):
         X = features[:, c]
-        precision = X.T @ X + 10.0 * np.eye(N)
-        mean = np.linalg.solve(precision, X.T @ targets[:, c] + 10.0 * layer.mean[c])
+        precision = X.T @ X / 100.0 + 10.0 * np.eye(N)
+        mean = np.linalg.solve(precision, X.T @ targets[:, c] / 100.0 + 10.0 * layer.mean[c])
         np.testing.assert_allclose(state.mean[c], mean, rtol=1e-6)
         np.testing.assert_allclose(state.covariance[c], np.linalg.inv(precision), rtol=1e-6, atol=1e-12)
 
