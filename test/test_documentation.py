@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from functools import reduce
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -66,7 +67,7 @@ def options() -> dict[str, set[str]]:
     """Options by command."""
     group = typer.main.get_command(app)
     return {
-        name: {option for parameter in command.params for option in parameter.opts}
+        name: {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
         for name, command in group.commands.items()  # type: ignore[attr-defined]
     }
 
@@ -189,7 +190,8 @@ def test_every_verdict_is_explained_and_every_explained_one_exists() -> None:
 
 
 def test_the_switches_that_pages_name_are_fields_of_model_files() -> None:
-    fields = load_model_config("dynssm").model_dump()
+    fields = load_model_config("dynssm_paper_av21").model_dump()
+    fields |= {name: block for name, block in load_model_config("dynssm").model_dump().items() if block is not None}
     named = [*table("block", PAGES["tuning.md"]), *(row[0] for row in table("deviation", PAGES["paper.md"]).values())]
     assert len(named) > 10
     for name in re.findall(r"[a-z_]+(?:\.[a-z_]+)?", " ".join(re.sub(r": \w+", "", each) for each in named)):
@@ -228,11 +230,15 @@ def declared_parameters(node: str) -> dict[str, object]:
     }
 
 
+def as_ros_writes(declared: dict[str, Any]) -> dict[str, str]:
+    """Values of parameters as they stand in tables."""
+    return {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in declared.items()}
+
+
 def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_file() -> None:
     declared = declared_parameters("predictor")
-    assert {name: cells[0].strip("`") for name, cells in table("parameter", PAGES["predictor.md"]).items()} == {
-        name: str(value) for name, value in declared.items()
-    }
+    described = {name: cells[0].strip("`") for name, cells in table("parameter", PAGES["predictor.md"]).items()}
+    assert described == as_ros_writes(declared)
     shipped = yaml.safe_load((ROOT / "config" / "predictor.yaml").read_text())["/**"]["ros__parameters"]
     assert shipped == declared
 
@@ -240,10 +246,7 @@ def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_fi
 def test_the_parameters_of_the_controller_are_those_of_its_page() -> None:
     described = {name: cells[0].strip("`") for name, cells in table("parameter", PAGES["controller.md"]).items()}
     declared = declared_parameters("controller")
-    as_ros_writes = {
-        name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in declared.items()
-    }
-    assert described == as_ros_writes
+    assert described == as_ros_writes(declared)
 
 
 def test_the_topics_are_those_of_the_default_signal_map_and_of_the_node() -> None:

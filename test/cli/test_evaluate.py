@@ -54,7 +54,7 @@ def test_writes_report_results_and_table(dynssm, recording, tmp_path):
     assert results == json.loads(extra.read_text())
     assert list(results["models"]) == ["persistence", "single_track"]
     assert results["recording"] == "run.parquet"
-    assert results["horizon_s"] == 0.3
+    assert results["horizon_s"] == 0.6
     assert "single_track" in shown
     assert "report.html" in shown
 
