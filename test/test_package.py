@@ -222,8 +222,11 @@ def test_parameters_file_fits_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
     finally:
         context.try_shutdown()
     assert read == content
-    assert read == {"model": "", "signals": "default", "max_age": 0.2, "horizon": 0.0, "diagnostics_period": 1.0}
-    assert [type(value) for value in read.values()] == [str, str, float, float, float]
+    assert read == {
+        "model": "", "signals": "default", "max_age": 0.2, "online": True, "online_state": "", "horizon": 0.0,
+        "diagnostics_period": 1.0,
+    }  # fmt: skip
+    assert [type(value) for value in read.values()] == [str, str, float, bool, str, float, float]
 
 
 class Recorder:
