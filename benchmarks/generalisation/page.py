@@ -79,21 +79,27 @@ def _summary(known: Known) -> dict[str, Any]:
 
 
 def heat_map(known: Known, model: str = "dynssm") -> Figure:
-    """Ratio of a model's errors to the best baseline's, a row for each cell."""
+    """Ratio of a model's errors to the best baseline's, a row for each cell: to those without ``rls``, and to all."""
     cells = sorted(known, key=lambda cell: (cell.training.simulated is not None, cell.name))
-    values = np.array([ratios(known[cell], model) for cell in cells])
-    figure = Figure(figsize=(6.4, 1.2 + 0.19 * len(cells)), layout="constrained")
-    panel = figure.subplots()
-    shown = panel.imshow(values, cmap="RdBu_r", vmin=0.6, vmax=1.4, aspect="auto")
-    for i, j in np.ndindex(values.shape):
-        exact = not np.isfinite(values[i, j])
-        panel.text(j, i, "exact" if exact else f"{values[i, j]:.2f}", ha="center", va="center", fontsize=6)
-    panel.set_xticks(range(len(QUANTITIES)), QUANTITIES)
-    panel.set_yticks(range(len(cells)), [f"{cell.name}{' *' if cell.is_test else ''}" for cell in cells], fontsize=6)
-    panel.xaxis.tick_top()
-    panel.grid(visible=False)
-    panel.set_title(f"error of {model} over the best baseline's (* test cell)", fontsize=9)
-    figure.colorbar(shown, ax=panel, shrink=0.4)
+    figure = Figure(figsize=(9.6, 1.4 + 0.17 * len(cells)), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for panel, without, title in zip(panels, (("rls",), ()), ("without rls", "rls among them"), strict=True):
+        values = np.array([ratios(known[cell], model, without) for cell in cells])
+        shown = panel.imshow(np.log2(values), cmap="RdBu_r", vmin=-1.5, vmax=1.5, aspect="auto")
+        for i, j in np.ndindex(values.shape):
+            value = values[i, j]
+            ink = "white" if np.isfinite(value) and abs(np.log2(value)) > 0.9 else "black"
+            words = f"{value:.2f}" if np.isfinite(value) else "exact"
+            panel.text(j, i, words, ha="center", va="center", fontsize=6, color=ink)
+        panel.set_xticks(range(len(QUANTITIES)), QUANTITIES, fontsize=7)
+        panel.xaxis.tick_top()
+        panel.grid(visible=False)
+        panel.set_title(f"{model} over the best baseline, {title}", fontsize=8)
+    names = [f"{cell.name}{' *' if cell.is_test else ''}" for cell in cells]
+    panels[0].set_yticks(range(len(cells)), names, fontsize=6)
+    bar = figure.colorbar(shown, ax=panels, shrink=0.3, ticks=(-1, 0, 1))
+    bar.ax.set_yticklabels(["1/2", "1", "2"])
+    bar.set_label("ratio of errors; below 1 is better (* test cell)", fontsize=7)
     return figure
 
 
