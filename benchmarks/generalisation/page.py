@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.generalisation.cells import Cell
 from benchmarks.generalisation.run import BASELINES
+from dynssm_ros.learning.layer import NETWORK_GAIN_WANTED
 
 PAGE, FIGURE = "generalisation.md", "generalisation.png"
 QUANTITIES = ("v_x", "v_y", "omega", "ADE", "FDE")
@@ -74,7 +75,7 @@ def _summary(known: Known) -> dict[str, Any]:
         out["models"][model] = entry
     gains = [content["network_gain"].get("dynssm") for content in known.values()]
     known_gains = [gain for gain in gains if gain is not None]
-    out["network_used"] = [sum(gain >= 0.01 for gain in known_gains), len(known_gains)]
+    out["network_used"] = [sum(gain >= NETWORK_GAIN_WANTED for gain in known_gains), len(known_gains)]
     return out
 
 
@@ -157,7 +158,8 @@ def _lines(known: Known, part: str, undriven: int) -> Iterator[str]:
             )
         worst_cells = ", ".join(f"{q} {c}" for q, c in zip(QUANTITIES, best["over_best"]["worst_cell"], strict=True))
         yield (
-            f"The network earned its place in the online layer (1 % on left-out laps) in {used} of {of} cells. Worst cells "
+            f"The network earned its place in the online layer ({100 * NETWORK_GAIN_WANTED:.0f} % on left-out laps) in "
+            f"{used} of {of} cells. Worst cells "
             f"of `dynssm`: {worst_cells}."
         )
     yield ""

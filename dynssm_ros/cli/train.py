@@ -59,7 +59,7 @@ def train(
     if trained.network_gain is not None:
         used = "network" in (trained.features.names if trained.features else ())
         console.print(
-            f"beside physics and online layer the network takes {100 * trained.network_gain:.1f} % off the one-step error on "
+            f"beside physics and online layer the network takes {100 * trained.network_gain:.1f} % off the error on "
             f"left-out parts of the laps, so it is {'used' if used else 'left out of the online layer'}",
             soft_wrap=True,
         )

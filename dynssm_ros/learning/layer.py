@@ -22,8 +22,9 @@ from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.kinematics import path
 
-NETWORK_GAIN_WANTED = 0.01
-"""A network that takes away less of the online layer's error is left out of it."""
+NETWORK_GAIN_WANTED = 0.03
+"""A network that takes away less of the online layer's error is left out of it. On the development cells of
+``benchmarks/generalisation`` gains of 1 to 2 % on left-out laps did not carry over to another track."""
 _STRETCHES = 4  # of the laps, for a layer without a network
 _HORIZON_S = 0.6  # of the paths
 _STARTS = 400  # rollouts in a part, at most

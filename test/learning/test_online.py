@@ -55,7 +55,7 @@ def test_with_sensor_noise_it_beats_the_physics_that_it_starts_from(noisy_laps, 
 
 def test_a_network_that_earns_nothing_is_left_out_of_the_layer(noisy_laps, orca, make_config, tmp_path: Path):
     trained = train(noisy_laps, make_config(online={"folds": 2}), orca, tmp_path / "c.pt")
-    assert trained.network_gain < 0.01
+    assert trained.network_gain < 0.03
     assert "network" not in trained.features.names
 
 
