@@ -139,7 +139,7 @@ def test_page_shows_every_figure(report, page):
 
 
 def test_page_says_what_was_done_how(page):
-    for part in ("planted", "50 Hz", "whole recording", "none: command inputs are zero", "dynssm_ros", "0.3 s", "UTC"):
+    for part in ("planted", "50 Hz", "whole recording", "none: command inputs are zero", "dynssm_ros", "0.6 s", "UTC"):
         assert part in page
 
 
