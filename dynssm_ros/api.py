@@ -17,6 +17,7 @@ from dynssm_ros.progress import Progress
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
 from dynssm_ros.vehicle import Vehicle, load_vehicle
+from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 from dynssm_ros.vehicle.single_track import Integrator
 
 if TYPE_CHECKING:
@@ -253,7 +254,7 @@ def evaluate(
     holdout: float | None = None,
     commands: Commands | None = None,
     min_speed: float | None = None,
-    horizon: float = 0.6,
+    horizon: float = PATH_HORIZON_S,
     stride: int = 1,
     track: Track | PathLike | None = None,
     on_progress: Progress | None = None,
@@ -309,13 +310,13 @@ def open_models(
 
 def with_offline(models: Mapping[str, WindowModel]) -> dict[str, WindowModel]:
     """Models, each that has an online layer followed by itself without it."""
-    from dynssm_ros.runtime.models import OnnxModel
+    from dynssm_ros.runtime.models import without_online
 
     both: dict[str, WindowModel] = {}
     for label, model in models.items():
         both[label] = model
-        if isinstance(model, OnnxModel) and model.online is not None:
-            both[f"{label} (offline)"] = model.offline()
+        if model.online is not None:
+            both[f"{label} (offline)"] = without_online(model)
     return both
 
 

@@ -19,6 +19,7 @@ from dynssm_ros.cli.console import (
 from dynssm_ros.extras import require
 from dynssm_ros.files import replacing
 from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
 TrackOption = Annotated[
     str | None,
@@ -50,7 +51,7 @@ def evaluate(
     ] = None,
     commands: CommandsOption = None,
     min_speed: MinSpeedOption = None,
-    horizon: Annotated[float, typer.Option(help="Length of the rollouts (s).", min=0.0)] = 0.6,
+    horizon: Annotated[float, typer.Option(help="Length of the rollouts (s).", min=0.0)] = PATH_HORIZON_S,
     stride: Annotated[int, typer.Option(help="Start a rollout at every n-th row.", min=1)] = 1,
     track: TrackOption = None,
     json: JsonOption = None,
@@ -65,11 +66,10 @@ def evaluate(
 
     models = api.open_models(list(model), vehicle)
     logs = [Recording.load(recording) for recording in recordings]
-    for log in logs:
-        if commands is None and (wanted := shared_commands(models)) not in (None, log.info.commands):
-            console.print(
-                f"note: commands '{wanted}' as the models were trained, not the recording's '{log.info.commands}'"
-            )
+    wanted, recorded = shared_commands(models), {log.info.commands for log in logs}
+    if commands is None and wanted is not None and recorded != {wanted}:
+        others = "', '".join(sorted(recorded - {wanted}))
+        console.print(f"note: commands '{wanted}' as the models were trained, not the recording's '{others}'")
     with progress_bar("evaluating") as progress:
         evaluation = api.evaluate(
             logs, models, vehicle, holdout, commands, min_speed, horizon, stride, track, progress,

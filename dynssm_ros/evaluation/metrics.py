@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from statistics import NormalDist
 from time import perf_counter_ns
+from typing import NamedTuple
 
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.runtime.models import WindowModel, WindowPrediction, corrected
+from dynssm_ros.runtime.models import WindowModel, WindowPrediction, corrected, seen_by
 from dynssm_ros.runtime.online import Learned, Seen
 from dynssm_ros.runtime.path_judge import trusted_along
 from dynssm_ros.signals.recording import Recording
@@ -78,38 +80,40 @@ def predict_rows(
     )
 
 
-def learned_while_driving(
-    model: WindowModel, recording: Recording, batch: int = BATCH
-) -> tuple[Indices, Learned] | None:
-    """What the model's online layer has learned at each row of a recording that it drives through in order.
+class DriveThrough(NamedTuple):
+    """What an online layer knew along a recording that it was driven through in order."""
 
-    It learns wherever its window is whole and the car is not slower than its minimum speed.
+    ends: Indices
+    """Rows at which it learned, ascending."""
+    learned: Learned
+
+    def at(self, rows: Indices) -> Learned:
+        """What it knew at ``rows``; where it did not learn, what it knew before."""
+        return self.learned.at(np.maximum(np.searchsorted(self.ends, rows, side="right") - 1, 0))
+
+
+def drive_through(model: WindowModel, recording: Recording, batch: int = BATCH) -> DriveThrough | None:
+    """Lets the model's online layer learn wherever its window is whole and the car not slower than its minimum speed.
 
     Returns:
-        The rows, ascending, and what was known there; ``None`` if nothing learns.
+        What it knew; ``None`` if nothing learns.
     """
     layer = model.online
     if layer is None:
         return None
     matrix = recording.matrix
     ends: Indices = recording.window_ends(model.H, 0, layer.minimum_speed)
-    parts = []
-    for start in range(0, len(ends), batch):
-        windows = gather(matrix, ends[start : start + batch], model.H - 1)
-        predicted = model.predict(windows)
-        assert predicted.seen is not None
-        parts.append(predicted.seen)
+    if len(ends) == 0:
+        return None
+    starts = range(0, len(ends), batch)
+    parts = [seen_by(model, gather(matrix, ends[start : start + batch], model.H - 1)) for start in starts]
     seen = Seen(*(np.concatenate(each) for each in zip(*parts, strict=True)))
     following = np.minimum(ends + 1, len(matrix) - 1)
     learned = layer.drive(seen, matrix[ends], matrix[following, :3] - matrix[ends, :3], ends)
-
-    def see(windows: Vector) -> Seen:
-        found = model.predict(windows).seen
-        assert found is not None
-        return found
-
-    trusted = trusted_along(layer, lambda row: matrix[row - model.H + 1 : row + 1], ends, learned, seen, see)
-    return ends, learned._replace(trusted=trusted)
+    trusted = trusted_along(
+        layer, lambda row: matrix[row - model.H + 1 : row + 1], ends, learned, seen, partial(seen_by, model)
+    )
+    return DriveThrough(ends, learned._replace(trusted=trusted))
 
 
 def rmse(errors: Vector) -> Vector:

@@ -17,24 +17,24 @@ from dynssm_ros.evaluation.metrics import (
     Tick,
     by_channel,
     coverage,
+    drive_through,
     explained,
     finite,
     gather,
     latency_us,
-    learned_while_driving,
     max_error,
     predict_rows,
     rmse,
 )
 from dynssm_ros.evaluation.regimes import Regime, driving_regimes, regime_rmse
-from dynssm_ros.evaluation.rollout import HORIZON_S, score_rollouts
+from dynssm_ros.evaluation.rollout import score_rollouts
 from dynssm_ros.evaluation.score import Group, Score, grouped
 from dynssm_ros.runtime.models import WindowModel
-from dynssm_ros.runtime.online import Learned
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.track.lap_position import first_lap
 from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def evaluate(
     name: str = "",
     split: str = "whole recording",
     min_speed: float | None = None,
-    horizon_s: float = HORIZON_S,
+    horizon_s: float = PATH_HORIZON_S,
     stride: int = 1,
     batch: int = BATCH,
     calls: int = 200,
@@ -205,12 +205,13 @@ def _score(
     matrix = recording.matrix
     increments = matrix[rows + 1, :3] - matrix[rows, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
-        drive = learned_while_driving(model, recording, batch)
-        at_rows, at_starts = (None, None) if drive is None else (_at(drive, rows), _at(drive, starts))
+        drive = drive_through(model, recording, batch)
+        at_rows, at_starts = (None, None) if drive is None else (drive.at(rows), drive.at(starts))
         predicted = predict_rows(model, matrix, rows, batch, tick, at_rows)
         errors = predicted.state - matrix[rows + 1, :3]
         return Score(
             model=model,
+            drive=drive,
             state=predicted.state,
             theta=predicted.theta,
             rmse=rmse(errors),
@@ -222,12 +223,6 @@ def _score(
             rollout=score_rollouts(model, matrix, starts, steps, recording.T_s, batch, tick, at_starts),
             latency_us=latency_us(model, gather(matrix, rows[:50], model.H - 1), calls),
         )
-
-
-def _at(drive: tuple[Indices, Learned], rows: Indices) -> Learned:
-    """What was known at ``rows``; where the layer did not learn, what it knew before."""
-    ends, learned = drive
-    return learned.at(np.maximum(np.searchsorted(ends, rows, side="right") - 1, 0))
 
 
 def horizon_steps(horizon_s: float, T_s: float) -> int:

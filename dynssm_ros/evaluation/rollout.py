@@ -20,9 +20,6 @@ from dynssm_ros.runtime.models import WindowModel, corrected
 from dynssm_ros.runtime.online import Learned
 from dynssm_ros.vehicle.kinematics import path
 
-HORIZON_S = 0.6
-"""How far a controller looks ahead with a model, about; the default length of rollouts for every car."""
-
 
 @dataclass(frozen=True)
 class Rollout:
@@ -83,7 +80,9 @@ def roll_out(model: WindowModel, stretches: Vector, steps: int, learned: Learned
     return fed_back[:, start:, :3]
 
 
-def branches(model: WindowModel, matrix: Vector, starts: Indices, steps: int, T_s: float) -> Vector:
+def branches(
+    model: WindowModel, matrix: Vector, starts: Indices, steps: int, T_s: float, learned: Learned | None = None
+) -> Vector:
     """Predicted paths that leave the measured one, each at its start.
 
     Args:
@@ -92,12 +91,13 @@ def branches(model: WindowModel, matrix: Vector, starts: Indices, steps: int, T_
         starts: last measured row of each branch, ascending, shape ``(M,)``.
         steps: length of a branch.
         T_s: sampling time (s).
+        learned: what the model's online layer had learned at ``starts``.
 
     Returns:
         Positions ``x, y`` (m) from the start of each branch to its end, shape ``(M, steps + 1, 2)``, in the frame of
         :func:`path` for the measured velocities from ``starts[0]`` on.
     """
-    predicted = roll_out(model, gather(matrix, starts, model.H - 1, steps), steps)
+    predicted = roll_out(model, gather(matrix, starts, model.H - 1, steps), steps, learned)
     driven = (
         path(np.concatenate([matrix[starts[0] : start + 1, :3], states]), T_s)
         for start, states in zip(starts, predicted, strict=True)

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from dynssm_ros.arrays import Vector
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.coefficients import CoefficientStatistics
-from dynssm_ros.evaluation.metrics import by_channel, finite
+from dynssm_ros.evaluation.metrics import DriveThrough, by_channel, finite
 from dynssm_ros.evaluation.regimes import Regime
 from dynssm_ros.evaluation.rollout import Rollout
 from dynssm_ros.evaluation.spread import SeedSpread, mean_and_std, spreads
 from dynssm_ros.runtime.models import WindowModel
+from dynssm_ros.runtime.online import Learned
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _WITH_STD = ("rmse", "max_error", "ade", "fde", "coverage_90", "explained")  # what is stated with its spread over seeds
@@ -27,6 +28,7 @@ class Score:
 
     Attributes:
         model: what was scored.
+        drive: what its online layer knew along the recording; ``None`` without one.
         state: its one-step predictions of the rows after the scored ones, shape ``(N, 3)``.
         theta: its coefficients, shape ``(N, 17)``; ``None`` if it has none.
         rmse: one-step root mean square error by channel, shape ``(3,)`` (m/s, m/s, rad/s); so are the next two.
@@ -40,6 +42,7 @@ class Score:
     """
 
     model: WindowModel
+    drive: DriveThrough | None
     state: Vector
     theta: Vector | None
     rmse: Vector
@@ -50,6 +53,10 @@ class Score:
     coefficients: CoefficientStatistics | None
     rollout: Rollout
     latency_us: Vector
+
+    def known_at(self, rows: Indices) -> Learned | None:
+        """What the model's online layer knew at ``rows``; ``None`` without one."""
+        return None if self.drive is None else self.drive.at(rows)
 
     @property
     def seed(self) -> int | None:

@@ -19,7 +19,7 @@ from dynssm_ros.learning.models.base import OnlineConfig, steps_of
 from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
-from dynssm_ros.runtime.online import CHANNELS, MEAN_ERROR, OnlineLayer, OnlineLayerCard, Seen
+from dynssm_ros.runtime.online import CHANNELS, MEAN_ERROR, Learned, OnlineLayer, OnlineLayerCard, Seen
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 
@@ -129,7 +129,7 @@ class OnlineFeatures(nn.Module):
         return torch.tensor(rows)
 
 
-class Drive(NamedTuple):
+class LayerDrive(NamedTuple):
     """What the prior is fitted to: what the layer sees of a recording's windows, and what happened next."""
 
     seen: Seen
@@ -141,10 +141,26 @@ class Drive(NamedTuple):
     """Rows, ascending."""
 
 
-def joined(drives: list[Drive]) -> Drive:
+def joined(drives: list[LayerDrive]) -> LayerDrive:
     """Drives one after the other."""
     seen = Seen(*(np.concatenate(parts) for parts in zip(*(drive.seen for drive in drives), strict=True)))
-    return Drive(seen, *(np.concatenate([drive[k] for drive in drives]) for k in (1, 2, 3)))
+    return LayerDrive(seen, *(np.concatenate([drive[k] for drive in drives]) for k in (1, 2, 3)))
+
+
+class LeftOut(NamedTuple):
+    """A part of the laps that a layer's prior was fitted without."""
+
+    layer: OnlineLayer
+    drive: LayerDrive
+    learned: Learned
+    """What the layer knew along it."""
+
+    @property
+    def errors(self) -> Vector:
+        """One-step errors, ``(N, 3)``, in units of s_delta."""
+        predicted = self.layer.increments(self.drive.seen.features, self.learned.weights)
+        errors: Vector = (predicted - self.drive.increments) / self.layer.scale
+        return errors
 
 
 class FittedLayer(NamedTuple):
@@ -152,12 +168,13 @@ class FittedLayer(NamedTuple):
 
     layer: OnlineLayer
     error: float
-    """Geometric mean over the channels of the RMSE on parts that the prior was fitted without, in units of s_delta."""
-    judged: list[tuple[OnlineLayer, Drive]]
-    """Those parts, each with the layer whose prior was fitted without it."""
+    """Geometric mean over the channels of the RMSE on the parts that are left out, in units of s_delta."""
+    left_out: list[LeftOut]
 
 
-def fit_layer(parts: list[Drive], features: OnlineFeatures, scale: Normalisation, config: OnlineConfig) -> FittedLayer:
+def fit_layer(
+    parts: list[LayerDrive], features: OnlineFeatures, scale: Normalisation, config: OnlineConfig
+) -> FittedLayer:
     """The layer with its prior, judged on parts of the laps that the prior was fitted without.
 
     The prior's mean is the least-squares solution on the training laps. Its covariance is that of so many
@@ -200,16 +217,21 @@ def fit_layer(parts: list[Drive], features: OnlineFeatures, scale: Normalisation
             vehicle, *stepping,
         )  # fmt: skip
 
-    losses = {}
-    for rows in _PRIOR_ROWS:
-        errors = np.concatenate([_errors(layer(prior, rows, {}), part) for part, prior in left_out])
-        losses[rows] = float(0.5 * np.log(np.mean(errors**2, axis=0) + _SMALLEST).mean())
+    def without(part: LayerDrive, prior: _Prior, rows: float) -> LeftOut:
+        fitted = layer(prior, rows, {})
+        return LeftOut(fitted, part, fitted.drive(*part))
+
+    trials = {rows: [without(part, prior, rows) for part, prior in left_out] for rows in _PRIOR_ROWS}
+    losses = {
+        rows: float(
+            0.5 * np.log(np.mean(np.concatenate([each.errors for each in trial]) ** 2, axis=0) + _SMALLEST).mean()
+        )
+        for rows, trial in trials.items()
+    }
     least = min(losses.values())
     chosen = next(rows for rows in _PRIOR_ROWS if losses[rows] <= least + np.log1p(_TOLERANCE))
-    judged = [(layer(prior, chosen, {}), part) for part, prior in left_out]
-    return FittedLayer(
-        layer(_least_squares(whole, s_delta), chosen, config.spread), float(np.exp(losses[chosen])), judged
-    )
+    whole_layer = layer(_least_squares(whole, s_delta), chosen, config.spread)
+    return FittedLayer(whole_layer, float(np.exp(losses[chosen])), trials[chosen])
 
 
 class _Prior(NamedTuple):
@@ -219,7 +241,7 @@ class _Prior(NamedTuple):
     physics: Vector
 
 
-def _least_squares(drive: Drive, s_delta: Vector) -> _Prior:
+def _least_squares(drive: LayerDrive, s_delta: Vector) -> _Prior:
     """Weights by least squares on a drive, drawn to the physics alone; the mean Gram matrix, mean square errors."""
     F, y = drive.seen.features, drive.increments / s_delta
     alone = np.zeros(F.shape[1:])
@@ -235,10 +257,3 @@ def _least_squares(drive: Drive, s_delta: Vector) -> _Prior:
     noise = np.mean((y - np.einsum("kci,ci->kc", F, mean)) ** 2, axis=0)
     physics = np.mean((y - drive.seen.physics / s_delta) ** 2, axis=0)
     return _Prior(mean, gram, np.maximum(noise, _LEAST_NOISE), np.maximum(physics, _LEAST_NOISE))
-
-
-def _errors(layer: OnlineLayer, drive: Drive) -> Vector:
-    """One-step errors over a drive, ``(N, 3)``, in units of s_delta."""
-    learned = layer.drive(*drive)
-    errors: Vector = (layer.increments(drive.seen.features, learned.weights) - drive.increments) / layer.scale
-    return errors

@@ -11,7 +11,7 @@ import torch
 
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.learning.dataset import TrainingWindows, normalisation, split_windows
-from dynssm_ros.learning.layer import LayerBase, earned_layer
+from dynssm_ros.learning.earned_layer import LayerBase, earned_layer
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.models.registry import build_model

@@ -115,6 +115,7 @@ class PredictorNode(Node):
         self._publish(outcome, message)
         done = time.monotonic()
         self._health.predicted(done - now, outcome.residual_share, done)
+        self._predictor.finish()
 
     def _publish(self, prediction: Prediction, message: Any) -> None:
         odometry = self._prediction

@@ -304,7 +304,7 @@ def _trajectory_section(evaluation: Evaluation, time: Vector) -> Section:
             (evaluation.recording.time[driven] - evaluation.recording.time[0]) / 1e9,
             np.concatenate([np.zeros((1, 2)), path(matrix[driven, :3], T_s)]),
             {
-                name: branches(group.first.model, matrix, starts, steps, T_s)
+                name: branches(group.first.model, matrix, starts, steps, T_s, group.first.known_at(starts))
                 for name, group in evaluation.groups.items()
             },
         ),

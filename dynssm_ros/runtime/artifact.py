@@ -122,13 +122,10 @@ def open_artifact(path: str | Path) -> Artifact:
     path = Path(path)
     if not path.is_dir():
         raise ArtifactError(f"{path}: no such model folder; `dynssm train` writes one")
-    for name in (CARD, WEIGHTS, ONNX, METRICS):
-        if not (path / name).is_file():
-            raise ArtifactError(f"{path}: incomplete model folder, {name} is missing")
+    _require(path, CARD)
     card = read_card(path)
     for name, expected in card.checksums.items():
-        if not (path / name).is_file():
-            raise ArtifactError(f"{path}: incomplete model folder, {name} is missing")
+        _require(path, name)
         try:
             found = checksum(path / name)
         except OSError as error:
@@ -137,6 +134,11 @@ def open_artifact(path: str | Path) -> Artifact:
             raise ArtifactError(f"{path / name}: does not match its checksum in {CARD}; damaged or exchanged")
     _check_weights(path / WEIGHTS)
     return Artifact(path, card)
+
+
+def _require(path: Path, name: str) -> None:
+    if not (path / name).is_file():
+        raise ArtifactError(f"{path}: incomplete model folder, {name} is missing")
 
 
 def read_card(path: Path) -> ModelCard:

@@ -22,9 +22,10 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.signals.inputs import applied_inputs
-from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.single_track import Integrator, increment, increments_along
+from dynssm_ros.vehicle.effects.carried import carries, increments_along
+from dynssm_ros.vehicle.single_track import Integrator, increment
 
 SPREAD: dict[str, float] = {
     "B_f": 0.1, "C_f": 0.03, "D_f": 0.15, "B_r": 0.1, "C_r": 0.03, "D_r": 0.15, "S_hf": 0.01, "S_hr": 0.01,
@@ -86,13 +87,9 @@ class CoefficientEstimator:
         self._vehicle, self._scale = vehicle, scale
         self._stepping: tuple[Integrator, int] = integrator, substeps
         self._effects = vehicle.active_effects
-        self._carries = any(effect.carries for effect in self._effects)
-        change = np.array(
-            [
-                spread.get(n, 0.0) * (1.0 if n in _ABSOLUTE else abs(v))
-                for n, v in zip(COEFFICIENTS, self.nominal, strict=True)
-            ]
-        )
+        self._carries = carries(self._effects)
+        size = np.where(np.isin(COEFFICIENTS, _ABSOLUTE), 1.0, np.abs(self.nominal))
+        change = size * [spread.get(name, 0.0) for name in COEFFICIENTS]
         known = np.array([vehicle.coefficients[name].std or 0.0 for name in COEFFICIENTS])
         self.adapted = np.flatnonzero(change > 0)
         """Which of the coefficients can change."""
@@ -254,8 +251,7 @@ class CoefficientEstimator:
                 columns = [[np.full((1, 1), value) for value in row] for row in rows]
                 each = increments_along(
                     np, [State(*row[:3]) for row in columns], [applied_inputs(row) for row in columns],
-                    initial_effect_states(self._effects, columns[0][3], columns[0][4]), theta, constants, T_s,
-                    self._effects, *self._stepping,
+                    Applied(*columns[0][3:5]), theta, constants, T_s, self._effects, *self._stepping,
                 )  # fmt: skip
                 moved = [
                     np.concatenate([np.broadcast_to(step[c], (len(cars), 1)) for step in each], axis=1)

@@ -16,12 +16,10 @@ from dynssm_ros.runtime.artifact import ONLINE, Artifact, ModelCard, open_artifa
 from dynssm_ros.runtime.online import Learned, OnlineLayer, Seen
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.signals.signal_map import Commands
-from dynssm_ros.vehicle import Coefficients, State, Vehicle
+from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.single_track import Integrator, increments_along, step_with_effect_states
-
-CARRIED_S = 0.64
-"""Length of the window over which effect states are carried (s); lags are far shorter."""
+from dynssm_ros.vehicle.effects.carried import CARRIED_S, carries, increments_along
+from dynssm_ros.vehicle.single_track import Integrator, step_with_effect_states
 
 
 class WindowPrediction(NamedTuple):
@@ -100,6 +98,20 @@ class WindowModel(Protocol):
         """Predicts from ``windows`` of shape ``(N, H, 7)``, columns ``WINDOW_COLUMNS``."""
 
 
+def without_online(model: WindowModel) -> WindowModel:
+    """The same model without its online layer, under a name of its own."""
+    plain = copy.copy(model)
+    plain.name, plain.online = f"{model.name} (offline)", None
+    return plain
+
+
+def seen_by(model: WindowModel, windows: Vector) -> Seen:
+    """What the online layer of a model that has one sees of ``windows`` ``(N, H, 7)``."""
+    seen = model.predict(windows).seen
+    assert seen is not None
+    return seen
+
+
 class Persistence:
     """The next state is the present one: the mark that every model must pass."""
 
@@ -137,7 +149,7 @@ class SingleTrack:
         self.T_s = vehicle.sampling_time
         self._theta = vehicle.nominal
         self._effects = vehicle.active_effects
-        self._carries = any(effect.carries for effect in self._effects)
+        self._carries = carries(self._effects)
         self._integrator: Integrator = integrator
         self._substeps = substeps
         self.H = 1 + (round(CARRIED_S / self.T_s) if self._carries else 0)
@@ -159,8 +171,7 @@ class SingleTrack:
         if self._carries:
             rows = [windows[:, k].T for k in range(windows.shape[1])]
             moved = increments_along(
-                np, [State(*row[:3]) for row in rows], [applied_inputs(row) for row in rows],
-                initial_effect_states(self._effects, rows[0][3], rows[0][4]), theta,
+                np, [State(*row[:3]) for row in rows], [applied_inputs(row) for row in rows], Applied(*rows[0][3:5]), theta,
                 self.vehicle.constants, self.T_s, self._effects, self._integrator, self._substeps,
             )[-latest:]  # fmt: skip
             increments = np.stack([np.stack(each, axis=-1) for each in moved], axis=1)
@@ -263,18 +274,6 @@ class OnnxModel:
             f"{card.kind}, window {card.window} rows, trained with commands '{card.commands}', vehicle "
             f"{card.vehicle.name}{physics}"
         )
-
-    def offline(self) -> OnnxModel:
-        """The same model without its online layer, under a name of its own."""
-        model = copy.copy(self)
-        model.name, model.online = f"{self.name} (offline)", None
-        return model
-
-    def see(self, windows: Vector) -> Seen:
-        """What its online layer sees of ``windows`` ``(N, H, 7)``."""
-        seen = self.predict(windows).seen
-        assert seen is not None
-        return seen
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Runs the graph on ``windows``; without variances of its own it has those of the validation data."""

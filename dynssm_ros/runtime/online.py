@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
 from dynssm_ros.arrays import Indices, Vector
@@ -31,11 +31,10 @@ from dynssm_ros.files import replacing
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 from dynssm_ros.vehicle.single_track import Integrator
 
 CHANNELS = 3
-PATH_HORIZON_S = 0.6
-"""Over which paths of the layer are judged: a controller's horizon."""
 MEAN_ERROR = "mean error of the physics"
 _OUTLIER = 4.0  # errors beyond this many standard deviations weigh less (Huber)
 _LARGEST = 10.0  # no innovation moves the noise estimate by more than this many standard deviations
@@ -154,7 +153,7 @@ class OnlineLayer:
         """Increments ``(N, 3)`` from rows of a rollout, after its first step.
 
         Where the layer's paths are believed they are the layer's, within its limit; else the physics' less its mean error.
-        Paths are judged over :data:`PATH_HORIZON_S`; beyond it the correction fades, and after twice as long the physics
+        Paths are judged over ``PATH_HORIZON_S``; beyond it the correction fades, and after twice as long the physics
         is alone.
 
         Args:
@@ -229,11 +228,6 @@ class OnlineState:
         limit: Vector = _ROLLOUT_LIMIT * np.sqrt(self.physics)
         return limit
 
-    def increment(self, features: Vector) -> Vector:
-        """Predicted increment ``(3,)`` (m/s, m/s, rad/s) from features ``(3, n)``."""
-        predicted: Vector = (self.mean * features).sum(axis=1) * self.layer.scale
-        return predicted
-
     def variance(self, features: Vector) -> Vector:
         """Variance of the prediction's error ``(3,)``, in units of s_delta squared, from weights, noise and coverage."""
         spread = (self.covariance @ features[:, :, None])[:, :, 0]
@@ -285,8 +279,6 @@ class OnlineState:
         Raises:
             ArtifactError: unreadable, not finite, or learned by another model.
         """
-        from safetensors import safe_open
-
         try:
             with safe_open(path, framework="numpy") as content:
                 about = content.metadata() or {}

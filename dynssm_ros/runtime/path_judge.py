@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.runtime.online import PATH_HORIZON_S, Learned, OnlineLayer, Seen
+from dynssm_ros.runtime.online import Learned, OnlineLayer, Seen
 from dynssm_ros.vehicle import State
-from dynssm_ros.vehicle.kinematics import SCALAR, Pose, advance_pose
+from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S, SCALAR, Pose, advance_pose
 
 _REMEMBERED = 20  # paths that the comparison is of
 _MARGIN = 0.1  # the plain path must be better by a tenth
@@ -64,24 +64,21 @@ class PathJudge:
         """
         pair = self._pair
         if pair is not None:
-            found = see(pair.windows) if pair.done else pair.seen
-            pair.advance(window, self._moved(pair, found), self.layer.T_s)
+            pair.advance(window, self._moved(pair, see), self.layer.T_s)
             if pair.done == self.steps:
                 self._compare(pair)
                 pair = None
         if pair is None:
-            both = Seen(*(np.concatenate([part, part]) for part in seen))
-            error = self.layer.mean_error(seen.features)[0]
-            self._pair = _Pair(np.tile(window, (2, 1, 1)), both, Learned(*(part.copy() for part in learned)), error)
+            both = np.zeros(2, dtype=np.intp)
+            known = learned.at(both)._replace(trusted=np.array([1.0, 0.0]))
+            start = Seen(*(part[both] for part in seen))
+            self._pair = _Pair(np.tile(window, (2, 1, 1)), start, known, self.layer.mean_error(start.features))
 
-    def _moved(self, pair: _Pair, found: Seen) -> Vector:
+    def _moved(self, pair: _Pair, see: See) -> Vector:
         """Increments ``(2, 3)`` of the layer's and the plain path."""
-        layer, learned = self.layer, pair.learned
-        moved = layer.increments(found.features, learned.weights)
-        if pair.done:
-            moved[0] = layer.bounded(moved[:1], found.physics[:1], learned.limit)[0]
-            moved[1] = found.physics[1] + pair.mean_error
-        return moved
+        if pair.done == 0:
+            return self.layer.increments(pair.start.features, pair.learned.weights)
+        return self.layer.in_rollout(see(pair.windows), pair.learned, pair.mean_error, pair.done)
 
     def _compare(self, pair: _Pair) -> None:
         own, plain = (max(float(distance), _NEAR) for distance in pair.distances)
@@ -96,9 +93,10 @@ class _Pair:
 
     windows: Vector
     """``(2, H, 7)``, the layer's and the plain one."""
-    seen: Seen
-    """Of the row that they start from."""
+    start: Seen
+    """Of the row that they start from, twice."""
     learned: Learned
+    """At that row: the layer's paths are believed in the first, and not in the second."""
     mean_error: Vector
     done: int = 0
     distances: Vector = field(default_factory=lambda: np.zeros(2))

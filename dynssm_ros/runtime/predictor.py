@@ -10,15 +10,14 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
-from dynssm_ros.runtime.models import OnnxModel, WindowPrediction, corrected
-from dynssm_ros.runtime.online import Learned, OnlineState, Seen
-from dynssm_ros.runtime.path_judge import PathJudge
+from dynssm_ros.runtime.learner import OnlineLearner
+from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.online import OnlineState
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.signal_map import SignalMap
 from dynssm_ros.vehicle import State
@@ -65,13 +64,14 @@ class Predictor:
     def __init__(self, model: OnnxModel, signal_map: SignalMap, max_age: float = 0.2, online: bool = True) -> None:
         self.signal_map = live_signal_map(model, signal_map)
         self.history = History(self.signal_map, model.T_s, model.H, max_age)
-        self.online: OnlineState | None = None
-        """What the online layer has learned so far; ``None`` without one."""
-        self.judge: PathJudge | None = None
-        """Whether its paths are believed."""
+        self._learner: OnlineLearner | None = None
         self._learns = online
-        self.model = model
         self._set_model(model)
+
+    @property
+    def online(self) -> OnlineState | None:
+        """What the online layer has learned so far; ``None`` without one."""
+        return None if self._learner is None else self._learner.state
 
     def check_swap(self, model: OnnxModel) -> None:
         """Checks that ``model`` can take the place of the present one.
@@ -94,6 +94,11 @@ class Predictor:
         self.history.resize(model.T_s, model.H)
         self._set_model(model)
 
+    def finish(self) -> None:
+        """Does what can wait until the prediction is out; the next one or a horizon does it else."""
+        if self._learner is not None:
+            self._learner.judge_paths()
+
     def save_online(self, path: Path) -> None:
         """Writes what was learned online, so that another stint can start with it; nothing without an online layer."""
         if self.online is not None:
@@ -110,12 +115,13 @@ class Predictor:
         self.online.load(path, self.model.prior)
 
     def _set_model(self, model: OnnxModel) -> None:
-        if model.online is None or not self._learns:
-            self.online = self.judge = None
-        elif self.online is None or self.model.prior != model.prior:
-            self.online = model.online.start()
-            self.judge = PathJudge(model.online)
-        self._row: _Row | None = None
+        layer, learner = model.online, self._learner
+        if layer is None or not self._learns:
+            self._learner = None
+        elif learner is not None and learner.model.prior == model.prior:
+            self._learner = learner.continued_with(model)
+        else:
+            self._learner = OnlineLearner(model, layer)
         self.model = model
         self._scale = model.artifact.card.normalisation.increment_scale
         self._period = round(model.T_s * 1e9)
@@ -128,10 +134,8 @@ class Predictor:
         """Takes the odometry sample ``values`` at ``stamp`` (ns) and predicts the instant ``stamp + T_s``."""
         refusal = self.history.add(stamp, values)
         if refusal is not None:
-            if refusal is Refusal.JUMPED_BACK and self.online is not None and self.judge is not None:
-                self.online.reset()
-                self.judge.reset()
-                self._row = None
+            if refusal is Refusal.JUMPED_BACK and self._learner is not None:
+                self._learner.reset()
             return refusal
         if not _finite(values.values()):  # the pose, which is no part of the window
             return Refusal.NOT_FINITE
@@ -139,12 +143,8 @@ class Predictor:
         if isinstance(window, Refusal):
             return window
         predicted = self.model.predict(window[None])
-        if self.online is not None:
-            assert predicted.seen is not None
-            self._learn(stamp, window, predicted)
-            known = self._known(predicted.seen.features)
-            self._rollout = known, self.online.layer.mean_error(predicted.seen.features)
-            predicted = corrected(predicted, window[None], self.online.layer, known)
+        if self._learner is not None:
+            predicted = self._learner.corrected(stamp, window, predicted, self.history.window)
         state, theta, physics, variance = predicted[:4]
         now, following = window[-1, :3].tolist(), state[0].tolist()  # a few floats are faster than a small array
         if not (_finite(following) and _finite_row(theta) and _finite_row(variance)):
@@ -174,9 +174,8 @@ class Predictor:
             row[:3], row[3:5], row[5:7] = state, row[3:5] + row[5:7], 0.0
             window = np.concatenate([window[1:], row[None]])
             predicted = self.model.predict(window[None])
-            if self.online is not None:
-                known, mean_error = self._rollout
-                predicted = corrected(predicted, window[None], self.online.layer, known, mean_error, done)
+            if self._learner is not None:
+                predicted = self._learner.in_rollout(window, predicted, done)
             following = predicted.state[0]
             pose = advance_pose(SCALAR, poses[-1], State(*state.tolist()), State(*following.tolist()), self.model.T_s)
             if not _finite(pose):
@@ -185,87 +184,10 @@ class Predictor:
             state = following
         return poses
 
-    def _learn(self, stamp: int, window: Vector, predicted: WindowPrediction) -> None:
-        """Takes the steps of T_s that were completed by ``stamp``, each from a row to the next on the layer's own grid.
-
-        The grid is that of the odometry where its rate is 1 / T_s. Else rows between the messages are cut from the
-        history. Gaps and rows slower than the minimum speed teach nothing; after them the grid starts anew.
-        """
-        assert self.online is not None
-        slack = self._period // 100
-        row, self._row = self._row, None
-        kept: Vector | None = None
-        while row is not None and row.stamp + self._period <= stamp + slack:
-            due = row.stamp + self._period
-            if due >= stamp - slack:
-                row = self._learned_row(row, stamp, window if kept is None else kept, predicted)
-                break
-            kept = window.copy() if kept is None else kept
-            earlier = self.history.window(due)  # in the place of `window`
-            row = (
-                None
-                if isinstance(earlier, Refusal)
-                else self._learned_row(row, due, earlier, self.model.predict(earlier[None]))
-            )
-        if kept is not None:
-            window[...] = kept
-        if row is None:
-            self.online.interrupt()
-            assert self.judge is not None
-            self.judge.interrupt()
-            row = _row_of(stamp, window, predicted, self.online.layer.minimum_speed)
-            if row is not None:
-                self._judge(window, predicted)
-        self._row = row
-
-    def _judge(self, window: Vector, predicted: WindowPrediction) -> None:
-        """Takes the paths that are under way a row further."""
-        assert self.judge is not None
-        assert predicted.seen is not None
-        self.judge.step(window, predicted.seen, self._known(predicted.seen.features), self.model.see)
-
-    def _learned_row(self, before: _Row, stamp: int, window: Vector, predicted: WindowPrediction) -> _Row | None:
-        """Learns the step that ends with ``window``; returns its last row, ``None`` if the car was too slow there."""
-        assert self.online is not None
-        row = _row_of(stamp, window, predicted, self.online.layer.minimum_speed)
-        if row is not None:
-            self.online.update(before.seen, before.values, window[-1, :3] - window[-2, :3])
-            self._judge(window, predicted)
-        return row
-
-    def _known(self, features: Vector) -> Learned:
-        """What was learned online, for a prediction from features ``(1, 3, n)``."""
-        online, judge = self.online, self.judge
-        assert online is not None
-        assert judge is not None
-        return Learned(
-            online.mean[None],
-            online.variance(features[0])[None],
-            online.limit[None],
-            online.coefficients.theta[None],
-            np.array([float(judge.trusted)]),
-        )
-
     def _residual_share(self, now: list[float], following: list[float], physics: list[float]) -> float:
         residual = sum(abs(a - b) / s for a, b, s in zip(following, physics, self._scale, strict=True))
         explained = sum(abs(a - b) / s for a, b, s in zip(physics, now, self._scale, strict=True))
         return residual / (residual + explained) if residual > 0 else 0.0
-
-
-class _Row(NamedTuple):
-    """A row that the online layer has yet to see the next one of."""
-
-    stamp: int
-    seen: Seen
-    values: Vector
-
-
-def _row_of(stamp: int, window: Vector, predicted: WindowPrediction, minimum_speed: float) -> _Row | None:
-    """The last row of ``window``; ``None`` if the car was slower than ``minimum_speed`` (m/s) within it."""
-    assert predicted.seen is not None
-    if not window[:, 0].min() >= minimum_speed:
-        return None
-    return _Row(stamp, Seen(predicted.seen.features[0], predicted.seen.physics[0]), window[-1].copy())
 
 
 def live_signal_map(model: OnnxModel, signal_map: SignalMap) -> SignalMap:

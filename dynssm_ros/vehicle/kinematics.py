@@ -17,6 +17,9 @@ SCALAR = SimpleNamespace(
     sqrt=math.sqrt, fabs=math.fabs, hypot=math.hypot, pi=math.pi,
 )  # fmt: skip
 
+PATH_HORIZON_S = 0.6
+"""How far a controller looks ahead with a model, about: paths are predicted, judged and scored over so long."""
+
 
 class Pose(NamedTuple):
     """Position (m) and heading (rad, counter-clockwise, not wrapped) of the centre of gravity in the odometry frame."""

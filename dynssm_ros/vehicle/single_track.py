@@ -471,43 +471,6 @@ def step_with_effect_states(
     return State(*_add(state, moved)), {name: value + changed[name] for name, value in effect_states.items()}
 
 
-def increments_along(
-    xp: Any,
-    states: Sequence[State],
-    applied: Sequence[Applied],
-    effect_states: Mapping[str, Array],
-    theta: Coefficients,
-    constants: Constants,
-    T_s: float,
-    effects: Sequence[StageEffect] = (),
-    integrator: Integrator = "euler",
-    substeps: int = 1,
-) -> list[State]:
-    """Increments from each of several measured rows, with effect states that are carried from row to row.
-
-    At every row the state is the measured one; only what no sensor shows is carried, as where a lagging steering is.
-
-    Args:
-        xp: array namespace.
-        states: measured, in order, ``T_s`` apart.
-        applied: inputs that act from each of them on.
-        effect_states: own states of effects at the first row, by name; those left out are settled there.
-        theta: the 17 coefficients.
-        constants: mass and geometry.
-        T_s: length of a step (s).
-        effects: physics beyond the nominal model.
-        integrator: of each step.
-        substeps: integration steps per sampling time.
-    """
-    carried = settled_effect_states(xp, states[0], applied[0], theta, constants, effects, effect_states)
-    found = []
-    for state, inputs_now in zip(states, applied, strict=True):
-        moved, changed = increment(xp, state, carried, inputs_now, theta, constants, T_s, effects, integrator, substeps)
-        carried = {name: value + changed[name] for name, value in carried.items()}
-        found.append(moved)
-    return found
-
-
 def increment(
     xp: Any,
     state: State,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from dynssm_ros.learning.layer import LayerBase
+from dynssm_ros.learning.earned_layer import LayerBase
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.stages import checkpoints, train
@@ -30,7 +30,7 @@ WITH_PARTS = {
 def test_the_layer_is_fitted_to_what_models_say_of_parts_that_they_did_not_know(
     drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicle, tmp_path: Path, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr("dynssm_ros.learning.layer.NETWORK_GAIN_WANTED", -10.0)
+    monkeypatch.setattr("dynssm_ros.learning.earned_layer.NETWORK_GAIN_WANTED", -10.0)
     recording = drive(orca, 800)
     config = make_config(**WITH_PARTS)
     trained = train(recording, config, orca, tmp_path / "a.pt")

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from dynssm_ros.errors import ArtifactError
-from dynssm_ros.evaluation.metrics import learned_while_driving, predict_rows
+from dynssm_ros.evaluation.metrics import drive_through, predict_rows
 from dynssm_ros.evaluation.open_loop import evaluate
 from dynssm_ros.learning.dataset import all_windows
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.online import OnlineFeatures
 from dynssm_ros.learning.stages import train
-from dynssm_ros.runtime.models import OnnxModel, SingleTrack
+from dynssm_ros.runtime.models import OnnxModel, SingleTrack, without_online
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -47,7 +47,7 @@ def test_on_exact_laps_of_the_known_car_it_is_the_true_model(laps, orca, make_co
 
 
 def test_with_sensor_noise_it_beats_the_physics_that_it_starts_from(noisy_laps, noisy_model):
-    scores = evaluate(noisy_laps, {"on": noisy_model, "off": noisy_model.offline()}, calls=1).scores
+    scores = evaluate(noisy_laps, {"on": noisy_model, "off": without_online(noisy_model)}, calls=1).scores
     assert np.all(scores["on"].rmse < scores["off"].rmse)
     assert scores["on"].rollout.ade < scores["off"].rollout.ade
     assert np.all(np.abs(scores["on"].coverage_90 - 0.9) < 0.03)
@@ -60,7 +60,7 @@ def test_a_network_that_earns_nothing_is_left_out_of_the_layer(noisy_laps, orca,
 
 
 def test_a_networks_increment_is_an_expert_of_its_own(noisy_laps, orca, make_config, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("dynssm_ros.learning.layer.NETWORK_GAIN_WANTED", -1.0)
+    monkeypatch.setattr("dynssm_ros.learning.earned_layer.NETWORK_GAIN_WANTED", -1.0)
     trained = train(noisy_laps, make_config(online={"folds": 2}), orca, tmp_path / "c.pt")
     model = OnnxModel(save_artifact(trained, tmp_path / "model"))
     window, _ = all_windows(noisy_laps, trained.H, orca.minimum_speed).batch(slice(0, 20))
@@ -96,10 +96,10 @@ def test_rollouts_of_a_changed_car_stay_as_bounded_as_the_physics(laps, orca, ma
     trained = train(laps, make_config(kind="rls", history=0.3), orca, tmp_path / "c.pt")
     model = OnnxModel(save_artifact(trained, tmp_path / "model"))
     changed = drive(orca.with_effect("front_grip", {"factor": 0.75}))
-    scores = evaluate(changed, {"on": model, "off": model.offline()}, calls=1, horizon_s=5.0, stride=10).scores
+    scores = evaluate(changed, {"on": model, "off": without_online(model)}, calls=1, horizon_s=5.0, stride=10).scores
     assert np.all(np.isfinite(scores["on"].rollout.rmse))
     assert scores["on"].rollout.rmse.max(axis=0) == pytest.approx(scores["off"].rollout.rmse.max(axis=0), rel=1.0)
-    short = evaluate(changed, {"on": model, "off": model.offline()}, calls=1).scores
+    short = evaluate(changed, {"on": model, "off": without_online(model)}, calls=1).scores
     assert short["on"].rollout.ade < short["off"].rollout.ade
 
 
@@ -126,7 +126,7 @@ def test_live_predictions_are_those_of_the_evaluation(noisy_laps, noisy_model):
     part = noisy_laps.select(rows)
     predictor = Predictor(noisy_model, SIGNALS)
     found = feed(predictor, part, rows)
-    ends, learned = learned_while_driving(noisy_model, part)
+    ends, learned = drive_through(noisy_model, part)
     shared = [k for k in ends if k in found]
     assert len(shared) > 300
     batch = predict_rows(noisy_model, part.matrix, np.array(shared), learned=learned.at(np.searchsorted(ends, shared)))

@@ -10,9 +10,10 @@ from torch import Tensor, nn
 
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
-from dynssm_ros.vehicle import Coefficients, State, Vehicle
+from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.single_track import Integrator, increment, increments_along
+from dynssm_ros.vehicle.effects.carried import carries, increments_along
+from dynssm_ros.vehicle.single_track import Integrator, increment
 
 INPUTS = len(WINDOW_COLUMNS)
 
@@ -66,7 +67,7 @@ class PhysicsLayer(nn.Module):
         self.vehicle = vehicle
         self.config = config
         self.effects = vehicle.active_effects
-        self.carries = any(effect.carries for effect in self.effects)
+        self.carries = carries(self.effects)
 
     def forward(self, latest: Tensor, theta: Tensor) -> Tensor:
         """Raw rows ``(..., 7)`` and coefficients, broadcastable to ``(..., 17)``, to increments ``(..., 3)``.
@@ -105,7 +106,7 @@ class PhysicsLayer(nn.Module):
             _XP,
             [State(*row[:3]) for row in rows],
             [applied_inputs(row) for row in rows],
-            initial_effect_states(self.effects, rows[0][3], rows[0][4]),
+            Applied(*rows[0][3:5]),
             Coefficients(*torch.split(each, 1, dim=-1)),
             self.vehicle.constants,
             self.vehicle.sampling_time,

@@ -15,18 +15,17 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.learning.dataset import all_windows
 from dynssm_ros.learning.models.base import OnlineConfig, TrainableModel, steps_of
 from dynssm_ros.learning.models.physics import PhysicsConfig
-from dynssm_ros.learning.online import Drive, FittedLayer, OnlineFeatures, fit_layer
+from dynssm_ros.learning.online import FittedLayer, LayerDrive, LeftOut, OnlineFeatures, fit_layer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.online import OnlineLayer, Seen
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
-from dynssm_ros.vehicle.kinematics import path
+from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S, path
 
 NETWORK_GAIN_WANTED = 0.03
 """A network that takes away less of the online layer's error is left out of it. On the development cells of
 ``benchmarks/generalisation`` gains of 1 to 2 % on left-out laps did not carry over to another track."""
 _STRETCHES = 4  # of the laps, for a layer without a network
-_HORIZON_S = 0.6  # of the paths
 _STARTS = 400  # rollouts in a part, at most
 _BATCH = 4096  # windows
 
@@ -88,14 +87,14 @@ def earned_layer(
 def _errors(base: LayerBase, features: OnlineFeatures, fitted: FittedLayer, parts: list[Part]) -> Vector:
     """Geometric mean of the one-step errors, and mean distance of the path, on parts that are not known, ``(2,)``."""
     distances = [
-        _path_error(base, features, layer, drive, model, recording)
-        for (layer, drive), (model, recording) in zip(fitted.judged, parts, strict=True)
+        _path_error(base, features, left_out, model, recording)
+        for left_out, (model, recording) in zip(fitted.left_out, parts, strict=True)
     ]
     return np.array([fitted.error, np.nanmean(np.concatenate(distances))])
 
 
 @torch.no_grad()
-def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording, base: LayerBase) -> Drive:
+def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording, base: LayerBase) -> LayerDrive:
     """What the layer sees of all windows of a recording, with what ``model`` predicts from them."""
     windows = all_windows(recording, base.H, base.vehicle.minimum_speed)
     parts = []
@@ -104,33 +103,30 @@ def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording
         parts.append((*features(window, model.eval()(window)), target))
     seen, physics, increments = (torch.cat(each).double().numpy() for each in zip(*parts, strict=True))
     ends = windows.ends.numpy()
-    return Drive(Seen(seen, physics), recording.matrix[ends], increments, ends)
+    return LayerDrive(Seen(seen, physics), recording.matrix[ends], increments, ends)
 
 
 @torch.no_grad()
 def _path_error(
-    base: LayerBase,
-    features: OnlineFeatures,
-    layer: OnlineLayer,
-    drive: Drive,
-    model: TrainableModel,
-    recording: Recording,
+    base: LayerBase, features: OnlineFeatures, left_out: LeftOut, model: TrainableModel, recording: Recording
 ) -> Vector:
     """Mean distance (m) of predicted from measured paths, for each of some starts; NaN for what diverges."""
-    steps = steps_of(_HORIZON_S, layer.T_s)
+    layer, drive, learned = left_out
+    steps = steps_of(PATH_HORIZON_S, layer.T_s)
     starts = recording.window_ends(base.H, steps, base.vehicle.minimum_speed)
     starts = starts[:: max(1, len(starts) // _STARTS)]
     if len(starts) == 0:
         return np.empty(0)
-    known = layer.drive(*drive).at(np.searchsorted(drive.ends, starts))
+    known = learned.at(np.searchsorted(drive.ends, starts))
     rows = recording.matrix[starts[:, None] + np.arange(1 - base.H, steps + 1)]
-    rolled = rows.copy()
+    rolled, mean_error = rows.copy(), None
     for k in range(steps):
         window = torch.tensor(rolled[:, k : k + base.H], dtype=torch.float32)
-        seen, physics = (each.double().numpy() for each in features(window, model(window)))
-        moved = layer.increments(seen, known.weights)
-        if k:
-            moved = layer.bounded(moved, physics, known.limit)
+        seen = Seen(*(each.double().numpy() for each in features(window, model(window))))
+        if mean_error is None:
+            mean_error, moved = layer.mean_error(seen.features), layer.increments(seen.features, known.weights)
+        else:
+            moved = layer.in_rollout(seen, known, mean_error, k)
         rolled[:, k + base.H, :3] = rolled[:, k + base.H - 1, :3] + moved
     driven, measured = (path(each[:, base.H - 1 :, :3], layer.T_s) for each in (rolled, rows))
     distance: Vector = np.linalg.norm(driven - measured, axis=-1).mean(axis=1)
