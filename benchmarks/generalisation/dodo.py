@@ -2,7 +2,7 @@
 
 Variables: ``out`` (folder), ``page`` (folder of the page and its figure), ``data`` (folder of the real logs), ``only`` (words
 that names of trainings must begin with, separated by commas), ``part`` (``development``, the default, or ``all``: test cells
-too), ``ablations`` (1: further models). What is done is kept; a kill costs the task under way.
+too), ``sets`` (``shipped``, the default, ``ablations``, ``rivals``, separated by commas). What is done is kept; a kill costs the task under way.
 """
 
 from __future__ import annotations
@@ -36,8 +36,15 @@ OUT = Path(get_var("out", "out/generalisation"))
 PAGE_FOLDER = Path(get_var("page", str(OUT)))
 DATA = Path(get_var("data", os.environ.get("DYNSSM_DATA", "../shared/data")))
 ONLY = tuple(get_var("only", "").split(","))
-PART = get_var("part", "development")
-ABLATED = get_var("ablations", "0") == "1"
+_SHIPPED, _DEVELOPMENT = "shipped", "development"
+PART = get_var("part", _DEVELOPMENT)
+SETS = get_var("sets", _SHIPPED)
+MODEL_SETS = tuple(SETS.split(","))
+ARGUMENTS = " ".join(
+    f"{name}={value}"
+    for name, value, usual in (("part", PART, _DEVELOPMENT), ("sets", SETS, _SHIPPED))
+    if value != usual
+)
 DOIT_CONFIG = doit_config(OUT / "doit.json")
 CELLS = [cell for cell in cells(DATA) if cell.training.name.startswith(ONLY) and (PART == "all" or not cell.is_test)]
 TRAININGS = {cell.training.name: cell.training for cell in CELLS}
@@ -57,7 +64,7 @@ def task_drive() -> Iterator[dict[str, Any]]:
 def task_train() -> Iterator[dict[str, Any]]:
     """Trains each model on each training."""
     for training in TRAININGS.values():
-        for name, content in models_of(ABLATED).items():
+        for name, content in models_of(MODEL_SETS).items():
             yield {
                 "name": f"{training.name}:{name}",
                 "actions": [(train_model, [training, name, OUT])],
@@ -72,10 +79,10 @@ def task_score() -> Iterator[dict[str, Any]]:
     for cell in CELLS:
         yield {
             "name": cell.name,
-            "actions": [(score_cell, [cell, OUT, DATA, ABLATED])],
-            "file_dep": [str(model_folder(cell.training, name, OUT) / CARD) for name in models_of(ABLATED)],
+            "actions": [(score_cell, [cell, OUT, DATA, MODEL_SETS])],
+            "file_dep": [str(model_folder(cell.training, name, OUT) / CARD) for name in models_of(MODEL_SETS)],
             "targets": [str(cell_file(cell, OUT))],
-            "uptodate": [config_changed(repr((cell, ABLATED)))],
+            "uptodate": [config_changed(repr((cell, MODEL_SETS)))],
         }
 
 
@@ -92,7 +99,7 @@ def write_page() -> None:
     write_json(OUT / "summary.json", summary(known))
     with replacing(PAGE_FOLDER / FIGURE) as aside:
         heat_map(known).savefig(aside, format="png", dpi=130, metadata={"Software": None})
-    text = page(known, PART, len(CELLS) - len(known))
+    text = page(known, ARGUMENTS, len(CELLS) - len(known))
     with replacing(PAGE_FOLDER / PAGE) as aside:
         aside.write_text(text, encoding="utf-8")
     print(text)

@@ -108,15 +108,13 @@ def heat_map(known: Known, model: str = "dynssm") -> Figure:
     return figure
 
 
-def page(known: Known, part: str, undriven: int) -> str:
-    """The results as Markdown."""
-    return "\n".join(_lines(known, part, undriven)) + "\n"
+def page(known: Known, arguments: str, undriven: int) -> str:
+    """The results as Markdown; ``arguments`` of doit's command that differ from the default."""
+    return "\n".join(_lines(known, arguments, undriven)) + "\n"
 
 
-def _lines(known: Known, part: str, undriven: int) -> Iterator[str]:
-    command = (
-        f"python -m doit -n 2 -f benchmarks/generalisation/dodo.py{'' if part == 'development' else f' part={part}'}"
-    )
+def _lines(known: Known, arguments: str, undriven: int) -> Iterator[str]:
+    command = " ".join(["python -m doit -n 2 -f benchmarks/generalisation/dodo.py", *arguments.split()])
     yield "# Generalisation"
     yield ""
     yield (

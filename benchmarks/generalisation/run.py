@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from dynssm_ros.files import write_json
 from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma, WindowModel, load_model
 from dynssm_ros.signals.recording import concatenate
 from dynssm_ros.simulation.laps import SimulationError
+from dynssm_ros.vehicle import load_vehicle
 
 MODELS: dict[str, dict[str, Any]] = {"rls": {"base": "rls"}, "ridge": {"base": "ridge"}, "dynssm": {"base": "dynssm"}}
 """What is trained, as changes of shipped model files."""
@@ -27,14 +29,21 @@ ABLATIONS: dict[str, dict[str, Any]] = {
         "loss": {"parameters": 0.01},
     },
     "no_mirror": {"base": "dynssm", "training": {"augmentation": {"mirror": False}}},
+    "rls_one_lag": {"base": "rls", "online": {"lags": 1, "other_lags": 1, "input_lags": 1}},
+    "rls_memory_100_s": {"base": "rls", "online": {"memory": 100.0}},
+    "rls_hardly_learning": {"base": "rls", "online": {"memory": 1.0}},
 }  # fmt: skip
+RIVALS: dict[str, dict[str, Any]] = {"ddm": {"base": "ddm_{size}"}, "fthd": {"base": "fthd_{size}"}}
+"""Models of others, with what their authors chose for a car of about that size: ``orca`` or ``av21``."""
+SETS = {"shipped": MODELS, "ablations": ABLATIONS, "rivals": RIVALS}
 BASELINES = ("persistence", "single_track", "single_track_ewma", "ridge", "rls")
 ROLLOUT_STRIDE = 5
+_HEAVY = 100.0  # kg
 
 
-def models_of(ablations: bool) -> dict[str, dict[str, Any]]:
-    """What is trained in all."""
-    return MODELS | (ABLATIONS if ablations else {})
+def models_of(sets: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """What is trained in all: those of some of :data:`SETS`."""
+    return {name: content for each in sets for name, content in SETS[each].items()}
 
 
 def model_folder(training: Training, model: str, out: Path) -> Path:
@@ -56,8 +65,9 @@ def train_model(training: Training, model: str, out: Path) -> None:
     """Trains one of :func:`models_of`."""
     from dynssm_ros.learning.models.registry import load_model_config, merge, parse_model_config
 
-    content = dict(models_of(True)[model])
-    base = load_model_config(content.pop("base")).model_dump(mode="json")
+    content = dict(models_of(SETS)[model])
+    size = "av21" if load_vehicle(training.vehicle).constants.m > _HEAVY else "orca"
+    base = load_model_config(content.pop("base").format(size=size)).model_dump(mode="json")
     config = parse_model_config({**merge(base, content), "name": model}, model)
     dynssm_ros.train(drive_file(training, out), config, training.vehicle, model_folder(training, model, out))
 
@@ -67,9 +77,9 @@ def cell_file(cell: Cell, out: Path) -> Path:
     return out / "cells" / f"{cell.name}.json"
 
 
-def score_cell(cell: Cell, out: Path, data: Path, ablations: bool) -> None:
+def score_cell(cell: Cell, out: Path, data: Path, sets: Iterable[str]) -> None:
     """Scores all models on a cell; ``null`` if the changed car cannot be driven."""
-    trained = {name: load_model(model_folder(cell.training, name, out)) for name in models_of(ablations)}
+    trained = {name: load_model(model_folder(cell.training, name, out)) for name in models_of(sets)}
     car = trained["rls"].vehicle
     assert car is not None
     models: dict[str, WindowModel] = {

@@ -12,6 +12,7 @@ from benchmarks.generalisation.page import errors, heat_map, page, ratios, summa
 from benchmarks.generalisation.run import (
     ABLATIONS,
     BASELINES,
+    RIVALS,
     drive,
     model_folder,
     models_of,
@@ -68,8 +69,17 @@ def test_no_measured_cell_shares_a_row_with_its_training():
 def test_ablations_are_model_files():
     for content in ABLATIONS.values():
         overrides = {key: value for key, value in content.items() if key != "base"}
-        assert load_model_config(content["base"], overrides).name == "dynssm"
-    assert set(models_of(False)) < set(models_of(True))
+        assert load_model_config(content["base"], overrides).name == content["base"]
+
+
+def test_rivals_are_model_files_for_both_sizes_of_cars():
+    for content in RIVALS.values():
+        for size in ("orca", "av21"):
+            assert load_model_config(content["base"].format(size=size)).name.endswith(size)
+
+
+def test_sets_are_of_different_models():
+    assert set(models_of(["shipped"])) < set(models_of(["shipped", "ablations"]))
 
 
 def test_ratios_are_to_the_best_baseline_of_each_quantity():
@@ -93,7 +103,8 @@ def test_the_page_has_means_worst_cells_and_exact_cells():
     content = summary(known)
     parts = [content[name] for name in ("development", "test") if content[name]["cells"]]
     assert sum(part["cells"] for part in parts) == 3
-    text = page(known, "all", 2)
+    text = page(known, "part=all", 2)
+    assert "dodo.py part=all`" in text
     assert "2 cells are missing" in text
     assert "![Heat map" in text
     assert len(heat_map(known).axes[0].get_yticklabels()) == 3
@@ -110,7 +121,7 @@ def test_a_cell_from_laps_to_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert (model_folder(training, name, tmp_path) / "model.yaml").is_file()
     monkeypatch.setattr("benchmarks.generalisation.run.models_of", lambda _: {"rls": {}, "ridge": {}})
     cell = Cell(training, "steering")
-    score_cell(cell, tmp_path, HERE, False)
+    score_cell(cell, tmp_path, HERE, ["shipped"])
     content = read_cell(cell, tmp_path)
     assert content is not None
     assert set(content["scores"]) == {*BASELINES, "rls (offline)"}
