@@ -2,8 +2,8 @@
 
 Variables: ``out`` (folder), ``page`` (folder of the page and its figure), ``data`` (folder of the real logs), ``only`` (words
 that names of trainings must begin with, separated by commas), ``part`` (``development``, the default, or ``all``: test cells
-too), ``sets`` (``shipped``, the default, ``ablations``, ``rivals``, separated by commas; rivals take a day). What is done is kept; a
-kill costs the task under way.
+too), ``sets`` (``shipped``, the default, ``ablations``, ``rivals``, separated by commas; rivals take a day). What is
+done is kept; a kill costs the task under way.
 """
 
 from __future__ import annotations
