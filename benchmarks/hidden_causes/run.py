@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.hidden_causes.cases import Case, cars, record
+from benchmarks.hidden_causes.cases import Case, record, vehicle_file
 from benchmarks.hidden_causes.outcomes import Outcome, judge
 from dynssm_ros.files import write_json
 from dynssm_ros.identification.diagnose import diagnose
@@ -21,7 +21,7 @@ def run_case(case: Case, folder: Path) -> None:
     try:
         if not drive.exists():
             record(case)[0].save(drive)
-        outcome = judge(case, diagnose(Recording.load(drive), cars(case)[1], line=case.road.centre).causes)
+        outcome = judge(case, diagnose(Recording.load(drive), vehicle_file(case), line=case.road.centre).causes)
     except SimulationError:
         outcome = None
     write_json(outcome_file(case, folder), {"outcome": None if outcome is None else asdict(outcome)})

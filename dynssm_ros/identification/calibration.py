@@ -101,19 +101,19 @@ def calibrate(
         windows.with_integrator(integrator, vehicle.with_nominal(np.array(near.theta))), near
     )
     # what is known before counts from here on, so the nominal values are a starting point again
-    fit = min((problem.fit(car, ()) for car in (near, given)), key=lambda fit: fit.objective)
+    fit = problem.temper(min((problem.fit(car, ()) for car in (near, given)), key=lambda fit: fit.objective))
     if on_progress is not None:
         on_progress(starts + 1, starts + 1)
     theta = np.array(fit.car.theta)
-    relative = np.minimum(np.sqrt(np.diag(problem.covariance(fit)))[: len(COEFFICIENTS)], 1.0)
-    std = fit.car.in_units(relative)
+    calibrated = fit.car.known(problem.covariance(fit))
+    std = np.array([calibrated.coefficients[name].std for name in COEFFICIENTS])
     lower, upper = (limit[: len(COEFFICIENTS)] for limit in given.limits)
     held = (fit.position[: len(COEFFICIENTS)] <= lower + _ON_BOUND) | (
         fit.position[: len(COEFFICIENTS)] >= upper - _ON_BOUND
     )
     before, after = (np.sqrt((one_step.errors(car)[:, 0] ** 2).mean(axis=0)) for car in (given, fit.car))
     return Calibration(
-        vehicle.with_nominal(theta, std),
+        calibrated,
         theta,
         std,
         tuple(name for name, on in zip(COEFFICIENTS, held, strict=True) if on),

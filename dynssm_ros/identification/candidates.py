@@ -19,7 +19,7 @@ from dynssm_ros.identification.problem import Fit, IdentificationProblem, unit
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 from dynssm_ros.vehicle.effects.base import section
 
-_SIZE_GRID_UNITS = (6.0, 1.5, 0.375, 0.094, 0.023)  # units: sizes at which effects are tried, a factor of 4 apart
+SIZE_GRID_UNITS = (6.0, 1.5, 0.375, 0.094, 0.023)  # units: sizes at which effects are tried, a factor of 4 apart
 _LOCAL_SIZE_UNITS = 1.5  # unit at which effects are tried that act somewhere on the lap
 _SIZE_REACH = (0.5, 3.0)  # times a size, for which its response serves
 _NONLINEARITY = (
@@ -135,9 +135,9 @@ class Responses:
             if candidate.local:
                 found = self._simulated(effect, parameter, form, (_LOCAL_SIZE_UNITS, -_LOCAL_SIZE_UNITS), everywhere)
             else:
-                found = self._simulated(effect, parameter, form, (_SIZE_GRID_UNITS[1], _SIZE_GRID_UNITS[3]), everywhere)
+                found = self._simulated(effect, parameter, form, (SIZE_GRID_UNITS[1], SIZE_GRID_UNITS[3]), everywhere)
                 if _differ(found):
-                    both = (*_SIZE_GRID_UNITS, *(-size for size in _SIZE_GRID_UNITS))
+                    both = (*SIZE_GRID_UNITS, *(-size for size in SIZE_GRID_UNITS))
                     found = self._simulated(effect, parameter, form, both, everywhere)
                 else:
                     found = found[:1]
@@ -198,11 +198,11 @@ class ScoreTest:
         white = fit.noise.whiten(fit.errors)
         self._root = np.sqrt(weights(white))[:, None]
         J = fit.noise.whiten(fit.jacobian) * self._root[..., None]
-        known = problem.prior_precision(fit.position)
         # what is known of the values as further rows, so that projecting is plain least squares
-        tall = np.concatenate([J.reshape(-1, J.shape[2]), np.diag(np.sqrt(known))])
+        known = np.sqrt(problem.tempering) * np.linalg.cholesky(problem.prior_precision(fit.position)).T
+        tall = np.concatenate([J.reshape(-1, J.shape[2]), known])
         basis = np.linalg.qr(tall)[0]
-        left = np.concatenate([(white * self._root).ravel(), np.sqrt(known) * fit.position])
+        left = np.concatenate([(white * self._root).ravel(), known @ fit.position])
         left = left - basis @ (basis.T @ left)
         rows = J.shape[0] * J.shape[1]
         self._basis = basis[:rows].reshape(*J.shape[:2], -1)

@@ -58,6 +58,13 @@ class CarEstimate:
         return np.asarray(relative * prior_std(self.vehicle) * grown)
 
     @property
+    def prior_precision(self) -> Vector:
+        """Inverse covariance of what is known of :attr:`moved`, ``(18, 18)``."""
+        precision = np.eye(len(COEFFICIENTS) + 1)
+        precision[:-1, :-1] = np.linalg.inv(self.vehicle.known_correlation)
+        return precision
+
+    @property
     def limits(self) -> tuple[Vector, Vector]:
         """The least and the largest of :attr:`moved`."""
         vehicle, known, scales = self.vehicle, prior_std(self.vehicle), _scaling(self.vehicle)
@@ -97,13 +104,20 @@ class CarEstimate:
         """The same car without an effect."""
         return replace(self, effects={key: values for key, values in self.effects.items() if key != name})
 
-    def extended(self, std: Vector) -> Vehicle:
-        """The vehicle to write: refitted nominal values, what is now known of them, and the effects.
+    def known(self, covariance: Vector) -> Vehicle:
+        """The vehicle with refitted nominal values and what is now known of them, never less than before.
 
         Args:
-            std: standard deviations of the 17 coefficients.
+            covariance: of :attr:`moved`, at least its first 17 rows and columns.
         """
-        vehicle = self.vehicle.with_nominal(np.array(self.theta), std)
+        n = len(COEFFICIENTS)
+        relative = np.sqrt(np.diag(covariance)[:n])
+        correlation = covariance[:n, :n] / np.outer(relative, relative)
+        return self.vehicle.with_nominal(np.array(self.theta), self.in_units(np.minimum(relative, 1.0)), correlation)
+
+    def extended(self, covariance: Vector) -> Vehicle:
+        """The vehicle to write: as :meth:`known`, with mass and effects."""
+        vehicle = self.known(covariance)
         vehicle = vehicle.model_copy(update={"constants": self.constants})
         return vehicle.with_effects(self.effects.items())
 

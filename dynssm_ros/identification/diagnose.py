@@ -8,9 +8,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Vector
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.identification.car import CarEstimate, prior_std
+from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.improvement import Improvement, measure_improvement
 from dynssm_ros.identification.integrator import SearchResult, search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
@@ -39,6 +39,7 @@ Verdict = Literal["effects", "none", "unexplained"]
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
 _LEAST_LAPS = 3  # with which whole laps are held out
+_PARTS = 4  # of the time, where there are no laps
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
 
@@ -184,7 +185,7 @@ def diagnose(
         ConfigurationError: an effect of the vehicle needs a signal that the recording has not; options out of range.
     """
     at = _prepare(recording, vehicle, horizon, holdout, min_speed, line)
-    found = search_causes(at.fitted, at.car, integrator, on_progress)
+    found = search_causes(at.fitted, at.car, at.unit, integrator, on_progress)
     problem, selection, fit = found.problem, found.selection, found.selection.fit
     windows = problem.windows
     at = at._replace(unseen=replace(at.unseen, integrator=windows.integrator, substeps=windows.substeps))
@@ -194,8 +195,9 @@ def diagnose(
     )
     sizes = minimum_detectable(problem, fit, found.search.found)
     limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
-    limits += [*_hidden(sizes), *_not_live(fit.car.extended(prior_std(vehicle)))]
-    std = np.sqrt(np.diag(problem.covariance(fit)))
+    covariance = problem.covariance(fit)
+    extended, std = fit.car.extended(covariance), np.sqrt(np.diag(covariance))
+    limits += [*_hidden(sizes), *_not_live(extended)]
     causes = tuple(_cause(one, found, at, std) for one in selection.chosen)
     left = explained_variance(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], problem.block)
     white = fit.noise.whiten(fit.errors)
@@ -204,7 +206,7 @@ def diagnose(
     return Diagnosis(
         "effects" if causes else "unexplained" if left.is_there or together.is_there else "none",
         causes,
-        fit.car.extended(fit.car.in_units(np.minimum(std[:17], 1.0))),
+        extended,
         improvement,
         left,
         together,
@@ -222,6 +224,7 @@ class _Prepared(NamedTuple):
     """What a diagnosis works on."""
 
     fitted: SimulationWindows
+    unit: Indices
     steps: int
     unseen: SimulationWindows
     car: CarEstimate
@@ -269,7 +272,18 @@ def _prepare(
         "Fit": f"{len(fitted)} simulations of {steps * recording.T_s:g} s, from {speed:g} m/s",
         "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * recording.T_s:g} s",
     }
-    return _Prepared(fitted, asked, unseen, CarEstimate.of(vehicle), notes, protocol)
+    return _Prepared(fitted, _units(recording, fitted, line), asked, unseen, CarEstimate.of(vehicle), notes, protocol)
+
+
+def _units(recording: Recording, fitted: SimulationWindows, line: ClosedLine | None) -> Indices:
+    """Number of the part of the drive that each simulation is left out with, ``(W,)``: laps, else parts of the time."""
+    lap = lap_number(recording, line)
+    if lap is not None and np.ptp(lap[fitted.starts]) + 1 >= _LEAST_LAPS:
+        number = lap[fitted.starts]
+    else:
+        time = fitted.time
+        number = np.floor(_PARTS * (time - time[0]) / (np.ptp(time) + 1e-9))
+    return np.unique(number, return_inverse=True)[1]
 
 
 def _cause(one: Refined, found: SearchResult, at: _Prepared, std: Vector) -> Cause:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynssm_ros.arrays import Indices
 from dynssm_ros.identification.candidates import candidates
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
@@ -40,37 +41,45 @@ class SearchResult(NamedTuple):
 
 
 def search_causes(
-    windows: SimulationWindows, car: CarEstimate, integrator: Integrator | None, on_progress: Callable[[str], None]
+    windows: SimulationWindows,
+    car: CarEstimate,
+    unit: Indices,
+    integrator: Integrator | None,
+    on_progress: Callable[[str], None],
 ) -> SearchResult:
     """Searches for causes.
 
     Args:
         windows: for the fit.
         car: as the vehicle file has it.
+        unit: number of the unit of each window that is left out as a whole, ``(W,)``.
         integrator: of the simulation; ``None``: chosen by the data.
         on_progress: told what is being done.
     """
     if integrator is not None:
-        return _search(_stepped(windows, car, integrator)[0], car, on_progress)
+        return _search(_stepped(windows, car, integrator)[0], car, unit, on_progress)
     on_progress("choosing how the model steps")
     runge_kutta, euler = _stepped(windows, car, "rk4"), _stepped(windows, car, "euler")
     first, other = (euler, runge_kutta) if _by_euler(runge_kutta[1], euler[1]) else (runge_kutta, euler)
-    found = _search(first[0], car, on_progress)
+    found = _search(first[0], car, unit, on_progress)
     fit = found.selection.fit
-    fits = {first[0].integrator: fit, other[0].integrator: IdentificationProblem(other[0], car).fit(fit.car, fit.free)}
+    beside = IdentificationProblem(other[0], car, found.problem.tempering).fit(fit.car, fit.free)
+    fits = {first[0].integrator: fit, other[0].integrator: beside}
     if _by_euler(fits["rk4"], fits["euler"]) == (first is euler):
         return found
-    return _search(other[0], car, on_progress)
+    return _search(other[0], car, unit, on_progress)
 
 
 def _by_euler(runge_kutta: Fit, euler: Fit) -> bool:
     return euler.objective < runge_kutta.objective - _CLEARLY
 
 
-def _search(windows: SimulationWindows, car: CarEstimate, on_progress: Callable[[str], None]) -> SearchResult:
+def _search(
+    windows: SimulationWindows, car: CarEstimate, unit: Indices, on_progress: Callable[[str], None]
+) -> SearchResult:
     problem = IdentificationProblem(windows, car)
     found, impossible = candidates(problem, car)
-    search = Search(problem, car, found, on_progress)
+    search = Search(problem, car, found, unit, on_progress)
     return SearchResult(problem, search, search.run(), impossible)
 
 

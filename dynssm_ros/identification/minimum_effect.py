@@ -31,9 +31,10 @@ def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable
     Returns:
         By effect, in the unit of the parameter; infinite where it changes nothing that was measured.
     """
-    J = (fit.noise.whiten(fit.jacobian) * _root(fit)[:, None, None]).reshape(-1, fit.jacobian.shape[2])
-    H = J.T @ J + np.diag(problem.prior_precision(fit.position))
-    needed = (np.log(problem.windows.target.size) + DECISIVE_DELTA_BIC) * problem.inflation(fit)
+    root = _root(problem, fit)[:, None]
+    J = (fit.noise.whiten(fit.jacobian) * root[..., None]).reshape(-1, fit.jacobian.shape[2])
+    H = J.T @ J + problem.prior_precision(fit.position)
+    needed = np.log(problem.windows.target.size) + DECISIVE_DELTA_BIC
     taken = {effect for effect, _ in fit.free}
     out: dict[str, float] = {}
     for candidate in found:
@@ -43,25 +44,28 @@ def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable
         about, parameter = EFFECTS[effect].PARAMETERS, candidate.amplitudes[0]
         form = {name: about[name].neutral for name in candidate.shapes}
         places = [{LOCATION[0]: float(place)} for place in _PLACES] if candidate.local else [{}]
-        left = np.median([_left(_column(problem, fit, effect, parameter, form | at), J, H) for at in places])
+        left = np.median([_left(root * _column(problem, fit, effect, parameter, form | at), J, H) for at in places])
         out[effect] = float(np.sqrt(needed / left) * unit(effect, parameter)) if left > _NOTHING else float("inf")
     return out
 
 
 def _column(problem: IdentificationProblem, fit: Fit, effect: str, parameter: str, form: Values) -> Vector:
-    """What a unit of a parameter does to the whitened errors, shape ``(W * 3 K,)``."""
+    """What a unit of a parameter does to the whitened errors, shape ``(W, 3 K)``."""
     about = EFFECTS[effect].PARAMETERS[parameter]
     moved = about.neutral + about.direction * unit(effect, parameter)
     values = dict(fit.car.effects.get(effect, {})) | form | {parameter: moved}
     change = problem.errors(fit.car.with_effect(effect, values)) - fit.errors
-    return (fit.noise.whiten(change) * _root(fit)[:, None]).ravel()
+    return fit.noise.whiten(change)
 
 
-def _root(fit: Fit) -> Vector:
-    return np.asarray(np.sqrt(weights(fit.noise.whiten(fit.errors))))
+def _root(problem: IdentificationProblem, fit: Fit) -> Vector:
+    """What each window counts, ``(W,)``."""
+    told = weights(fit.noise.whiten(fit.errors)) / max(problem.inflation(fit), problem.tempering)
+    return np.asarray(np.sqrt(told))
 
 
-def _left(column: Vector, J: Vector, H: Vector) -> float:
-    """Squared length of what fitted values cannot take up of a column."""
+def _left(response: Vector, J: Vector, H: Vector) -> float:
+    """Squared length of what fitted values cannot take up of a response."""
+    column = response.ravel()
     across = J.T @ column
     return float(column @ column - across @ np.linalg.solve(H, across))

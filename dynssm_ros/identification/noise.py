@@ -80,10 +80,10 @@ class Noise:
         return np.asarray(np.linalg.inv(self.roots), dtype=np.float64)
 
     @cached_property
-    def log_det(self) -> float:
-        """Sum over the windows of the logarithm of the covariance's determinant."""
+    def log_dets(self) -> Vector:
+        """Logarithm of the covariance's determinant of each window, ``(W,)``."""
         per_group = 2 * np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1)
-        return float(per_group[self.spread.group].sum())
+        return np.asarray(per_group[self.spread.group])
 
     def whiten(self, errors: Vector) -> Vector:
         """Errors or their derivatives ``(W, 3 K, ...)`` as independent ones of unit variance."""
@@ -115,7 +115,7 @@ def fit_noise(spread: NoiseResponse, errors: Vector, start: Vector, floor: Vecto
     for _ in range(_REWEIGHTED):
         weight = weights(noise.whiten(errors))
         before, noise = noise, Noise(spread, _most_likely(spread, errors * np.sqrt(weight)[:, None], noise.v, floor))
-        if abs(noise.log_det - before.log_det) < _SETTLED:
+        if abs(noise.log_dets.sum() - before.log_dets.sum()) < _SETTLED:
             break
     return noise
 

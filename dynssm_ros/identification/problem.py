@@ -109,16 +109,25 @@ class IdentificationProblem:
 
     Args:
         windows: the simulations that are compared with the measurement.
-        car: gives the derivatives along which noise spreads.
+        car: gives the derivatives along which noise spreads, and what is known of the nominal values.
+        tempering: by which the logarithm of the likelihood is divided: so many errors that hang together tell as much as
+            one.
     """
 
-    def __init__(self, windows: SimulationWindows, car: CarEstimate) -> None:
+    def __init__(self, windows: SimulationWindows, car: CarEstimate, tempering: float = 1.0) -> None:
         self.windows = windows
         speed = windows.target[:, :, 0].mean(axis=1)
         self.spread = NoiseResponse.of(windows.transitions(car), speed)
         block = (windows.time // BLOCK).astype(np.intp)
         self.block: npt.NDArray[np.intp] = np.unique(block, return_inverse=True)[1]
         self._channels = np.tile(windows.spread**2, 3)
+        self._known = car.prior_precision
+        self.tempering = tempering
+
+    def temper(self, fit: Fit) -> Fit:
+        """Weighs the data as the errors of ``fit`` hang together, against what is known before, and fits anew."""
+        self.tempering = self.inflation(fit)
+        return self.fit(fit.car, fit.free, fit)
 
     def errors(self, car: CarEstimate, context: dict[str, float] | None = None) -> Vector:
         """Errors of a car, shape ``(W, 3 K)``."""
@@ -151,19 +160,28 @@ class IdentificationProblem:
 
     def objective(self, errors: Vector, p: Vector, noise: Noise) -> float:
         """Twice the negative logarithm of likelihood and prior."""
+        told = -2.0 * self.log_likelihood(errors, noise).sum() / self.tempering
+        return float(told + p @ self.prior_precision(p) @ p)
+
+    @staticmethod
+    def log_likelihood(errors: Vector, noise: Noise) -> Vector:
+        """Of each window, ``(W,)``, but for a constant; windows that are far out count less and less."""
         white = noise.whiten(errors)
         size, limit = (white**2).sum(axis=1), 4.0 * white.shape[1]
         far = np.maximum(size / limit, 1.0)
-        return float(
-            (np.minimum(size, limit) + limit * np.log(far)).sum() + noise.log_det + (p * self.prior_precision(p)) @ p
-        )
+        return np.asarray(-0.5 * (np.minimum(size, limit) + limit * np.log(far) + noise.log_dets))
+
+    def prior_precision(self, p: Vector) -> Vector:
+        """Inverse covariance of what is known of the values ``(P,)`` beforehand, ``(P, P)``."""
+        known = np.diag(np.full(len(p), _FREE**-2))
+        known[: len(self._known), : len(self._known)] = self._known
+        return known
 
     @staticmethod
-    def prior_precision(p: Vector) -> Vector:
-        """Inverse variance of what is known of each value beforehand."""
-        known = np.full(len(p), _FREE**-2)
-        known[:18] = 1.0
-        return known
+    def surprise(fit: Fit) -> float:
+        """How far the nominal values of a fit are off what was known: squared, in standard deviations."""
+        moved = fit.car.moved
+        return float(moved @ fit.car.prior_precision @ moved)
 
     def fit(
         self, car: CarEstimate, free: Free, near: Fit | None = None, rounds: int = _ROUNDS, rough: bool = False
@@ -219,11 +237,12 @@ class IdentificationProblem:
         return Fit(car, free, errors, jacobian, noise, best)
 
     def part(self, fit: Fit, every: int) -> tuple[IdentificationProblem, Fit]:
-        """One window of each ``every``, and what ``fit`` is there."""
+        """One window of each ``every``, which count for all, and what ``fit`` is there."""
         other = copy(self)
         other.windows = self.windows.select(np.arange(0, len(self.windows), every))
         other.spread = NoiseResponse(self.spread.group[::every], self.spread.G)
         other.block = self.block[::every]
+        other.tempering = self.tempering * len(other.windows) / len(self.windows)
         noise, errors = Noise(other.spread, fit.noise.v), fit.errors[::every]
         objective = other.objective(errors, fit.position, noise)
         return other, replace(fit, errors=errors, jacobian=fit.jacobian[::every], noise=noise, objective=objective)
@@ -244,8 +263,9 @@ class IdentificationProblem:
         root = np.sqrt(weights(white))[:, None]
         J = (noise.whiten(jacobian) * root[..., None]).reshape(-1, len(p))
         known = self.prior_precision(p)
-        H, g = normal_equations(J, (white * root).ravel(), np.diag(known))
-        return H, g + known * p
+        weight = self.tempering**-0.5
+        H, g = normal_equations(weight * J, weight * (white * root).ravel(), known)
+        return H, g + known @ p
 
     def covariance(self, fit: Fit) -> Vector:
         """Covariance of the fitted values in the units of the fit, robust against errors that hang together in blocks.
@@ -253,9 +273,8 @@ class IdentificationProblem:
         Shape ``(P, P)``.
         """
         information, _ = self._scores(fit)
-        known = np.diag(self.prior_precision(fit.position))
-        bread = np.linalg.inv(information + known)
-        return np.asarray(bread @ (self.inflation(fit) * information + known) @ bread)
+        told = information / max(self.inflation(fit), self.tempering)
+        return np.asarray(np.linalg.inv(told + self.prior_precision(fit.position)))
 
     def information(self, fit: Fit) -> Vector:
         """What the data alone say of the fitted values, ``(P, P)``: the inverse of their covariance."""
@@ -273,7 +292,7 @@ class IdentificationProblem:
         ratio = np.einsum("pi,pq,qi->i", vectors[:, told], meat, vectors[:, told]) / values[told]
         inflation = float(ratio.mean()) if told.any() else 1.0
         if last:
-            known = np.diag(self.prior_precision(fit.position))
+            known = self.prior_precision(fit.position)
             n = len(information) - last
             taken = np.linalg.solve((information + known)[:n, :n], information[:n, n:])
             left = np.concatenate([-taken, np.eye(last)])

@@ -1,18 +1,23 @@
-"""Which effects the data ask for: forward, exchanged, backward; and which of them the data cannot tell apart."""
+"""Which effects the data ask for: forward, exchanged, backward; and which of them the data cannot tell apart.
+
+An information criterion finds what is worth a look. What is named has to predict parts of the drive that it was not fitted to
+(:mod:`dynssm_ros.identification.confirmation`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from dynssm_ros.identification.candidates import Candidate, Responses, ScoredCandidate, ScoreTest
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.noise import weights
+from dynssm_ros.arrays import Indices
+from dynssm_ros.identification.candidates import SIZE_GRID_UNITS, Candidate, Responses, ScoredCandidate, ScoreTest
+from dynssm_ros.identification.car import CarEstimate, Values
+from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
+from dynssm_ros.identification.problem import unit as unit_of
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS
 
@@ -24,7 +29,7 @@ _REFINED = 4  # of them are fitted in full
 _SHORTLIST_SHARE = 0.15  # of the best scored, that another one must reach to be fitted in full
 _NEAR_BEST_SHARE = 0.9  # of the best evidence, near which others are fitted to the end as well
 _MAX_CAUSES = 4  # effects
-_FOLDS = 5
+_ALIKE = 0.1  # logarithm of a ratio of inflations
 _WARM_STARTS = 3  # times that nominal values make room for an effect before it is fitted
 _SHARES = (1.6, 1.0, 0.6, 0.3)  # of what linearised errors promise
 
@@ -38,14 +43,19 @@ class Refined:
         fit: with it.
         improvement: decrease of twice the negative logarithm of likelihood and prior, by the errors' true freedom.
         delta_bic: what is left of it when its parameters are paid for.
-        crossed: decrease of the squared error on parts of the data that the fit did not see.
+        confirmation: what it gains on parts of the drive that were left out; ``None``: it was not worth a look.
     """
 
     candidate: Candidate
     fit: Fit
     improvement: float
     delta_bic: float
-    crossed: float
+    confirmation: Confirmation | None = None
+
+    @property
+    def gain(self) -> float:
+        """Logarithm of the predictive likelihood that it gains, nothing where it is not confirmed."""
+        return self.confirmation.total if self.confirmation is not None and self.confirmation.holds else 0.0
 
 
 @dataclass
@@ -78,12 +88,13 @@ class _CandidateStart(NamedTuple):
 
 
 class Search:
-    """Selects effects by the information criterion and by the improvement on parts of the data that were left out.
+    """Selects effects by what they predict on parts of the data that were left out.
 
     Args:
         problem: the windows.
         car: where to start.
         found: the candidates.
+        unit: number of the unit of each window that is left out as a whole, ``(W,)``.
         on_progress: told what is being done.
     """
 
@@ -92,36 +103,42 @@ class Search:
         problem: IdentificationProblem,
         car: CarEstimate,
         found: Sequence[Candidate],
+        unit: Indices,
         on_progress: OnProgress = lambda words: None,
     ) -> None:
-        self._study, self.found, self._report = problem, list(found), on_progress
+        self._study, self._given, self.found, self._report = problem, car, list(found), on_progress
+        self._unit = unit
         self._price = np.log(3.0 * problem.windows.steps * len(problem.windows))
         on_progress("recalibrating the nominal car")
-        self.base = problem.fit(car, ())
+        self.base = problem.temper(problem.fit(car, ()))
         self._responses = Responses(problem, self.base.car, self.base.errors)
         self._ranked: dict[frozenset[Candidate], list[Refined]] = {}
         self._fits: dict[frozenset[Candidate], Fit] = {frozenset(): self.base}
+        self._left_out = LeaveOneOut(problem, unit)
         self.tried: dict[str, float] = {}
 
     def run(self) -> Selection:
         """Forward while it pays; then each effect is exchanged against all others, or dropped."""
         chosen: list[Candidate] = []
         while len(chosen) < _MAX_CAUSES:
-            best = next((r for r in self.ranked(tuple(chosen)) if _pays(r)), None)
+            best = max(self._confirmed(tuple(chosen)), key=lambda r: r.gain, default=None)
             if best is None:
                 break
             chosen.append(best.candidate)
             self._exchange(chosen)
+            self._temper(tuple(chosen))
         result: dict[Candidate, Refined] = {}
         dropped = True
         while dropped and chosen:
-            result = {c: self._against(tuple(chosen), c) for c in chosen}
-            weakest = min(chosen, key=lambda c: result[c].delta_bic)
+            result = {
+                c: self._confirm(self._without(tuple(chosen), c), self._against(tuple(chosen), c)) for c in chosen
+            }
+            weakest = min(chosen, key=lambda c: (result[c].gain, result[c].delta_bic))
             dropped = not _pays(result[weakest])
             if dropped:
                 chosen.remove(weakest)
         fit = self.fit(tuple(chosen))
-        ordered = sorted(chosen, key=lambda c: -result[c].delta_bic)
+        ordered = sorted(chosen, key=lambda c: -result[c].gain)
         return Selection(
             self.base,
             fit,
@@ -174,6 +191,29 @@ class Search:
         self._ranked[key] = sorted(refined, key=lambda r: -r.delta_bic)
         return self._ranked[key]
 
+    def _confirmed(self, before: tuple[Candidate, ...]) -> list[Refined]:
+        """The candidates beside ``before`` that hold where they were not fitted."""
+        without = self.fit(before)
+        worth = [r for r in self.ranked(before) if r.delta_bic > DECISIVE_DELTA_BIC]
+        return [r for r in (self._confirm(without, r) for r in worth) if _pays(r)]
+
+    def _confirm(self, without: Fit, refined: Refined) -> Refined:
+        self._report(f"leaving parts out: {refined.candidate.effect}")
+        return replace(refined, confirmation=self._left_out.compare(without, refined.fit))
+
+    def _temper(self, chosen: tuple[Candidate, ...]) -> None:
+        """Weighs the data anew, as the errors hang together now that ``chosen`` are known."""
+        fit = self.fit(chosen)
+        inflation = self._study.inflation(fit)
+        if abs(np.log(inflation / self._study.tempering)) < _ALIKE:
+            return
+        self._study.tempering = inflation
+        self._ranked, self._left_out = {}, LeaveOneOut(self._study, self._unit)
+        self._fits = {
+            frozenset(): self._study.fit(self.base.car, (), self.base),
+            frozenset(chosen): self._study.fit(fit.car, fit.free, fit),
+        }
+
     def _polish(self, before: frozenset[Candidate], without: Fit, rough: Refined) -> Refined:
         """The same, fitted to the end."""
         key = before | {rough.candidate}
@@ -182,7 +222,7 @@ class Search:
         return self._judge(without, self._fits[key], rough.candidate)
 
     def _expected_delta_bic(self, scored: ScoredCandidate) -> float:
-        return float(scored.improvement - self._price * len(scored.candidate.parameters))
+        return float(scored.improvement / self._study.tempering - self._price * len(scored.candidate.parameters))
 
     def _refine(self, fit: Fit, start: _CandidateStart) -> Refined:
         candidate = start.candidate
@@ -194,7 +234,8 @@ class Search:
         """Where to fit from, and what is reached there.
 
         What linearised errors promise is too much where an effect grows faster than its size, and too little where the
-        nominal values have hidden it: so several sizes are tried, as they are and with the nominal values moved along.
+        nominal values have hidden it: so several sizes are tried, as they are and with the nominal values moved along, from
+        where they are and from where the vehicle file has them.
         """
         candidate, cars = scored.candidate, []
         for share in _SHARES:
@@ -204,6 +245,7 @@ class Search:
                 wanted = about.neutral + share * (values[name] - about.neutral)
                 values[name] = float(np.clip(wanted, about.lower, about.upper))
             cars.append(near.car.with_effect(candidate.effect, values))
+        cars += self._from_the_file(near, candidate, scored.values)
         warm_started = cars
         for _ in range(_WARM_STARTS):
             warm_started = some.warm_started(warm_started, near)
@@ -212,15 +254,25 @@ class Search:
             some.objective(errors, position(car, free), near.noise)
             for car, errors in zip(cars, some.errors_of(cars), strict=True)
         ]
-        improvement = (near.objective - min(reached)) * len(self._study.windows) / len(some.windows)
-        expected_delta_bic = improvement - self._price * len(candidate.parameters)
+        expected_delta_bic = near.objective - min(reached) - self._price * len(candidate.parameters)
         return _CandidateStart(candidate, cars[int(np.argmin(reached))], expected_delta_bic)
 
+    def _from_the_file(self, near: Fit, candidate: Candidate, values: Values) -> list[CarEstimate]:
+        """Cars with the nominal values of the file, and the effect in all sizes."""
+        if candidate.local or len(candidate.amplitudes) > 1:
+            return []
+        (name,), effect = candidate.amplitudes, candidate.effect
+        about = EFFECTS[effect].PARAMETERS[name]
+        sizes = sorted({sign * size for sign in (-1.0, 1.0) for size in SIZE_GRID_UNITS})
+        wanted = {float(np.clip(about.neutral + k * unit_of(effect, name), about.lower, about.upper)) for k in sizes}
+        given = replace(near.car, moved=self._given.moved)
+        return [given.with_effect(effect, values | {name: value}) for value in sorted(wanted - {about.neutral})]
+
     def _judge(self, without: Fit, fit: Fit, candidate: Candidate) -> Refined:
-        inflation = self._study.inflation(fit, len(fit.free) - len(without.free))
-        improvement = (without.objective - fit.objective) / inflation
+        own = self._study.inflation(fit, len(fit.free) - len(without.free))
+        improvement = (without.objective - fit.objective) * min(1.0, self._study.tempering / own)
         delta = improvement - self._price * (len(fit.free) - len(without.free))
-        return Refined(candidate, fit, improvement, delta, self._crossed(without, fit))
+        return Refined(candidate, fit, improvement, delta)
 
     def _against(self, chosen: tuple[Candidate, ...], one: Candidate) -> Refined:
         """What ``one`` is worth among ``chosen``."""
@@ -252,40 +304,10 @@ class Search:
     def _alternatives(self, chosen: tuple[Candidate, ...], one: Candidate) -> list[str]:
         rest = tuple(c for c in chosen if c != one)
         self._without(chosen, one)
-        own = self._against(chosen, one).delta_bic
-        return [
-            r.candidate.effect
-            for r in self.ranked(rest)
-            if r.candidate.effect != one.effect and r.delta_bic > own - AMBIGUITY_DELTA_BIC and _pays(r)
-        ]
-
-    def _crossed(self, without: Fit, fit: Fit) -> float:
-        """How much less the squared error is where the parameters were not fitted: every n-th part of the time in turn.
-
-        What is seen once, as one pass over a place, does not count: it has to repeat. The place itself stays where it was
-        found: parts without it would move it anywhere. What is known of the nominal values counts as a measurement beside
-        them: it is all that tells more drag from a badly known C_r2.
-        """
-        parts = self._study.block * _FOLDS // (self._study.block.max() + 1)
-        return self._left_out(without, fit, parts) - self._left_out(fit, fit, parts)
-
-    def _left_out(self, fit: Fit, noise_of: Fit, parts: npt.NDArray[np.intp]) -> float:
-        white = noise_of.noise.whiten(fit.errors)
-        root = np.sqrt(weights(noise_of.noise.whiten(noise_of.errors)))
-        shapes = [EFFECTS[effect].PARAMETERS[name].shape for effect, name in fit.free]
-        moving = np.flatnonzero(~np.array([False] * len(fit.car.moved) + shapes))
-        J = noise_of.noise.whiten(fit.jacobian[..., moving]) * root[:, None, None]
-        r = white * root[:, None]
-        p = fit.position[moving]
-        known = self._study.prior_precision(p)
-        H = [np.tensordot(J[parts == f], J[parts == f], ([0, 1], [0, 1])) for f in range(_FOLDS)]
-        g = [np.einsum("wnp,wn->p", J[parts == f], r[parts == f]) for f in range(_FOLDS)]
-        total = 0.0
-        for f in range(_FOLDS):
-            step = -np.linalg.solve(sum(H) - H[f] + np.diag(known), sum(g) - g[f] + known * p)
-            total += float(((r[parts == f] + J[parts == f] @ step) ** 2).sum())
-        return total + float(known @ p**2)
+        fit = self.fit(chosen)
+        others = [r for r in self._confirmed(rest) if r.candidate.effect != one.effect]
+        return [r.candidate.effect for r in others if self._left_out.compare(r.fit, fit).alike]
 
 
 def _pays(refined: Refined) -> bool:
-    return refined.delta_bic > DECISIVE_DELTA_BIC and refined.crossed > 0
+    return refined.delta_bic > DECISIVE_DELTA_BIC and refined.gain > 0

@@ -6,7 +6,7 @@ Names and units are the paper's (Table I); a file is checked completely when it 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ COEFFICIENT_UNITS: dict[str, str] = {
 }  # fmt: skip
 COEFFICIENTS: tuple[str, ...] = Coefficients._fields
 assert tuple(COEFFICIENT_UNITS) == COEFFICIENTS
+_DRAWN = 1e-4
 
 
 class Coefficient(StrictModel):
@@ -115,6 +116,11 @@ class Vehicle(StrictModel):
     )
     inputs: InputLimits
     coefficients: dict[str, Coefficient]
+    correlation: tuple[tuple[float, ...], ...] | None = Field(
+        default=None,
+        description="of what is known of the coefficients, in their order: row k has the correlations with the k before it. "
+        "null: their standard deviations are independent",
+    )
     effects: tuple[EffectEntry, ...] = ()
 
     @field_validator("coefficients")
@@ -127,6 +133,18 @@ class Vehicle(StrictModel):
         if unknown:
             raise ValueError(f"unknown {', '.join(unknown)}; expected {' '.join(COEFFICIENTS)}")
         return {name: value[name] for name in COEFFICIENTS}
+
+    @field_validator("correlation")
+    @classmethod
+    def _correlations(cls, value: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
+        if value is not None:
+            if [len(row) for row in value] != list(range(len(COEFFICIENTS))):
+                raise ValueError(
+                    f"{len(value)} rows; expected {len(COEFFICIENTS)}, of which row k has k numbers, from 0"
+                )
+            if np.linalg.eigvalsh(_symmetric(value)).min() <= 0:
+                raise ValueError("not positive definite; expected correlations of the coefficients")
+        return value
 
     @field_validator("effects")
     @classmethod
@@ -165,15 +183,27 @@ class Vehicle(StrictModel):
         """The effects of the file, ready to act."""
         return tuple(build_effect(entry.name, entry.parameters) for entry in self.effects)
 
-    def with_nominal(self, nominal: Vector, std: Vector | None = None) -> Vehicle:
-        """The same car with other nominal values and, if given, what is known of them."""
+    @property
+    def known_correlation(self) -> Vector:
+        """Correlation of what is known of the coefficients, ``(17, 17)``."""
+        return np.eye(len(COEFFICIENTS)) if self.correlation is None else _symmetric(self.correlation)
+
+    def with_nominal(self, nominal: Vector, std: Vector | None = None, correlation: Vector | None = None) -> Vehicle:
+        """The same car with other nominal values and, if given, what is known of them.
+
+        Args:
+            nominal: ``(17,)``.
+            std: standard deviations ``(17,)``; ``None``: what was known before.
+            correlation: ``(17, 17)``; ``None``: with ``std`` they are independent.
+        """
         coefficients = {
             name: self.coefficients[name].model_copy(
                 update={"nominal": float(nominal[k])} | ({} if std is None else {"std": float(std[k])})
             )
             for k, name in enumerate(COEFFICIENTS)
         }
-        return self.model_copy(update={"coefficients": coefficients})
+        known = {} if std is None else {"correlation": None if correlation is None else _rows(correlation)}
+        return self.model_copy(update={"coefficients": coefficients} | known)
 
     def unmeasured(self) -> Vehicle:
         """The same car of which nothing but the bounds is known: values in their middle, no standard deviations."""
@@ -181,7 +211,7 @@ class Vehicle(StrictModel):
             name: c.model_copy(update={"nominal": sum(c.bounds) / 2, "std": None})
             for name, c in self.coefficients.items()
         }
-        return self.model_copy(update={"coefficients": coefficients})
+        return self.model_copy(update={"coefficients": coefficients, "correlation": None})
 
     def with_effect(self, name: str, parameters: dict[str, float]) -> Vehicle:
         """The same car with one more effect.
@@ -209,6 +239,21 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
         ConfigurationError: not found, malformed, incomplete or out of bounds.
     """
     return configuration.load(Vehicle, "vehicles", name_or_path)
+
+
+def _symmetric(rows: Sequence[Sequence[float]]) -> Vector:
+    """The correlation matrix of which ``rows`` are below the diagonal."""
+    matrix = np.eye(len(rows))
+    for k, row in enumerate(rows):
+        matrix[k, :k] = matrix[:k, k] = row
+    return matrix
+
+
+def _rows(correlation: Vector) -> tuple[tuple[float, ...], ...]:
+    """What is below the diagonal, rounded, and drawn to independence by so much that it stays positive definite."""
+    return tuple(
+        tuple(round((1.0 - _DRAWN) * float(value), 6) for value in row[:k]) for k, row in enumerate(correlation)
+    )
 
 
 def save_vehicle(vehicle: Vehicle, path: str | Path, comment: str = "") -> None:

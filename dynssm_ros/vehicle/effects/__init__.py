@@ -23,7 +23,7 @@ from dynssm_ros.vehicle.effects.base import (
 from dynssm_ros.vehicle.effects.drivetrain import LockedDifferential
 from dynssm_ros.vehicle.effects.environment import Crosswind, RoadBank, RoadGrade
 from dynssm_ros.vehicle.effects.inertia import Mass, YawInertia
-from dynssm_ros.vehicle.effects.loads import Downforce, LoadTransfer
+from dynssm_ros.vehicle.effects.loads import Downforce, LoadSensitivity, LoadTransfer
 from dynssm_ros.vehicle.effects.longitudinal import Drag, DriveGain, RollingResistance
 from dynssm_ros.vehicle.effects.measurement import (
     OdometryDelay,
@@ -76,7 +76,7 @@ for _effect in (
         Drag, RollingResistance, DriveGain,
         Mass, YawInertia,
         FrontGrip, RearGrip,
-        Downforce, LoadTransfer,
+        Downforce, LoadSensitivity, LoadTransfer,
         TireRelaxation, CombinedSlip,
         RoadBank, RoadGrade, Crosswind,
         GripDrift, GripPatch,

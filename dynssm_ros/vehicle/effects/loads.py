@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from dynssm_ros.vehicle.effects.base import Effect, Parameter
-from dynssm_ros.vehicle.single_track import Array, Constants, Motion
+from dynssm_ros.vehicle.single_track import Array, Constants, Motion, at_least
+
+_LEAST_LOAD = 0.05  # of the nominal axle load
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,30 @@ class Downforce(Effect):
         pressed = self.coefficient * q.v_x * q.v_x
         q.F_zf = q.F_zf + self.balance * pressed
         q.F_zr = q.F_zr + (1.0 - self.balance) * pressed
+
+
+@dataclass(frozen=True)
+class LoadSensitivity(Effect):
+    """``F_y (F_z / F_z0)^(exponent - 1)``: with 1 the lateral force is in proportion to the axle load."""
+
+    NAME = "load_sensitivity"
+    SUMMARY = "The tyres do not gain lateral force in proportion to their load."
+    ADVICE = "Take the tyres' load sensitivity into the vehicle file, from the maker's data or from these laps."
+    MANOEUVRE = "cornering at the limit while braking and driving, and at low and at high speed"
+    PARAMETERS = {"exponent": Parameter("1", 0.0, 2.0, 1.0)}
+    TYPICAL = (0.12, 0.6)
+    DIRECTIONS = (-1.0,)  # as tyres are
+    exponent: Array = 1.0
+
+    @classmethod
+    def unusable(cls, constants: Constants) -> str | None:
+        """Loads must change."""
+        return None if constants.load_transfer else "load_transfer false; expected axle loads that change"
+
+    def tyres(self, xp: Any, q: Motion) -> None:
+        """Scales the lateral forces."""
+        q.F_fy = q.F_fy * at_least(q.F_zf / q.F_z0, _LEAST_LOAD) ** (self.exponent - 1.0)
+        q.F_ry = q.F_ry * at_least(q.F_zr / q.F_z0, _LEAST_LOAD) ** (self.exponent - 1.0)
 
 
 @dataclass(frozen=True)
