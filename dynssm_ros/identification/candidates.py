@@ -6,7 +6,7 @@ A local effect's response is the global response times a window over the lap, so
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -17,7 +17,7 @@ from dynssm_ros.identification.car import CarEstimate, Values
 from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, unit
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
-from dynssm_ros.vehicle.effects.base import section
+from dynssm_ros.vehicle.effects.base import LAP, section
 
 SIZE_GRID_UNITS = (6.0, 1.5, 0.375, 0.094, 0.023)  # units: sizes at which effects are tried, a factor of 4 apart
 _LOCAL_SIZE_UNITS = 1.5  # unit at which effects are tried that act somewhere on the lap
@@ -77,11 +77,15 @@ class ScoredCandidate:
     improvement: float
 
 
-def candidates(problem: IdentificationProblem, car: CarEstimate) -> tuple[list[Candidate], dict[str, str]]:
+def candidates(
+    problem: IdentificationProblem, car: CarEstimate, excluded: Collection[str] = ()
+) -> tuple[list[Candidate], dict[str, str]]:
     """The effects that can be tried, and for those that cannot, why."""
     found, left = [], {}
     have = set(problem.windows.data.context)
     for name, effect in EFFECTS.items():
+        if name in excluded:
+            continue
         reason = effect.unusable(car.vehicle.constants)
         if reason is not None:
             left[name] = reason
@@ -90,6 +94,8 @@ def candidates(problem: IdentificationProblem, car: CarEstimate) -> tuple[list[C
             left[name] = "the vehicle file has it already"
             continue
         usable = [v for v in effect.variants() if set(effect.signals(v)) <= have]
+        if set(LAP) <= have:
+            usable = [v for v in usable if v not in effect.OPEN_ROAD]
         found += [Candidate(name, variant) for variant in usable]
         if not usable:
             left[name] = f"the recording has no {', '.join(s for s in effect.signals() if s not in have)}"

@@ -19,6 +19,7 @@ from dynssm_ros.identification.noise import Noise, NoiseResponse
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
 from dynssm_ros.vehicle.effects import EFFECTS
 
+_KNOWN = 2.0  # standard errors that the nominal values must be spared, where left-out units tell nothing
 _ROUNDS = 4  # of linearising anew, from the fit of all
 
 
@@ -62,7 +63,10 @@ class Confirmation:
         """
         if self.total <= self.std:
             return False
-        return 2 * int((self.gain > 0).sum()) > len(self.gain) or self.known > self.std >= -self.gain.sum()
+        told = float(self.gain.sum())
+        if told > self.std:
+            return 2 * int((self.gain > 0).sum()) > len(self.gain)
+        return told > -self.std and self.known > _KNOWN * self.std
 
     @property
     def alike(self) -> bool:
@@ -93,17 +97,17 @@ class LeaveOneOut:
         return Confirmation(gain, std, known, 1.0 - left)
 
     def _predicted(self, fit: Fit) -> _Predicted:
-        """Of each window by the fit without its unit; the place of a local effect stays where it was found."""
+        """Of each window by the fit without its unit; noise and the place of a local effect stay as they were found."""
         if id(fit) not in self._known:
             shaping = [k for k, (effect, name) in enumerate(fit.free) if EFFECTS[effect].PARAMETERS[name].shape]
             likelihood, error = np.empty(len(self._unit)), np.empty((len(self._unit), 3))
             for number in range(int(self._unit.max()) + 1):
                 out = self._unit == number
                 rest, near = _part(self._problem, fit, ~out, shaping)
-                found = rest.fit(near.car, near.free, near, _ROUNDS, rough=True)
+                found = rest.fit(near.car, near.free, near, _ROUNDS, rough=True, noise=near.noise)
                 unseen = _part(self._problem, fit, out, shaping)[0]
                 errors = unseen.errors(found.car)
-                likelihood[out] = unseen.log_likelihood(errors, Noise(unseen.spread, found.noise.v))
+                likelihood[out] = unseen.log_likelihood(errors, Noise(unseen.spread, fit.noise.v))
                 error[out] = errors[:, -3:] ** 2
             self._known[id(fit)] = fit, _Predicted(likelihood, error)
         return self._known[id(fit)][1]

@@ -67,7 +67,7 @@ def search_causes(
     fits = {first[0].integrator: fit, other[0].integrator: beside}
     if _by_euler(fits["rk4"], fits["euler"]) == (first is euler):
         return found
-    return _search(other[0], car, unit, on_progress)
+    return _search(other[0], car, unit, on_progress, fit)
 
 
 def _by_euler(runge_kutta: Fit, euler: Fit) -> bool:
@@ -75,12 +75,16 @@ def _by_euler(runge_kutta: Fit, euler: Fit) -> bool:
 
 
 def _search(
-    windows: SimulationWindows, car: CarEstimate, unit: Indices, on_progress: Callable[[str], None]
+    windows: SimulationWindows,
+    car: CarEstimate,
+    unit: Indices,
+    on_progress: Callable[[str], None],
+    start: Fit | None = None,
 ) -> SearchResult:
     problem = IdentificationProblem(windows, car)
     found, impossible = candidates(problem, car)
     search = Search(problem, car, found, unit, on_progress)
-    return SearchResult(problem, search, search.run(), impossible)
+    return SearchResult(problem, search, search.run(start), impossible)
 
 
 def _stepped(windows: SimulationWindows, car: CarEstimate, integrator: Integrator) -> tuple[SimulationWindows, Fit]:

@@ -184,9 +184,15 @@ class IdentificationProblem:
         return float(moved @ fit.car.prior_precision @ moved)
 
     def fit(
-        self, car: CarEstimate, free: Free, near: Fit | None = None, rounds: int = _ROUNDS, rough: bool = False
+        self,
+        car: CarEstimate,
+        free: Free,
+        near: Fit | None = None,
+        rounds: int = _ROUNDS,
+        rough: bool = False,
+        noise: Noise | None = None,
     ) -> Fit:
-        """Levenberg-Marquardt from ``car``; the noise is fitted along.
+        """Levenberg-Marquardt from ``car``; the noise is fitted along, unless it is given.
 
         Derivatives by the nominal values hardly change, so they are those of a fit nearby while they keep what they promise
         and until it has settled with them.
@@ -197,10 +203,11 @@ class IdentificationProblem:
             near: a fit of a like car, whose derivatives serve to begin with.
             rounds: of linearising anew, at most.
             rough: whether it may end with the derivatives of ``near``.
+            noise: under which it is fitted.
         """
         car = with_values(car, free, position(car, free))
-        errors, n = self.errors(car), len(car.moved)
-        noise = self.noise(errors)
+        errors, n, given = self.errors(car), len(car.moved), noise is not None
+        noise = self.noise(errors) if noise is None else noise
         p = position(car, free)
         lower, upper = limits(car, free)
         best = self.objective(errors, p, noise)
@@ -223,7 +230,7 @@ class IdentificationProblem:
                     promised = -float(2 * g @ step + step @ H @ step)
                     gained = best - value
                     car, errors, p = other, there, position(other, free)
-                    if gained > _CONVERGED:
+                    if gained > _CONVERGED and not given:
                         noise = self.noise(errors)
                     best = self.objective(errors, p, noise)
                     break

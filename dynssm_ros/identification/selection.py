@@ -29,6 +29,8 @@ _REFINED = 4  # of them are fitted in full
 _SHORTLIST_SHARE = 0.15  # of the best scored, that another one must reach to be fitted in full
 _NEAR_BEST_SHARE = 0.9  # of the best evidence, near which others are fitted to the end as well
 _MAX_CAUSES = 4  # effects
+_WORTH_A_LOOK = 0.3  # of the best by the criterion, that another must reach to be tried on parts that are left out
+_SURE = 3.0  # standard deviations that a cause must be off neutral
 _ALIKE = 0.1  # logarithm of a ratio of inflations
 _WARM_STARTS = 3  # times that nominal values make room for an effect before it is fitted
 _SHARES = (1.6, 1.0, 0.6, 0.3)  # of what linearised errors promise
@@ -44,6 +46,7 @@ class Refined:
         improvement: decrease of twice the negative logarithm of likelihood and prior, by the errors' true freedom.
         delta_bic: what is left of it when its parameters are paid for.
         confirmation: what it gains on parts of the drive that were left out; ``None``: it was not worth a look.
+        sure: by how many standard deviations one of its amplitudes is off neutral.
     """
 
     candidate: Candidate
@@ -51,6 +54,7 @@ class Refined:
     improvement: float
     delta_bic: float
     confirmation: Confirmation | None = None
+    sure: float = 0.0
 
     @property
     def gain(self) -> float:
@@ -117,9 +121,13 @@ class Search:
         self._left_out = LeaveOneOut(problem, unit)
         self.tried: dict[str, float] = {}
 
-    def run(self) -> Selection:
-        """Forward while it pays; then each effect is exchanged against all others, or dropped."""
-        chosen: list[Candidate] = []
+    def run(self, start: Fit | None = None) -> Selection:
+        """Forward while it pays; then each effect is exchanged against all others, or dropped.
+
+        Args:
+            start: a fit of a like problem, whose effects are taken as chosen.
+        """
+        chosen = self._taken_over(start)
         while len(chosen) < _MAX_CAUSES:
             best = max(self._confirmed(tuple(chosen)), key=lambda r: r.gain, default=None)
             if best is None:
@@ -191,15 +199,36 @@ class Search:
         self._ranked[key] = sorted(refined, key=lambda r: -r.delta_bic)
         return self._ranked[key]
 
+    def _taken_over(self, start: Fit | None) -> list[Candidate]:
+        """The candidates of another problem's fit, fitted here."""
+        if start is None or not start.free:
+            return []
+        effects = dict.fromkeys(effect for effect, _ in start.free)
+        chosen = [Candidate(name, tuple(p for effect, p in start.free if effect == name)) for name in effects]
+        self._fits[frozenset(chosen)] = self._study.fit(start.car, start.free)
+        self._temper(tuple(chosen))
+        return chosen
+
     def _confirmed(self, before: tuple[Candidate, ...]) -> list[Refined]:
         """The candidates beside ``before`` that hold where they were not fitted."""
         without = self.fit(before)
-        worth = [r for r in self.ranked(before) if r.delta_bic > DECISIVE_DELTA_BIC]
-        return [r for r in (self._confirm(without, r) for r in worth) if _pays(r)]
+        ranked = self.ranked(before)
+        least = max([DECISIVE_DELTA_BIC, *(_WORTH_A_LOOK * r.delta_bic for r in ranked[:1])])
+        return [r for r in (self._confirm(without, r) for r in ranked if r.delta_bic > least) if _pays(r)]
 
     def _confirm(self, without: Fit, refined: Refined) -> Refined:
         self._report(f"leaving parts out: {refined.candidate.effect}")
-        return replace(refined, confirmation=self._left_out.compare(without, refined.fit))
+        confirmation = self._left_out.compare(without, refined.fit)
+        return replace(refined, confirmation=confirmation, sure=self._sure(refined))
+
+    def _sure(self, refined: Refined) -> float:
+        fit, effect = refined.fit, refined.candidate.effect
+        off = np.abs(fit.position) / np.sqrt(np.diag(self._study.covariance(fit)))
+        first = len(fit.position) - len(fit.free)
+        amplitudes = [
+            k for k, pair in enumerate(fit.free) if pair[0] == effect and pair[1] in refined.candidate.amplitudes
+        ]
+        return float(max(off[first + k] for k in amplitudes))
 
     def _temper(self, chosen: tuple[Candidate, ...]) -> None:
         """Weighs the data anew, as the errors hang together now that ``chosen`` are known."""
@@ -310,4 +339,4 @@ class Search:
 
 
 def _pays(refined: Refined) -> bool:
-    return refined.delta_bic > DECISIVE_DELTA_BIC and refined.gain > 0
+    return refined.delta_bic > DECISIVE_DELTA_BIC and refined.gain > 0 and refined.sure > _SURE

@@ -20,11 +20,12 @@ from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.single_track import Integrator, settled_effect_states, settling_rate, step_with_effect_states
 
+_LONGEST = 1.5  # integration step, times the rate at which the linear car settles
 _FINEST = 16  # integration steps per sampling time, at most
 WARM_UP = 0.64  # s of measured rows along which a simulation is led before it runs free
 _FOLLOWING = 0.16  # s, time constant with which a simulation that is led follows the measured rows
 _COMPARED = 13  # rows of each simulation, at most: more hang together
-_MAX_WINDOWS = 500  # windows in a fit, evenly spread: more would cost time and tell little
+_MAX_WINDOWS = 300  # windows in a fit, evenly spread: more would cost time and tell little
 _MEASURED = 3000  # windows in held-out rows
 _LEAST = 24  # windows with which a fit can begin
 _WILD = 1e3  # a prediction farther off than this many spreads of its channel counts as that far
@@ -83,13 +84,13 @@ class SimulationWindows:
     def with_integrator(self, integrator: Integrator, vehicle: Vehicle) -> SimulationWindows:
         """The same simulations in Euler steps of the sampling time, or in Runge-Kutta steps that are short enough.
 
-        A step is at most the inverse of the rate at which the linear car settles; see :func:`settling_rate`.
+        A step is at most 1.5 times the inverse of the rate at which the linear car settles; see :func:`settling_rate`.
         """
         if integrator == "euler":
             return replace(self, integrator=integrator, substeps=1)
         slow = max(float(np.quantile(self.data.rows[0, self.starts], 0.05)), 0.1)
         rate = settling_rate(Coefficients(*vehicle.nominal), vehicle.constants) / slow
-        count = int(np.clip(np.ceil(self.data.T_s * rate), 1, _FINEST))
+        count = int(np.clip(np.ceil(self.data.T_s * rate / _LONGEST), 1, _FINEST))
         return replace(self, integrator=integrator, substeps=count)
 
     @cached_property

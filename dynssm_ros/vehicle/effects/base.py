@@ -90,6 +90,7 @@ class Effect(StageEffect):
         MANOEUVRE: the driving that shows it best.
         PARAMETERS: the parameters by name.
         VARIANTS: sets of parameters to be fitted together, the simplest first; empty: all of them.
+        OPEN_ROAD: those of them that cannot be on a closed lap.
         EFFECT_STATES: names of its own states. :func:`lagged` settles and integrates them.
         SENSOR: it changes what the sensors show; the car moves as without it.
         TYPICAL: how far it is off neutral in a car that is badly set up: just noticeable in ordinary laps, and large.
@@ -102,6 +103,7 @@ class Effect(StageEffect):
     MANOEUVRE: ClassVar[str] = ""
     PARAMETERS: ClassVar[dict[str, Parameter]] = {}
     VARIANTS: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    OPEN_ROAD: ClassVar[tuple[tuple[str, ...], ...]] = ()
     EFFECT_STATES: ClassVar[tuple[str, ...]] = ()
     SENSOR: ClassVar[bool] = False
     TYPICAL: ClassVar[tuple[float, float]] = (0.0, 0.0)

@@ -88,11 +88,19 @@ class RoadGrade(RoadAngle):
     ADVICE = "Map the height of the track and give the model its slope."
     MANOEUVRE = "the same stretch with and without throttle"
     PARAMETERS = RoadAngle.PARAMETERS
+    VARIANTS = (("angle",), _SECTION, _WAVES)
+    OPEN_ROAD = (("angle",),)
     TYPICAL = (0.005, 0.05)
 
     def forces(self, xp: Any, q: Motion) -> None:
         """Adds the weight's part along the car."""
         q.F_x = q.F_x - q.m * GRAVITY * xp.sin(self.here(xp, q))
+
+    @classmethod
+    def drawn(cls, amount: float, rng: np.random.Generator) -> dict[str, float]:
+        """A wave over the lap with that amplitude: what climbs falls again."""
+        direction = float(rng.uniform(0, 2 * math.pi))
+        return {"cos_1": amount * math.cos(direction), "sin_1": amount * math.sin(direction)}
 
 
 @dataclass(frozen=True)
