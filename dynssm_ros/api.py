@@ -7,7 +7,7 @@ printed; ``on_progress`` is called with what is done and what there is to do. Wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -383,6 +383,7 @@ def diagnose(
     track: Track | PathLike | None = None,
     commands: Commands | None = None,
     on_progress: Callable[[str], None] | None = None,
+    exclude: Collection[str] = (),
 ) -> Diagnosis:
     """Finds out what the simulation gets wrong about measured laps, and why.
 
@@ -396,6 +397,7 @@ def diagnose(
         track: from whose start positions on the lap are counted; if not given, the first full lap.
         commands: source of the command inputs; the recording's own if not given.
         on_progress: called with what is being done.
+        exclude: names of effects that are impossible there, such as wind in a hall.
 
     Example:
         >>> hidden = {"steering_offset": {"offset": 0.03}}
@@ -410,7 +412,7 @@ def diagnose(
     line = None if track is None else _track(track).centre
     report = on_progress or (lambda words: None)
     data = _joined(recordings, commands, 0.0)
-    return diagnose(data, _vehicle(vehicle), horizon, holdout, min_speed, integrator, line, report)
+    return diagnose(data, _vehicle(vehicle), horizon, holdout, min_speed, integrator, line, report, exclude)
 
 
 def race(

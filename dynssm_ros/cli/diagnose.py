@@ -44,6 +44,10 @@ def diagnose(
             show_default="the first full lap in the recording",
         ),
     ] = None,
+    exclude: Annotated[
+        list[str] | None,
+        typer.Option(help="Effect that is impossible there, such as crosswind in a hall; repeat for more."),
+    ] = None,
     commands: CommandsOption = None,
     json: JsonOption = None,
 ) -> None:
@@ -55,7 +59,7 @@ def diagnose(
         steps = itertools.count(1)
         result = api.diagnose(
             list(recordings), vehicle, horizon, holdout, min_speed, integrator, track, commands,
-            lambda words: progress(min(next(steps), 39), 40, words),
+            lambda words: progress(min(next(steps), 39), 40, words), exclude or (),
         )  # fmt: skip
     path = out / "vehicle.yaml"
     about = f"{result.car.vehicle.name}, extended by a diagnosis of {result.protocol['Recording']}: {result.verdict}."

@@ -17,7 +17,7 @@ from dynssm_ros.vehicle.parameters import VehicleConstants
 
 Values = dict[str, float]
 
-MASS_STD = 0.01  # of the mass: vehicle files do not say how well it was weighed
+MASS_STD = 0.01  # of the mass, where the vehicle file does not say how well it was weighed
 _LIGHTEST = 0.1  # of the nominal mass
 _ON_BOUND = 1e-3  # of the range, that a nominal value keeps from its bounds
 
@@ -40,8 +40,11 @@ class CarEstimate:
     mass_std: float = MASS_STD
 
     @classmethod
-    def of(cls, vehicle: Vehicle, mass_std: float = MASS_STD) -> CarEstimate:
-        """The car as the vehicle file has it."""
+    def of(cls, vehicle: Vehicle, mass_std: float | None = None) -> CarEstimate:
+        """The car as the vehicle file has it, with the standard deviation of the mass that it states if not given."""
+        if mass_std is None:
+            weighed = vehicle.constants.m_std
+            mass_std = MASS_STD if weighed is None else weighed / vehicle.constants.m
         return cls(vehicle, np.zeros(len(COEFFICIENTS) + 1), {}, mass_std)
 
     def at(self, theta: Vector) -> CarEstimate:

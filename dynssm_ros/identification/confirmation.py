@@ -56,7 +56,7 @@ class Confirmation:
 
     @property
     def holds(self) -> bool:
-        """Whether the gain is more than its standard error, and there in most units.
+        """Whether the gain is more than its standard error, and there in half of the units or more.
 
         More mass, say, predicts no better than less drive and less drag. What tells them apart is that the car was weighed:
         then it is enough that nothing speaks against the cause elsewhere.
@@ -65,7 +65,7 @@ class Confirmation:
             return False
         told = float(self.gain.sum())
         if told > self.std:
-            return 2 * int((self.gain > 0).sum()) > len(self.gain)
+            return 2 * int((self.gain > 0).sum()) >= len(self.gain)
         return told > -self.std and self.known > _KNOWN * self.std
 
     @property

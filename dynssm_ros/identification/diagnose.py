@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -11,6 +11,7 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.confirmation import Confirmation
 from dynssm_ros.identification.improvement import Improvement, measure_improvement
 from dynssm_ros.identification.integrator import SearchResult, search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
@@ -30,7 +31,7 @@ from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, require_context
 from dynssm_ros.vehicle.single_track import Integrator
 
@@ -39,6 +40,9 @@ Verdict = Literal["effects", "none", "unexplained"]
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
 _LEAST_LAPS = 3  # with which whole laps are held out
+_NO_WORSE = 0.01  # of the error on held-out laps, that the extended car may be worse than the recalibrated one
+_MOVED = 3.0  # standard deviations beyond which recalibration is a finding
+_AT = 1e-3  # of the span, nearer to a bound than which an estimate is on it
 _PARTS = 4  # of the time, where there are no laps
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
@@ -54,6 +58,8 @@ class Cause:
         improvement: decrease of twice the negative log-likelihood by it.
         delta_bic: what is left when its parameters are paid for.
         heldout_gain: share of the error on the held-out rows that is gone by it.
+        confirmation: what it gains on parts of the fitted rows that were left out.
+        on_bound: its parameters that the data push against a bound: they are at least that far off.
         alternatives: effects that explain the data as well.
     """
 
@@ -63,6 +69,8 @@ class Cause:
     improvement: float
     delta_bic: float
     heldout_gain: float
+    confirmation: Confirmation
+    on_bound: tuple[str, ...]
     alternatives: tuple[str, ...]
 
 
@@ -74,6 +82,8 @@ class Diagnosis:
         verdict: ``effects``: causes are named; ``none``: right within noise; ``unexplained``: wrong, and nothing of the
             library says why.
         causes: the strongest first.
+        moved: coefficients, and ``m``, that are now more than three of the stated standard deviations off what the vehicle
+            file has; by name, how many.
         vehicle: the vehicle with effects and refitted nominal values.
         improvement: on the held-out rows.
         left: what is systematic in the errors of the extended car, on the rows of the fit.
@@ -90,6 +100,7 @@ class Diagnosis:
 
     verdict: Verdict
     causes: tuple[Cause, ...]
+    moved: Mapping[str, float]
     vehicle: Vehicle
     improvement: Improvement
     left: ExplainedVariance
@@ -101,6 +112,17 @@ class Diagnosis:
     notes: tuple[str, ...]
     protocol: Mapping[str, str]
     windows: SimulationWindows
+
+    @property
+    def recalibrated(self) -> dict[str, tuple[float, float]]:
+        """What :attr:`moved` names: as the vehicle file has it, and now."""
+        given, now = self.car.vehicle, self.vehicle
+        return {
+            name: (given.constants.m, now.constants.m)
+            if name == "m"
+            else (given.coefficients[name].nominal, now.coefficients[name].nominal)
+            for name in self.moved
+        }
 
     def to_json(self, vehicle_path: str) -> dict[str, Any]:
         """For programs; ``vehicle_path`` is where the extended vehicle was written."""
@@ -120,7 +142,17 @@ class Diagnosis:
                         }
                         for name, value in cause.values.items()
                     },
-                    "evidence": {"delta_bic": cause.delta_bic, "heldout_gain": cause.heldout_gain},
+                    "evidence": {
+                        "delta_bic": cause.delta_bic,
+                        "heldout_gain": cause.heldout_gain,
+                        "left_out": {
+                            "gain": cause.confirmation.total,
+                            "std": cause.confirmation.std,
+                            "units": cause.confirmation.gain.tolist(),
+                            "error_gone": by_channel(cause.confirmation.share),
+                        },
+                    },
+                    "on_bound": list(cause.on_bound),
                     "alternatives": list(cause.alternatives),
                 }
                 for cause in self.causes
@@ -143,6 +175,10 @@ class Diagnosis:
             },
             "noticeable": {
                 effect: size if np.isfinite(size) else None for effect, size in self.minimum_detectable.items()
+            },
+            "moved": {
+                name: {"from": was, "to": now, "standard_deviations": self.moved[name]}
+                for name, (was, now) in self.recalibrated.items()
             },
             "notes": list(self.notes),
             "vehicle": vehicle_path,
@@ -167,6 +203,7 @@ def diagnose(
     integrator: Integrator | None = None,
     line: ClosedLine | None = None,
     on_progress: OnProgress = lambda words: None,
+    exclude: Collection[str] = (),
 ) -> Diagnosis:
     """Finds out what a vehicle file gets wrong about a recording.
 
@@ -179,13 +216,16 @@ def diagnose(
         integrator: of the simulation; ``None``: Runge-Kutta, unless Euler steps are clearly closer to the data.
         line: of the track, from which positions on the lap are counted; ``None``: the first full lap of the recording.
         on_progress: told what is being done.
+        exclude: names of effects that are impossible there, such as wind in a hall.
 
     Raises:
         RecordingError: another sampling time than the vehicle's, a constant or missing channel, too few rows.
         ConfigurationError: an effect of the vehicle needs a signal that the recording has not; options out of range.
     """
     at = _prepare(recording, vehicle, horizon, holdout, min_speed, line)
-    found = search_causes(at.fitted, at.car, at.unit, integrator, on_progress)
+    if unknown := sorted(set(exclude) - set(EFFECTS)):
+        raise ConfigurationError(f"exclude {', '.join(unknown)}: no such effect; expected some of {', '.join(EFFECTS)}")
+    found = search_causes(at.fitted, at.car, at.unit, integrator, on_progress, exclude)
     problem, selection, fit = found.problem, found.selection, found.selection.fit
     windows = problem.windows
     at = at._replace(unseen=replace(at.unseen, integrator=windows.integrator, substeps=windows.substeps))
@@ -193,6 +233,15 @@ def diagnose(
     improvement = measure_improvement(
         at.unseen, {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: fit.car}, at.steps
     )
+    if selection.chosen and _worse(improvement):
+        # what was found is no better than moved coefficients where nobody looked
+        named = ", ".join(one.candidate.effect for one in selection.chosen)
+        at.notes.append(f"{named} explained the fitted laps but not the held-out ones, so that nothing of it is kept")
+        selection = replace(selection, fit=selection.base, chosen=[], alternatives={})
+        fit = selection.fit
+        improvement = measure_improvement(
+            at.unseen, {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: fit.car}, at.steps
+        )
     sizes = minimum_detectable(problem, fit, found.search.found)
     limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
     covariance = problem.covariance(fit)
@@ -206,6 +255,7 @@ def diagnose(
     return Diagnosis(
         "effects" if causes else "unexplained" if left.is_there or together.is_there else "none",
         causes,
+        _moved(fit.car),
         extended,
         improvement,
         left,
@@ -218,6 +268,23 @@ def diagnose(
         at.protocol | {"Integrator": windows.integrator},
         windows,
     )
+
+
+def _worse(improvement: Improvement) -> bool:
+    """Whether the extended car errs more than the recalibrated one, in the geometric mean of the channels.
+
+    Causes that a recalibration would make up for, such as more mass for less drive, change nothing but noise.
+    """
+    ratio = improvement.rmse[EXTENDED][improvement.horizon] / np.maximum(
+        improvement.rmse[RECALIBRATED][improvement.horizon], 1e-300
+    )
+    return bool(np.log(np.maximum(ratio, 1e-300)).mean() > _NO_WORSE)
+
+
+def _moved(car: CarEstimate) -> dict[str, float]:
+    """See :attr:`Diagnosis.moved`."""
+    names = (*COEFFICIENTS, "m")
+    return {name: float(by) for name, by in zip(names, car.moved, strict=True) if abs(by) > _MOVED}
 
 
 class _Prepared(NamedTuple):
@@ -293,6 +360,7 @@ def _cause(one: Refined, found: SearchResult, at: _Prepared, std: Vector) -> Cau
         for k, (owner, name) in enumerate(fit.free)
         if owner == effect
     }
+    assert one.confirmation is not None
     other = found.search.leave_out(found.selection, one).car
     errors = [at.unseen.errors(car)[:, at.steps - 1] for car in (other, fit.car)]
     without, with_it = ((e**2).mean(axis=0) for e in errors)
@@ -303,7 +371,20 @@ def _cause(one: Refined, found: SearchResult, at: _Prepared, std: Vector) -> Cau
         one.improvement,
         float(one.delta_bic),
         float(1.0 - np.sqrt((with_it / np.maximum(without, 1e-300)).mean())),
+        one.confirmation,
+        _on_bound(effect, fit.car.effects[effect], known),
         tuple(found.selection.alternatives[effect]),
+    )
+
+
+def _on_bound(effect: str, values: Mapping[str, float], fitted: Collection[str]) -> tuple[str, ...]:
+    """The fitted parameters that are at a bound."""
+    about = EFFECTS[effect].PARAMETERS
+    return tuple(
+        name
+        for name in fitted
+        if not about[name].shape
+        and min(values[name] - about[name].lower, about[name].upper - values[name]) < _AT * about[name].span
     )
 
 

@@ -6,7 +6,7 @@ chance, so that the choice is made anew with the causes that were found.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -46,6 +46,7 @@ def search_causes(
     unit: Indices,
     integrator: Integrator | None,
     on_progress: Callable[[str], None],
+    exclude: Collection[str] = (),
 ) -> SearchResult:
     """Searches for causes.
 
@@ -55,36 +56,31 @@ def search_causes(
         unit: number of the unit of each window that is left out as a whole, ``(W,)``.
         integrator: of the simulation; ``None``: chosen by the data.
         on_progress: told what is being done.
+        exclude: effects that are not tried.
     """
+
+    def search(windows: SimulationWindows, start: Fit | None = None) -> SearchResult:
+        problem = IdentificationProblem(windows, car)
+        found, impossible = candidates(problem, car, exclude)
+        searching = Search(problem, car, found, unit, on_progress)
+        return SearchResult(problem, searching, searching.run(start), impossible)
+
     if integrator is not None:
-        return _search(_stepped(windows, car, integrator)[0], car, unit, on_progress)
+        return search(_stepped(windows, car, integrator)[0])
     on_progress("choosing how the model steps")
     runge_kutta, euler = _stepped(windows, car, "rk4"), _stepped(windows, car, "euler")
     first, other = (euler, runge_kutta) if _by_euler(runge_kutta[1], euler[1]) else (runge_kutta, euler)
-    found = _search(first[0], car, unit, on_progress)
+    found = search(first[0])
     fit = found.selection.fit
     beside = IdentificationProblem(other[0], car, found.problem.tempering).fit(fit.car, fit.free)
     fits = {first[0].integrator: fit, other[0].integrator: beside}
     if _by_euler(fits["rk4"], fits["euler"]) == (first is euler):
         return found
-    return _search(other[0], car, unit, on_progress, fit)
+    return search(other[0], fit)
 
 
 def _by_euler(runge_kutta: Fit, euler: Fit) -> bool:
     return euler.objective < runge_kutta.objective - _CLEARLY
-
-
-def _search(
-    windows: SimulationWindows,
-    car: CarEstimate,
-    unit: Indices,
-    on_progress: Callable[[str], None],
-    start: Fit | None = None,
-) -> SearchResult:
-    problem = IdentificationProblem(windows, car)
-    found, impossible = candidates(problem, car)
-    search = Search(problem, car, found, unit, on_progress)
-    return SearchResult(problem, search, search.run(start), impossible)
 
 
 def _stepped(windows: SimulationWindows, car: CarEstimate, integrator: Integrator) -> tuple[SimulationWindows, Fit]:

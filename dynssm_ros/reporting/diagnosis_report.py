@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.diagnose import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
 from dynssm_ros.identification.residuals import ExplainedVariance
 from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC
@@ -18,6 +19,12 @@ from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS
 from dynssm_ros.vehicle.effects import EFFECTS
 
+_COEFFICIENTS_IN_WORDS = {
+    "D_f": "the front tyres' peak force", "D_r": "the rear tyres' peak force", "C_m1": "the drive force",
+    "C_m2": "what the drive loses with speed", "C_r0": "the rolling resistance", "C_r2": "the drag", "I_z": "the yaw inertia",
+    "S_hf": "the front slip angle's zero", "S_hr": "the rear slip angle's zero", "m": "the mass",
+    "B_f": "the front tyres' stiffness", "B_r": "the rear tyres' stiffness",
+}  # fmt: skip
 _LITTLE = 0.02  # of the squared error; less is not worth a word
 _WIDTH = 110
 
@@ -29,7 +36,11 @@ def as_text(diagnosis: Diagnosis) -> str:
         lines += ["", f"{number}. {cause.effect}: {size_in_words(cause)}"]
         lines += [f"   {line}" for words in _about(cause) for line in textwrap.wrap(words, _WIDTH)]
     lines += ["", *gain_in_words(diagnosis)]
-    for words in (left_in_words(diagnosis), *(f"Note: {note}." for note in diagnosis.notes)):
+    for words in (
+        *moved_in_words(diagnosis),
+        left_in_words(diagnosis),
+        *(f"Note: {note}." for note in diagnosis.notes),
+    ):
         lines += textwrap.wrap(words, _WIDTH)
     return "\n".join(lines)
 
@@ -72,13 +83,29 @@ def left_in_words(diagnosis: Diagnosis) -> str:
     return " ".join(parts)
 
 
+def moved_in_words(diagnosis: Diagnosis) -> list[str]:
+    """What recalibration moved farther than the vehicle file allows for."""
+    sentences = []
+    for name, (was, now) in diagnosis.recalibrated.items():
+        unit = "kg" if name == "m" else COEFFICIENT_UNITS[name]
+        change = f"{abs(now / was - 1):.0%} {'more' if abs(now) > abs(was) else 'less'}" if was * now > 0 else "moved"
+        sentences.append(
+            f"Recalibrated: {_COEFFICIENTS_IN_WORDS.get(name, name)} ({name}) is {text(now)}{'' if unit == '1' else f' {unit}'}, "
+            f"{change} than the vehicle file's {text(was)}: {abs(diagnosis.moved[name]):.0f} of its standard deviations."
+        )
+    return sentences
+
+
 def size_in_words(cause: Cause) -> str:
-    """The parameters with unit and standard deviation."""
+    """The parameters with unit and standard deviation, or a bound that they are at."""
     parts = []
     for name, value in cause.values.items():
         unit = EFFECTS[cause.effect].PARAMETERS[name].unit
         unit = "" if unit == "1" else f" {unit}"
-        spread = f" ± {cause.std[name]:.2g}" if name in cause.std else " (assumed)"
+        if name in cause.on_bound:
+            spread = " or farther from neutral (at its bound)"
+        else:
+            spread = f" ± {cause.std[name]:.2g}" if name in cause.std else " (assumed)"
         parts.append(f"{name} = {value:.4g}{spread}{unit}")
     return ", ".join(parts)
 
@@ -90,8 +117,19 @@ def evidence_in_words(cause: Cause) -> str:
         if cause.heldout_gain > 0
         else f"on held-out laps it takes nothing away ({percent(cause.heldout_gain)})"
     )
+    confirmed = cause.confirmation
+    units = confirmed.gain
     strong = f"above {DECISIVE_DELTA_BIC:.0f} is very strong"
-    return f"the information criterion is better by {cause.delta_bic:.0f} ({strong}); {held_out}"
+    return (
+        f"on parts of the drive that were left out the logarithm of the predictive likelihood is better by "
+        f"{confirmed.total:.0f} ± {confirmed.std:.0f}, in {int((units > 0).sum())} of {len(units)} parts, and "
+        f"{_shares(confirmed.share)} of the squared error is gone; the information criterion is better by "
+        f"{cause.delta_bic:.0f} ({strong}); {held_out}"
+    )
+
+
+def _shares(share: Vector) -> str:
+    return ", ".join(f"{percent(max(float(s), 0.0))} of {c}'s" for c, s in zip(STATE_SIGNALS, share, strict=True))
 
 
 def alternatives_in_words(cause: Cause) -> str:
@@ -138,14 +176,17 @@ def _about(cause: Cause) -> Iterator[str]:
 
 def _causes(diagnosis: Diagnosis) -> Table:
     columns = (
-        Column("cause"), Column("size"), Column("better by", group="information criterion"),
+        Column("cause"), Column("size"), Column("better by", group="left-out parts"), Column("±", group="left-out parts"),
+        *(Column(channel, "%", "squared error gone there") for channel in STATE_SIGNALS),
         Column("less", "%", "held-out error"), Column("the data fit as well"),
     )  # fmt: skip
     rows: list[list[Value]] = [
         [
             cause.effect,
             size_in_words(cause),
-            cause.delta_bic,
+            cause.confirmation.total,
+            cause.confirmation.std,
+            *(100 * float(share) for share in cause.confirmation.share),
             100 * cause.heldout_gain,
             ", ".join(cause.alternatives) or "nothing else",
         ]
@@ -237,7 +278,8 @@ def _found(diagnosis: Diagnosis) -> Iterator[Section]:
     )
     yield Section(
         "Nominal values",
-        "What the fit makes of them. Moved: by how many of the standard deviations that the vehicle file states.",
+        "What the fit makes of them. Moved: by how many of the standard deviations that the vehicle file states. "
+        + " ".join(moved_in_words(diagnosis)),
         None,
         _nominal_table(diagnosis),
     )

@@ -55,6 +55,9 @@ class VehicleConstants(StrictModel):
     """Mass and geometry, known and not adapted."""
 
     m: float = Field(gt=0, description="mass (kg)")
+    m_std: float | None = Field(
+        default=None, ge=0, description="standard deviation with which it was weighed (kg); null: 1 % of it"
+    )
     l_f: float = Field(gt=0, description="centre of gravity to front axle (m)")
     l_r: float = Field(gt=0, description="centre of gravity to rear axle (m)")
     h_cg: float = Field(ge=0, description="height of the centre of gravity (m)")
