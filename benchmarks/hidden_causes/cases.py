@@ -1,9 +1,9 @@
 """Cases with a hidden cause: simulated laps whose car has effects that the vehicle file does not know.
 
 In every case the sensors are noisy, and driver and track differ. The car is one of three truths: single-track in steps of
-1 ms, four wheels, or one of another make (:mod:`benchmarks.hidden_causes.foreign`). The nominal values of the vehicle file are
-off by about 2 %. Of the car of another make nobody knows them: its file comes from a drive without hidden effects, calibrated
-from nothing but the bounds and then diagnosed, as a team would begin.
+1 ms, four wheels, or one of another make (:mod:`benchmarks.hidden_causes.foreign`). The nominal values of the vehicle file
+are off by about 2 %. Of the car of another make nobody knows them: its file comes from a drive without hidden effects,
+calibrated from nothing but the bounds and then diagnosed, as a team would begin.
 
 Sizes. An effect is just noticeable where its estimate stands seven standard deviations from neutral on the reference
 drive: 90 s of the road course at 25 Hz in moderate style, the noise of ``NOISE``, and nominal values free as far as the

@@ -27,6 +27,7 @@ _NOMINAL_STEP, _EFFECT_STEP = 1e-3, 0.02  # of the derivatives: standard deviati
 _KEPT_PROMISE = 0.5  # of what a quadratic promises: derivatives that keep less are too old
 _LARGEST_NOISE_SHARE, _LEAST = 1e-2, 1e-12  # of the variance of a channel: more than any noise, and less
 _DAMPING = (0.0, 0.03, 0.3, 3.0, 30.0)
+_ROUNDING = 1e-12  # of second derivatives, that keeps them positive where nothing was excited
 _CONVERGED = 0.3  # of the squared error
 
 
@@ -324,5 +325,5 @@ class IdentificationProblem:
 
 def _step(H: Vector, g: Vector, lower: Vector, upper: Vector) -> Vector:
     """The step that a quadratic asks for within bounds: what would leave them stays on them, the others follow."""
-    root = np.linalg.cholesky(H)
+    root = np.linalg.cholesky(H + _ROUNDING * np.diag(np.diag(H)))
     return np.asarray(lsq_linear(root.T, -np.linalg.solve(root, g), (lower, upper), "bvls").x)

@@ -18,6 +18,7 @@ from benchmarks.hidden_causes.page import page
 from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
 from dynssm_ros.files import write_json
 from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.confirmation import Confirmation
 from dynssm_ros.identification.diagnose import Cause
 from dynssm_ros.identification.problem import IdentificationProblem
 from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
@@ -31,7 +32,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def cause(effect: str, values: dict[str, float], *alternatives: str, std: float = 0.0) -> Cause:
-    return Cause(effect, values, dict.fromkeys(values, std), 50.0, 40.0, 0.1, alternatives)
+    confirmation = Confirmation(np.ones(4), 1.0, 0.0, np.zeros(3))
+    return Cause(effect, values, dict.fromkeys(values, std), 50.0, 40.0, 0.1, confirmation, (), alternatives)
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
@@ -51,10 +53,11 @@ def test_the_cases_hold_every_effect_none_two_and_four_wheels() -> None:
     single = Counter(name for case in listed if len(case.hidden) == 1 for name in case.hidden)
     assert set(single) == set(EFFECTS)
     assert min(single.values()) >= 3
+    assert {case.plant for case in listed if not case.hidden} == {"rk4", "double_track", "foreign"}
     assert Counter(len(case.hidden) for case in listed)[0] == 20
     assert Counter(len(case.hidden) for case in listed)[2] == 20
     assert Counter(len(case.hidden) for case in listed)[1] == 90
-    assert {case.plant for case in listed} == {"rk4", "double_track"}
+    assert {case.plant for case in listed} == {"rk4", "double_track", "foreign"}
     assert {case.track for case in listed} == set(TRACKS)
     assert {case.sampling_time for case in listed} == {0.04, 0.02}
     four_wheels = {len(case.hidden) for case in listed if case.plant == "double_track"}

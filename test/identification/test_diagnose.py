@@ -94,10 +94,13 @@ def test_the_json_is_that_of_the_contract(lagging: tuple[Recording, Vehicle, Dia
     content = json.loads(json.dumps(lagging[2].to_json("out/vehicle.yaml"), allow_nan=False))
     assert content["verdict"] == "effects"
     (cause,) = content["causes"]
-    assert set(cause) == {"effect", "parameters", "evidence", "alternatives"}
+    assert set(cause) == {"effect", "parameters", "evidence", "on_bound", "alternatives"}
     assert set(cause["parameters"]["time_constant"]) == {"value", "std", "unit"}
     assert cause["parameters"]["time_constant"]["unit"] == "s"
-    assert set(cause["evidence"]) == {"delta_bic", "heldout_gain"}
+    assert set(cause["evidence"]) == {"delta_bic", "heldout_gain", "left_out"}
+    assert set(cause["evidence"]["left_out"]) == {"gain", "std", "units", "error_gone"}
+    assert cause["evidence"]["left_out"]["gain"] > cause["evidence"]["left_out"]["std"]
+    assert content["moved"] == {}
     assert {"horizon_s", "before", "after", "reduction"} <= set(content["gain"])
     for part in ("before", "after", "reduction"):
         assert list(content["gain"][part]) == ["v_x", "v_y", "omega"]

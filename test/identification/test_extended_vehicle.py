@@ -37,7 +37,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     moved = np.zeros(len(COEFFICIENTS) + 1)
     moved[COEFFICIENTS.index("D_f")] = 0.5
     path = tmp_path_factory.mktemp("extended") / "vehicle.yaml"
-    save_vehicle(CarEstimate(load_vehicle("orca"), moved, CAUSES).extended(np.full(17, 0.01)), path, "extended")
+    save_vehicle(CarEstimate(load_vehicle("orca"), moved, CAUSES).extended(1e-4 * np.eye(18)), path, "extended")
     return path
 
 

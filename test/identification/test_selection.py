@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dynssm_ros.arrays import Indices
 from dynssm_ros.identification.candidates import Candidate
 from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.problem import IdentificationProblem
 from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
@@ -37,18 +39,22 @@ def windows(plant: str = "euler", **effects: dict[str, float]) -> SimulationWind
 
 def search(**effects: dict[str, float]) -> Search:
     given = windows(**effects).with_integrator("euler", ORCA)
-    return Search(IdentificationProblem(given, CarEstimate.of(ORCA)), CarEstimate.of(ORCA), FEW)
+    return Search(IdentificationProblem(given, CarEstimate.of(ORCA)), CarEstimate.of(ORCA), FEW, quarters(given))
+
+
+def quarters(given: SimulationWindows) -> Indices:
+    return np.arange(len(given)) * 4 // len(given)
 
 
 def test_a_pair_is_found_the_stronger_first_and_with_its_sizes() -> None:
     found = search(steering_offset={"offset": 0.03}, drive_gain={"factor": 1.15}).run()
     assert {one.candidate.effect for one in found.chosen} == {"steering_offset", "drive_gain"}
-    evidence = [one.delta_bic for one in found.chosen]
-    assert evidence == sorted(evidence, reverse=True)
-    assert min(evidence) > DECISIVE_DELTA_BIC
+    gains = [one.gain for one in found.chosen]
+    assert gains == sorted(gains, reverse=True)
+    assert min(one.delta_bic for one in found.chosen) > DECISIVE_DELTA_BIC
     assert found.fit.car.effects["steering_offset"]["offset"] == pytest.approx(0.03, rel=0.1)
     assert found.fit.car.effects["drive_gain"]["factor"] == pytest.approx(1.15, rel=0.05)
-    assert found.fit.objective < found.base.objective
+    assert all(one.confirmation is not None and one.confirmation.holds for one in found.chosen)
 
 
 def test_nothing_is_chosen_where_nothing_is_hidden() -> None:
@@ -63,23 +69,53 @@ def test_leaving_one_out_is_a_fit_without_it() -> None:
     (one,) = found.chosen
     without = searching.leave_out(found, one)
     assert "steering_offset" not in without.car.effects
-    assert without.objective - found.fit.objective == pytest.approx(
-        one.improvement * max(1.0, found.inflation), rel=0.5
-    )
+    assert without.objective - found.fit.objective == pytest.approx(one.improvement, rel=0.5)
 
 
 def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     searching = search()
     fit = searching.base
-    strong = Refined(FEW[0], fit, 100.0, 90.0, 5.0)
+    everywhere = Confirmation(np.array([3.0, 4.0, 5.0, -1.0]), 4.0, 0.0, np.zeros(3))
+    strong = Refined(FEW[0], fit, 100.0, 90.0, everywhere, 5.0)
     assert _pays(strong)
-    assert not _pays(replace(strong, crossed=-1.0))
+    once = replace(everywhere, gain=np.array([20.0, -1.0, -2.0, -0.5]))
+    assert not _pays(replace(strong, confirmation=once))
+    assert not _pays(replace(strong, confirmation=replace(everywhere, std=12.0)))
     assert not _pays(replace(strong, delta_bic=DECISIVE_DELTA_BIC))
+    assert not _pays(replace(strong, sure=2.9))
+    assert not _pays(replace(strong, confirmation=None))
+
+
+def test_what_was_known_decides_where_left_out_parts_tell_nothing() -> None:
+    level = Confirmation(np.array([1.0, -1.0, 0.5, -0.5]), 2.0, 5.0, np.zeros(3))
+    assert level.holds
+    assert not replace(level, known=3.0).holds
+    assert not replace(level, gain=np.array([-1.0, -1.0, -0.5, -0.5])).holds
+
+
+def test_left_out_parts_are_predicted_by_the_others() -> None:
+    given = windows(steering_offset={"offset": 0.03}).with_integrator("euler", ORCA)
+    problem = IdentificationProblem(given, CarEstimate.of(ORCA))
+    without = problem.fit(CarEstimate.of(ORCA), ())
+    car = without.car.with_effect("steering_offset", {"offset": 0.03})
+    fit = problem.fit(car, FEW[0].free, without)
+    found = LeaveOneOut(problem, quarters(given)).compare(without, fit)
+    # as good on rows that were left out as the likelihood of all of them says, but for what was fitted to each
+    log_likelihood = (
+        problem.log_likelihood(fit.errors, fit.noise) - problem.log_likelihood(without.errors, without.noise)
+    ).sum()
+    assert found.gain.sum() == pytest.approx(log_likelihood, rel=0.3)
+    assert found.holds
+    assert len(found.gain) == 4
+    nothing = LeaveOneOut(problem, quarters(given)).compare(fit, fit)
+    np.testing.assert_array_equal(nothing.gain, 0.0)
+    assert nothing.alike or nothing.std == 0.0
 
 
 @pytest.mark.parametrize("plant", ["euler", "rk4"])
 def test_the_integrator_is_that_of_the_data(plant: str) -> None:
-    found = search_causes(windows(plant), CarEstimate.of(ORCA), None, lambda words: None)
+    given = windows(plant)
+    found = search_causes(given, CarEstimate.of(ORCA), quarters(given), None, lambda words: None)
     assert found.problem.windows.integrator == plant
     assert [one.candidate.effect for one in found.selection.chosen] == []
     assert np.isfinite(found.selection.fit.objective)

@@ -132,20 +132,21 @@ def test_whitening_undoes_what_the_covariance_says() -> None:
     spread = NoiseResponse.of(np.broadcast_to(0.9 * np.eye(3), (5, 4, 3, 3)), np.arange(5.0))
     noise = Noise(spread, np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.5, 0.6, 0.7]))
     np.testing.assert_allclose(noise.whiten(np.stack([noise.roots[0]] * 5))[0], np.eye(12), atol=1e-12)
-    assert noise.log_det == pytest.approx(5 * np.linalg.slogdet(noise.roots[0] @ noise.roots[0].T)[1])
+    assert noise.log_dets.sum() == pytest.approx(5 * np.linalg.slogdet(noise.roots[0] @ noise.roots[0].T)[1])
 
 
 def test_a_fit_finds_planted_values_and_knows_how_well() -> None:
     stds = (0.01, 0.01, 0.002)
     some = windows(AV21.with_effect("drag", {"coefficient": 0.4}), stds)
-    problem = IdentificationProblem(some, CarEstimate.of(AV21))
+    known = CarEstimate.of(AV21.with_nominal(AV21.nominal, 0.1 * prior_std(AV21)))
+    problem = IdentificationProblem(some, known)
     free = (("drag", "coefficient"),)
-    fit = problem.fit(CarEstimate.of(AV21).with_effect("drag", {"coefficient": 0.0}), free)
+    fit = problem.fit(known.with_effect("drag", {"coefficient": 0.0}), free)
     std = 0.2 * np.sqrt(problem.covariance(fit)[-1, -1])
     assert abs(fit.car.effects["drag"]["coefficient"] - 0.4) < 3 * std < 0.2
     assert problem.inflation(fit) < 1.5
     assert problem.inflation(fit, 1) < 3.0
-    without = problem.fit(CarEstimate.of(AV21), ())
+    without = problem.fit(known, ())
     assert without.objective - fit.objective > 100
 
 
@@ -171,7 +172,11 @@ def test_what_the_vehicle_file_does_not_say_is_known_by_its_bounds() -> None:
 
 def test_the_extended_vehicle_is_the_car_as_fitted(laps: Callable[..., tuple[Recording, Vehicle]]) -> None:
     car = replace(CarEstimate.of(AV21), moved=np.full(18, 0.5)).with_effect("mass", {"factor": 1.1})
-    vehicle = car.extended(np.ones(17))
+    covariance = np.diag(np.full(18, 0.25))
+    covariance[0, 1] = covariance[1, 0] = -0.2
+    vehicle = car.extended(covariance)
+    assert vehicle.coefficients["B_f"].std == pytest.approx(0.5 * AV21.coefficients["B_f"].std * np.exp(0.5 * 0.25))
+    assert vehicle.known_correlation[0, 1] == pytest.approx(-0.8, abs=1e-3)
     np.testing.assert_allclose(vehicle.nominal, np.array(car.theta))
     assert vehicle.constants.m == pytest.approx(790 * np.exp(0.005))
     assert [(entry.name, entry.parameters) for entry in vehicle.effects] == [("mass", {"factor": 1.1})]

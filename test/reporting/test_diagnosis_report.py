@@ -19,6 +19,7 @@ from dynssm_ros.reporting.diagnosis_report import (
     as_text,
     diagnosis_report,
     left_in_words,
+    moved_in_words,
     pattern_in_words,
     size_in_words,
 )
@@ -111,7 +112,16 @@ def test_words_say_cause_size_evidence_gain_and_what_to_do(lagging: Lagging) -> 
     words = as_text(found)
     assert words.startswith("The simulation lacks: steering_lag.")
     assert f"steering_lag: {size_in_words(cause)}" in words
-    assert "Evidence: the information criterion is better by" in words
+    assert (
+        "Evidence: on parts of the drive that were left out the logarithm of the predictive likelihood is better"
+        in words
+    )
+    assert moved_in_words(found) == []
+    (sentence,) = moved_in_words(replace(found, moved={"D_f": -4.0}))
+    assert sentence.startswith("Recalibrated: the front tyres' peak force (D_f) is ")
+    assert sentence.endswith(": 4 of its standard deviations.")
+    stuck = replace(cause, on_bound=("time_constant",))
+    assert size_in_words(stuck).endswith(" or farther from neutral (at its bound) s")
     assert "Error on held-out laps 0.52 s ahead:" in words
     for channel in STATE_SIGNALS:
         assert f"   {channel} (" in words
