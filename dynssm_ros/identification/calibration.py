@@ -105,7 +105,7 @@ def calibrate(
     if on_progress is not None:
         on_progress(starts + 1, starts + 1)
     theta = np.array(fit.car.theta)
-    calibrated = fit.car.known(problem.covariance(fit))
+    calibrated = fit.car.known(problem.covariance(fit)).model_copy(update={"integrator": integrator})
     std = np.array([calibrated.coefficients[name].std for name in COEFFICIENTS])
     lower, upper = (limit[: len(COEFFICIENTS)] for limit in given.limits)
     held = (fit.position[: len(COEFFICIENTS)] <= lower + _ON_BOUND) | (

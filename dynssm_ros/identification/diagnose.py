@@ -245,7 +245,13 @@ def diagnose(
     sizes = minimum_detectable(problem, fit, found.search.found)
     limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
     covariance = problem.covariance(fit)
-    extended, std = fit.car.extended(covariance), np.sqrt(np.diag(covariance))
+    extended = fit.car.extended(covariance).model_copy(update={"integrator": windows.integrator})
+    std = np.sqrt(np.diag(covariance))
+    if vehicle.integrator not in (None, windows.integrator):
+        limits.append(
+            f"the vehicle file was calibrated for {vehicle.integrator} steps, the data are closer to {windows.integrator}; "
+            f"calibrate with --integrator {windows.integrator}, else what the steps differ by may be named"
+        )
     limits += [*_hidden(sizes), *_not_live(extended)]
     causes = tuple(_cause(one, found, at, std) for one in selection.chosen)
     left = explained_variance(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], problem.block)

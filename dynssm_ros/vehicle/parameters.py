@@ -19,7 +19,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.files import replacing
 from dynssm_ros.vehicle.effects import EFFECTS, Effect, build_effect
-from dynssm_ros.vehicle.single_track import Applied, Coefficients
+from dynssm_ros.vehicle.single_track import Applied, Coefficients, Integrator
 
 COEFFICIENT_UNITS: dict[str, str] = {
     "B_f": "1/rad", "C_f": "1", "D_f": "N", "E_f": "1",
@@ -123,6 +123,9 @@ class Vehicle(StrictModel):
         default=None,
         description="of what is known of the coefficients, in their order: row k has the correlations with the k before it. "
         "null: their standard deviations are independent",
+    )
+    integrator: Integrator | None = Field(
+        default=None, description="of the steps that the coefficients were calibrated for; null: of any"
     )
     effects: tuple[EffectEntry, ...] = ()
 

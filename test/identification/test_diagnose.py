@@ -72,6 +72,8 @@ def test_the_extended_car_errs_less_on_held_out_rows(lagging: tuple[Recording, V
     ).all()
     assert [entry.name for entry in found.vehicle.effects] == ["steering_lag"]
     assert found.vehicle.name == vehicle.name
+    assert found.vehicle.integrator == "euler"
+    assert found.vehicle.correlation is not None
 
 
 def test_no_held_out_row_reaches_the_fit(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
@@ -138,6 +140,37 @@ def test_an_impossible_option_is_one_clear_line(
     recording, vehicle, _ = lagging
     with pytest.raises((ConfigurationError, RecordingError), match=words):
         diagnose(recording, vehicle, **options)  # type: ignore[arg-type]
+
+
+def test_what_is_excluded_is_not_named(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
+    recording, vehicle, _ = lagging
+    late = {"steering_lag", "odometry_delay", "yaw_rate_lag", "tire_relaxation"}
+    found = diagnose(recording, vehicle, integrator="euler", line=LINE, exclude=late)
+    assert not {cause.effect for cause in found.causes} & late
+    assert not set(found.minimum_detectable) & late
+    with pytest.raises(
+        ConfigurationError, match="exclude witchcraft: no such effect; expected some of steering_offset"
+    ):
+        diagnose(recording, vehicle, exclude=["witchcraft"])
+
+
+def test_an_extended_car_that_errs_more_where_nobody_looked_is_not_written(
+    lagging: tuple[Recording, Vehicle, Diagnosis],
+) -> None:
+    recording, vehicle, found = lagging
+    cut, late = int(found.improvement.windows.starts.min()), 8
+    # from here on the steering is recorded late, so that the wheels lead it
+    columns = {name: values.copy() for name, values in recording.columns.items()}
+    for name in ("delta_fb", "delta_cmd"):
+        columns[name][cut + late :] = recording[name][cut:-late]
+    other = diagnose(replace(recording, columns=columns), vehicle, integrator="euler", line=LINE)
+    assert other.causes == ()
+    assert other.vehicle.effects == ()
+    assert any(
+        note.startswith("steering_lag explained the fitted laps but not the held-out ones") for note in other.notes
+    )
+    rmse = other.improvement.rmse
+    np.testing.assert_array_equal(rmse["extended"], rmse["recalibrated"])
 
 
 def test_a_channel_without_measurement_is_one_clear_line(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:

@@ -175,3 +175,33 @@ def test_an_effect_that_does_not_fit_is_refused(name: str, parameters: dict[str,
     vehicle: Vehicle = load_vehicle("orca").with_effect("steering_lag", {"time_constant": 0.1})
     with pytest.raises(ConfigurationError, match=expected):
         vehicle.with_effect(name, parameters)
+
+
+def test_what_is_known_together_is_saved_and_read_back(tmp_path: Path) -> None:
+    orca, std = load_vehicle("orca"), np.linspace(0.1, 1.0, 17)
+    correlation = np.eye(17)
+    correlation[0, 2] = correlation[2, 0] = -0.9
+    known = orca.with_nominal(orca.nominal, std, correlation)
+    save_vehicle(known, tmp_path / "car.yaml")
+    again = load_vehicle(tmp_path / "car.yaml")
+    assert again == known
+    np.testing.assert_allclose(again.known_correlation, correlation, atol=1e-3)
+    np.testing.assert_array_equal(orca.known_correlation, np.eye(17))
+    assert known.with_nominal(orca.nominal).correlation == known.correlation
+    assert known.with_nominal(orca.nominal, std).correlation is None
+    assert known.unmeasured().correlation is None
+
+
+@pytest.mark.parametrize(
+    ("correlation", "expected"),
+    [
+        ([[]], "1 rows; expected 17"),
+        ([[0.9] * k for k in range(16)] + [[0.9, -0.9] * 8], "not positive definite"),
+    ],
+)
+def test_correlations_that_cannot_be_are_refused(tmp_path: Path, correlation: list[list[float]], expected: str) -> None:
+    content = load_vehicle("orca").model_dump(mode="json") | {"correlation": correlation}
+    file = tmp_path / "car.yaml"
+    file.write_text(yaml.safe_dump(content), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=expected):
+        load_vehicle(file)
