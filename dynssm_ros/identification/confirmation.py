@@ -64,7 +64,7 @@ class Confirmation:
         if self.total <= self.std:
             return False
         told = float(self.gain.sum())
-        if told > self.std:
+        if told >= self.known:
             return 2 * int((self.gain > 0).sum()) >= len(self.gain)
         return told > -self.std and self.known > _KNOWN * self.std
 

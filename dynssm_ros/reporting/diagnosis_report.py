@@ -124,13 +124,13 @@ def evidence_in_words(cause: Cause) -> str:
     return (
         f"on parts of the drive that were left out the logarithm of the predictive likelihood is better by "
         f"{confirmed.total:.0f} ± {confirmed.std:.0f}, in {int((units > 0).sum())} of {len(units)} parts, and "
-        f"{_shares(confirmed.share)} of the squared error is gone; the information criterion is better by "
+        f"of the squared error {_shares(confirmed.share)} is gone; the information criterion is better by "
         f"{cause.delta_bic:.0f} ({strong}); {held_out}"
     )
 
 
 def _shares(share: Vector) -> str:
-    return ", ".join(f"{percent(max(float(s), 0.0))} of {c}'s" for c, s in zip(STATE_SIGNALS, share, strict=True))
+    return ", ".join(f"{percent(max(float(s), 0.0))} ({c})" for c, s in zip(STATE_SIGNALS, share, strict=True))
 
 
 def alternatives_in_words(cause: Cause) -> str:
