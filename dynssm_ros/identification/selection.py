@@ -129,7 +129,7 @@ class Search:
         """
         chosen = self._taken_over(start)
         while len(chosen) < _MAX_CAUSES:
-            best = max(self._confirmed(tuple(chosen)), key=lambda r: r.gain, default=None)
+            best = self._best(tuple(chosen))
             if best is None:
                 break
             chosen.append(best.candidate)
@@ -198,6 +198,12 @@ class Search:
         refined = [self._polish(key, fit, r) if r.delta_bic > close else r for r in refined]
         self._ranked[key] = sorted(refined, key=lambda r: -r.delta_bic)
         return self._ranked[key]
+
+    def _best(self, before: tuple[Candidate, ...]) -> Refined | None:
+        """The candidate that gains most; of those that cannot be told from it, rather one as real cars have it."""
+        found = sorted(self._confirmed(before), key=lambda r: -r.gain)
+        alike = [r for r in found if r is found[0] or self._left_out.compare(r.fit, found[0].fit).alike]
+        return next((r for r in alike if _is_met(r)), next(iter(found), None))
 
     def _taken_over(self, start: Fit | None) -> list[Candidate]:
         """The candidates of another problem's fit, fitted here."""
@@ -336,6 +342,14 @@ class Search:
         fit = self.fit(chosen)
         others = [r for r in self._confirmed(rest) if r.candidate.effect != one.effect]
         return [r.candidate.effect for r in others if self._left_out.compare(r.fit, fit).alike]
+
+
+def _is_met(refined: Refined) -> bool:
+    """Whether an effect is on a side of neutral on which it is met in cars that can be driven."""
+    effect, name = refined.candidate.effect, refined.candidate.amplitudes[0]
+    about = EFFECTS[effect]
+    side = np.sign(refined.fit.car.effects[effect][name] - about.PARAMETERS[name].neutral)
+    return not about.DIRECTIONS or float(side) in about.DIRECTIONS
 
 
 def _pays(refined: Refined) -> bool:

@@ -43,7 +43,7 @@ class LoadSensitivity(Effect):
     SUMMARY = "The tyres do not gain lateral force in proportion to their load."
     ADVICE = "Take the tyres' load sensitivity into the vehicle file, from the maker's data or from these laps."
     MANOEUVRE = "cornering at the limit while braking and driving, and at low and at high speed"
-    PARAMETERS = {"exponent": Parameter("1", 0.0, 2.0, 1.0)}
+    PARAMETERS = {"exponent": Parameter("1", 0.0, 1.0, 1.0)}
     TYPICAL = (0.12, 0.6)
     DIRECTIONS = (-1.0,)  # as tyres are
     exponent: Array = 1.0
