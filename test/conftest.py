@@ -46,12 +46,16 @@ def orca_bag(data: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def acting() -> Callable[..., dict[str, float]]:
-    """Parameters with which the effect of a name acts: each a share of the way from neutral to its upper bound."""
+    """Parameters with which the effect of a name acts: each a share of the way from neutral to its upper bound, or to
+    the lower one where there is nothing above."""
     from dynssm_ros.vehicle.effects import EFFECTS
 
     def parameters(name: str, share: float = 0.2) -> dict[str, float]:
         described = EFFECTS[name].PARAMETERS.items()
-        return {key: p.neutral + (0.0 if p.shape else share) * (p.upper - p.neutral) for key, p in described}
+        return {
+            key: p.neutral + (0.0 if p.shape else share) * ((p.upper if p.direction > 0 else p.lower) - p.neutral)
+            for key, p in described
+        }
 
     return parameters
 
