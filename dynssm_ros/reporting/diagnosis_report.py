@@ -92,7 +92,8 @@ def moved_in_words(diagnosis: Diagnosis) -> list[str]:
         what = f"{_COEFFICIENTS_IN_WORDS[name]} ({name})" if name in _COEFFICIENTS_IN_WORDS else name
         change = f"{abs(now / was - 1):.0%} {'more' if abs(now) > abs(was) else 'less'}" if was * now > 0 else "moved"
         sentences.append(
-            f"Recalibrated: {what} is {value}, {change} than the vehicle file's {text(was)}: {abs(diagnosis.moved[name]):.0f} of its standard deviations."
+            f"Recalibrated: {what} is {value}, {change} than the vehicle file's {text(was)}: "
+            f"{abs(diagnosis.moved[name]):.0f} of its standard deviations."
         )
     return sentences
 
