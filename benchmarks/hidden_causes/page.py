@@ -16,7 +16,7 @@ _IN_WORDS = {
     "false_alarms": "something is named where nothing is hidden",
     "more_named": "more is named than the one effect that is hidden",
 }
-_PLANTS = {"rk4": "one track, steps of 1 ms", "double_track": "four wheels"}
+_PLANTS = {"rk4": "one track, steps of 1 ms", "double_track": "four wheels", "foreign": "another make"}
 
 
 def page(outcomes: Sequence[tuple[Case, Outcome | None]], seed: int) -> str:
@@ -35,10 +35,10 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
     yield "# Hidden causes"
     yield ""
     yield (
-        f"Made by `python -m doit -f benchmarks/hidden_causes/dodo.py seed={seed}`: {len(outcomes)} simulated drives "
-        f"with hidden effects, seeds {seed} to {seed + len(of) - 1}"
+        f"Made by `python -m doit -f benchmarks/hidden_causes/dodo.py seed={seed} count={len(of)}`: {len(outcomes)} "
+        f"simulated drives with hidden effects, seeds {seed} to {seed + len(of) - 1}"
         + (f", without {undriven} whose car could not be driven" if undriven else "")
-        + ". How they are drawn and what counts as just minimum_detectable: `benchmarks/hidden_causes/cases.py`."
+        + ". How they are drawn and what counts as just noticeable: `benchmarks/hidden_causes/cases.py`."
     )
     yield ""
     yield f"| rate | cases | share | 95 % interval | goal | {' | '.join(_PLANTS.values())} |"
@@ -58,7 +58,8 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
     yield ""
     yield (
         "Four wheels are a car that the equations do not have: an axle loses grip as load moves from one wheel to the other, "
-        "and unequal forces at the steered wheels turn the car. Small effects that are named there stand for this."
+        "and unequal forces at the steered wheels turn the car. Small effects that are named there stand for this. The car "
+        "of another make has brush tyres, forces that grow less than the load, and steering that gives way."
     )
     yield ""
     yield f"![What was hidden and what was named first]({FIGURE})"
