@@ -15,6 +15,7 @@ least of them are harder than that.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,31 +108,37 @@ def cases(seed: int, count: int, effects: Sequence[str] = tuple(EFFECTS)) -> Ite
 
 
 def record(case: Case) -> tuple[Recording, Vehicle]:
-    """Drives a case: the recording, and the vehicle file that does not know what is hidden.
+    """The recording of a case, and the vehicle file that does not know what is hidden.
 
     Raises:
         SimulationError: the car cannot be driven with what is hidden, however gently.
     """
+    return drive(case), vehicle_file(case)
+
+
+def drive(case: Case) -> Recording:
+    """Drives a case; for errors see :func:`record`."""
     recording = _drive(case, known(case).with_effects(case.hidden.items()), case.seed)
-    return replace(recording, info=recording.info.model_copy(update={"source": (case.name,)})), vehicle_file(case)
+    return replace(recording, info=recording.info.model_copy(update={"source": (case.name,)}))
 
 
 def _drive(case: Case, car: Vehicle, seed: int) -> Recording:
     rng = np.random.default_rng([seed, 7])
     aggressiveness, variation = float(rng.uniform(0.6, 0.85)), float(rng.uniform(0.4, 0.9))
     noise = [std * float(rng.uniform(0.5, 1.5)) for std in NOISE]
-    for attempt in range(_TRIES):
-        style = Style(aggressiveness * 0.9**attempt, variation)
-        try:
-            run = simulate(
-                car, case.road, duration=case.duration, plant=case.plant, seed=seed, style=style,
-                noise=(noise[0], noise[1], noise[2]),
-            )  # fmt: skip
-            return as_recording(run)
-        except SimulationError:
-            if attempt == _TRIES - 1:
-                raise
-    raise AssertionError("unreachable")
+
+    def lap(attempt: int) -> Recording:
+        return as_recording(
+            simulate(
+                car, case.road, duration=case.duration, plant=case.plant, seed=seed,
+                style=Style(aggressiveness * 0.9**attempt, variation), noise=(noise[0], noise[1], noise[2]),
+            )
+        )  # fmt: skip
+
+    for attempt in range(_TRIES - 1):
+        with suppress(SimulationError):
+            return lap(attempt)
+    return lap(_TRIES - 1)
 
 
 def known(case: Case) -> Vehicle:

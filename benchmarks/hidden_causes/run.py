@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.hidden_causes.cases import Case, record, vehicle_file
+from benchmarks.hidden_causes.cases import Case, drive, vehicle_file
 from benchmarks.hidden_causes.outcomes import Outcome, judge
 from dynssm_ros.files import write_json
 from dynssm_ros.identification.diagnose import diagnose
@@ -17,11 +17,11 @@ from dynssm_ros.simulation.laps import SimulationError
 
 def run_case(case: Case, folder: Path) -> None:
     """Drives and diagnoses a case; its outcome is ``null`` if the car cannot be driven."""
-    drive = folder / "drives" / f"{_name(case)}.parquet"
+    laps = folder / "drives" / f"{_name(case)}.parquet"
     try:
-        if not drive.exists():
-            record(case)[0].save(drive)
-        outcome = judge(case, diagnose(Recording.load(drive), vehicle_file(case), line=case.road.centre).causes)
+        if not laps.exists():
+            drive(case).save(laps)
+        outcome = judge(case, diagnose(Recording.load(laps), vehicle_file(case), line=case.road.centre).causes)
     except SimulationError:
         outcome = None
     write_json(outcome_file(case, folder), {"outcome": None if outcome is None else asdict(outcome)})

@@ -19,7 +19,8 @@ from dynssm_ros.identification.problem import Fit, IdentificationProblem, unit
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 from dynssm_ros.vehicle.effects.base import LAP, section
 
-SIZE_GRID_UNITS = (6.0, 1.5, 0.375, 0.094, 0.023)  # units: sizes at which effects are tried, a factor of 4 apart
+_SIZE_GRID_UNITS = (6.0, 1.5, 0.375, 0.094, 0.023)  # units: sizes at which effects are tried, a factor of 4 apart
+BOTH_SIDES_UNITS = (*_SIZE_GRID_UNITS, *(-size for size in _SIZE_GRID_UNITS))
 _LOCAL_SIZE_UNITS = 1.5  # unit at which effects are tried that act somewhere on the lap
 _SIZE_REACH = (0.5, 3.0)  # times a size, for which its response serves
 _NONLINEARITY = (
@@ -141,10 +142,9 @@ class Responses:
             if candidate.local:
                 found = self._simulated(effect, parameter, form, (_LOCAL_SIZE_UNITS, -_LOCAL_SIZE_UNITS), everywhere)
             else:
-                found = self._simulated(effect, parameter, form, (SIZE_GRID_UNITS[1], SIZE_GRID_UNITS[3]), everywhere)
+                found = self._simulated(effect, parameter, form, (_SIZE_GRID_UNITS[1], _SIZE_GRID_UNITS[3]), everywhere)
                 if _differ(found):
-                    both = (*SIZE_GRID_UNITS, *(-size for size in SIZE_GRID_UNITS))
-                    found = self._simulated(effect, parameter, form, both, everywhere)
+                    found = self._simulated(effect, parameter, form, BOTH_SIDES_UNITS, everywhere)
                 else:
                     found = found[:1]
             self._known[key] = found
@@ -157,13 +157,17 @@ class Responses:
         """Responses to those sizes that the parameter can have; at least one."""
         about, one = EFFECTS[effect].PARAMETERS[parameter], unit(effect, parameter)
         start = dict(self._car.effects.get(effect, {})) | form
-        wanted = (
-            float(np.clip(about.neutral + size * one, about.lower, about.upper)) - about.neutral for size in sizes
-        )
-        steps = sorted({step for step in wanted if step != 0.0}) or [-sizes[0] * one]
+        steps = steps_off(effect, parameter, sizes) or [-sizes[0] * one]
         cars = [self._car.with_effect(effect, start | {parameter: about.neutral + step}) for step in steps]
         changes = self._study.errors_of(cars, everywhere) - self._errors
         return [Response(step / one, change * one / step) for step, change in zip(steps, changes, strict=True)]
+
+
+def steps_off(effect: str, parameter: str, sizes: Sequence[float]) -> list[float]:
+    """How far off neutral a parameter is at ``sizes`` (units, signed), within its bounds and without those at neutral."""
+    about, one = EFFECTS[effect].PARAMETERS[parameter], unit(effect, parameter)
+    wanted = (float(np.clip(about.neutral + size * one, about.lower, about.upper)) - about.neutral for size in sizes)
+    return sorted({step for step in wanted if step != 0.0})
 
 
 def _differ(found: list[Response]) -> bool:

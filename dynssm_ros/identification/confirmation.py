@@ -1,21 +1,19 @@
 """What a cause is worth where it was not fitted: every unit of the drive is left out in turn, and the car fitted again.
 
-A unit is a recording, a lap, or a quarter of the time. Its windows are predicted by a car that was fitted to all others.
+A unit is a lap, or a quarter of the time. Its windows are predicted by a car that was fitted to all others.
 The logarithm of their predictive likelihood with a cause, less that without it, is what the cause gains there (Vehtari,
 Gelman and Gabry 2017). A cause that follows the accidents of one stretch gains nothing elsewhere.
 """
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.identification.noise import Noise, NoiseResponse
+from dynssm_ros.identification.noise import Noise
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
 from dynssm_ros.vehicle.effects import EFFECTS
 
@@ -99,13 +97,14 @@ class LeaveOneOut:
     def _predicted(self, fit: Fit) -> _Predicted:
         """Of each window by the fit without its unit; noise and the place of a local effect stay as they were found."""
         if id(fit) not in self._known:
-            shaping = [k for k, (effect, name) in enumerate(fit.free) if EFFECTS[effect].PARAMETERS[name].shape]
+            near = _placed(fit)
             likelihood, error = np.empty(len(self._unit)), np.empty((len(self._unit), 3))
             for number in range(int(self._unit.max()) + 1):
                 out = self._unit == number
-                rest, near = _part(self._problem, fit, ~out, shaping)
-                found = rest.fit(near.car, near.free, near, _ROUNDS, rough=True, noise=near.noise)
-                unseen = _part(self._problem, fit, out, shaping)[0]
+                rest, unseen = self._problem.select(~out), self._problem.select(out)
+                start = replace(near, errors=near.errors[~out], jacobian=near.jacobian[~out])
+                noise = Noise(rest.spread, fit.noise.v)
+                found = rest.fit(fit.car, near.free, start, _ROUNDS, rough=True, noise=noise)
                 errors = unseen.errors(found.car)
                 likelihood[out] = unseen.log_likelihood(errors, Noise(unseen.spread, fit.noise.v))
                 error[out] = errors[:, -3:] ** 2
@@ -113,18 +112,11 @@ class LeaveOneOut:
         return self._known[id(fit)][1]
 
 
-def _part(
-    problem: IdentificationProblem, fit: Fit, chosen: npt.NDArray[np.bool_], held: list[int]
-) -> tuple[IdentificationProblem, Fit]:
-    """Some of the windows, and the fit there with some of its values no longer free."""
-    part = copy(problem)
-    part.windows = problem.windows.select(chosen)
-    part.spread = NoiseResponse(problem.spread.group[chosen], problem.spread.G)
-    part.block = np.unique(problem.block[chosen], return_inverse=True)[1]
-    free = tuple(pair for k, pair in enumerate(fit.free) if k not in held)
-    columns = np.delete(fit.jacobian[chosen], [len(fit.car.moved) + k for k in held], axis=2)
-    noise = Noise(part.spread, fit.noise.v)
-    return part, replace(fit, free=free, errors=fit.errors[chosen], jacobian=columns, noise=noise)
+def _placed(fit: Fit) -> Fit:
+    """The fit with what shapes its effects, such as the place of a local one, no longer free."""
+    shaping = [k for k, (effect, name) in enumerate(fit.free) if EFFECTS[effect].PARAMETERS[name].shape]
+    free = tuple(pair for k, pair in enumerate(fit.free) if k not in shaping)
+    return replace(fit, free=free, jacobian=np.delete(fit.jacobian, [len(fit.car.moved) + k for k in shaping], axis=2))
 
 
 def _spread(parts: Vector) -> float:

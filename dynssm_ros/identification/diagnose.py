@@ -234,14 +234,12 @@ def diagnose(
         at.unseen, {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: fit.car}, at.steps
     )
     if selection.chosen and _worse(improvement):
-        # what was found is no better than moved coefficients where nobody looked
-        named = ", ".join(one.candidate.effect for one in selection.chosen)
-        at.notes.append(f"{named} explained the fitted laps but not the held-out ones, so that nothing of it is kept")
-        selection = replace(selection, fit=selection.base, chosen=[], alternatives={})
-        fit = selection.fit
-        improvement = measure_improvement(
-            at.unseen, {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: fit.car}, at.steps
+        at.notes.append(
+            f"{', '.join(one.candidate.effect for one in selection.chosen)} explained the fitted laps but not the held-out "
+            "ones, so that nothing of it is kept"
         )
+        selection = replace(selection, fit=selection.base, chosen=[], alternatives={})
+        fit, improvement = selection.base, improvement.ending_with(RECALIBRATED)
     sizes = minimum_detectable(problem, fit, found.search.found)
     limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
     covariance = problem.covariance(fit)
@@ -281,9 +279,7 @@ def _worse(improvement: Improvement) -> bool:
 
     Causes that a recalibration would make up for, such as more mass for less drive, change nothing but noise.
     """
-    ratio = improvement.rmse[EXTENDED][improvement.horizon] / np.maximum(
-        improvement.rmse[RECALIBRATED][improvement.horizon], 1e-300
-    )
+    ratio = 1.0 - improvement.reduction_from(RECALIBRATED)[improvement.horizon]
     return bool(np.log(np.maximum(ratio, 1e-300)).mean() > _NO_WORSE)
 
 

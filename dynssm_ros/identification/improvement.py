@@ -59,6 +59,16 @@ class Improvement:
         """Share of a car's error that is gone with the last, shape ``(n, 3)``."""
         return np.asarray(1.0 - self.rmse[list(self.rmse)[-1]] / np.maximum(self.rmse[name], 1e-300))
 
+    def ending_with(self, name: str) -> Improvement:
+        """The same with another car of it in the place of the last."""
+        last = list(self.cars)[-1]
+        return replace(
+            self,
+            cars={**self.cars, last: self.cars[name]},
+            errors={**self.errors, last: self.errors[name]},
+            explained_variance={**self.explained_variance, last: self.explained_variance[name]},
+        )
+
     def interval_from(self, name: str) -> Vector:
         """95 % interval of :meth:`reduction_from` by a bootstrap over blocks in time, shape ``(2, n, 3)``."""
         block = blocks(self.windows)

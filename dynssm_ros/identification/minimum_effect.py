@@ -60,7 +60,7 @@ def _column(problem: IdentificationProblem, fit: Fit, effect: str, parameter: st
 
 def _root(problem: IdentificationProblem, fit: Fit) -> Vector:
     """What each window counts, ``(W,)``."""
-    told = weights(fit.noise.whiten(fit.errors)) / max(problem.inflation(fit), problem.tempering)
+    told = weights(fit.noise.whiten(fit.errors)) / problem.counted_once(fit)
     return np.asarray(np.sqrt(told))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import lsq_linear
 
-from dynssm_ros.arrays import Vector, normal_equations
+from dynssm_ros.arrays import Indices, Vector, normal_equations
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.noise import Noise, NoiseResponse, fit_noise, weights
 from dynssm_ros.identification.windows import SimulationWindows
@@ -120,7 +120,7 @@ class IdentificationProblem:
         speed = windows.target[:, :, 0].mean(axis=1)
         self.spread = NoiseResponse.of(windows.transitions(car), speed)
         block = (windows.time // BLOCK).astype(np.intp)
-        self.block: npt.NDArray[np.intp] = np.unique(block, return_inverse=True)[1]
+        self.block: Indices = np.unique(block, return_inverse=True)[1]
         self._channels = np.tile(windows.spread**2, 3)
         self._known = car.prior_precision
         self.tempering = tempering
@@ -178,11 +178,9 @@ class IdentificationProblem:
         known[: len(self._known), : len(self._known)] = self._known
         return known
 
-    @staticmethod
-    def surprise(fit: Fit) -> float:
+    def surprise(self, fit: Fit) -> float:
         """How far the nominal values of a fit are off what was known: squared, in standard deviations."""
-        moved = fit.car.moved
-        return float(moved @ fit.car.prior_precision @ moved)
+        return float(fit.car.moved @ self._known @ fit.car.moved)
 
     def fit(
         self,
@@ -244,12 +242,17 @@ class IdentificationProblem:
                 nominal = jacobian[..., :n]
         return Fit(car, free, errors, jacobian, noise, best)
 
+    def select(self, chosen: Indices | npt.NDArray[np.bool_]) -> IdentificationProblem:
+        """Some of the windows, with the noise responses of all."""
+        other = copy(self)
+        other.windows = self.windows.select(chosen)
+        other.spread = NoiseResponse(self.spread.group[chosen], self.spread.G)
+        other.block = np.unique(self.block[chosen], return_inverse=True)[1]
+        return other
+
     def part(self, fit: Fit, every: int) -> tuple[IdentificationProblem, Fit]:
         """One window of each ``every``, which count for all, and what ``fit`` is there."""
-        other = copy(self)
-        other.windows = self.windows.select(np.arange(0, len(self.windows), every))
-        other.spread = NoiseResponse(self.spread.group[::every], self.spread.G)
-        other.block = self.block[::every]
+        other = self.select(np.arange(0, len(self.windows), every))
         other.tempering = self.tempering * len(other.windows) / len(self.windows)
         noise, errors = Noise(other.spread, fit.noise.v), fit.errors[::every]
         objective = other.objective(errors, fit.position, noise)
@@ -280,9 +283,12 @@ class IdentificationProblem:
 
         Shape ``(P, P)``.
         """
-        information, _ = self._scores(fit)
-        told = information / max(self.inflation(fit), self.tempering)
+        told = self.information(fit) / self.counted_once(fit)
         return np.asarray(np.linalg.inv(told + self.prior_precision(fit.position)))
+
+    def counted_once(self, fit: Fit) -> float:
+        """How many errors that hang together count as one beside ``fit``."""
+        return max(self.inflation(fit), self.tempering)
 
     def information(self, fit: Fit) -> Vector:
         """What the data alone say of the fitted values, ``(P, P)``: the inverse of their covariance."""

@@ -13,11 +13,17 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Indices
-from dynssm_ros.identification.candidates import SIZE_GRID_UNITS, Candidate, Responses, ScoredCandidate, ScoreTest
+from dynssm_ros.identification.candidates import (
+    BOTH_SIDES_UNITS,
+    Candidate,
+    Responses,
+    ScoredCandidate,
+    ScoreTest,
+    steps_off,
+)
 from dynssm_ros.identification.car import CarEstimate, Values
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
-from dynssm_ros.identification.problem import unit as unit_of
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS
 
@@ -230,11 +236,8 @@ class Search:
     def _sure(self, refined: Refined) -> float:
         fit, effect = refined.fit, refined.candidate.effect
         off = np.abs(fit.position) / np.sqrt(np.diag(self._study.covariance(fit)))
-        first = len(fit.position) - len(fit.free)
-        amplitudes = [
-            k for k, pair in enumerate(fit.free) if pair[0] == effect and pair[1] in refined.candidate.amplitudes
-        ]
-        return float(max(off[first + k] for k in amplitudes))
+        of_free = off[len(fit.car.moved) :]
+        return float(max(of_free[fit.free.index((effect, name))] for name in refined.candidate.amplitudes))
 
     def _temper(self, chosen: tuple[Candidate, ...]) -> None:
         """Weighs the data anew, as the errors hang together now that ``chosen`` are known."""
@@ -297,11 +300,10 @@ class Search:
         if candidate.local or len(candidate.amplitudes) > 1:
             return []
         (name,), effect = candidate.amplitudes, candidate.effect
-        about = EFFECTS[effect].PARAMETERS[name]
-        sizes = sorted({sign * size for sign in (-1.0, 1.0) for size in SIZE_GRID_UNITS})
-        wanted = {float(np.clip(about.neutral + k * unit_of(effect, name), about.lower, about.upper)) for k in sizes}
+        neutral = EFFECTS[effect].PARAMETERS[name].neutral
         given = replace(near.car, moved=self._given.moved)
-        return [given.with_effect(effect, values | {name: value}) for value in sorted(wanted - {about.neutral})]
+        steps = steps_off(effect, name, BOTH_SIDES_UNITS)
+        return [given.with_effect(effect, values | {name: neutral + step}) for step in steps]
 
     def _judge(self, without: Fit, fit: Fit, candidate: Candidate) -> Refined:
         own = self._study.inflation(fit, len(fit.free) - len(without.free))

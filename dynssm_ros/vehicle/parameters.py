@@ -29,7 +29,7 @@ COEFFICIENT_UNITS: dict[str, str] = {
 }  # fmt: skip
 COEFFICIENTS: tuple[str, ...] = Coefficients._fields
 assert tuple(COEFFICIENT_UNITS) == COEFFICIENTS
-_DRAWN = 1e-4
+_DRAWN = 1e-4  # share by which correlations are drawn to independence when they are written
 
 
 class Coefficient(StrictModel):
