@@ -384,11 +384,12 @@ def diagnose(
     commands: Commands | None = None,
     on_progress: Callable[[str], None] | None = None,
     exclude: Collection[str] = (),
+    suspect: Log | Sequence[Log] = (),
 ) -> Diagnosis:
     """Finds out what the simulation gets wrong about measured laps, and why.
 
     Args:
-        recordings: of one car.
+        recordings: of one car. What only one of several has is named with it.
         vehicle: the simulated car; how well it is known decides whether a coefficient that has to move is a cause.
         horizon: time that is simulated from a measured state on (s).
         holdout: share at the end that only measures the improvement; whole laps if there are three.
@@ -398,6 +399,7 @@ def diagnose(
         commands: source of the command inputs; the recording's own if not given.
         on_progress: called with what is being done.
         exclude: names of effects that are impossible there, such as wind in a hall.
+        suspect: recordings of the same car in which something may have changed since ``recordings``.
 
     Example:
         >>> hidden = {"steering_offset": {"offset": 0.03}}
@@ -411,8 +413,10 @@ def diagnose(
 
     line = None if track is None else _track(track).centre
     report = on_progress or (lambda words: None)
-    data = _joined(recordings, commands, 0.0)
-    return diagnose(data, _vehicle(vehicle), horizon, holdout, min_speed, integrator, line, report, exclude)
+    data, changed = (
+        [_recording(log).with_commands(commands) for log in _several(logs)] for logs in (recordings, suspect)
+    )
+    return diagnose(data, _vehicle(vehicle), horizon, holdout, min_speed, integrator, line, report, exclude, changed)
 
 
 def race(

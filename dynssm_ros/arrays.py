@@ -11,6 +11,8 @@ Vector = npt.NDArray[np.float64]
 """Real numbers in double precision; docstrings say the shape."""
 Indices = npt.NDArray[np.intp]
 """Row numbers."""
+Yes = npt.NDArray[np.bool_]
+"""Which of them."""
 
 
 def normal_equations(J: Any, r: Any, precision: Any) -> tuple[Any, Any]:

@@ -18,15 +18,24 @@ from dynssm_ros.cli.console import (
     progress_bar,
     write_results,
 )
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
 from dynssm_ros.vehicle import save_vehicle
 from dynssm_ros.vehicle.single_track import Integrator
 
 
 def diagnose(
-    recordings: Annotated[list[Path], typer.Argument(help="Recordings of one car.", metavar="R.parquet...")],
     vehicle: VehicleOption,
     out: Annotated[Path, typer.Option(help="Folder for vehicle.yaml, report.html and results.json.", file_okay=False)],
+    recordings: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Recordings of one car. What only one of several has is named with it.", metavar="R.parquet..."
+        ),
+    ] = None,
+    reference: Annotated[
+        list[Path] | None, typer.Option(help="Recording as R.parquet, beside those that are suspect; repeat for more.")
+    ] = None,
     horizon: Annotated[float, typer.Option(help="Time that is simulated from a measured state on (s).", min=0.0)] = 0.5,
     holdout: Annotated[
         float,
@@ -48,6 +57,10 @@ def diagnose(
         list[str] | None,
         typer.Option(help="Effect that is impossible there, such as crosswind in a hall; repeat for more."),
     ] = None,
+    suspect: Annotated[
+        list[Path] | None,
+        typer.Option(help="Recording in which something may have changed since the others; repeat for more."),
+    ] = None,
     commands: CommandsOption = None,
     json: JsonOption = None,
 ) -> None:
@@ -55,11 +68,13 @@ def diagnose(
     require("diagnose", "train", "report")
     from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report
 
+    if not (given := [*(recordings or ()), *(reference or ())]):
+        raise ConfigurationError("no recording given; expected R.parquet or --reference R.parquet")
     with progress_bar("diagnosing") as progress:
         steps = itertools.count(1)
         result = api.diagnose(
-            list(recordings), vehicle, horizon, holdout, min_speed, integrator, track, commands,
-            lambda words: progress(min(next(steps), 39), 40, words), exclude or (),
+            given, vehicle, horizon, holdout, min_speed, integrator, track, commands,
+            lambda words: progress(min(next(steps), 39), 40, words), exclude or (), suspect or (),
         )  # fmt: skip
     path = out / "vehicle.yaml"
     about = f"{result.car.vehicle.name}, extended by a diagnosis of {result.protocol['Recording']}: {result.verdict}."

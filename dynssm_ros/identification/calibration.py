@@ -135,8 +135,8 @@ def _windows(
     """
     for horizon in horizons[:-1]:
         with suppress(RecordingError):
-            return fit_windows(recording, data, horizon, min_speed, len(recording))
-    return fit_windows(recording, data, horizons[-1], min_speed, len(recording))
+            return fit_windows(recording, data, horizon, min_speed)
+    return fit_windows(recording, data, horizons[-1], min_speed)
 
 
 def _nearest_start(

@@ -37,10 +37,12 @@ class Candidate:
     Attributes:
         effect: its name.
         parameters: to be fitted together.
+        only_in: numbers of the recordings in which it acts; empty: in all.
     """
 
     effect: str
     parameters: tuple[str, ...]
+    only_in: tuple[int, ...] = ()
 
     @property
     def amplitudes(self) -> tuple[str, ...]:
@@ -79,9 +81,19 @@ class ScoredCandidate:
 
 
 def candidates(
-    problem: IdentificationProblem, car: CarEstimate, excluded: Collection[str] = ()
+    problem: IdentificationProblem,
+    car: CarEstimate,
+    excluded: Collection[str] = (),
+    groups: Sequence[tuple[int, ...]] = (),
 ) -> tuple[list[Candidate], dict[str, str]]:
-    """The effects that can be tried, and for those that cannot, why."""
+    """The effects that can be tried, and for those that cannot, why.
+
+    Args:
+        problem: the windows.
+        car: as the vehicle file has it.
+        excluded: effects that are not tried.
+        groups: of recordings, in each of which an effect may act that the others do not have.
+    """
     found, left = [], {}
     have = set(problem.windows.data.context)
     for name, effect in EFFECTS.items():
@@ -97,7 +109,7 @@ def candidates(
         usable = [v for v in effect.variants() if set(effect.signals(v)) <= have]
         if set(LAP) <= have:
             usable = [v for v in usable if v not in effect.OPEN_ROAD]
-        found += [Candidate(name, variant) for variant in usable]
+        found += [Candidate(name, variant, group) for group in ((), *groups) for variant in usable]
         if not usable:
             left[name] = f"the recording has no {', '.join(s for s in effect.signals() if s not in have)}"
     return found, left
@@ -149,6 +161,9 @@ class Responses:
                     found = found[:1]
             self._known[key] = found
         share = np.asarray(section(np, self._lap, **place)).mean(axis=0) if local else None
+        if candidate.only_in:
+            acts = np.isin(self._study.windows.number, candidate.only_in)
+            share = acts if share is None else acts * share
         return self._known[key], share
 
     def _simulated(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from dynssm_ros.arrays import Vector
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, Effect
 from dynssm_ros.vehicle.parameters import VehicleConstants
@@ -32,12 +32,14 @@ class CarEstimate:
             deviations of what is known of it; shape ``(18,)``. Those that are positive move as logarithms.
         effects: values by effect and parameter, in the order in which they act.
         mass_std: standard deviation of the mass, as a share of it; 0: the mass is known.
+        only_in: numbers of the recordings in which an effect acts, by its name; those that are not there act in all.
     """
 
     vehicle: Vehicle
     moved: Vector
     effects: Mapping[str, Values]
     mass_std: float = MASS_STD
+    only_in: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, vehicle: Vehicle, mass_std: float | None = None) -> CarEstimate:
@@ -94,18 +96,21 @@ class CarEstimate:
         factor = float(np.exp(self.mass_std * np.clip(self.moved, *self.limits)[-1]))
         return self.vehicle.constants.model_copy(update={"m": self.vehicle.constants.m * factor})
 
-    @property
-    def active(self) -> tuple[Effect, ...]:
-        """All effects, ready to act."""
-        return (*self.vehicle.active_effects, *(EFFECTS[name](**values) for name, values in self.effects.items()))
+    def with_effect(self, name: str, values: Values, only_in: tuple[int, ...] | None = None) -> CarEstimate:
+        """The same car with an effect added or changed.
 
-    def with_effect(self, name: str, values: Values) -> CarEstimate:
-        """The same car with an effect added or changed."""
-        return replace(self, effects={**self.effects, name: dict(values)})
+        Args:
+            name: of the effect.
+            values: of its parameters.
+            only_in: recordings in which it acts; empty: in all; ``None``: as before.
+        """
+        changed = replace(self, effects={**self.effects, name: dict(values)})
+        return changed if only_in is None else replace(changed, only_in=_changed(self.only_in, name, only_in))
 
     def without(self, name: str) -> CarEstimate:
         """The same car without an effect."""
-        return replace(self, effects={key: values for key, values in self.effects.items() if key != name})
+        others = {key: values for key, values in self.effects.items() if key != name}
+        return replace(self, effects=others, only_in=_changed(self.only_in, name, ()))
 
     def known(self, covariance: Vector) -> Vehicle:
         """The vehicle with refitted nominal values and what is now known of them, never less than before.
@@ -118,11 +123,20 @@ class CarEstimate:
         correlation = covariance[:n, :n] / np.outer(relative, relative)
         return self.vehicle.with_nominal(np.array(self.theta), self.in_units(np.minimum(relative, 1.0)), correlation)
 
-    def extended(self, covariance: Vector) -> Vehicle:
-        """The vehicle to write: as :meth:`known`, with mass and effects."""
+    def extended(self, covariance: Vector, recording: int | None = None) -> Vehicle:
+        """The vehicle to write: as :meth:`known`, with mass and effects.
+
+        Args:
+            covariance: of :attr:`moved`, at least its first 17 rows and columns.
+            recording: number of the one in which the car is meant; ``None``: with what acts in all of them alone.
+        """
         vehicle = self.known(covariance)
         vehicle = vehicle.model_copy(update={"constants": self.constants})
-        return vehicle.with_effects(self.effects.items())
+        return vehicle.with_effects(
+            (name, values)
+            for name, values in self.effects.items()
+            if name not in self.only_in or recording in self.only_in[name]
+        )
 
 
 class CarBatch(NamedTuple):
@@ -136,18 +150,34 @@ class CarBatch(NamedTuple):
     effects: tuple[Effect, ...]
 
     @classmethod
-    def of(cls, cars: Sequence[CarEstimate]) -> CarBatch:
-        """Cars of one vehicle with the same effects in the same order."""
+    def of(cls, cars: Sequence[CarEstimate], number: Indices) -> CarBatch:
+        """Cars of one vehicle with the same effects in the same order.
+
+        Args:
+            cars: that differ in values alone.
+            number: of the recording of each simulation, shape ``(W,)``.
+        """
         first = cars[0]
-        if len(cars) == 1:
-            return cls(first.theta, first.constants, first.active)
         theta = Coefficients(*map(_together, zip(*(car.theta for car in cars), strict=True)))
-        constants = SimpleNamespace(**dict(first.constants) | {"m": _together([car.constants.m for car in cars])})
-        own = [
-            EFFECTS[name](**{key: _together([car.effects[name][key] for car in cars]) for key in values})
-            for name, values in first.effects.items()
-        ]
+        mass = _together([car.constants.m for car in cars])
+        constants = first.constants if len(cars) == 1 else SimpleNamespace(**dict(first.constants) | {"m": mass})
+        own = []
+        for name, values in first.effects.items():
+            columns = {key: _together([car.effects[name][key] for car in cars]) for key in values}
+            if name in first.only_in:
+                acts = np.isin(number, first.only_in[name])
+                about = EFFECTS[name].PARAMETERS
+                columns = {k: v if about[k].shape else np.where(acts, v, about[k].neutral) for k, v in columns.items()}
+            own.append(EFFECTS[name](**columns))
         return cls(theta, constants, (*first.vehicle.active_effects, *own))
+
+
+def _changed(
+    only_in: Mapping[str, tuple[int, ...]], name: str, recordings: tuple[int, ...]
+) -> dict[str, tuple[int, ...]]:
+    """Where effects act, with one of them in other recordings; none: in all."""
+    others = {key: where for key, where in only_in.items() if key != name}
+    return others | {name: recordings} if recordings else others
 
 
 def _together(values: Sequence[float]) -> Any:

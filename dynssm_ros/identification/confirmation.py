@@ -1,6 +1,7 @@
 """What a cause is worth where it was not fitted: every unit of the drive is left out in turn, and the car fitted again.
 
-A unit is a lap, or a quarter of the time. Its windows are predicted by a car that was fitted to all others.
+A unit is a recording, a lap, or a quarter of the time. Its windows are predicted by a car that was fitted to all others.
+What acts in one recording alone is judged by parts of that recording.
 The logarithm of their predictive likelihood with a cause, less that without it, is what the cause gains there (Vehtari,
 Gelman and Gabry 2017). A cause that follows the accidents of one stretch gains nothing elsewhere.
 """
@@ -15,6 +16,7 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.identification.noise import Noise
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
+from dynssm_ros.identification.recordings import LeftOut
 from dynssm_ros.vehicle.effects import EFFECTS
 
 _KNOWN = 2.0  # standard errors that the nominal values must be spared, where left-out units tell nothing
@@ -77,30 +79,38 @@ class LeaveOneOut:
 
     Args:
         problem: all windows.
-        unit: number of each window's unit, ``(W,)``.
+        whole: recordings, if there are enough of them, else as ``parts``.
+        parts: laps or quarters of the time of each recording.
     """
 
-    def __init__(self, problem: IdentificationProblem, unit: Indices) -> None:
-        self._problem, self._unit = problem, unit
-        self._known: dict[int, tuple[Fit, _Predicted]] = {}
+    def __init__(self, problem: IdentificationProblem, whole: LeftOut, parts: LeftOut) -> None:
+        self._problem, self._whole, self._parts = problem, whole, parts
+        self._known: dict[tuple[int, int], tuple[Fit, _Predicted]] = {}
 
     def compare(self, without: Fit, fit: Fit) -> Confirmation:
         """What ``fit`` gains over ``without``."""
-        before, after = self._predicted(without), self._predicted(fit)
-        by_window = (after.likelihood - before.likelihood) / self._problem.tempering
-        gain: Vector = np.bincount(self._unit, by_window).astype(np.float64)
-        std = max(_spread(gain), _spread(np.bincount(self._problem.block, by_window).astype(np.float64)))
+        only_in = _differ_only_in(without, fit)
+        left_out = self._parts if only_in else self._whole
+        before, after = self._predicted(without, left_out), self._predicted(fit, left_out)
+        number = self._problem.windows.number
+        told = np.isin(number, only_in) if only_in else np.ones(len(number), dtype=bool)
+        by_window = ((after.likelihood - before.likelihood) / self._problem.tempering)[told]
+        gain, by_block = (_sums(by_window, n[told]) for n in (left_out.unit, self._problem.block))
         known = (self._problem.surprise(without) - self._problem.surprise(fit)) / 2.0
-        left = after.error.sum(axis=0) / np.maximum(before.error.sum(axis=0), 1e-300)
-        return Confirmation(gain, std, known, 1.0 - left)
+        left = after.error[told].sum(axis=0) / np.maximum(before.error[told].sum(axis=0), 1e-300)
+        return Confirmation(gain, max(_spread(gain), _spread(by_block)), known, 1.0 - left)
 
-    def _predicted(self, fit: Fit) -> _Predicted:
-        """Of each window by the fit without its unit; noise and the place of a local effect stay as they were found."""
-        if id(fit) not in self._known:
-            near = _placed(fit)
-            likelihood, error = np.empty(len(self._unit)), np.empty((len(self._unit), 3))
-            for number in range(int(self._unit.max()) + 1):
-                out = self._unit == number
+    def _predicted(self, fit: Fit, left_out: LeftOut) -> _Predicted:
+        """Of each window by the fit without its fold; noise and the place of a local effect stay as they were found.
+
+        So do effects of single recordings where whole recordings are left out, which tell nothing of them.
+        """
+        fold, key = left_out.fold, (id(fit), id(left_out))
+        if key not in self._known:
+            near = _held(fit, self._whole is not self._parts and left_out is self._whole)
+            likelihood, error = np.empty(len(fold)), np.empty((len(fold), 3))
+            for number in range(int(fold.max()) + 1):
+                out = fold == number
                 rest, unseen = self._problem.select(~out), self._problem.select(out)
                 start = replace(near, errors=near.errors[~out], jacobian=near.jacobian[~out])
                 noise = Noise(rest.spread, fit.noise.v)
@@ -108,15 +118,36 @@ class LeaveOneOut:
                 errors = unseen.errors(found.car)
                 likelihood[out] = unseen.log_likelihood(errors, Noise(unseen.spread, fit.noise.v))
                 error[out] = errors[:, -3:] ** 2
-            self._known[id(fit)] = fit, _Predicted(likelihood, error)
-        return self._known[id(fit)][1]
+            self._known[key] = fit, _Predicted(likelihood, error)
+        return self._known[key][1]
 
 
-def _placed(fit: Fit) -> Fit:
-    """The fit with what shapes its effects, such as the place of a local one, no longer free."""
-    shaping = [k for k, (effect, name) in enumerate(fit.free) if EFFECTS[effect].PARAMETERS[name].shape]
-    free = tuple(pair for k, pair in enumerate(fit.free) if k not in shaping)
-    return replace(fit, free=free, jacobian=np.delete(fit.jacobian, [len(fit.car.moved) + k for k in shaping], axis=2))
+def _differ_only_in(one: Fit, other: Fit) -> tuple[int, ...]:
+    """The recordings outside of which two fits have the same effects; empty: they differ in all."""
+    acts = [{name: fit.car.only_in.get(name, ()) for name in fit.car.effects} for fit in (one, other)]
+    differ = set(acts[0].items()) ^ set(acts[1].items())
+    return () if not all(where for _, where in differ) else tuple({k for _, where in differ for k in where})
+
+
+def _held(fit: Fit, recordings: bool) -> Fit:
+    """The fit with what shapes its effects, such as the place of a local one, no longer free.
+
+    Args:
+        fit: of all.
+        recordings: whether effects of single recordings are no longer free either.
+    """
+    held = [
+        k
+        for k, (effect, name) in enumerate(fit.free)
+        if EFFECTS[effect].PARAMETERS[name].shape or (recordings and effect in fit.car.only_in)
+    ]
+    free = tuple(pair for k, pair in enumerate(fit.free) if k not in held)
+    return replace(fit, free=free, jacobian=np.delete(fit.jacobian, [len(fit.car.moved) + k for k in held], axis=2))
+
+
+def _sums(values: Vector, number: Indices) -> Vector:
+    """Sums of values with the same number, of those numbers that there are."""
+    return np.bincount(np.unique(number, return_inverse=True)[1], values).astype(np.float64)
 
 
 def _spread(parts: Vector) -> float:

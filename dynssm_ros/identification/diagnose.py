@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.confirmation import Confirmation
@@ -17,19 +17,13 @@ from dynssm_ros.identification.integrator import SearchResult, search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
 from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import per_unit
+from dynssm_ros.identification.recordings import LeftOut, RecordingSet
 from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance, clustered, explained_variance
 from dynssm_ros.identification.selection import Refined, Selection
-from dynssm_ros.identification.windows import (
-    SimulationWindows,
-    compared_every,
-    fit_windows,
-    held_out_windows,
-    recorded_rows,
-)
+from dynssm_ros.identification.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
-from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, require_context
@@ -39,11 +33,9 @@ Verdict = Literal["effects", "none", "unexplained"]
 
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
-_LEAST_LAPS = 3  # with which whole laps are held out
 _NO_WORSE = 0.01  # of the error on held-out laps, that the extended car may be worse than the recalibrated one
 _MOVED = 3.0  # standard deviations beyond which recalibration is a finding
 _AT = 1e-3  # of the span, nearer to a bound than which an estimate is on it
-_PARTS = 4  # of the time, where there are no laps
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
 
@@ -61,6 +53,7 @@ class Cause:
         confirmation: what it gains on parts of the fitted rows that were left out.
         on_bound: its parameters that the data push against a bound: they are at least that far off.
         alternatives: effects that explain the data as well.
+        only_in: names of the recordings in which it acts; empty: in all.
     """
 
     effect: str
@@ -72,6 +65,7 @@ class Cause:
     confirmation: Confirmation
     on_bound: tuple[str, ...]
     alternatives: tuple[str, ...]
+    only_in: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -96,6 +90,7 @@ class Diagnosis:
         notes: what limits the diagnosis.
         protocol: how it was obtained, by name.
         windows: of the fit.
+        recordings: what was diagnosed.
     """
 
     verdict: Verdict
@@ -112,6 +107,7 @@ class Diagnosis:
     notes: tuple[str, ...]
     protocol: Mapping[str, str]
     windows: SimulationWindows
+    recordings: RecordingSet
 
     @property
     def recalibrated(self) -> dict[str, tuple[float, float]]:
@@ -154,6 +150,7 @@ class Diagnosis:
                     },
                     "on_bound": list(cause.on_bound),
                     "alternatives": list(cause.alternatives),
+                    "only_in": list(cause.only_in),
                 }
                 for cause in self.causes
             ],
@@ -195,7 +192,7 @@ def _intervals(bounds: Vector) -> dict[str, list[float]]:
 
 
 def diagnose(
-    recording: Recording,
+    recordings: Recording | Sequence[Recording],
     vehicle: Vehicle,
     horizon: float = _HORIZON,
     holdout: float = _HOLDOUT,
@@ -204,28 +201,37 @@ def diagnose(
     line: ClosedLine | None = None,
     on_progress: OnProgress = lambda words: None,
     exclude: Collection[str] = (),
+    suspect: Sequence[Recording] = (),
 ) -> Diagnosis:
-    """Finds out what a vehicle file gets wrong about a recording.
+    """Finds out what a vehicle file gets wrong about recordings.
+
+    An effect acts in all recordings, or in one of several and not in the others. With ``suspect`` it acts in all or in
+    those: what has changed since the others.
 
     Args:
-        recording: measured laps of one car.
+        recordings: measured laps of one car.
         vehicle: the nominal car. How well its coefficients are known decides whether one that has to move is a cause.
         horizon: time that is simulated from a measured state on (s).
-        holdout: share of the recording, at its end, that neither fit nor selection sees; whole laps if there are three.
+        holdout: share of each recording, at its end, that neither fit nor selection sees; whole laps if there are three.
         min_speed: stretches below are left out (m/s); ``None``: the vehicle file's.
         integrator: of the simulation; ``None``: Runge-Kutta, unless Euler steps are clearly closer to the data.
         line: of the track, from which positions on the lap are counted; ``None``: the first full lap of the recording.
         on_progress: told what is being done.
         exclude: names of effects that are impossible there, such as wind in a hall.
+        suspect: recordings of the same car in which something may have changed.
 
     Raises:
         RecordingError: another sampling time than the vehicle's, a constant or missing channel, too few rows.
         ConfigurationError: an effect of the vehicle needs a signal that the recording has not; options out of range.
     """
-    at = _prepare(recording, vehicle, horizon, holdout, min_speed, line)
+    first = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    at = _prepare([*first, *suspect], vehicle, horizon, holdout, min_speed, line)
+    suspects = tuple(range(len(first), len(first) + len(suspect)))
     if unknown := sorted(set(exclude) - set(EFFECTS)):
         raise ConfigurationError(f"exclude {', '.join(unknown)}: no such effect; expected some of {', '.join(EFFECTS)}")
-    found = search_causes(at.fitted, at.car, at.unit, integrator, on_progress, exclude)
+    found = search_causes(
+        at.fitted, at.car, at.left_out, integrator, on_progress, exclude, _groups(len(first), suspects)
+    )
     problem, selection, fit = found.problem, found.selection, found.selection.fit
     windows = problem.windows
     at = at._replace(unseen=replace(at.unseen, integrator=windows.integrator, substeps=windows.substeps))
@@ -243,18 +249,20 @@ def diagnose(
     sizes = minimum_detectable(problem, fit, found.search.found)
     limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
     covariance = problem.covariance(fit)
-    extended = fit.car.extended(covariance).model_copy(update={"integrator": windows.integrator})
+    extended = fit.car.extended(covariance, suspects[-1] if suspects else None)
+    extended = extended.model_copy(update={"integrator": windows.integrator})
     std = np.sqrt(np.diag(covariance))
     if vehicle.integrator not in (None, windows.integrator):
         limits.append(
             f"the vehicle file was calibrated for {vehicle.integrator} steps, the data are closer to {windows.integrator}; "
             f"calibrate with --integrator {windows.integrator}, else what the steps differ by may be named"
         )
-    limits += [*_hidden(sizes), *_not_live(extended)]
+    limits += [*_hidden(sizes), *_not_live(extended), *_not_written(fit.car, extended)]
     causes = tuple(_cause(one, found, at, std) for one in selection.chosen)
     left = explained_variance(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], problem.block)
     white = fit.noise.whiten(fit.errors)
     in_noise = weights(white) * (white**2).mean(axis=1)
+    in_noise = in_noise / (np.bincount(windows.number, in_noise) / np.bincount(windows.number))[windows.number]
     together = clustered(in_noise, windows.time, problem.block, selection.inflation)
     return Diagnosis(
         "effects" if causes else "unexplained" if left.is_there or together.is_there else "none",
@@ -271,7 +279,15 @@ def diagnose(
         (*at.notes, *limits),
         at.protocol | {"Integrator": windows.integrator},
         windows,
+        at.recordings,
     )
+
+
+def _groups(count: int, suspects: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """The groups of recordings that may differ from the others: the suspects, else each of several."""
+    if suspects:
+        return [suspects]
+    return [(k,) for k in range(count)] if count > 1 else []
 
 
 def _worse(improvement: Improvement) -> bool:
@@ -292,8 +308,9 @@ def _moved(car: CarEstimate) -> dict[str, float]:
 class _Prepared(NamedTuple):
     """What a diagnosis works on."""
 
+    recordings: RecordingSet
     fitted: SimulationWindows
-    unit: Indices
+    left_out: tuple[LeftOut, LeftOut]
     steps: int
     unseen: SimulationWindows
     car: CarEstimate
@@ -302,7 +319,7 @@ class _Prepared(NamedTuple):
 
 
 def _prepare(
-    recording: Recording,
+    recordings: Sequence[Recording],
     vehicle: Vehicle,
     horizon: float,
     holdout: float,
@@ -312,6 +329,8 @@ def _prepare(
     """Checks what was given, holds laps out and lays the simulations along the rest; see :func:`diagnose`."""
     if not 0.05 <= holdout <= 0.8:
         raise ConfigurationError(f"holdout {holdout:g}: expected a share between 0.05 and 0.8")
+    together = RecordingSet.of(recordings, holdout)
+    recording = together.recording
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
     steps = int(np.ceil(horizon / recording.T_s - 1e-9))
     if steps < 2:
@@ -323,36 +342,24 @@ def _prepare(
     steps = every * -(-steps // every)
     notes = _check_signals(recording)
     speed = vehicle.minimum_speed if min_speed is None else min_speed
-    cut, split = _cut(recording, holdout)
-    line = first_lap(recording.select(slice(None, cut))) if line is None else line
+    line = together.fitted_lap() if line is None else line
     if line is None:
         notes.append("no full lap with positions: effects that live at a place of the track cannot be judged")
-    context = lap_context(recording, line)
+    data = together.rows(line)
     source = ", ".join(recording.info.source)
-    require_context(vehicle.active_effects, context, f"recording {source}")
-    data = recorded_rows(recording, context)
-    fitted = fit_windows(recording, data, steps * recording.T_s, speed, cut)
-    unseen = held_out_windows(recording, data, steps, 2 * asked, speed, cut)
+    require_context(vehicle.active_effects, data.context, f"recording {source}")
+    fitted = fit_windows(recording, data, steps * recording.T_s, speed, together.held_out)
+    unseen = held_out_windows(recording, data, steps, 2 * asked, speed, together.held_out)
     protocol = {
         "Recording": source,
         "Commands": recording.info.commands,
         "Vehicle": vehicle.name,
-        "Held out": split,
+        "Held out": together.split,
         "Fit": f"{len(fitted)} simulations of {steps * recording.T_s:g} s, from {speed:g} m/s",
         "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * recording.T_s:g} s",
     }
-    return _Prepared(fitted, _units(recording, fitted, line), asked, unseen, CarEstimate.of(vehicle), notes, protocol)
-
-
-def _units(recording: Recording, fitted: SimulationWindows, line: ClosedLine | None) -> Indices:
-    """Number of the part of the drive that each simulation is left out with, ``(W,)``: laps, else parts of the time."""
-    lap = lap_number(recording, line)
-    if lap is not None and np.ptp(lap[fitted.starts]) + 1 >= _LEAST_LAPS:
-        number = lap[fitted.starts]
-    else:
-        time = fitted.time
-        number = np.floor(_PARTS * (time - time[0]) / (np.ptp(time) + 1e-9))
-    return np.unique(number, return_inverse=True)[1]
+    left_out = together.left_out(fitted.starts, line)
+    return _Prepared(together, fitted, left_out, asked, unseen, CarEstimate.of(vehicle), notes, protocol)
 
 
 def _cause(one: Refined, found: SearchResult, at: _Prepared, std: Vector) -> Cause:
@@ -376,6 +383,7 @@ def _cause(one: Refined, found: SearchResult, at: _Prepared, std: Vector) -> Cau
         one.confirmation,
         _on_bound(effect, fit.car.effects[effect], known),
         tuple(found.selection.alternatives[effect]),
+        tuple(at.recordings.names[k] for k in one.candidate.only_in),
     )
 
 
@@ -411,6 +419,13 @@ def _not_live(vehicle: Vehicle) -> Iterator[str]:
             )
 
 
+def _not_written(car: CarEstimate, vehicle: Vehicle) -> Iterator[str]:
+    """What was found in some recordings and is not in the vehicle file."""
+    written = {entry.name for entry in vehicle.effects}
+    if left := [name for name in car.only_in if name not in written]:
+        yield f"{', '.join(left)}: not in the vehicle file, because not all recordings have it"
+
+
 def _check_signals(recording: Recording) -> list[str]:
     where = f"recording {', '.join(recording.info.source)}"
     for name in STATE_SIGNALS:
@@ -421,20 +436,3 @@ def _check_signals(recording: Recording) -> list[str]:
         if np.ptp(recording[feedback] + recording[command]) == 0:
             notes.append(f"{name} is constant: effects that need it to change cannot be judged")
     return notes
-
-
-def _cut(recording: Recording, holdout: float) -> tuple[int, str]:
-    """First held-out row, and in words."""
-    N = len(recording)
-    line = first_lap(recording)
-    lap = lap_number(recording, line)
-    if lap is not None:
-        # laps are counted from the first row's place, so that the last full ones are held out
-        total = int(lap[-1] - lap[0])
-        held = max(1, round(holdout * total))
-        if total >= _LEAST_LAPS:
-            cut = int(np.argmax(lap >= lap[-1] - held))
-            if 0 < cut < N:
-                return cut, f"the last {held} of {total} laps and what follows"
-    cut = N - max(1, round(holdout * N))
-    return cut, f"the last {100 * holdout:.0f} % as one block (fewer than {_LEAST_LAPS} laps)"

@@ -6,16 +6,16 @@ chance, so that the choice is made anew with the causes that were found.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices
 from dynssm_ros.identification.candidates import candidates
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
+from dynssm_ros.identification.recordings import LeftOut
 from dynssm_ros.identification.selection import Search, Selection
 from dynssm_ros.identification.windows import SimulationWindows
 from dynssm_ros.vehicle.single_track import Integrator
@@ -43,26 +43,28 @@ class SearchResult(NamedTuple):
 def search_causes(
     windows: SimulationWindows,
     car: CarEstimate,
-    unit: Indices,
+    left_out: tuple[LeftOut, LeftOut],
     integrator: Integrator | None,
     on_progress: Callable[[str], None],
     exclude: Collection[str] = (),
+    groups: Sequence[tuple[int, ...]] = (),
 ) -> SearchResult:
     """Searches for causes.
 
     Args:
         windows: for the fit.
         car: as the vehicle file has it.
-        unit: number of the unit of each window that is left out as a whole, ``(W,)``.
+        left_out: how windows are left out: recordings in turn, and parts of each.
         integrator: of the simulation; ``None``: chosen by the data.
         on_progress: told what is being done.
         exclude: effects that are not tried.
+        groups: of recordings, in each of which an effect may act that the others do not have.
     """
 
     def search(windows: SimulationWindows, start: Fit | None = None) -> SearchResult:
         problem = IdentificationProblem(windows, car)
-        found, impossible = candidates(problem, car, exclude)
-        searching = Search(problem, car, found, unit, on_progress)
+        found, impossible = candidates(problem, car, exclude, groups)
+        searching = Search(problem, car, found, left_out, on_progress)
         return SearchResult(problem, searching, searching.run(start), impossible)
 
     if integrator is not None:

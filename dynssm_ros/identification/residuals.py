@@ -69,7 +69,8 @@ def clustered(sizes: Vector, time: Vector, block: Indices, inflation: float, see
     """Looks for errors that come together.
 
     Args:
-        sizes: of the error of each window, squared and in units of the noise, shape ``(W,)``.
+        sizes: of the error of each window, squared and in units of the noise, shape ``(W,)``; that of each recording has the
+            same mean, for some days' sensors are noisier.
         time: of each window (s), shape ``(W,)``.
         block: number of the block in time of each window, shape ``(W,)``.
         inflation: of the variance of what was fitted, by errors that hang together.

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices
 from dynssm_ros.identification.candidates import (
     BOTH_SIDES_UNITS,
     Candidate,
@@ -24,6 +23,7 @@ from dynssm_ros.identification.candidates import (
 from dynssm_ros.identification.car import CarEstimate, Values
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
+from dynssm_ros.identification.recordings import LeftOut
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS
 
@@ -104,7 +104,7 @@ class Search:
         problem: the windows.
         car: where to start.
         found: the candidates.
-        unit: number of the unit of each window that is left out as a whole, ``(W,)``.
+        left_out: how windows are left out: recordings in turn, and parts of each.
         on_progress: told what is being done.
     """
 
@@ -113,18 +113,18 @@ class Search:
         problem: IdentificationProblem,
         car: CarEstimate,
         found: Sequence[Candidate],
-        unit: Indices,
+        left_out: tuple[LeftOut, LeftOut],
         on_progress: OnProgress = lambda words: None,
     ) -> None:
         self._study, self._given, self.found, self._report = problem, car, list(found), on_progress
-        self._unit = unit
+        self._parts = left_out
         self._price = np.log(3.0 * problem.windows.steps * len(problem.windows))
         on_progress("recalibrating the nominal car")
         self.base = problem.temper(problem.fit(car, ()))
         self._responses = Responses(problem, self.base.car, self.base.errors)
         self._ranked: dict[frozenset[Candidate], list[Refined]] = {}
         self._fits: dict[frozenset[Candidate], Fit] = {frozenset(): self.base}
-        self._left_out = LeaveOneOut(problem, unit)
+        self._left_out = LeaveOneOut(problem, *left_out)
         self.tried: dict[str, float] = {}
 
     def run(self, start: Fit | None = None) -> Selection:
@@ -216,7 +216,10 @@ class Search:
         if start is None or not start.free:
             return []
         effects = dict.fromkeys(effect for effect, _ in start.free)
-        chosen = [Candidate(name, tuple(p for effect, p in start.free if effect == name)) for name in effects]
+        chosen = [
+            Candidate(name, tuple(p for effect, p in start.free if effect == name), start.car.only_in.get(name, ()))
+            for name in effects
+        ]
         self._fits[frozenset(chosen)] = self._study.fit(start.car, start.free)
         self._temper(tuple(chosen))
         return chosen
@@ -246,7 +249,7 @@ class Search:
         if abs(np.log(inflation / self._study.tempering)) < _ALIKE:
             return
         self._study.tempering = inflation
-        self._ranked, self._left_out = {}, LeaveOneOut(self._study, self._unit)
+        self._ranked, self._left_out = {}, LeaveOneOut(self._study, *self._parts)
         self._fits = {
             frozenset(): self._study.fit(self.base.car, (), self.base),
             frozenset(chosen): self._study.fit(fit.car, fit.free, fit),
@@ -282,7 +285,7 @@ class Search:
                 about = EFFECTS[candidate.effect].PARAMETERS[name]
                 wanted = about.neutral + share * (values[name] - about.neutral)
                 values[name] = float(np.clip(wanted, about.lower, about.upper))
-            cars.append(near.car.with_effect(candidate.effect, values))
+            cars.append(near.car.with_effect(candidate.effect, values, candidate.only_in))
         cars += self._from_the_file(near, candidate, scored.values)
         warm_started = cars
         for _ in range(_WARM_STARTS):
@@ -303,7 +306,7 @@ class Search:
         neutral = EFFECTS[effect].PARAMETERS[name].neutral
         given = replace(near.car, moved=self._given.moved)
         steps = steps_off(effect, name, BOTH_SIDES_UNITS)
-        return [given.with_effect(effect, values | {name: neutral + step}) for step in steps]
+        return [given.with_effect(effect, values | {name: neutral + step}, candidate.only_in) for step in steps]
 
     def _judge(self, without: Fit, fit: Fit, candidate: Candidate) -> Refined:
         own = self._study.inflation(fit, len(fit.free) - len(without.free))
@@ -347,9 +350,14 @@ class Search:
 
 
 def _is_met(refined: Refined) -> bool:
-    """Whether an effect is on a side of neutral on which it is met in cars that can be driven."""
+    """Whether an effect is on a side of neutral on which it is met in cars that can be driven.
+
+    Beside other recordings either side is.
+    """
     effect, name = refined.candidate.effect, refined.candidate.amplitudes[0]
     about = EFFECTS[effect]
+    if refined.candidate.only_in:
+        return True
     side = np.sign(refined.fit.car.effects[effect][name] - about.PARAMETERS[name].neutral)
     return not about.DIRECTIONS or float(side) in about.DIRECTIONS
 

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Indices, Vector, Yes
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.identification.car import CarBatch, CarEstimate
 from dynssm_ros.signals.inputs import applied_inputs
@@ -40,12 +39,14 @@ class RecordedRows:
         context: other signals by name, each of shape ``(N,)``.
         T_s: sampling time (s).
         time: of each row since the first (s), shape ``(N,)``.
+        number: of the recording that each row is of, shape ``(N,)``.
     """
 
     rows: Vector
     context: dict[str, Vector]
     T_s: float
     time: Vector
+    number: Indices
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class SimulationWindows:
     def __len__(self) -> int:
         return len(self.starts)
 
-    def select(self, chosen: Indices | npt.NDArray[np.bool_]) -> SimulationWindows:
+    def select(self, chosen: Indices | Yes) -> SimulationWindows:
         """Some of the simulations."""
         return replace(self, starts=self.starts[chosen])
 
@@ -104,6 +105,11 @@ class SimulationWindows:
         """Time of each start (s), shape ``(W,)``."""
         return self.data.time[self.starts]
 
+    @property
+    def number(self) -> Indices:
+        """Number of the recording of each simulation, shape ``(W,)``."""
+        return self.data.number[self.starts]
+
     def context(self, shift: int) -> dict[str, Vector]:
         """The other signals ``shift`` rows after the starts."""
         return {name: values[self.starts + shift] for name, values in self.data.context.items()}
@@ -119,7 +125,7 @@ class SimulationWindows:
             cars: what is simulated; they differ in values alone.
             context: values that replace signals of the recording, the same in all rows.
         """
-        fleet = CarBatch.of(cars)
+        fleet = CarBatch.of(cars, self.number)
         carries = any(effect.carries for effect in fleet.effects)
         shift = -self.warm if carries or self.filtered else 0
         taken = 1.0 - np.exp(-self.data.T_s / _FOLLOWING) if self.filtered else 1.0
@@ -145,7 +151,7 @@ class SimulationWindows:
 
     def transitions(self, car: CarEstimate) -> Vector:
         """Derivatives of each compared row by the one before, along the measured rows, shape ``(W, K, 3, 3)``."""
-        fleet = CarBatch.of([car])
+        fleet = CarBatch.of([car], self.number)
         fleet = fleet._replace(effects=tuple(effect for effect in fleet.effects if not effect.carries))
         out = np.empty((len(self), self.steps, 3, 3))
         for k in range(self.steps):
@@ -194,8 +200,9 @@ class SimulationWindows:
 
 
 def recorded_rows(recording: Recording, context: dict[str, Vector]) -> RecordedRows:
-    """The rows of a recording with other signals by name."""
-    return RecordedRows(recording.matrix.T, context, recording.T_s, (recording.time - recording.time[0]) / 1e9)
+    """The rows of a single recording with other signals by name."""
+    time, number = (recording.time - recording.time[0]) / 1e9, np.zeros(len(recording), dtype=np.intp)
+    return RecordedRows(recording.matrix.T, context, recording.T_s, time, number)
 
 
 def compared_every(steps: int) -> int:
@@ -204,16 +211,16 @@ def compared_every(steps: int) -> int:
 
 
 def fit_windows(
-    recording: Recording, data: RecordedRows, horizon: float, min_speed: float, cut: int
+    recording: Recording, data: RecordedRows, horizon: float, min_speed: float, held_out: Yes | None = None
 ) -> SimulationWindows:
-    """Simulations for a fit, end to end before the row ``cut``.
+    """Simulations for a fit, end to end.
 
     Args:
         recording: what was measured.
         data: the same, as simulations read it.
         horizon: of each simulation (s), rounded up to rows that are compared.
         min_speed: of all rows (m/s).
-        cut: rows from here on are left out.
+        held_out: rows that no simulation may reach, ``(N,)``; ``None``: all may be used.
 
     Raises:
         RecordingError: too few stretches.
@@ -224,30 +231,41 @@ def fit_windows(
     warm = round(WARM_UP / recording.T_s)
     ends = recording.window_ends(warm + 1, horizon=steps, min_speed=min_speed)
     starts: list[int] = []
-    for row in ends[ends + steps < cut]:
+    for row in ends if held_out is None else ends[~held_out[ends + steps]]:
         if not starts or row >= starts[-1] + steps:
             starts.append(int(row))
     if len(starts) < _LEAST:
-        beside = " beside the held-out part" if cut < len(recording) else ""
+        beside = " beside the held-out part" if held_out is not None else ""
         raise RecordingError(
             f"recording {', '.join(recording.info.source)}: {len(starts)} stretches of {steps * recording.T_s:g} s at "
             f"{min_speed:g} m/s or more{beside}; expected at least {_LEAST}"
         )
-    chosen = np.array(starts)[np.linspace(0, len(starts) - 1, min(len(starts), _MAX_WINDOWS)).round().astype(int)]
-    return SimulationWindows(data, chosen, steps, warm, every=every, filtered=True)
+    return SimulationWindows(
+        data, _spread_evenly(np.array(starts), data.number), steps, warm, every=every, filtered=True
+    )
+
+
+def _spread_evenly(starts: Indices, number: Indices) -> Indices:
+    """At most as many starts as a fit takes, evenly spread; a short recording gives all that it has."""
+    parts = sorted((starts[number[starts] == k] for k in np.unique(number[starts])), key=len)
+    chosen: list[Indices] = []
+    for k, part in enumerate(parts):
+        share = (_MAX_WINDOWS - sum(map(len, chosen))) // (len(parts) - k)
+        chosen.append(part[np.linspace(0, len(part) - 1, min(len(part), share)).round().astype(int)])
+    return np.sort(np.concatenate(chosen))
 
 
 def held_out_windows(
-    recording: Recording, data: RecordedRows, steps: int, long: int, min_speed: float, cut: int
+    recording: Recording, data: RecordedRows, steps: int, long: int, min_speed: float, held_out: Yes
 ) -> SimulationWindows:
-    """Overlapping simulations of ``long`` steps for measuring, behind the row ``cut``; ``steps``: of those of the fit.
+    """Overlapping simulations of ``long`` steps for measuring, on the rows ``held_out``; ``steps``: of those of the fit.
 
     Raises:
         RecordingError: too few rows.
     """
     warm = round(WARM_UP / recording.T_s)
     ends = recording.window_ends(warm + 1, horizon=long, min_speed=min_speed)
-    later = ends[ends - warm >= cut]
+    later = ends[held_out[ends - warm]]
     if len(later) < _LEAST:
         raise RecordingError(
             f"recording {', '.join(recording.info.source)}: {len(later)} rows in the held-out part from which "

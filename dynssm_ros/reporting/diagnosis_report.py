@@ -33,7 +33,7 @@ def as_text(diagnosis: Diagnosis) -> str:
     """The result for a terminal: cause, size, evidence, improvement, what to do, what is left."""
     lines = [headline(diagnosis)]
     for number, cause in enumerate(diagnosis.causes, 1):
-        lines += ["", f"{number}. {cause.effect}: {size_in_words(cause)}"]
+        lines += ["", f"{number}. {cause.effect}{_where(cause)}: {size_in_words(cause)}"]
         lines += [f"   {line}" for words in _about(cause) for line in textwrap.wrap(words, _WIDTH)]
     lines += ["", *gain_in_words(diagnosis)]
     for words in (
@@ -48,11 +48,16 @@ def as_text(diagnosis: Diagnosis) -> str:
 def headline(diagnosis: Diagnosis) -> str:
     """The verdict in a sentence."""
     if diagnosis.verdict == "effects":
-        listed = ", ".join(cause.effect for cause in diagnosis.causes)
+        listed = ", ".join(cause.effect + _where(cause) for cause in diagnosis.causes)
         return f"The simulation lacks: {listed}."
     if diagnosis.verdict == "none":
         return "The simulation is right within the noise of the measurement, once its nominal values are recalibrated."
     return "Something is wrong that no effect of the library explains."
+
+
+def _where(cause: Cause) -> str:
+    """The recordings that a cause is in, if not in all."""
+    return f" (only in {' and '.join(cause.only_in)})" if cause.only_in else ""
 
 
 def pattern_in_words(left: ExplainedVariance) -> str:
@@ -73,12 +78,13 @@ def left_in_words(diagnosis: Diagnosis) -> str:
     """What the extended car gets wrong beyond noise; empty if there is nothing."""
     parts = []
     if diagnosis.left.is_there:
-        parts.append(f"ExplainedVariance error that is left, and what it goes with: {pattern_in_words(diagnosis.left)}")
+        parts.append(f"Systematic error that is left, and what it goes with: {pattern_in_words(diagnosis.left)}")
     if diagnosis.clustered.is_there:
-        low, high = diagnosis.clustered.when
+        recording, low = diagnosis.recordings.place(diagnosis.clustered.when[0])
+        high = low + diagnosis.clustered.when[1] - diagnosis.clustered.when[0]
         parts.append(
             "Errors come together over seconds as noise does not, so that something is missing that comes and goes; they are "
-            f"largest {low:.0f} to {high:.0f} s into the recording."
+            f"largest {low:.0f} to {high:.0f} s into {recording}."
         )
     return " ".join(parts)
 
@@ -184,7 +190,7 @@ def _causes(diagnosis: Diagnosis) -> Table:
     )  # fmt: skip
     rows: list[list[Value]] = [
         [
-            cause.effect,
+            cause.effect + _where(cause),
             size_in_words(cause),
             cause.confirmation.total,
             cause.confirmation.std,
@@ -199,7 +205,7 @@ def _causes(diagnosis: Diagnosis) -> Table:
 
 def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
     for cause in diagnosis.causes:
-        yield Section(cause.effect, " ".join((f"{size_in_words(cause)}.", *_about(cause))))
+        yield Section(cause.effect + _where(cause), " ".join((f"{size_in_words(cause)}.", *_about(cause))))
     yield from _gained(diagnosis)
     yield from _shown(diagnosis)
     yield from _found(diagnosis)
@@ -225,7 +231,7 @@ def _gained(diagnosis: Diagnosis) -> Iterator[Section]:
         _gain_table(diagnosis),
     )
     yield Section(
-        "ExplainedVariance error and noise",
+        "Systematic error and noise",
         "The same errors in two parts: what the signals and the place on the lap predict, and the rest, which is noise "
         "or what the signals do not show. By place alone is what repeats lap after lap. Gone is the share of the "
         f"systematic squared error of the car {GIVEN} that the extended one does not make. {left_in_words(diagnosis)}",
@@ -258,7 +264,7 @@ def _shown(diagnosis: Diagnosis) -> Iterator[Section]:
         yield Section(
             f"Errors against {label.split(' (')[0]}",
             "Mean and spread in bins: where the mean is off zero by more than the line's wiggling, the error is "
-            f"explained_variance. The car {GIVEN} may leave the panel.",
+            f"systematic. The car {GIVEN} may leave the panel.",
             diagnosis_figures.errors_over(label, values, improvement),
         )
 
@@ -310,9 +316,9 @@ def _systematic_table(diagnosis: Diagnosis) -> Table:
     improvement = diagnosis.improvement
     columns = (
         Column("channel"), Column("ahead", "s"),
-        *(Column(title, "", name) for name in improvement.rmse for title in ("explained_variance", "rest")),
-        Column("gone", "%", "explained_variance"),
-        *(Column(name, "%", "explained_variance by place alone") for name in (GIVEN, EXTENDED)),
+        *(Column(title, "", name) for name in improvement.rmse for title in ("systematic", "rest")),
+        Column("gone", "%", "systematic"),
+        *(Column(name, "%", "systematic by place alone") for name in (GIVEN, EXTENDED)),
     )  # fmt: skip
     gone = improvement.systematic_gone(GIVEN)
     rows: list[list[Value]] = []

@@ -47,16 +47,16 @@ def test_every_effect_has_sizes_that_the_library_admits(name: str) -> None:
 
 
 def test_the_cases_hold_every_effect_none_two_and_four_wheels() -> None:
-    listed = list(cases(0, 130))
-    assert len(listed) == 130
-    assert len({case.name for case in listed}) == 130
+    listed = list(cases(0, 143))
+    assert len(listed) == 143
+    assert len({case.name for case in listed}) == 143
     single = Counter(name for case in listed if len(case.hidden) == 1 for name in case.hidden)
     assert set(single) == set(EFFECTS)
     assert min(single.values()) >= 3
     assert {case.plant for case in listed if not case.hidden} == {"rk4", "double_track", "foreign"}
-    assert Counter(len(case.hidden) for case in listed)[0] == 20
-    assert Counter(len(case.hidden) for case in listed)[2] == 20
-    assert Counter(len(case.hidden) for case in listed)[1] == 90
+    assert Counter(len(case.hidden) for case in listed)[0] == 22
+    assert Counter(len(case.hidden) for case in listed)[2] == 22
+    assert Counter(len(case.hidden) for case in listed)[1] == 99
     assert {case.plant for case in listed} == {"rk4", "double_track", "foreign"}
     assert {case.track for case in listed} == set(TRACKS)
     assert {case.sampling_time for case in listed} == {0.04, 0.02}
@@ -176,7 +176,9 @@ def test_the_least_sizes_are_just_noticeable() -> None:
     rows = np.concatenate([drive.measured.T, drive.feedback.T, (drive.command - drive.feedback).T])
     time = (drive.time - drive.time[0]) / 1e9
     lap = {"s": drive.s % drive.track.length, "lap_length": np.full(len(time), drive.track.length)}
-    track = RecordedRows(rows, {"t": time, "theta": drive.pose[:, 2]} | lap, car.sampling_time, time)
+    track = RecordedRows(
+        rows, {"t": time, "theta": drive.pose[:, 2]} | lap, car.sampling_time, time, np.zeros(len(time), dtype=np.intp)
+    )
     problem = IdentificationProblem(
         SimulationWindows(track, np.arange(8, rows.shape[1] - 14, 13), 13, 8, "euler"), CarEstimate.of(car)
     )

@@ -60,7 +60,7 @@ def test_line_and_plant_are_chosen_and_said(dynssm, tmp_path):
         (["--effect", "drag:coefficient=much"], "expected NAME=NUMBER"),
         (["--effect", "drag:coefficient=99"], "outside"),
         (["--effect", "drag:size=1"], "has no parameter 'size'"),
-        (["--effect", "load_transfer:factor=1.3"], "expected load transfer on and h_cg > 0"),
+        (["--effect", "load_sensitivity:exponent=0.7"], "expected axle loads that change"),
         (["--effect", "road_bank:roll_gain=1"], "needs the signal roll (rad)"),
         (["--noise", "1,2"], "expected three numbers"),
         (["--noise", "0,-1,0"], "expected finite numbers of at least 0"),

@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.identification.diagnose import Diagnosis, _check_signals, _cut, _hidden, _not_live, diagnose
+from dynssm_ros.identification.diagnose import Diagnosis, _check_signals, _hidden, _not_live, diagnose
+from dynssm_ros.identification.recordings import _cut
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
@@ -91,11 +92,11 @@ def test_too_little_to_hold_out_is_refused(lagging: Lagging) -> None:
 
 def test_an_effect_that_needs_a_constant_says_which(lagging: Lagging) -> None:
     _, vehicle, found = lagging
-    assert not any(note.startswith("load_transfer cannot be judged") for note in found.notes)
-    flat = vehicle.model_copy(update={"constants": vehicle.constants.model_copy(update={"h_cg": 0.0})})
+    assert not any(note.startswith("load_sensitivity cannot be judged") for note in found.notes)
+    flat = vehicle.model_copy(update={"constants": vehicle.constants.model_copy(update={"load_transfer": False})})
     limited = diagnose(lagging[0], flat, integrator="euler")
-    (note,) = [note for note in limited.notes if note.startswith("load_transfer cannot be judged")]
-    assert "h_cg 0 m; expected load transfer on and h_cg > 0" in note
+    (note,) = [note for note in limited.notes if note.startswith("load_sensitivity cannot be judged")]
+    assert "load_transfer false; expected axle loads that change" in note
 
 
 def test_an_extended_car_that_no_live_window_can_serve_says_so() -> None:

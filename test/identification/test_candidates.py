@@ -22,7 +22,7 @@ def problem(with_lap: bool = True, **effects: dict[str, float]) -> Identificatio
     car = ORCA.with_effects(effects.items())
     recording = as_recording(simulate(car, CLUB, duration=25.0, noise=(0.005, 0.005, 0.02)))
     context = lap_context(recording, CLUB.centre) if with_lap else recording_context(recording)
-    windows = fit_windows(recording, recorded_rows(recording, context), 0.3, 0.0, len(recording))
+    windows = fit_windows(recording, recorded_rows(recording, context), 0.3, 0.0)
     return IdentificationProblem(windows.with_integrator("euler", ORCA), CarEstimate.of(ORCA))
 
 
@@ -36,7 +36,7 @@ def test_a_candidate_tells_amounts_from_shapes() -> None:
 
 def test_what_cannot_be_tried_is_said_and_why() -> None:
     found, left = candidates(problem(with_lap=False), CarEstimate.of(ORCA))
-    assert left["load_transfer"].startswith("load_transfer false")
+    assert left["load_sensitivity"].startswith("load_transfer false")
     assert "grip_patch" in left
     assert "s" in left["grip_patch"]
     assert {"drag", "mass", "steering_offset"} <= {candidate.effect for candidate in found}

@@ -12,7 +12,7 @@ from dynssm_ros.control.race_models import load_prediction_model
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
+from dynssm_ros.identification.windows import SimulationWindows, recorded_rows
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import train
@@ -59,7 +59,7 @@ def recording(bag: Path) -> Recording:
 
 
 def test_it_drives_in_the_simulator_as_the_diagnosis_simulates_it(extended: Vehicle, recording: Recording) -> None:
-    track = RecordedRows(recording.matrix.T, {}, recording.T_s, (recording.time - recording.time[0]) / 1e9)
+    track = recorded_rows(recording, {})
     some = SimulationWindows(track, np.arange(50, len(recording) - 20, 10), 10, 40, "euler")
     errors = np.abs(some.errors(CarEstimate.of(extended))).max(axis=(0, 1))
     # the state of the lag is led along the rows before the start, and forgets where that began

@@ -20,7 +20,9 @@ def driven(place: bool = True) -> SimulationWindows:
     ]
     rows = np.stack([30 + 5 * waves[0], waves[1], 0.3 * waves[2], waves[3], 0.1 * waves[4], 0 * time, 0 * time])
     context = {"s": (37.0 * time) % 1000.0, "lap_length": np.full(N, 1000.0)} if place else {}
-    return SimulationWindows(RecordedRows(rows, context, 0.04, time), np.arange(0, N - K, K), K, 0)
+    return SimulationWindows(
+        RecordedRows(rows, context, 0.04, time, np.zeros(N, dtype=np.intp)), np.arange(0, N - K, K), K, 0
+    )
 
 
 def errors(windows: SimulationWindows, planted: np.ndarray) -> np.ndarray:

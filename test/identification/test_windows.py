@@ -27,7 +27,9 @@ def windows(
     run = simulate(vehicle, load_track("road_course"), duration=duration, noise=noise, seed=3)
     rows = np.concatenate([run.measured.T, run.feedback.T, (run.command - run.feedback).T])
     time = (run.time - run.time[0]) / 1e9
-    track = RecordedRows(rows, {"t": time, "theta": run.pose[:, 2]}, vehicle.sampling_time, time)
+    track = RecordedRows(
+        rows, {"t": time, "theta": run.pose[:, 2]}, vehicle.sampling_time, time, np.zeros(len(time), dtype=np.intp)
+    )
     return SimulationWindows(track, np.arange(8, rows.shape[1] - 13, 12), 12, 8, "euler")
 
 

@@ -44,7 +44,7 @@ def driven(noise: float, straight: bool = False) -> SimulationWindows:
     if straight:
         rows[[1, 2, 4, 6]] = 0.0
     time = (run.time - run.time[0]) / 1e9
-    track = RecordedRows(rows, {"t": time}, AV21.sampling_time, time)
+    track = RecordedRows(rows, {"t": time}, AV21.sampling_time, time, np.zeros(len(time), dtype=np.intp))
     return SimulationWindows(track, np.arange(8, rows.shape[1] - 2 * STEPS - 1, STEPS // 2), 2 * STEPS, 8, "euler")
 
 
@@ -148,7 +148,7 @@ def test_the_json_measures_from_both_cars(lagging: Lagging) -> None:
 def test_the_report_shows_one_step_and_the_horizon_over_time_place_and_signals(lagging: Lagging) -> None:
     page = diagnosis_report(lagging[2]).html()
     assert page.count("data:image/svg+xml") == 9
-    for title in ("Simulated and measured", "ExplainedVariance error and noise", "Errors over time", "Errors against speed",
+    for title in ("Simulated and measured", "Systematic error and noise", "Errors over time", "Errors against speed",
                   "Errors against steering", "Errors against throttle", "Errors against position on the lap",
                   "Errors against lateral acceleration", "What these laps would show", "Nominal values"):  # fmt: skip
         assert f"<h2>{title}</h2>" in page

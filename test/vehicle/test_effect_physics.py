@@ -70,7 +70,35 @@ def test_yaw_inertia_divides_the_yaw_acceleration_alone() -> None:
     assert (q.a_x, q.a_y) == (PLAIN.a_x, PLAIN.a_y)
 
 
-def test_grip_scales_its_own_axle() -> None:
+def test_steering_curve_bends_the_angle_and_may_differ_between_the_sides() -> None:
+    for delta in (0.1, -0.1):
+        bent = delta + 0.5 * delta**2 + 4.0 * delta**3
+        q = act(applied=Applied(0.4, delta), steering_curve={"quadratic": 0.5, "cubic": 4.0})
+        assert accelerations(q) == pytest.approx(accelerations(act(applied=Applied(0.4, bent))))
+
+
+@pytest.mark.parametrize(("r", "acts"), [(0.5, 0.4), (0.05, 0.0), (-0.05, 0.0), (-0.5, -0.4)])
+def test_within_the_dead_band_the_throttle_does_nothing(r: float, acts: float) -> None:
+    q = act(applied=Applied(r, 0.05), throttle_dead_band={"width": 0.1})
+    assert accelerations(q) == pytest.approx(accelerations(act(applied=Applied(acts, 0.05))))
+
+
+def test_front_drive_turns_with_the_front_wheels() -> None:
+    share = 0.4
+    q, pulled = act(front_drive={"share": share}), share * PLAIN.F_d
+    assert q.F_x - PLAIN.F_x == pytest.approx(pulled * (np.cos(APPLIED.delta) - 1.0))
+    assert q.F_y - PLAIN.F_y == pytest.approx(pulled * np.sin(APPLIED.delta))
+    assert q.M_z - PLAIN.M_z == pytest.approx(CONSTANTS.l_f * pulled * np.sin(APPLIED.delta))
+    straight = Applied(0.4, 0.0)
+    assert accelerations(act(applied=straight, front_drive={"share": 1.0})) == accelerations(act(applied=straight))
+
+
+def test_grip_scales_both_axles() -> None:
+    q = act(grip={"factor": 0.7})
+    assert (q.F_fy, q.F_ry) == pytest.approx((0.7 * PLAIN.F_fy, 0.7 * PLAIN.F_ry))
+
+
+def test_grip_of_an_axle_scales_that_one() -> None:
     front, rear = act(front_grip={"factor": 0.8}), act(rear_grip={"factor": 0.8})
     assert (front.F_fy, front.F_ry) == (0.8 * PLAIN.F_fy, PLAIN.F_ry)
     assert (rear.F_fy, rear.F_ry) == (PLAIN.F_fy, 0.8 * PLAIN.F_ry)
@@ -84,18 +112,27 @@ def test_downforce_adds_to_the_weight_with_speed_squared_and_by_its_balance() ->
     assert q.F_ry / PLAIN.F_ry == pytest.approx(q.F_zr / PLAIN.F_zr)
 
 
-def test_load_transfer_scales_what_driving_moves_between_the_axles() -> None:
+def test_a_higher_centre_of_gravity_moves_more_load_between_the_axles() -> None:
     still = M * GRAVITY * CONSTANTS.l_f / WHEELBASE
-    q = act(load_transfer={"factor": 1.5})
-    assert q.F_zr - still == pytest.approx(1.5 * (PLAIN.F_zr - still))
-    assert act(load_transfer={"factor": 0.0}).F_zr == pytest.approx(still)
+    q = act(load_transfer={"height": 0.05})
+    assert q.F_zr - still == pytest.approx((CONSTANTS.h_cg / WHEELBASE + 0.05) * PLAIN.F_rx)
+    assert act(load_transfer={"height": -0.2}).F_zr == pytest.approx(still)  # on the ground
 
 
-def test_load_transfer_of_a_car_without_any_is_one_clear_line() -> None:
-    expected = "effect load_transfer cannot act: load_transfer false, h_cg 0 m; expected load transfer on and h_cg > 0"
+def test_load_transfer_of_a_car_without_any_begins_at_the_ground() -> None:
+    car = load_vehicle("orca")
+    theta, constants = Coefficients(*car.nominal), car.constants
+    effects = (build_effect("load_transfer", {"height": 0.1}),)
+    q = motion(np, State(2.0, 0.0, 0.0), Applied(0.6, 0.1), theta, constants, effects)
+    assert q.F_zr - constants.F_z0 == pytest.approx(0.1 * q.F_rx)
+    assert constants.F_z0 - q.F_zf == pytest.approx(0.1 * q.F_rx)
+
+
+def test_load_sensitivity_of_a_car_without_load_transfer_is_one_clear_line() -> None:
+    expected = "effect load_sensitivity cannot act: load_transfer false; expected axle loads that change"
     with pytest.raises(ConfigurationError, match=expected):
-        load_vehicle("orca").with_effect("load_transfer", {"factor": 1.2})
-    assert load_vehicle("orca").with_effect("load_transfer", {}).active_effects[0].is_neutral
+        load_vehicle("orca").with_effect("load_sensitivity", {"exponent": 0.7})
+    assert load_vehicle("orca").with_effect("load_sensitivity", {}).active_effects[0].is_neutral
 
 
 def test_relaxing_tyres_reach_their_slip_over_the_distance_rolled() -> None:

@@ -11,7 +11,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.vehicle.effects.actuators import SteeringGain, SteeringLag, SteeringOffset, ThrottleLag
+from dynssm_ros.vehicle.effects.actuators import (
+    SteeringCurve,
+    SteeringGain,
+    SteeringLag,
+    SteeringOffset,
+    ThrottleDeadBand,
+    ThrottleLag,
+)
 from dynssm_ros.vehicle.effects.base import (
     CONTEXT_UNITS,
     LOCATION,
@@ -20,7 +27,7 @@ from dynssm_ros.vehicle.effects.base import (
     initial_effect_states,
     require_context,
 )
-from dynssm_ros.vehicle.effects.drivetrain import LockedDifferential
+from dynssm_ros.vehicle.effects.drivetrain import FrontDrive, LockedDifferential
 from dynssm_ros.vehicle.effects.environment import Crosswind, RoadBank, RoadGrade
 from dynssm_ros.vehicle.effects.inertia import Mass, YawInertia
 from dynssm_ros.vehicle.effects.loads import Downforce, LoadSensitivity, LoadTransfer
@@ -32,7 +39,15 @@ from dynssm_ros.vehicle.effects.measurement import (
     YawRateBias,
     YawRateLag,
 )
-from dynssm_ros.vehicle.effects.tyres import CombinedSlip, FrontGrip, GripDrift, GripPatch, RearGrip, TireRelaxation
+from dynssm_ros.vehicle.effects.tyres import (
+    CombinedSlip,
+    FrontGrip,
+    Grip,
+    GripDrift,
+    GripPatch,
+    RearGrip,
+    TireRelaxation,
+)
 from dynssm_ros.vehicle.single_track import StageEffect
 
 __all__ = [
@@ -72,15 +87,15 @@ def register_effect(effect: type[Effect]) -> type[Effect]:
 
 for _effect in (
 
-        SteeringOffset, SteeringGain, SteeringLag, ThrottleLag,
+        SteeringOffset, SteeringGain, SteeringCurve, SteeringLag, ThrottleDeadBand, ThrottleLag,
         Drag, RollingResistance, DriveGain,
         Mass, YawInertia,
-        FrontGrip, RearGrip,
+        Grip, FrontGrip, RearGrip,
         Downforce, LoadSensitivity, LoadTransfer,
         TireRelaxation, CombinedSlip,
         RoadBank, RoadGrade, Crosswind,
         GripDrift, GripPatch,
-        LockedDifferential,
+        FrontDrive, LockedDifferential,
         OdometryLeverArm, OdometryMisalignment, OdometryDelay, YawRateBias, YawRateLag,
 ):  # fmt: skip
     register_effect(_effect)

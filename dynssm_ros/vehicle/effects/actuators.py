@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dynssm_ros.vehicle.effects.base import Effect, Parameter, lagged
-from dynssm_ros.vehicle.single_track import Array, Motion
+from dynssm_ros.vehicle.single_track import Array, Motion, at_least
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,30 @@ class SteeringGain(Effect):
 
 
 @dataclass(frozen=True)
+class SteeringCurve(Effect):
+    """``delta + quadratic delta^2 + cubic delta^3`` steers."""
+
+    NAME = "steering_curve"
+    SUMMARY = "The ratio from sensor to wheels changes with the angle, or is not the same to both sides."
+    ADVICE = (
+        "Measure the road-wheel angle over the sensor's range, to both sides, and take the curve into the signal map."
+    )
+    MANOEUVRE = "slow corners of every radius to both sides"
+    PARAMETERS = {
+        "cubic": Parameter("1/rad^2", -8.0, 8.0, 0.0),
+        "quadratic": Parameter("1/rad", -1.5, 1.5, 0.0),
+    }
+    VARIANTS = (("cubic",), ("cubic", "quadratic"))
+    TYPICAL = (1.5, 6.0)
+    cubic: Array = 0.0
+    quadratic: Array = 0.0
+
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Bends the steering that acts on the tyres."""
+        q.delta = q.delta * (1.0 + self.quadratic * q.delta + self.cubic * q.delta * q.delta)
+
+
+@dataclass(frozen=True)
 class SteeringLag(Effect):
     """``time_constant * ddelta/dt = measured - delta``."""
 
@@ -59,6 +83,23 @@ class SteeringLag(Effect):
     def inputs(self, xp: Any, q: Motion) -> None:
         """Replaces the steering by its lagged value."""
         q.delta = lagged(q, self.EFFECT_STATES[0], q.delta, self.time_constant)
+
+
+@dataclass(frozen=True)
+class ThrottleDeadBand(Effect):
+    """Throttle and brake below ``width`` do nothing, and beyond it act by what is left."""
+
+    NAME = "throttle_dead_band"
+    SUMMARY = "The first part of the throttle does nothing: play, a dead zone of the motor controller, a clutch."
+    ADVICE = "Measure from which throttle on the car pulls, and take it off in the signal map."
+    MANOEUVRE = "small throttle, slowly opened and closed on a straight"
+    PARAMETERS = {"width": Parameter("1", 0.0, 0.5, 0.0)}
+    TYPICAL = (0.008, 0.1)
+    width: Array = 0.0
+
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Takes the dead zone off the throttle."""
+        q.r = at_least(q.r - self.width, 0.0) - at_least(-q.r - self.width, 0.0)
 
 
 @dataclass(frozen=True)

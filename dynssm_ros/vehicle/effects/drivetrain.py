@@ -1,4 +1,4 @@
-"""Drivetrain: how the wheels of an axle hang together."""
+"""Drivetrain: which wheels drive, and how those of an axle hang together."""
 
 from __future__ import annotations
 
@@ -9,6 +9,27 @@ from dynssm_ros.vehicle.effects.base import SLOWEST, Effect, Parameter
 from dynssm_ros.vehicle.single_track import Array, Motion
 
 TRACK_WIDTH = 0.55  # of the wheelbase: 1.64 m for an Indy car, 34 mm for a 1:43 car
+
+
+@dataclass(frozen=True)
+class FrontDrive(Effect):
+    """The share ``share`` of drive and brakes acts along the front wheels and turns with them."""
+
+    NAME = "front_drive"
+    SUMMARY = "Part of drive or brakes acts on the front wheels, and pulls the car where they point."
+    ADVICE = "Measure how drive and brakes are shared between the axles, and keep it in the vehicle file."
+    MANOEUVRE = "driving and braking in tight corners"
+    PARAMETERS = {"share": Parameter("1", 0.0, 1.0, 0.0)}
+    TYPICAL = (0.3, 0.9)
+    share: Array = 0.0
+
+    def forces(self, xp: Any, q: Motion) -> None:
+        """Turns that part of the force with the wheels."""
+        front = self.share * q.F_d
+        across = front * xp.sin(q.delta)
+        q.F_x = q.F_x - front * (1.0 - xp.cos(q.delta))
+        q.F_y = q.F_y + across
+        q.M_z = q.M_z + q.l_f * across
 
 
 @dataclass(frozen=True)

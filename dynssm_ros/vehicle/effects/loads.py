@@ -61,27 +61,26 @@ class LoadSensitivity(Effect):
 
 @dataclass(frozen=True)
 class LoadTransfer(Effect):
-    """``factor * h_cg``: longitudinal load transfer, and on a double-track car the lateral one too."""
+    """``h_cg + height (l_f + l_r)``: longitudinal load transfer, and on a double-track car the lateral one too.
+
+    The height may be that of a car whose file has none: its axles then carry F_z0 and what is moved between them.
+    """
 
     NAME = "load_transfer"
     SUMMARY = "Braking and driving move more or less load between the axles than the vehicle file says."
     ADVICE = "Measure the height of the centre of gravity and correct h_cg; check anti-dive and anti-squat."
     MANOEUVRE = "braking into corners and accelerating out of them"
-    PARAMETERS = {"factor": Parameter("1", 0.0, 4.0, 1.0)}
-    TYPICAL = (0.12, 2.0)
+    PARAMETERS = {"height": Parameter("wheelbase", -0.2, 0.4, 0.0)}
+    TYPICAL = (0.012, 0.19)
     DIRECTIONS = (1.0,)  # a car that can be driven
-    factor: Array = 1.0
-
-    @classmethod
-    def unusable(cls, constants: Constants) -> str | None:
-        """It scales what must be there."""
-        if constants.load_transfer and constants.h_cg > 0:
-            return None
-        return (
-            f"load_transfer {str(constants.load_transfer).lower()}, h_cg {constants.h_cg:g} m; expected load transfer on "
-            "and h_cg > 0"
-        )
+    height: Array = 0.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Scales the height of the centre of gravity."""
-        q.h_cg = q.h_cg * self.factor
+        """Raises the centre of gravity, from the ground at least."""
+        q.h_cg = at_least(q.h_cg + self.height * (q.l_f + q.l_r), 0.0)
+
+    def loads(self, xp: Any, q: Motion) -> None:
+        """Moves load between axles that have their nominal one."""
+        if not q.load_transfer:
+            transfer = q.h_cg / (q.l_f + q.l_r) * q.F_rx
+            q.F_zf, q.F_zr = q.F_zf - transfer, q.F_zr + transfer

@@ -13,6 +13,23 @@ _LEAST_SHARE = 0.05  # squared share of the lateral force that the longitudinal 
 
 
 @dataclass(frozen=True)
+class Grip(Effect):
+    """``factor`` times the lateral forces of both axles."""
+
+    NAME = "grip"
+    SUMMARY = "All tyres grip more or less than the nominal ones: another floor, rain, temperature, another compound."
+    ADVICE = "Treat that floor, weather or set of tyres apart, and drive it with the grip that it has."
+    MANOEUVRE = "steady cornering up to the limit"
+    PARAMETERS = {"factor": Parameter("1", 0.3, 1.7, 1.0)}
+    TYPICAL = (0.13, 0.3)
+    factor: Array = 1.0
+
+    def tyres(self, xp: Any, q: Motion) -> None:
+        """Scales the lateral forces."""
+        q.F_fy, q.F_ry = q.F_fy * self.factor, q.F_ry * self.factor
+
+
+@dataclass(frozen=True)
 class FrontGrip(Effect):
     """``factor * F_fy``."""
 

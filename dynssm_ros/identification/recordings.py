@@ -1,0 +1,147 @@
+"""Recordings of one car side by side: which row is of which, which rows only measure, and which are left out together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from dynssm_ros.arrays import Indices, Vector, Yes
+from dynssm_ros.identification.problem import BLOCK
+from dynssm_ros.identification.windows import RecordedRows
+from dynssm_ros.signals.recording import Recording, concatenate
+from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
+from dynssm_ros.track.lines import ClosedLine
+
+LEAST_LAPS = 3  # with which whole laps are held out, and left out in turn
+_LEAST_RECORDINGS = 3  # with which whole recordings are left out in turn
+_QUARTERS = 4  # parts of a recording that are left out in turn where there are no laps
+_MOST_PARTS = 8  # of a single recording, so that many short laps do not take long
+
+
+class LeftOut(NamedTuple):
+    """What is left out together, and what counts as one piece of evidence, of each simulation.
+
+    Attributes:
+        fold: number of the fit that does not see it, ``(W,)``.
+        unit: number of the lap, the quarter or the recording that it belongs to, ``(W,)``; within one fold.
+    """
+
+    fold: Indices
+    unit: Indices
+
+
+@dataclass(frozen=True)
+class RecordingSet:
+    """Recordings of one car, one after the other.
+
+    Attributes:
+        recording: all rows.
+        number: of the recording that each row is of, ``(N,)``.
+        names: of the recordings.
+        clock: time since the first row of its recording, of each row (s), ``(N,)``.
+        held_out: the rows that neither fit nor selection sees, ``(N,)``.
+        split: how they were chosen, in words.
+    """
+
+    recording: Recording = field(repr=False)
+    number: Indices
+    names: tuple[str, ...]
+    clock: Vector
+    held_out: Yes
+    split: str
+
+    @classmethod
+    def of(cls, recordings: Sequence[Recording], holdout: float) -> RecordingSet:
+        """Joins recordings and holds out the share ``holdout`` at the end of each; whole laps if there are three.
+
+        Raises:
+            RecordingError: sampling times or command protocols differ, or there is none.
+        """
+        joined = concatenate(recordings)
+        number = np.repeat(np.arange(len(recordings)), [len(one) for one in recordings])
+        clock = np.concatenate([(one.time - one.time[0]) / 1e9 for one in recordings])
+        cuts = [_cut(one, holdout) for one in recordings]
+        held = np.concatenate([np.arange(len(one)) >= cut for one, (cut, _) in zip(recordings, cuts, strict=True)])
+        return cls(joined, number, _names(recordings), clock, held, _in_words([words for _, words in cuts]))
+
+    @property
+    def time(self) -> Vector:
+        """Time of each row (s), ``(N,)``: each recording follows the one before, at a multiple of :data:`BLOCK`."""
+        longest = [self.clock[self.number == k].max() for k in range(len(self.names))]
+        begins = np.cumsum([0.0, *(BLOCK * (np.floor(t / BLOCK) + 1.0) for t in longest[:-1])])
+        return np.asarray(begins[self.number] + self.clock)
+
+    def fitted_lap(self) -> ClosedLine | None:
+        """The first full lap among the rows that are fitted."""
+        return first_lap(self.recording.select(~self.held_out))
+
+    def rows(self, line: ClosedLine | None) -> RecordedRows:
+        """As simulations read them, with the place on the lap along ``line``; ``t`` is the recording's own clock."""
+        context = lap_context(self.recording, line) | {"t": self.clock}
+        return RecordedRows(self.recording.matrix.T, context, self.recording.T_s, self.time, self.number)
+
+    def place(self, time: float) -> tuple[str, float]:
+        """The recording that is at a :attr:`time`, and its own clock (s) there."""
+        row = int(np.argmin(np.abs(self.time - time)))
+        return self.names[self.number[row]], float(self.clock[row])
+
+    def left_out(self, starts: Indices, line: ClosedLine | None) -> tuple[LeftOut, LeftOut]:
+        """How simulations from the rows ``starts`` are left out: recordings in turn, and parts of each of them in turn.
+
+        Parts are laps, or quarters of the time where there are fewer than three. With fewer than three recordings both are
+        the same.
+        """
+        lap, whose, several = lap_number(self.recording, line), self.number[starts], len(self.names) > 1
+        part = np.empty(len(starts), dtype=np.intp)
+        for k in np.unique(whose):
+            own = starts[whose == k]
+            if lap is not None and np.ptp(lap[own]) + 1 >= LEAST_LAPS:
+                part[whose == k] = _grouped(lap[own], _QUARTERS if several else _MOST_PARTS)
+            else:
+                t = self.clock[own] - self.clock[own[0]]
+                part[whose == k] = np.floor(_QUARTERS * t / (np.ptp(t) + 1e-9))
+        parts = LeftOut(*(np.unique(n, return_inverse=True)[1] for n in (part, whose * (part.max() + 1) + part)))
+        if len(np.unique(whose)) < _LEAST_RECORDINGS:
+            return parts, parts
+        number = np.unique(whose, return_inverse=True)[1]
+        return LeftOut(number, number), parts
+
+
+def _grouped(lap: Vector, most: int) -> Indices:
+    """Numbers of at most ``most`` groups of laps that follow each other."""
+    order = np.unique(lap, return_inverse=True)[1]
+    count = int(order.max()) + 1
+    return np.asarray(order * min(most, count) // count)
+
+
+def _names(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """What each recording is called: its source, with a number where that is not enough."""
+    sources = [", ".join(one.info.source) or f"recording {k}" for k, one in enumerate(recordings, 1)]
+    return tuple(source if sources.count(source) == 1 else f"{source} ({k})" for k, source in enumerate(sources, 1))
+
+
+def _in_words(splits: Sequence[str]) -> str:
+    """How the rows of one or of several recordings were held out."""
+    if len(splits) == 1:
+        return splits[0]
+    return "of each recording " + (splits[0] if len(set(splits)) == 1 else "in turn: " + "; ".join(splits))
+
+
+def _cut(recording: Recording, holdout: float) -> tuple[int, str]:
+    """First held-out row, and in words."""
+    N = len(recording)
+    line = first_lap(recording)
+    lap = lap_number(recording, line)
+    if lap is not None:
+        # laps are counted from the first row's place, so that the last full ones are held out
+        total = int(lap[-1] - lap[0])
+        held = max(1, round(holdout * total))
+        if total >= LEAST_LAPS:
+            cut = int(np.argmax(lap >= lap[-1] - held))
+            if 0 < cut < N:
+                return cut, f"the last {held} of {total} laps and what follows"
+    cut = N - max(1, round(holdout * N))
+    return cut, f"the last {100 * holdout:.0f} % as one block (fewer than {LEAST_LAPS} laps)"
