@@ -17,7 +17,7 @@ from dynssm_ros.identification.integrator import SearchResult, search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
 from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import per_unit
-from dynssm_ros.identification.recordings import LeftOut, RecordingSet
+from dynssm_ros.identification.recordings import LeftOut, RecordingSet, driven_alike
 from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance, clustered, explained_variance
 from dynssm_ros.identification.selection import Refined, Selection
 from dynssm_ros.identification.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
@@ -35,7 +35,7 @@ _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
 _NO_WORSE = 0.01  # of the error on held-out laps, that the extended car may be worse than the recalibrated one
 _MOVED = 3.0  # standard deviations beyond which recalibration is a finding
-_AT = 1e-3  # of the span, nearer to a bound than which an estimate is on it
+_DRIVEN_ALIKE = 0.5  # of a recording, that others must have for causes of it alone
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
 
@@ -229,9 +229,8 @@ def diagnose(
     suspects = tuple(range(len(first), len(first) + len(suspect)))
     if unknown := sorted(set(exclude) - set(EFFECTS)):
         raise ConfigurationError(f"exclude {', '.join(unknown)}: no such effect; expected some of {', '.join(EFFECTS)}")
-    found = search_causes(
-        at.fitted, at.car, at.left_out, integrator, on_progress, exclude, _groups(len(first), suspects)
-    )
+    groups = _groups(at, suspects)
+    found = search_causes(at.fitted, at.car, at.left_out, integrator, on_progress, exclude, groups)
     problem, selection, fit = found.problem, found.selection, found.selection.fit
     windows = problem.windows
     at = at._replace(unseen=replace(at.unseen, integrator=windows.integrator, substeps=windows.substeps))
@@ -283,11 +282,21 @@ def diagnose(
     )
 
 
-def _groups(count: int, suspects: tuple[int, ...]) -> list[tuple[int, ...]]:
-    """The groups of recordings that may differ from the others: the suspects, else each of several."""
-    if suspects:
-        return [suspects]
-    return [(k,) for k in range(count)] if count > 1 else []
+def _groups(at: _Prepared, suspects: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """The groups of recordings that may differ from the others: the suspects, else each that was driven like others."""
+    names = at.recordings.names
+    single = [(k,) for k in np.unique(at.fitted.number).tolist()]
+    if len(single) == 1:
+        return []
+    alike = {group: driven_alike(at.fitted, group) for group in ([suspects] if suspects else single)}
+    for group, share in alike.items():
+        if share < _DRIVEN_ALIKE:
+            at.notes.append(
+                f"{' and '.join(names[k] for k in group)}: {100 * share:.0f} % driven like the others (speed, steering, "
+                "throttle), so that what differs there can hardly be told from what its driving shows"
+                + ("" if suspects else "; causes of it alone are not tried")
+            )
+    return [group for group, share in alike.items() if suspects or share >= _DRIVEN_ALIKE]
 
 
 def _worse(improvement: Improvement) -> bool:
@@ -381,20 +390,9 @@ def _cause(one: Refined, found: SearchResult, at: _Prepared, std: Vector) -> Cau
         float(one.delta_bic),
         float(1.0 - np.sqrt((with_it / np.maximum(without, 1e-300)).mean())),
         one.confirmation,
-        _on_bound(effect, fit.car.effects[effect], known),
+        one.bounded,
         tuple(found.selection.alternatives[effect]),
         tuple(at.recordings.names[k] for k in one.candidate.only_in),
-    )
-
-
-def _on_bound(effect: str, values: Mapping[str, float], fitted: Collection[str]) -> tuple[str, ...]:
-    """The fitted parameters that are at a bound."""
-    about = EFFECTS[effect].PARAMETERS
-    return tuple(
-        name
-        for name in fitted
-        if not about[name].shape
-        and min(values[name] - about[name].lower, about[name].upper - values[name]) < _AT * about[name].span
     )
 
 

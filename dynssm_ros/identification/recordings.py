@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from dynssm_ros.arrays import Indices, Vector, Yes
 from dynssm_ros.identification.problem import BLOCK
-from dynssm_ros.identification.windows import RecordedRows
+from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
 from dynssm_ros.track.lines import ClosedLine
@@ -18,6 +19,7 @@ from dynssm_ros.track.lines import ClosedLine
 LEAST_LAPS = 3  # with which whole laps are held out, and left out in turn
 _LEAST_RECORDINGS = 3  # with which whole recordings are left out in turn
 _QUARTERS = 4  # parts of a recording that are left out in turn where there are no laps
+_LIKE = 0.5  # spreads of speed, steering and throttle within which two simulations are driven alike
 _MOST_PARTS = 8  # of a single recording, so that many short laps do not take long
 
 
@@ -108,6 +110,18 @@ class RecordingSet:
             return parts, parts
         number = np.unique(whose, return_inverse=True)[1]
         return LeftOut(number, number), parts
+
+
+def driven_alike(windows: SimulationWindows, recordings: Collection[int]) -> float:
+    """Share of the simulations of ``recordings`` that the others have at like speed, steering and throttle.
+
+    What only one recording has can be told from what its driving shows only where others were driven alike.
+    """
+    rows = windows.data.rows[:, windows.starts[:, None] + np.arange(windows.steps)].mean(axis=2)
+    driven = np.stack([rows[0], rows[3] + rows[5], rows[4] + rows[6]], axis=1)
+    driven /= np.maximum(driven.std(axis=0), 1e-9)
+    own = np.isin(windows.number, list(recordings))
+    return float(np.mean(cKDTree(driven[~own]).query(driven[own])[0] < _LIKE))
 
 
 def _grouped(lap: Vector, most: int) -> Indices:

@@ -37,6 +37,7 @@ _NEAR_BEST_SHARE = 0.9  # of the best evidence, near which others are fitted to 
 _MAX_CAUSES = 4  # effects
 _WORTH_A_LOOK = 0.3  # of the best by the criterion, that another must reach to be tried on parts that are left out
 _SURE = 3.0  # standard deviations that a cause must be off neutral
+_ONE_OF_MANY = 2.0  # standard errors that a cause must gain that one recording alone has: more of them are tried
 _ALIKE = 0.1  # logarithm of a ratio of inflations
 _WARM_STARTS = 3  # times that nominal values make room for an effect before it is fitted
 _SHARES = (1.6, 1.0, 0.6, 0.3)  # of what linearised errors promise
@@ -53,6 +54,7 @@ class Refined:
         delta_bic: what is left of it when its parameters are paid for.
         confirmation: what it gains on parts of the drive that were left out; ``None``: it was not worth a look.
         sure: by how many standard deviations one of its amplitudes is off neutral.
+        bounded: its amplitudes that are at a bound: the data ask for more than such a thing can be.
     """
 
     candidate: Candidate
@@ -61,6 +63,7 @@ class Refined:
     delta_bic: float
     confirmation: Confirmation | None = None
     sure: float = 0.0
+    bounded: tuple[str, ...] = ()
 
     @property
     def gain(self) -> float:
@@ -206,10 +209,13 @@ class Search:
         return self._ranked[key]
 
     def _best(self, before: tuple[Candidate, ...]) -> Refined | None:
-        """The candidate that gains most; of those that cannot be told from it, rather one as real cars have it."""
+        """The candidate that gains most; of those that cannot be told from it the most ordinary one.
+
+        That is one within its bounds, then one that all recordings have, then one as it is met in real cars.
+        """
         found = sorted(self._confirmed(before), key=lambda r: -r.gain)
         alike = [r for r in found if r is found[0] or self._left_out.compare(r.fit, found[0].fit).alike]
-        return next((r for r in alike if _is_met(r)), next(iter(found), None))
+        return min(alike, key=lambda r: (bool(r.bounded), bool(r.candidate.only_in), not _is_met(r)), default=None)
 
     def _taken_over(self, start: Fit | None) -> list[Candidate]:
         """The candidates of another problem's fit, fitted here."""
@@ -234,7 +240,9 @@ class Search:
     def _confirm(self, without: Fit, refined: Refined) -> Refined:
         self._report(f"leaving parts out: {refined.candidate.effect}")
         confirmation = self._left_out.compare(without, refined.fit)
-        return replace(refined, confirmation=confirmation, sure=self._sure(refined))
+        values, about = refined.fit.car.effects[refined.candidate.effect], EFFECTS[refined.candidate.effect].PARAMETERS
+        bounded = tuple(name for name in refined.candidate.amplitudes if about[name].at_bound(values[name]))
+        return replace(refined, confirmation=confirmation, sure=self._sure(refined), bounded=bounded)
 
     def _sure(self, refined: Refined) -> float:
         fit, effect = refined.fit, refined.candidate.effect
@@ -363,4 +371,7 @@ def _is_met(refined: Refined) -> bool:
 
 
 def _pays(refined: Refined) -> bool:
-    return refined.delta_bic > DECISIVE_DELTA_BIC and refined.gain > 0 and refined.sure > _SURE
+    told = refined.delta_bic > DECISIVE_DELTA_BIC and refined.gain > 0 and refined.sure > _SURE
+    if refined.candidate.only_in and refined.confirmation is not None:
+        return told and refined.gain > _ONE_OF_MANY * refined.confirmation.std
+    return told

@@ -13,7 +13,7 @@ from dynssm_ros.errors import RecordingError
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.diagnose import diagnose
 from dynssm_ros.identification.problem import BLOCK
-from dynssm_ros.identification.recordings import RecordingSet
+from dynssm_ros.identification.recordings import RecordingSet, driven_alike
 from dynssm_ros.identification.windows import SimulationWindows, fit_windows
 from dynssm_ros.reporting.diagnosis_report import as_text
 from dynssm_ros.signals.recording import Recording
@@ -97,6 +97,16 @@ def test_many_short_laps_are_left_out_in_groups() -> None:
     assert whole is parts
     assert len(set(whole.fold)) == 8
     assert (np.diff(whole.fold) >= 0).all()
+
+
+def test_recordings_of_the_same_driving_are_alike_and_others_are_not(days: list[Recording]) -> None:
+    together = RecordingSet.of(days[:2], 0.25)
+    windows = fit_windows(together.recording, together.rows(None), 0.4, 0.0)
+    assert driven_alike(windows, (1,)) > 0.8
+    rows = windows.data.rows.copy()
+    rows[3, windows.data.number == 1] -= 2.0
+    braked = replace(windows, data=replace(windows.data, rows=rows))
+    assert driven_alike(braked, (1,)) < 0.2
 
 
 def test_recordings_of_different_rates_are_one_clear_line(days: list[Recording]) -> None:

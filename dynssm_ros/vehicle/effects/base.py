@@ -25,6 +25,7 @@ along the track's centre line (which may count on over the laps) and the length 
 (positive with the left side up)."""
 
 LAP = ("s", "lap_length")
+_AT = 1e-3  # of the span, nearer to a bound than which a value is on it
 SLOWEST = 1e-3  # m/s; what divides by the speed does not divide by less
 
 
@@ -62,6 +63,10 @@ class Parameter:
     def scales(self) -> bool:
         """Whether it multiplies what is positive; then it is fitted as a logarithm."""
         return self.neutral == 1.0 and self.lower > 0.0
+
+    def at_bound(self, value: float) -> bool:
+        """Whether ``value`` is as far off neutral as it can be."""
+        return any(abs(value - bound) < _AT * self.span and bound != self.neutral for bound in (self.lower, self.upper))
 
     @property
     def direction(self) -> float:
