@@ -1,12 +1,13 @@
-"""Which steps the simulation makes: Runge-Kutta, unless the data were clearly made by Euler steps of the sampling time.
+"""Which steps the simulation makes: Runge-Kutta with inputs that are held, unless the data clearly say otherwise.
 
-Euler steps act about half a step late. Before the causes are known a car that errs may be closer to the data with them by
-chance, so that the choice is made anew with the causes that were found.
+Euler steps of the sampling time, as some simulators make them, act about half a step late. Inputs that went on changing
+between the rows act half a step early, as a line from row to row does. Before the causes are known a car that errs may be
+closer to the data with either by chance, so that the choice is made anew with the causes that were found.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,11 +18,21 @@ from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
 from dynssm_ros.identification.recordings import LeftOut
 from dynssm_ros.identification.selection import Search, Selection
-from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.identification.windows import Hold, SimulationWindows
 from dynssm_ros.vehicle.single_track import Integrator
 
 _TRIED = 300  # windows with which the integrator is chosen at first
 _CLEARLY = 20.0  # difference of twice the log-likelihood for which another integrator is taken than Runge-Kutta
+
+
+class Stepping(NamedTuple):
+    """How a simulation steps from row to row."""
+
+    integrator: Integrator
+    hold: Hold
+
+
+_OPTIONS = (Stepping("rk4", "zero"), Stepping("rk4", "first"), Stepping("euler", "zero"))
 
 
 class SearchResult(NamedTuple):
@@ -67,29 +78,39 @@ def search_causes(
         searching = Search(problem, car, found, left_out, on_progress)
         return SearchResult(problem, searching, searching.run(start), impossible)
 
-    if integrator is not None:
-        return search(_stepped(windows, car, integrator)[0])
     on_progress("choosing how the model steps")
-    runge_kutta, euler = _stepped(windows, car, "rk4"), _stepped(windows, car, "euler")
-    first, other = (euler, runge_kutta) if _by_euler(runge_kutta[1], euler[1]) else (runge_kutta, euler)
-    found = search(first[0])
+    options = [one for one in _OPTIONS if integrator in (None, one.integrator)]
+    windows_of = {}
+    fits = {}
+    for one in options:
+        windows_of[one], fits[one] = _stepped(windows, car, one)
+    first = _closest(fits)
+    found = search(windows_of[first])
     fit = found.selection.fit
-    beside = IdentificationProblem(other[0], car, found.problem.tempering).fit(fit.car, fit.free)
-    fits = {first[0].integrator: fit, other[0].integrator: beside}
-    if _by_euler(fits["rk4"], fits["euler"]) == (first is euler):
-        return found
-    return search(other[0], fit)
+    fits = {
+        one: fit
+        if one == first
+        else IdentificationProblem(windows_of[one], car, found.problem.tempering).fit(fit.car, fit.free)
+        for one in options
+    }
+    closest = _closest(fits)
+    return found if closest == first else search(windows_of[closest], fits[first])
 
 
-def _by_euler(runge_kutta: Fit, euler: Fit) -> bool:
-    return euler.objective < runge_kutta.objective - _CLEARLY
+def _closest(fits: Mapping[Stepping, Fit]) -> Stepping:
+    """What is closest to the data; not the first option only if that is clear."""
+    given = next(iter(fits))
+    best = min(fits, key=lambda one: fits[one].objective)
+    return best if fits[best].objective < fits[given].objective - _CLEARLY else given
 
 
-def _stepped(windows: SimulationWindows, car: CarEstimate, integrator: Integrator) -> tuple[SimulationWindows, Fit]:
+def _stepped(windows: SimulationWindows, car: CarEstimate, stepping: Stepping) -> tuple[SimulationWindows, Fit]:
     """The windows in steps that are short enough for the recalibrated car too, and its fit to some of them.
 
     That car may be much stiffer than the one of the file, and a simulation whose steps are too long for it runs away.
     """
+    integrator, hold = stepping
+    windows = replace(windows, hold=hold)
     some = windows.select(np.arange(0, len(windows), -(-len(windows) // _TRIED)))
     trial = some.with_integrator(integrator, car.vehicle)
     fit = IdentificationProblem(trial, car).fit(car, ())

@@ -371,7 +371,15 @@ def _is_met(refined: Refined) -> bool:
 
 
 def _pays(refined: Refined) -> bool:
-    told = refined.delta_bic > DECISIVE_DELTA_BIC and refined.gain > 0 and refined.sure > _SURE
-    if refined.candidate.only_in and refined.confirmation is not None:
-        return told and refined.gain > _ONE_OF_MANY * refined.confirmation.std
-    return told
+    """Whether a cause is worth its parameters and holds where it was not fitted.
+
+    What left-out parts hardly tell, and only the vehicle file speaks for, must hold too if its standard deviations were
+    too small by a factor of 1.4: half of what it spares the nominal values does not count.
+    """
+    confirmation = refined.confirmation
+    if confirmation is None or not confirmation.holds or refined.sure <= _SURE:
+        return False
+    if refined.candidate.only_in and confirmation.total <= _ONE_OF_MANY * confirmation.std:
+        return False
+    untold = confirmation.known if confirmation.gain.sum() < confirmation.known else 0.0
+    return refined.delta_bic - untold > DECISIVE_DELTA_BIC

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.single_track import Integrator, settled_effect_states, settling_rate, step_with_effect_states
+
+Hold = Literal["zero", "first"]
+"""What is taken for the inputs between two rows: those of the first row, or a line from row to row."""
 
 _LONGEST = 1.5  # integration step, times the rate at which the linear car settles
 _FINEST = 16  # integration steps per sampling time, at most
@@ -61,6 +65,7 @@ class SimulationWindows:
         integrator: how the model steps.
         substeps: integration steps per sampling time.
         every: compared is every so many rows, so that ``K = steps / every``.
+        hold: of the inputs between rows. A line, which a live prediction cannot know, acts half a step earlier.
         filtered: whether a simulation is led up to its start by the rows before as an observer is, and not put on the
             measured row. The noise of a row would otherwise be seen in what the car does next, and effects that answer
             to it, such as a relaxing tyre, be taken for smaller than they are.
@@ -74,6 +79,7 @@ class SimulationWindows:
     substeps: int = 1
     every: int = 1
     filtered: bool = False
+    hold: Hold = "zero"
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -93,6 +99,10 @@ class SimulationWindows:
         rate = settling_rate(Coefficients(*vehicle.nominal), vehicle.constants) / slow
         count = int(np.clip(np.ceil(self.data.T_s * rate / _LONGEST), 1, _FINEST))
         return replace(self, integrator=integrator, substeps=count)
+
+    def stepped_as(self, other: SimulationWindows) -> SimulationWindows:
+        """The same simulations in the steps of others."""
+        return replace(self, integrator=other.integrator, substeps=other.substeps, hold=other.hold)
 
     @cached_property
     def target(self) -> Vector:
@@ -184,11 +194,15 @@ class SimulationWindows:
         context: Mapping[str, float] | None,
     ) -> tuple[State, dict[str, Vector]]:
         """One step from the rows ``k`` after the starts."""
+        applied = applied_inputs(rows)
+        if self.hold == "first":
+            following = applied_inputs(self.data.rows[:, self.starts + k + 1])
+            applied = Applied(*((now + then) / 2 for now, then in zip(applied, following, strict=True)))
         return step_with_effect_states(
             np,
             state,
             effect_states,
-            applied_inputs(rows),
+            applied,
             fleet.theta,
             fleet.constants,
             self.data.T_s,

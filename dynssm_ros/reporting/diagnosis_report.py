@@ -48,8 +48,12 @@ def as_text(diagnosis: Diagnosis) -> str:
 def headline(diagnosis: Diagnosis) -> str:
     """The verdict in a sentence."""
     if diagnosis.verdict == "effects":
-        listed = ", ".join(cause.effect + _where(cause) for cause in diagnosis.causes)
-        return f"The simulation lacks: {listed}."
+        large, small = (
+            ", ".join(cause.effect + _where(cause) for cause in diagnosis.causes if cause.small == little)
+            for little in (False, True)
+        )
+        lacks = f"The simulation lacks: {large}." if large else "The simulation is right but for small effects."
+        return f"{lacks} Sure but small, within the structure of the model: {small}." if small else lacks
     if diagnosis.verdict == "none":
         return "The simulation is right within the noise of the measurement, once its nominal values are recalibrated."
     return "Something is wrong that no effect of the library explains."

@@ -16,6 +16,7 @@ from dynssm_ros.identification.recordings import LeftOut
 from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
 from dynssm_ros.identification.windows import SimulationWindows, fit_windows, recorded_rows
 from dynssm_ros.signals.context import recording_context
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import load_vehicle
@@ -85,6 +86,12 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     assert not _pays(replace(strong, delta_bic=DECISIVE_DELTA_BIC))
     assert not _pays(replace(strong, sure=2.9))
     assert not _pays(replace(strong, confirmation=None))
+    only_known = replace(strong, confirmation=replace(everywhere, gain=np.zeros(4), known=20.0), delta_bic=31.0)
+    assert _pays(only_known)
+    assert not _pays(replace(only_known, delta_bic=29.0))
+    one_day = replace(strong, candidate=replace(FEW[0], only_in=(1,)))
+    assert _pays(one_day)
+    assert not _pays(replace(one_day, confirmation=replace(everywhere, std=6.0)))
 
 
 def test_what_was_known_decides_where_left_out_parts_tell_nothing() -> None:
@@ -120,3 +127,23 @@ def test_the_integrator_is_that_of_the_data(plant: str) -> None:
     assert found.problem.windows.integrator == plant
     assert [one.candidate.effect for one in found.selection.chosen] == []
     assert np.isfinite(found.selection.fit.objective)
+
+
+def test_inputs_that_changed_between_the_rows_go_on_a_line() -> None:
+    fast = ORCA.model_copy(update={"sampling_time": ORCA.sampling_time / 4})
+    recording = as_recording(
+        simulate(fast, load_track("club"), duration=25.0, plant="rk4", noise=(0.002, 0.002, 0.005))
+    )
+    slow = recording.info.model_copy(update={"sampling_time": ORCA.sampling_time})
+    every = Recording(
+        slow,
+        recording.time[::4],
+        recording.segment[::4],
+        {name: values[::4] for name, values in recording.columns.items()},
+    )
+    given = fit_windows(every, recorded_rows(every, recording_context(every)), 0.3, 0.0)
+    found = search_causes(given, CarEstimate.of(ORCA), quarters(given), None, lambda words: None)
+    windows = found.problem.windows
+    assert (windows.integrator, windows.hold) == ("rk4", "first")
+    held = IdentificationProblem(replace(windows, hold="zero"), CarEstimate.of(ORCA), found.problem.tempering)
+    assert held.fit(CarEstimate.of(ORCA), ()).objective > found.search.base.objective + 100.0
