@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -56,6 +56,7 @@ class Cause:
         on_bound: its parameters that the data push against a bound: they are at least that far off.
         alternatives: effects that explain the data as well.
         only_in: names of the recordings in which it acts; empty: in all.
+        without: what the car with all other causes errs on the held-out rows, at the horizon, ``(W, 3)``.
     """
 
     effect: str
@@ -68,6 +69,7 @@ class Cause:
     on_bound: tuple[str, ...]
     alternatives: tuple[str, ...]
     only_in: tuple[str, ...] = ()
+    without: Vector = field(default_factory=lambda: np.empty((0, 3)), repr=False)
 
     @property
     def small(self) -> bool:
@@ -406,6 +408,7 @@ def _cause(one: Refined, found: SearchResult, at: _Prepared, std: Vector) -> Cau
         one.bounded,
         tuple(found.selection.alternatives[effect]),
         tuple(at.recordings.names[k] for k in one.candidate.only_in),
+        errors[0],
     )
 
 

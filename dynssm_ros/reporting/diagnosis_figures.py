@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.improvement import Improvement
+from dynssm_ros.identification.windows import SimulationWindows
 from dynssm_ros.reporting.evaluation_figures import (
     MEASURED,
     NO_MODEL,
@@ -24,11 +25,14 @@ from dynssm_ros.reporting.evaluation_figures import (
 )
 from dynssm_ros.reporting.tables import text
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.vehicle.effects import Effect
 
 _BINS = 16
 _FEWEST = 8  # simulations in a bin
 _COLOURS = (NO_MODEL, PALETTE[1], PALETTE[0])  # as given, recalibrated, extended
 _SECONDS = 15.0  # of the stretch that is shown in full
+_PLACES = 400  # of the lap at which a cause is drawn
+_BLOCKS = 24  # parts of the time
 _LONGEST = 2.2  # of the recalibrated car's error; what the car as given exceeds leaves the panel
 
 
@@ -63,6 +67,64 @@ def simulated_and_measured(improvement: Improvement) -> Figure:
     axes[-1].set_xlabel("time (s)")
     figure.align_ylabels()
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+@styled
+def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector, effect: Effect) -> Figure:
+    """How much a cause takes away, where and when; and along the lap, if it is a matter of the place.
+
+    Args:
+        windows: the held-out simulations.
+        without: errors of the car with all other causes, shape ``(W, 3)``.
+        with_it: errors of the extended car, likewise.
+        effect: the cause.
+    """
+    lap = np.linspace(0.0, 1.0, _PLACES)
+    profile = effect.along_lap(lap)
+    figure = Figure(figsize=(WIDTH, 4.6 if profile else 2.8), layout="constrained")
+    grid = figure.add_gridspec(2 if profile else 1, 3, height_ratios=[2.6, 1.4] if profile else None)
+    size, there, over = (figure.add_subplot(grid[0, k]) for k in range(3))
+    scale = np.maximum((without**2).mean(axis=0), 1e-300)
+    left = np.sqrt((with_it**2).mean(axis=0) / scale)
+    size.bar(range(3), np.ones(3), 0.7, color=_COLOURS[1])
+    size.bar(range(3), left, 0.45, color=_COLOURS[2])
+    size.set_xticks(range(3), [SYMBOLS[channel] for channel in STATE_SIGNALS])
+    size.set_title("error: orange without, blue with")
+    size.grid(axis="x", visible=False)
+    gone = ((without**2 - with_it**2) / scale).mean(axis=1)
+    known = windows.data.context
+    at = windows.starts + windows.steps // 4
+    if {"x", "y"} <= set(known):
+        span = max(float(np.quantile(np.abs(gone), 0.95)), 1e-12)
+        dots = there.scatter(
+            known["x"][at], known["y"][at], c=gone, s=8, cmap="RdBu", vmin=-span, vmax=span, lw=0, rasterized=True
+        )
+        figure.colorbar(dots, ax=there, location="bottom", shrink=0.8, aspect=24)
+        there.set_aspect("equal", adjustable="datalim")
+        there.set_title("where: blue, error is gone")
+    else:
+        bins = _binned(windows.data.rows[0, at])
+        there.plot(
+            [windows.data.rows[0, at][b].mean() for b in bins], [gone[b].mean() for b in bins], "o-", color=_COLOURS[2]
+        )
+        there.axhline(0.0, color=MEASURED, lw=0.8)
+        there.set_xlabel("speed (m/s)")
+        there.set_title("at which speed error is gone")
+    order, blocks = np.argsort(windows.time), max(1, min(_BLOCKS, len(gone) // _FEWEST))
+    parts = np.array_split(order, blocks)
+    over.bar(range(blocks), [gone[part].mean() for part in parts], 0.9, color=_COLOURS[2])
+    ticks = np.unique(np.linspace(0, blocks - 1, 4).round().astype(int))
+    over.set_xticks(ticks, [f"{windows.time[parts[k]].mean():.0f}" for k in ticks])
+    over.axhline(0.0, color=MEASURED, lw=0.8)
+    over.set_xlabel("time (s)")
+    over.set_title("when: error gone, 1 = the mean error")
+    if profile:
+        label, values = profile
+        along = figure.add_subplot(grid[1, :])
+        length = float(np.asarray(known["lap_length"]).flat[0]) if "lap_length" in known else 1.0
+        along.plot(lap * length, values, color=_COLOURS[2])
+        along.set(xlabel="position on the lap (m)", ylabel=label)
     return figure
 
 

@@ -27,13 +27,14 @@ _COEFFICIENTS_IN_WORDS = {
 }  # fmt: skip
 _LITTLE = 0.02  # of the squared error; less is not worth a word
 _WIDTH = 110
+_FEW = 4  # parameters of a curve that are shown one by one
 
 
 def as_text(diagnosis: Diagnosis) -> str:
     """The result for a terminal: cause, size, evidence, improvement, what to do, what is left."""
     lines = [headline(diagnosis)]
     for number, cause in enumerate(diagnosis.causes, 1):
-        lines += ["", f"{number}. {cause.effect}{_where(cause)}: {size_in_words(cause)}"]
+        lines += ["", f"{number}. {cause.effect}{_where(cause)}: {size_in_words(cause)}; {_share_in_words(cause)}"]
         lines += [f"   {line}" for words in _about(cause) for line in textwrap.wrap(words, _WIDTH)]
     lines += ["", *gain_in_words(diagnosis)]
     for words in (
@@ -57,6 +58,13 @@ def headline(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "none":
         return "The simulation is right within the noise of the measurement, once its nominal values are recalibrated."
     return "Something is wrong that no effect of the library explains."
+
+
+def _share_in_words(cause: Cause) -> str:
+    """Its share of the error in a few words."""
+    if cause.small:
+        return f"small, {percent(cause.heldout_gain)} of the error on held-out laps"
+    return f"{percent(cause.heldout_gain)} of the error on held-out laps"
 
 
 def _where(cause: Cause) -> str:
@@ -109,7 +117,11 @@ def moved_in_words(diagnosis: Diagnosis) -> list[str]:
 
 
 def size_in_words(cause: Cause) -> str:
-    """The parameters with unit and standard deviation, or a bound that they are at."""
+    """The parameters with unit and standard deviation, or a bound that they are at; of a long curve its range."""
+    profile = EFFECTS[cause.effect](**cause.values).along_lap(np.linspace(0.0, 1.0, 200))
+    if profile is not None and len(cause.std) > _FEW:
+        label, values = profile
+        return f"{label} from {values.min():.3g} to {values.max():.3g} along the lap, {len(cause.std)} parameters"
     parts = []
     for name, value in cause.values.items():
         unit = EFFECTS[cause.effect].PARAMETERS[name].unit
@@ -208,8 +220,18 @@ def _causes(diagnosis: Diagnosis) -> Table:
 
 
 def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
+    improvement = diagnosis.improvement
     for cause in diagnosis.causes:
-        yield Section(cause.effect + _where(cause), " ".join((f"{size_in_words(cause)}.", *_about(cause))))
+        yield Section(
+            cause.effect + _where(cause),
+            " ".join((f"{size_in_words(cause)}.", *_about(cause))),
+            diagnosis_figures.cause_pictures(
+                improvement.windows,
+                cause.without,
+                improvement.errors[EXTENDED][:, improvement.horizon],
+                EFFECTS[cause.effect](**cause.values),
+            ),
+        )
     yield from _gained(diagnosis)
     yield from _shown(diagnosis)
     yield from _found(diagnosis)

@@ -14,7 +14,7 @@ from dynssm_ros.identification.improvement import Improvement, measure_improveme
 from dynssm_ros.identification.minimum_effect import minimum_detectable
 from dynssm_ros.identification.problem import IdentificationProblem
 from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
-from dynssm_ros.reporting.diagnosis_figures import errors_over, gain_by_horizon, simulated_and_measured
+from dynssm_ros.reporting.diagnosis_figures import cause_pictures, errors_over, gain_by_horizon, simulated_and_measured
 from dynssm_ros.reporting.diagnosis_report import (
     as_text,
     diagnosis_report,
@@ -147,7 +147,7 @@ def test_the_json_measures_from_both_cars(lagging: Lagging) -> None:
 
 def test_the_report_shows_one_step_and_the_horizon_over_time_place_and_signals(lagging: Lagging) -> None:
     page = diagnosis_report(lagging[2]).html()
-    assert page.count("data:image/svg+xml") == 9
+    assert page.count("data:image/svg+xml") == 10
     for title in ("Simulated and measured", "Systematic error and noise", "Errors over time", "Errors against speed",
                   "Errors against steering", "Errors against throttle", "Errors against position on the lap",
                   "Errors against lateral acceleration", "What these laps would show", "Nominal values"):  # fmt: skip
@@ -163,3 +163,29 @@ def test_figures_have_a_row_for_one_step_and_one_for_the_horizon(improvement: Im
     x, y = (np.asarray(v) for v in lines[-1].get_data())
     starts = np.isin(np.round(x / 0.04), np.round(np.asarray(lines[0].get_xdata()) / 0.04))
     assert np.isfinite(y[starts]).any()
+
+
+def test_each_cause_has_a_picture_of_how_much_where_and_when(lagging: Lagging) -> None:
+    found = lagging[2]
+    windows, (cause,) = found.improvement.windows, found.causes
+    with_it = found.improvement.errors["extended"][:, found.improvement.horizon]
+    assert cause.without.shape == with_it.shape
+    ratio = np.sqrt((with_it**2).mean(axis=0) / (cause.without**2).mean(axis=0))
+    assert cause.heldout_gain == pytest.approx(1.0 - np.sqrt((ratio**2).mean()))
+    figure = cause_pictures(windows, cause.without, with_it, EFFECTS[cause.effect](**cause.values))
+    size, there, over = (panel for panel in figure.axes if panel.get_label() != "<colorbar>")
+    np.testing.assert_allclose([bar.get_height() for bar in size.patches[3:]], ratio)
+    assert "where" in there.get_title("left")
+    assert "when" in over.get_title("left")
+
+
+def test_a_curve_along_the_lap_is_drawn_and_its_range_told(lagging: Lagging) -> None:
+    found = lagging[2]
+    (cause,) = found.causes
+    values = {"angle": 0.01, "cos_1": 0.05, "sin_1": 0.0, "cos_2": 0.0, "sin_2": 0.0, "cos_3": 0.0, "sin_3": 0.0}
+    bank = replace(cause, effect="road_bank", values=values, std=dict.fromkeys(values, 1e-3))
+    assert size_in_words(bank) == "road bank (deg) from -2.29 to 3.44 along the lap, 7 parameters"
+    with_it = found.improvement.errors["extended"][:, found.improvement.horizon]
+    figure = cause_pictures(found.improvement.windows, bank.without, with_it, EFFECTS["road_bank"](**values))
+    line = np.asarray(figure.axes[-1].lines[0].get_ydata())
+    assert line.max() == pytest.approx(np.degrees(0.06))

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle.single_track import Array, Coefficients, Constants, Motion, StageEffect, at_least
 
@@ -190,6 +191,10 @@ class Effect(StageEffect):
         if signal not in q.context:
             raise ConfigurationError(_lacking(self, signal, q.context))
         return q.context[signal]
+
+    def along_lap(self, lap: Vector) -> tuple[str, Vector] | None:
+        """Name with unit, and values at places ``(n,)`` (fractions of the lap); ``None``: the place does not matter."""
+        return None
 
     def lap(self, q: Motion) -> Array:
         """Track position as a fraction of the lap."""

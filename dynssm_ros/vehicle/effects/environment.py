@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, Effect, Parameter, like, section
 from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion
 
@@ -42,6 +44,13 @@ class RoadAngle(Effect):
     sin_2: Array = 0.0
     cos_3: Array = 0.0
     sin_3: Array = 0.0
+
+    def along_lap(self, lap: Vector) -> tuple[str, Vector] | None:
+        """The angle in degrees."""
+        if not set(LAP) & set(self.needs):
+            return None
+        q: Any = SimpleNamespace(v_x=np.zeros_like(lap), context={"s": lap, "lap_length": 1.0})
+        return f"{self.NAME.replace('_', ' ')} (deg)", np.degrees(self.here(np, q))
 
     def here(self, xp: Any, q: Motion) -> Array:
         """The angle at the present place (rad)."""

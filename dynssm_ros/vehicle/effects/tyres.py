@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from dynssm_ros.arrays import Vector
 from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, SLOWEST, Effect, Parameter, lagged, section
 from dynssm_ros.vehicle.single_track import Array, Motion, at_least
 
@@ -147,6 +150,10 @@ class GripPatch(Effect):
     factor: Array = 1.0
     centre: Array = 0.5
     length: Array = 0.1
+
+    def along_lap(self, lap: Vector) -> tuple[str, Vector] | None:
+        """The factor of the grip."""
+        return "grip (1)", np.asarray(1.0 + (self.factor - 1.0) * section(np, lap, self.centre, self.length))
 
     def tyres(self, xp: Any, q: Motion) -> None:
         """Scales the lateral forces of both axles there."""
