@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import per_unit
 from dynssm_ros.identification.recordings import LeftOut, RecordingSet, driven_alike
 from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance, clustered, explained_variance
-from dynssm_ros.identification.selection import Refined, Selection
+from dynssm_ros.identification.selection import Refined, Search, Selection
 from dynssm_ros.identification.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.signals.recording import Recording
@@ -33,7 +33,7 @@ Verdict = Literal["effects", "none", "unexplained"]
 
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
-_NO_WORSE = 0.01  # of the error on held-out laps, that the extended car may be worse than the recalibrated one
+_NO_WORSE = 0.01  # of the error on held-out laps, that the car may be worse with a cause than without
 _MOVED = 3.0  # standard deviations beyond which recalibration is a finding
 _DRIVEN_ALIKE = 0.5  # of a recording, that others must have for causes of it alone
 _SMALL = 0.01  # of the error on held-out rows: less is within the structure of the model
@@ -241,20 +241,11 @@ def diagnose(
         raise ConfigurationError(f"exclude {', '.join(unknown)}: no such effect; expected some of {', '.join(EFFECTS)}")
     groups = _groups(at, suspects)
     found = search_causes(at.fitted, at.car, at.left_out, integrator, on_progress, exclude, groups)
-    problem, selection, fit = found.problem, found.selection, found.selection.fit
-    windows = problem.windows
+    problem, windows = found.problem, found.problem.windows
     at = at._replace(unseen=at.unseen.stepped_as(windows))
     on_progress("measuring the improvement on held-out laps")
-    improvement = measure_improvement(
-        at.unseen, {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: fit.car}, at.steps
-    )
-    if selection.chosen and _worse(improvement):
-        at.notes.append(
-            f"{', '.join(one.candidate.effect for one in selection.chosen)} explained the fitted laps but not the held-out "
-            "ones, so that nothing of it is kept"
-        )
-        selection = replace(selection, fit=selection.base, chosen=[], alternatives={})
-        fit, improvement = selection.base, improvement.ending_with(RECALIBRATED)
+    selection, improvement = _gated(found, at)
+    fit = selection.fit
     sizes = minimum_detectable(problem, fit, found.search.found)
     limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
     covariance = problem.covariance(fit)
@@ -272,7 +263,7 @@ def diagnose(
             "rows; a live prediction cannot, and errs by that: record them faster, or take the commands"
         )
     limits += [*_hidden(sizes), *_not_live(extended), *_not_written(fit.car, extended)]
-    causes = tuple(_cause(one, found, at, std) for one in selection.chosen)
+    causes = tuple(_cause(one, selection, found.search, at, std) for one in selection.chosen)
     left = explained_variance(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], problem.block)
     white = fit.noise.whiten(fit.errors)
     in_noise = weights(white) * (white**2).mean(axis=1)
@@ -312,6 +303,42 @@ def _groups(at: _Prepared, suspects: tuple[int, ...]) -> list[tuple[int, ...]]:
                 + ("" if suspects else "; causes of it alone are not tried")
             )
     return [group for group, share in alike.items() if suspects or share >= _DRIVEN_ALIKE]
+
+
+def _gated(found: SearchResult, at: _Prepared) -> tuple[Selection, Improvement]:
+    """What of the selection is no worse on held-out rows, each cause beside the others and all together; what it gains."""
+    selection = found.selection
+    while selection.chosen:
+        gains = [_held_out_gain(*_held_out_errors(one, selection, found.search, at)) for one in selection.chosen]
+        worst = int(np.argmin(gains))
+        if gains[worst] > -_NO_WORSE:
+            break
+        at.notes.append(_not_kept(selection.candidates[worst].effect))
+        selection = found.search.dropped(tuple(c for k, c in enumerate(selection.candidates) if k != worst))
+    cars = {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: selection.fit.car}
+    improvement = measure_improvement(at.unseen, cars, at.steps)
+    if selection.chosen and _worse(improvement):
+        at.notes.append(_not_kept(", ".join(one.effect for one in selection.candidates)))
+        return found.search.dropped(()), improvement.ending_with(RECALIBRATED)
+    return selection, improvement
+
+
+def _not_kept(effects: str) -> str:
+    return f"{effects} explained the fitted laps but not the held-out ones, so that nothing of it is kept"
+
+
+def _held_out_errors(one: Refined, selection: Selection, search: Search, at: _Prepared) -> tuple[Vector, Vector]:
+    """Errors at the horizon without one of the causes and with all, each ``(W, 3)``."""
+    without, with_it = (
+        at.unseen.errors(car)[:, at.steps - 1] for car in (search.leave_out(selection, one).car, selection.fit.car)
+    )
+    return without, with_it
+
+
+def _held_out_gain(without: Vector, with_it: Vector) -> float:
+    """Share of the error that is gone, as a mean of the channels."""
+    left = (with_it**2).mean(axis=0) / np.maximum((without**2).mean(axis=0), 1e-300)
+    return float(1.0 - np.sqrt(left.mean()))
 
 
 def _worse(improvement: Improvement) -> bool:
@@ -386,27 +413,25 @@ def _prepare(
     return _Prepared(together, fitted, left_out, asked, unseen, CarEstimate.of(vehicle), notes, protocol)
 
 
-def _cause(one: Refined, found: SearchResult, at: _Prepared, std: Vector) -> Cause:
-    effect, fit = one.candidate.effect, found.selection.fit
+def _cause(one: Refined, selection: Selection, search: Search, at: _Prepared, std: Vector) -> Cause:
+    effect, fit = one.candidate.effect, selection.fit
     known = {
         name: float(std[18 + k]) * per_unit(effect, name, fit.car.effects[effect][name])
         for k, (owner, name) in enumerate(fit.free)
         if owner == effect
     }
     assert one.confirmation is not None
-    other = found.search.leave_out(found.selection, one).car
-    errors = [at.unseen.errors(car)[:, at.steps - 1] for car in (other, fit.car)]
-    without, with_it = ((e**2).mean(axis=0) for e in errors)
+    errors = _held_out_errors(one, selection, search, at)
     return Cause(
         effect,
         dict(fit.car.effects[effect]),
         known,
         one.improvement,
         float(one.delta_bic),
-        float(1.0 - np.sqrt((with_it / np.maximum(without, 1e-300)).mean())),
+        _held_out_gain(*errors),
         one.confirmation,
         one.bounded,
-        tuple(found.selection.alternatives[effect]),
+        tuple(selection.alternatives[effect]),
         tuple(at.recordings.names[k] for k in one.candidate.only_in),
         errors[0],
     )

@@ -91,6 +91,11 @@ class Selection:
     tried: dict[str, float] = field(default_factory=dict)
     inflation: float = 1.0
 
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """What was chosen."""
+        return tuple(one.candidate for one in self.chosen)
+
 
 class _CandidateStart(NamedTuple):
     """Where to fit a candidate from, and roughly what it is worth."""
@@ -144,31 +149,25 @@ class Search:
             chosen.append(best.candidate)
             self._exchange(chosen)
             self._temper(tuple(chosen))
-        result: dict[Candidate, Refined] = {}
-        dropped = True
-        while dropped and chosen:
-            result = {
-                c: self._confirm(self._without(tuple(chosen), c), self._against(tuple(chosen), c)) for c in chosen
-            }
-            weakest = min(chosen, key=lambda c: (result[c].gain, result[c].delta_bic))
-            dropped = not _pays(result[weakest])
-            if dropped:
-                chosen.remove(weakest)
-        fit = self.fit(tuple(chosen))
-        ordered = sorted(chosen, key=lambda c: -result[c].gain)
-        return Selection(
-            self.base,
-            fit,
-            [result[c] for c in ordered],
-            {c.effect: self._alternatives(tuple(chosen), c) for c in ordered},
-            self.tried,
-            self._study.inflation(fit),
-        )
+        return self.dropped(tuple(chosen))
+
+    def dropped(self, chosen: tuple[Candidate, ...]) -> Selection:
+        """What holds of ``chosen``: the weakest is dropped while it does not pay beside the others."""
+        while True:
+            found = [self._confirm(self._without(chosen, c), self._against(chosen, c)) for c in chosen]
+            weakest = min(found, key=lambda r: (r.gain, r.delta_bic), default=None)
+            if weakest is None or _pays(weakest):
+                break
+            self._without(chosen, weakest.candidate)
+            chosen = tuple(c for c in chosen if c != weakest.candidate)
+        fit = self.fit(chosen) if chosen else self.base
+        found = sorted(found, key=lambda r: -r.gain)
+        others = {r.candidate.effect: self._alternatives(chosen, r.candidate) for r in found}
+        return Selection(self.base, fit, found, others, self.tried, self._study.inflation(fit))
 
     def leave_out(self, selection: Selection, one: Refined) -> Fit:
         """The fit of everything chosen but ``one``."""
-        chosen = tuple(r.candidate for r in selection.chosen)
-        return self._without(chosen, one.candidate)
+        return self._without(selection.candidates, one.candidate)
 
     def fit(self, chosen: tuple[Candidate, ...]) -> Fit:
         """All of ``chosen`` together, linearised anew."""

@@ -116,7 +116,7 @@ def test_words_and_report_name_cause_size_gain_and_advice(lagging: tuple[Recordi
     for part in (
         "steering_lag: time_constant = ",
         "±",
-        " s\n",
+        " s; 5 % of the error on held-out laps\n",
         EFFECTS["steering_lag"].ADVICE,
         "Error on held-out laps",
     ):
