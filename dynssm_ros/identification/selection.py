@@ -369,16 +369,20 @@ def _is_met(refined: Refined) -> bool:
     return not about.DIRECTIONS or float(side) in about.DIRECTIONS
 
 
-def _pays(refined: Refined) -> bool:
-    """Whether a cause is worth its parameters and holds where it was not fitted.
+def _is_little(refined: Refined) -> bool:
+    """Whether a cause of the car is nearer to neutral than what cars of another structure show."""
+    effect, name = refined.candidate.effect, refined.candidate.amplitudes[0]
+    least = EFFECTS[effect].LEAST
+    if not least or refined.candidate.only_in:
+        return False
+    return abs(refined.fit.car.effects[effect][name] - EFFECTS[effect].PARAMETERS[name].neutral) < least
 
-    What left-out parts hardly tell, and only the vehicle file speaks for, must hold too if its standard deviations were
-    too small by a factor of 1.4: half of what it spares the nominal values does not count.
-    """
+
+def _pays(refined: Refined) -> bool:
+    """Whether a cause is worth its parameters, large enough, and holds where it was not fitted."""
     confirmation = refined.confirmation
-    if confirmation is None or not confirmation.holds or refined.sure <= _SURE:
+    if confirmation is None or not confirmation.holds or refined.sure <= _SURE or _is_little(refined):
         return False
     if refined.candidate.only_in and confirmation.total <= _ONE_OF_MANY * confirmation.std:
         return False
-    untold = confirmation.known if confirmation.gain.sum() < confirmation.known else 0.0
-    return refined.delta_bic - untold > DECISIVE_DELTA_BIC
+    return refined.delta_bic > DECISIVE_DELTA_BIC

@@ -86,9 +86,9 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     assert not _pays(replace(strong, delta_bic=DECISIVE_DELTA_BIC))
     assert not _pays(replace(strong, sure=2.9))
     assert not _pays(replace(strong, confirmation=None))
-    only_known = replace(strong, confirmation=replace(everywhere, gain=np.zeros(4), known=20.0), delta_bic=31.0)
-    assert _pays(only_known)
-    assert not _pays(replace(only_known, delta_bic=29.0))
+    gripping = replace(strong, candidate=Candidate("grip", ("factor",)))
+    for factor, pays in ((0.85, True), (0.95, False)):
+        assert _pays(replace(gripping, fit=replace(fit, car=fit.car.with_effect("grip", {"factor": factor})))) == pays
     one_day = replace(strong, candidate=replace(FEW[0], only_in=(1,)))
     assert _pays(one_day)
     assert not _pays(replace(one_day, confirmation=replace(everywhere, std=6.0)))

@@ -100,6 +100,7 @@ class Effect(StageEffect):
         EFFECT_STATES: names of its own states. :func:`lagged` settles and integrates them.
         SENSOR: it changes what the sensors show; the car moves as without it.
         TYPICAL: how far it is off neutral in a car that is badly set up: just noticeable in ordinary laps, and large.
+        LEAST: how far it must be off neutral to be a cause; less is what a single-track car lacks anyway.
         DIRECTIONS: to which sides of neutral it is met in a car that can be driven; empty: those that its bounds admit.
     """
 
@@ -114,6 +115,7 @@ class Effect(StageEffect):
     SENSOR: ClassVar[bool] = False
     TYPICAL: ClassVar[tuple[float, float]] = (0.0, 0.0)
     DIRECTIONS: ClassVar[tuple[float, ...]] = ()
+    LEAST: ClassVar[float] = 0.0
 
     @classmethod
     def variants(cls) -> tuple[tuple[str, ...], ...]:

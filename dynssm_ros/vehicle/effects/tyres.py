@@ -25,6 +25,7 @@ class Grip(Effect):
     MANOEUVRE = "steady cornering up to the limit"
     PARAMETERS = {"factor": Parameter("1", 0.3, 1.7, 1.0)}
     TYPICAL = (0.13, 0.3)
+    LEAST = 0.1  # the load that leans to one side takes that from the grip of an axle with two wheels
     factor: Array = 1.0
 
     def tyres(self, xp: Any, q: Motion) -> None:
