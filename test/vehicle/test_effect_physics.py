@@ -98,6 +98,20 @@ def test_grip_scales_both_axles() -> None:
     assert (q.F_fy, q.F_ry) == pytest.approx((0.7 * PLAIN.F_fy, 0.7 * PLAIN.F_ry))
 
 
+def test_on_another_road_the_peak_shrinks_and_the_stiffness_stays() -> None:
+    slow = State(30.0, 0.0, 0.0)
+    little, plain = Applied(0.0, 1e-4), act(slow, Applied(0.0, 1e-4))
+    other = {"factor": 0.5, "similarity": 1.0}
+    offset = act(slow, Applied(0.0, 0.0))
+    of_plain = plain.F_fy - offset.F_fy
+    of_other = act(slow, little, grip=other).F_fy - act(slow, Applied(0.0, 0.0), grip=other).F_fy
+    assert of_other == pytest.approx(of_plain, rel=0.05)
+    peak = max(act(slow, Applied(0.0, delta)).F_fy for delta in np.linspace(0.0, 0.4, 200))
+    assert max(act(slow, Applied(0.0, d), grip=other).F_fy for d in np.linspace(0.0, 0.4, 200)) == pytest.approx(
+        0.5 * peak, rel=0.01
+    )
+
+
 def test_grip_of_an_axle_scales_that_one() -> None:
     front, rear = act(front_grip={"factor": 0.8}), act(rear_grip={"factor": 0.8})
     assert (front.F_fy, front.F_ry) == (0.8 * PLAIN.F_fy, PLAIN.F_ry)

@@ -17,16 +17,30 @@ _LEAST_SHARE = 0.05  # squared share of the lateral force that the longitudinal 
 
 @dataclass(frozen=True)
 class Grip(Effect):
-    """``factor`` times the lateral forces of both axles."""
+    """``factor F_y(alpha / factor^similarity)`` on both axles.
+
+    With a similarity of 0 the whole curve shrinks. With 1 the peak does and the cornering stiffness stays, as it does on
+    another road: the similarity method (Pacejka, Tire and Vehicle Dynamics, 2012, section 4.2).
+    """
 
     NAME = "grip"
     SUMMARY = "All tyres grip more or less than the nominal ones: another floor, rain, temperature, another compound."
     ADVICE = "Treat that floor, weather or set of tyres apart, and drive it with the grip that it has."
     MANOEUVRE = "steady cornering up to the limit"
-    PARAMETERS = {"factor": Parameter("1", 0.3, 1.7, 1.0)}
+    PARAMETERS = {
+        "factor": Parameter("1", 0.3, 1.7, 1.0),
+        "similarity": Parameter("1", 0.0, 1.0, 0.0, shape=True, tried=(0.5, 1.0)),
+    }
+    VARIANTS = (("factor",), ("factor", "similarity"))
     TYPICAL = (0.13, 0.3)
     LEAST = 0.1  # the load that leans to one side takes that from the grip of an axle with two wheels
     factor: Array = 1.0
+    similarity: Array = 0.0
+
+    def slip(self, xp: Any, q: Motion) -> None:
+        """Scales the slip angles at which the tyres are."""
+        scale = self.factor**-self.similarity
+        q.alpha_f, q.alpha_r = q.alpha_f * scale, q.alpha_r * scale
 
     def tyres(self, xp: Any, q: Motion) -> None:
         """Scales the lateral forces."""
