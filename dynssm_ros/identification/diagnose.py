@@ -306,7 +306,7 @@ def _groups(at: _Prepared, suspects: tuple[int, ...]) -> list[tuple[int, ...]]:
 
 
 def _gated(found: SearchResult, at: _Prepared) -> tuple[Selection, Improvement]:
-    """What of the selection is no worse on held-out rows, each cause beside the others and all together; what it gains."""
+    """A selection of which no cause is worse on held-out rows beside the others, nor all together; and what it gains."""
     selection = found.selection
     while selection.chosen:
         gains = [_held_out_gain(*_held_out_errors(one, selection, found.search, at)) for one in selection.chosen]
@@ -314,7 +314,7 @@ def _gated(found: SearchResult, at: _Prepared) -> tuple[Selection, Improvement]:
         if gains[worst] > -_NO_WORSE:
             break
         at.notes.append(_not_kept(selection.candidates[worst].effect))
-        selection = found.search.dropped(tuple(c for k, c in enumerate(selection.candidates) if k != worst))
+        selection = found.search.reject(selection.candidates[worst].effect)
     cars = {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: selection.fit.car}
     improvement = measure_improvement(at.unseen, cars, at.steps)
     if selection.chosen and _worse(improvement):

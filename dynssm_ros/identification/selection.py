@@ -129,6 +129,7 @@ class Search:
         self._price = np.log(3.0 * problem.windows.steps * len(problem.windows))
         on_progress("recalibrating the nominal car")
         self.base = problem.temper(problem.fit(car, ()))
+        self._tempering = problem.tempering
         self._responses = Responses(problem, self.base.car, self.base.errors)
         self._ranked: dict[frozenset[Candidate], list[Refined]] = {}
         self._fits: dict[frozenset[Candidate], Fit] = {frozenset(): self.base}
@@ -150,6 +151,13 @@ class Search:
             self._exchange(chosen)
             self._temper(tuple(chosen))
         return self.dropped(tuple(chosen))
+
+    def reject(self, effect: str) -> Selection:
+        """Selects anew without an effect."""
+        self.found = [candidate for candidate in self.found if candidate.effect != effect]
+        self._study.tempering, self._fits, self._ranked = self._tempering, {frozenset(): self.base}, {}
+        self._left_out = LeaveOneOut(self._study, *self._parts)
+        return self.run()
 
     def dropped(self, chosen: tuple[Candidate, ...]) -> Selection:
         """What holds of ``chosen``: the weakest is dropped while it does not pay beside the others."""
