@@ -86,13 +86,16 @@ def size(effect: str, rng: np.random.Generator) -> dict[str, float]:
     return EFFECTS[effect].drawn(float(np.exp(rng.uniform(np.log(low), np.log(high)))), rng)
 
 
-def cases(seed: int, count: int, effects: Sequence[str] = tuple(EFFECTS)) -> Iterator[Case]:
-    """``count`` cases: every effect in turn, with pairs and with none in between; the truths in turn."""
+def cases(seed: int, count: int, effects: Sequence[str] = tuple(EFFECTS), healthy: bool = False) -> Iterator[Case]:
+    """``count`` cases: every effect in turn, with pairs and with none in between; the truths in turn.
+
+    With ``healthy`` nothing is hidden in any of them.
+    """
     rng = np.random.default_rng(seed)
     turn = 0
     for k in range(count):
         kind = k % _ROUND
-        if kind in _NONE:
+        if healthy or kind in _NONE:
             names: list[str] = []
         elif kind in _PAIRS:
             names = [effects[i] for i in rng.choice(len(effects), 2, replace=False)]

@@ -1,7 +1,8 @@
 """The benchmark of hidden causes as doit's tasks: ``python -m doit -n 2 -f benchmarks/hidden_causes/dodo.py seed=1000``.
 
-Variables: ``out`` (folder for drives and outcomes), ``page`` (folder for the page and its figure), ``seed`` (of the
-first case), ``count`` (of cases). What is done is kept; after a change of the engine ``doit forget`` has it diagnosed again.
+Variables: ``out`` (folder for drives and outcomes), ``page`` (folder for the page and its figure), ``seed`` (of the first
+case), ``count`` (of cases), ``healthy=1`` (nothing is hidden in any). What is done is kept; after a change of
+the engine ``doit forget`` has it diagnosed again.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from dynssm_ros.reporting.diagnosis_figures import confusion
 SEED, COUNT = int(get_var("seed", "0")), int(get_var("count", "130"))
 OUT = Path(get_var("out", "out/hidden_causes"))
 PAGE_FOLDER = Path(get_var("page", str(OUT)))
-CASES = list(cases(SEED, COUNT))
+HEALTHY = get_var("healthy", "0") == "1"
+CASES = list(cases(SEED, COUNT, healthy=HEALTHY))
 DOIT_CONFIG = doit_config(OUT / "doit.json")
 _DPI = 130
 

@@ -14,6 +14,8 @@ from benchmarks.hidden_causes.cases import Case, Hidden
 from dynssm_ros.identification.diagnose import Cause
 from dynssm_ros.vehicle.effects import EFFECTS
 
+_NINETY = 1.645  # standard deviations of a 90 % interval
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -31,6 +33,7 @@ class Outcome:
         found: what was named, with its parameters.
         alternatives: what is reported as explaining the data as well, by what was named.
         evidence: difference in the information criterion, by what was named.
+        std: stated standard deviations of what was named, with its parameters.
     """
 
     case: str
@@ -43,6 +46,22 @@ class Outcome:
     found: Hidden = field(default_factory=dict)
     alternatives: dict[str, tuple[str, ...]] = field(default_factory=dict)
     evidence: dict[str, float] = field(default_factory=dict)
+    std: Hidden = field(default_factory=dict)
+
+    @property
+    def strictly_first(self) -> bool:
+        """Whether the first one named was hidden itself; without effects, whether none was named."""
+        return self.named[:1] == () if not self.hidden else self.named[:1] != () and self.named[0] in self.hidden
+
+    @property
+    def covered(self) -> list[bool]:
+        """Whether the stated 90 % interval of each parameter that was found and says how much holds what was hidden."""
+        return [
+            abs(self.found[effect][name] - value) <= _NINETY * self.std[effect][name]
+            for effect, values in self.values.items()
+            for name, value in values.items()
+            if name in self.std.get(effect, {}) and not EFFECTS[effect].PARAMETERS[name].shape
+        ]
 
     @property
     def right(self) -> bool:
@@ -68,6 +87,7 @@ def judge(case: Case, causes: Sequence[Cause]) -> Outcome:
         {cause.effect: dict(cause.values) for cause in causes},
         {cause.effect: tuple(cause.alternatives) for cause in causes},
         {cause.effect: cause.delta_bic for cause in causes},
+        {cause.effect: dict(cause.std) for cause in causes},
     )
 
 
@@ -91,7 +111,9 @@ def rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     return {
         "cases": len(outcomes),
         "named_first": _share([o.first for o in one]),
+        "strictly_first": _share([o.strictly_first for o in one]),
         "right_size": _share([o.sized for o in outcomes if o.sized is not None]),
+        "covered": _share([covered for o in outcomes for covered in o.covered]),
         "both_found": _share([o.all for o in two]),
         "false_alarms": _share([not o.first for o in none]),
         "more_named": _share([len(o.named) > 1 for o in one]),

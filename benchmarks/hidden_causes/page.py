@@ -11,7 +11,9 @@ PAGE, FIGURE = "hidden_causes.md", "hidden_causes_confusion.png"
 GOALS = {"named_first": 0.95, "right_size": 0.95, "both_found": 0.85, "false_alarms": 0.05}
 _IN_WORDS = {
     "named_first": "the hidden effect, or an alternative reported with it, is named first",
+    "strictly_first": "the same without alternatives",
     "right_size": "parameters of what was found are within 15 % or two standard deviations",
+    "covered": "stated 90 % intervals hold what was hidden",
     "both_found": "both effects of a pair are found",
     "false_alarms": "something is named where nothing is hidden",
     "more_named": "more is named than the one effect that is hidden",

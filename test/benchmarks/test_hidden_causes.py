@@ -88,6 +88,22 @@ def test_sizes_are_right_within_15_percent_or_two_standard_deviations() -> None:
     assert judge(case, [cause("mass", {"factor": 1.25}, std=0.03)]).sized
 
 
+def test_stated_intervals_hold_what_was_hidden_or_not() -> None:
+    case = Case({"mass": {"factor": 1.2}}, 0)
+    assert judge(case, [cause("mass", {"factor": 1.24}, std=0.03)]).covered == [True]
+    assert judge(case, [cause("mass", {"factor": 1.24}, std=0.02)]).covered == [False]
+    assert judge(case, [cause("drag", {"coefficient": 0.3}, std=0.02)]).covered == []
+
+
+def test_an_alternative_does_not_count_strictly() -> None:
+    case = Case({"drag": {"coefficient": 0.4}}, 0)
+    assert not judge(case, [cause("mass", {"factor": 1.1}, "drag")]).strictly_first
+    assert judge(case, [cause("drag", {"coefficient": 0.4})]).strictly_first
+    assert not judge(case, []).strictly_first
+    assert judge(Case({}, 0), []).strictly_first
+    assert {tuple(one.hidden) for one in cases(0, 26, healthy=True)} == {()}
+
+
 def test_none_and_two_are_judged_by_all_that_is_named() -> None:
     assert judge(Case({}, 0), []).first
     assert not judge(Case({}, 0), [cause("mass", {"factor": 1.1})]).first
@@ -109,6 +125,8 @@ def test_rates_and_confusion_count_what_happened() -> None:
     found = rates(OUTCOMES)
     assert {name: (rate["of"], rate["share"]) for name, rate in found.items() if name != "cases"} == {
         "named_first": (2, 0.5),
+        "strictly_first": (2, 0.5),
+        "covered": (0, None),
         "both_found": (1, 1.0),
         "false_alarms": (1, 1.0),
         "right_size": (2, 0.5),
