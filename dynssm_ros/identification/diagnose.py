@@ -16,7 +16,7 @@ from dynssm_ros.identification.improvement import Improvement, measure_improveme
 from dynssm_ros.identification.integrator import SearchResult, search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
 from dynssm_ros.identification.noise import weights
-from dynssm_ros.identification.problem import per_unit
+from dynssm_ros.identification.problem import IdentificationProblem, per_unit
 from dynssm_ros.identification.recordings import LeftOut, RecordingSet, driven_alike
 from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance, clustered, explained_variance
 from dynssm_ros.identification.selection import Refined, Search, Selection
@@ -264,11 +264,7 @@ def diagnose(
         )
     limits += [*_hidden(sizes), *_not_live(extended), *_not_written(fit.car, extended)]
     causes = tuple(_cause(one, selection, found.search, at, std) for one in selection.chosen)
-    left = explained_variance(windows, fit.errors.reshape(len(windows), -1, 3)[:, -1], problem.block)
-    white = fit.noise.whiten(fit.errors)
-    in_noise = weights(white) * (white**2).mean(axis=1)
-    in_noise = in_noise / (np.bincount(windows.number, in_noise) / np.bincount(windows.number))[windows.number]
-    together = clustered(in_noise, windows.time, problem.block, selection.inflation)
+    left, together = _left(problem, selection)
     return Diagnosis(
         "effects" if causes else "unexplained" if left.is_there or together.is_there else "none",
         causes,
@@ -310,17 +306,36 @@ def _gated(found: SearchResult, at: _Prepared) -> tuple[Selection, Improvement]:
     selection = found.selection
     while selection.chosen:
         gains = [_held_out_gain(*_held_out_errors(one, selection, found.search, at)) for one in selection.chosen]
-        worst = int(np.argmin(gains))
-        if gains[worst] > -_NO_WORSE:
+        worst = selection.candidates[int(np.argmin(gains))].effect
+        strange = [one.candidate.effect for one in selection.chosen if not one.is_met]
+        if min(gains) <= -_NO_WORSE:
+            at.notes.append(_not_kept(worst))
+            selection = found.search.reject(worst)
+        elif strange and any(rest.is_there for rest in _left(found.problem, selection)):
+            at.notes.append(
+                f"{strange[0]} would be on the side of neutral on which no car has it, and leaves errors that come together: "
+                "it stands for something else, so that nothing of it is kept"
+            )
+            selection = found.search.reject(strange[0])
+        else:
             break
-        at.notes.append(_not_kept(selection.candidates[worst].effect))
-        selection = found.search.reject(selection.candidates[worst].effect)
     cars = {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: selection.fit.car}
     improvement = measure_improvement(at.unseen, cars, at.steps)
     if selection.chosen and _worse(improvement):
         at.notes.append(_not_kept(", ".join(one.effect for one in selection.candidates)))
         return found.search.dropped(()), improvement.ending_with(RECALIBRATED)
     return selection, improvement
+
+
+def _left(problem: IdentificationProblem, selection: Selection) -> tuple[ExplainedVariance, ClusteredResiduals]:
+    """What the selected car leaves: what is systematic, and what comes together in time."""
+    windows, fit = problem.windows, selection.fit
+    white = fit.noise.whiten(fit.errors)
+    size = weights(white) * (white**2).mean(axis=1)
+    size = size / (np.bincount(windows.number, size) / np.bincount(windows.number))[windows.number]
+    ends = fit.errors.reshape(len(windows), -1, 3)[:, -1]
+    together = clustered(size, windows.time, problem.block, selection.inflation)
+    return explained_variance(windows, ends, problem.block), together
 
 
 def _not_kept(effects: str) -> str:

@@ -66,6 +66,17 @@ class Refined:
     bounded: tuple[str, ...] = ()
 
     @property
+    def is_met(self) -> bool:
+        """Whether it is on a side of neutral on which it is met in cars that can be driven.
+
+        Beside other recordings either side is.
+        """
+        effect, name = self.candidate.effect, self.candidate.amplitudes[0]
+        about = EFFECTS[effect]
+        side = np.sign(self.fit.car.effects[effect][name] - about.PARAMETERS[name].neutral)
+        return bool(self.candidate.only_in) or not about.DIRECTIONS or float(side) in about.DIRECTIONS
+
+    @property
     def gain(self) -> float:
         """Logarithm of the predictive likelihood that it gains, nothing where it is not confirmed."""
         return self.confirmation.total if self.confirmation is not None and self.confirmation.holds else 0.0
@@ -222,7 +233,7 @@ class Search:
         """
         found = sorted(self._confirmed(before), key=lambda r: -r.gain)
         alike = [r for r in found if r is found[0] or self._left_out.compare(r.fit, found[0].fit).alike]
-        return min(alike, key=lambda r: (bool(r.bounded), bool(r.candidate.only_in), not _is_met(r)), default=None)
+        return min(alike, key=lambda r: (bool(r.bounded), bool(r.candidate.only_in), not r.is_met), default=None)
 
     def _taken_over(self, start: Fit | None) -> list[Candidate]:
         """The candidates of another problem's fit, fitted here."""
@@ -362,19 +373,6 @@ class Search:
         fit = self.fit(chosen)
         others = [r for r in self._confirmed(rest) if r.candidate.effect != one.effect]
         return [r.candidate.effect for r in others if self._left_out.compare(r.fit, fit).alike]
-
-
-def _is_met(refined: Refined) -> bool:
-    """Whether an effect is on a side of neutral on which it is met in cars that can be driven.
-
-    Beside other recordings either side is.
-    """
-    effect, name = refined.candidate.effect, refined.candidate.amplitudes[0]
-    about = EFFECTS[effect]
-    if refined.candidate.only_in:
-        return True
-    side = np.sign(refined.fit.car.effects[effect][name] - about.PARAMETERS[name].neutral)
-    return not about.DIRECTIONS or float(side) in about.DIRECTIONS
 
 
 def _is_little(refined: Refined) -> bool:
