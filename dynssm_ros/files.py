@@ -1,29 +1,97 @@
-"""Outputs are written aside and renamed: a kill leaves the old file or the new one, never half of one."""
+"""Outputs are written aside and renamed: a kill leaves the old file or the new one, never half of one.
+
+An output never replaces an input of the same command, nor a log, nor what is neither file nor folder.
+"""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
+import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 from dynssm_ros.errors import UserError
 
+LOG_SUFFIXES = (".mcap", ".db3", ".bag", ".zstd")
+"""Of files that recorders write, and we do not."""
+_INPUTS: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
+_FORCED: ContextVar[bool] = ContextVar("forced", default=False)
+
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def protecting(inputs: Collection[Path], force: bool = False) -> Iterator[None]:
+    """While this lasts, no output replaces one of ``inputs``; with ``force`` it replaces what others wrote."""
+    tokens = _INPUTS.set(tuple(path.resolve() for path in inputs)), _FORCED.set(force)
+    try:
+        yield
+    finally:
+        _INPUTS.reset(tokens[0])
+        _FORCED.reset(tokens[1])
+
+
+def require_replaceable(path: str | Path, ours: bool, what: str) -> None:
+    """Checks that ``path`` may be written: that nothing is there, or what we wrote.
+
+    Args:
+        path: of an output.
+        ours: whether what is there is of the kind that we write.
+        what: that kind, in words.
+
+    Raises:
+        UserError: something else is there, and nobody forces it.
+    """
+    if os.path.lexists(path) and not ours and not _FORCED.get():
+        raise UserError(f"{path}: exists and is not {what}; not replaced (another name, or --force)")
+
+
+def require_no_input(path: str | Path) -> None:
+    """Checks that writing ``path`` destroys nothing that the command reads, and nothing that is no file or folder.
+
+    Raises:
+        UserError: it would.
+    """
+    target = Path(path)
+    if not os.path.lexists(target):
+        return
+    here = target.resolve()
+    if here.exists() and not stat.S_ISREG(here.stat().st_mode) and not here.is_dir():
+        raise UserError(f"{target}: is neither a file nor a folder; not replaced")
+    for one in _INPUTS.get():
+        if here == one or here in one.parents or _same(here, one):
+            raise UserError(f"{target}: the command reads {one.name} there; an output never replaces an input")
+    if here.is_file() and here.suffix in LOG_SUFFIXES and not _FORCED.get():
+        raise UserError(f"{target}: exists and looks like a log; not replaced (another name, or --force)")
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Whether two names are of one file, also by a hard link."""
+    try:
+        return os.path.samefile(one, other)
+    except OSError:
+        return False
+
+
+@contextmanager
+def replacing(path: str | Path, may_hold: Collection[str] = ()) -> Iterator[Path]:
     """Yields a path beside ``path`` to write a file or folder to; it takes the name of ``path`` on success.
 
     On an exception what was written aside is removed and ``path`` is as it was.
 
+    Args:
+        path: of the output.
+        may_hold: names that a folder there may hold beside those of the new one; with others it is not replaced.
+
     Raises:
-        UserError: ``path`` cannot be written.
+        UserError: ``path`` cannot be written, or would destroy what is there.
     """
     target = Path(path)
+    require_no_input(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
@@ -31,9 +99,21 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise UserError(f"{target}: cannot be written ({error.strerror}: {error.filename})") from error
     try:
         yield scratch / target.name
+        _require_nothing_else(target, scratch / target.name, may_hold)
         _put(scratch / target.name, target, scratch / "replaced")
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _require_nothing_else(target: Path, aside: Path, may_hold: Collection[str]) -> None:
+    """Checks that a folder which is replaced holds nothing of somebody else's."""
+    if not (aside.is_dir() and target.is_dir()) or _FORCED.get():
+        return
+    foreign = sorted(set(os.listdir(target)) - set(os.listdir(aside)) - set(may_hold))
+    if foreign:
+        raise UserError(
+            f"{target}: holds {foreign[0]}, which we did not write; not replaced (another name, or --force)"
+        )
 
 
 def _put(aside: Path, target: Path, replaced: Path) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from dynssm_ros.errors import UserError
-from dynssm_ros.files import replacing, write_json
+from dynssm_ros.files import protecting, replacing, write_json
 
 
 def folder_of(path: Path, text: str) -> None:
@@ -101,3 +102,49 @@ def test_json_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
         write_json(tmp_path / "a.json", {"rmse": float("nan")})
     assert json.loads((tmp_path / "a.json").read_text())["rmse"] == {"v_x": 0.1}
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_an_input_is_never_replaced_by_whatever_name(tmp_path: Path) -> None:
+    log = tmp_path / "laps" / "log.json"
+    log.parent.mkdir()
+    log.write_text("precious")
+    (tmp_path / "link").symlink_to(log)
+    os.link(log, tmp_path / "hard")
+    with protecting([log], force=True):
+        for name in (log, tmp_path / "link", tmp_path / "hard", log.parent):
+            with pytest.raises(UserError, match=r"reads log\.json there; an output never replaces an input"):
+                write_json(name, {})
+        write_json(tmp_path / "other.json", {})
+    assert log.read_text() == "precious"
+    write_json(log, {})
+    assert log.read_text() == "{}\n"
+
+
+def test_a_log_and_a_device_are_not_replaced(tmp_path: Path) -> None:
+    log = tmp_path / "race.mcap"
+    log.write_text("precious")
+    with pytest.raises(UserError, match=r"race\.mcap: exists and looks like a log; not replaced"):
+        write_json(log, {})
+    with protecting([], force=True):
+        write_json(log, {})
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with (
+        protecting([], force=True),
+        pytest.raises(UserError, match="pipe: is neither a file nor a folder; not replaced"),
+    ):
+        write_json(pipe, {})
+    with pytest.raises(UserError, match="is neither a file nor a folder"):
+        write_json("/dev/null", {})
+
+
+def test_a_folder_that_holds_something_else_is_not_replaced(tmp_path: Path) -> None:
+    folder = tmp_path / "model"
+    folder_of(folder, "old")
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match=r"model: holds notes\.txt, which we did not write"), replacing(folder) as aside:
+        folder_of(aside, "new")
+    assert (folder / "notes.txt").read_text() == "mine"
+    with replacing(folder, may_hold=("notes.txt",)) as aside:
+        folder_of(aside, "new")
+    assert text_of(folder) == "new"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, cast
 
 import typer
@@ -20,6 +23,7 @@ from dynssm_ros.cli.simulate import simulate
 from dynssm_ros.cli.train import train
 from dynssm_ros.errors import UserError
 from dynssm_ros.extras import load_plugins
+from dynssm_ros.files import protecting
 
 app = typer.Typer(
     name="dynssm",
@@ -35,6 +39,9 @@ for command in (simulate, extract, calibrate, train, evaluate, replay, diagnose,
     app.command()(command)
 
 
+_OUTPUTS = ("--out", "--bag", "--json", "--online-state")
+
+
 def _print_version(value: bool) -> None:
     if value:
         print(f"dynssm {__version__}")
@@ -42,15 +49,25 @@ def _print_version(value: bool) -> None:
 
 
 @app.callback()
-def _options(version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True)) -> None:
+def _options(
+    version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True),
+    force: bool = typer.Option(
+        False, "--force", help="Replace what others wrote, but never an input; may stand anywhere."
+    ),
+) -> None:
     """Options before the subcommand."""
 
 
 def main() -> None:
-    """Runs the command line; whatever is wrong with what the user gave is one line and exit status 1."""
+    """Runs the command line; whatever is wrong with what the user gave is one line and exit status 1.
+
+    ``--force`` may stand anywhere: outputs then replace what others wrote, but never an input.
+    """
+    arguments = [word for word in sys.argv[1:] if word != "--force"]
     try:
         load_plugins()
-        status = app(standalone_mode=False)
+        with protecting(inputs(arguments), force=len(arguments) < len(sys.argv) - 1):
+            status = app(arguments, standalone_mode=False)
     except UserError as error:
         _fail(str(error))
     except _UsageProblem as error:
@@ -61,6 +78,20 @@ def main() -> None:
         sys.exit(130)
     else:
         sys.exit(status if isinstance(status, int) else 0)
+
+
+def inputs(arguments: Sequence[str]) -> list[Path]:
+    """What a command reads: all arguments that are paths of something there, but for those of outputs."""
+    found, option = [], ""
+    for word in arguments:
+        name, is_option, value = word.partition("=") if word.startswith("--") else ("", "", word)
+        if name and not is_option:
+            option = name
+            continue
+        if (name or option) not in _OUTPUTS and value and os.path.lexists(value):
+            found.append(Path(value))
+        option = ""
+    return found
 
 
 def _fail(words: str) -> None:

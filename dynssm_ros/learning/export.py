@@ -91,7 +91,7 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
     check_replaceable(out)
     model, config = trained.model, trained.config
     sample = _sample_windows(trained)
-    with replacing(out) as folder:
+    with replacing(out, may_hold=(ONLINE, "losses.png")) as folder:
         folder.mkdir()
         save_file({name: value.contiguous() for name, value in model.state_dict().items()}, folder / WEIGHTS)
         export_onnx(model, sample, folder / ONNX, trained.features)

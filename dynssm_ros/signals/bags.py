@@ -17,13 +17,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from dynssm_ros import __version__
 from dynssm_ros.errors import BagError
-from dynssm_ros.files import replacing
+from dynssm_ros.files import replacing, require_replaceable
 from dynssm_ros.signals.recover import is_short, is_unindexed, log_left, merge_log, recover, unpack, unpacked_message
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
@@ -235,18 +237,31 @@ def _damage(file: Path) -> str | None:
     return None
 
 
+_MARK = "dynssm_ros"
+"""Key of the custom data in the metadata of bags that are written here."""
+
+
 @contextmanager
 def write_bag(path: str | Path) -> Iterator[BagWriter]:
     """Writes a rosbag2 folder (MCAP, zstd-free so that any reader opens it), atomically.
 
     Raises:
-        BagError: ``path`` exists and is not a bag folder, which would be replaced.
+        UserError: ``path`` exists and is not a bag that was written here.
     """
     path = Path(path)
-    if path.exists() and not (path / "metadata.yaml").is_file():
-        raise BagError(f"{path}: exists and is not a rosbag2 folder; not replaced")
+    require_replaceable(path, _is_ours(path), "a bag that dynssm wrote")
     with replacing(path) as aside, Writer(aside, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.set_custom_data(_MARK, __version__)
         yield BagWriter(writer)
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a rosbag2 folder has our mark."""
+    try:
+        content = yaml.safe_load((path / "metadata.yaml").read_text(encoding="utf-8"))
+        return _MARK in content["rosbag2_bagfile_information"]["custom_data"]
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+        return False
 
 
 class BagWriter:

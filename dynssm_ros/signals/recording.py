@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.configuration import StrictModel, describe
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.files import replacing
+from dynssm_ros.files import replacing, require_replaceable
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, Commands
 
@@ -158,6 +158,7 @@ class Recording:
             for name, array in arrays.items()
         ]
         schema = pa.schema(fields, metadata={METADATA_KEY: self.info.model_dump_json().encode()})
+        require_replaceable(path, _is_recording(path), "a recording")
         with replacing(path) as aside:
             pq.write_table(pa.table(list(arrays.values()), schema=schema), aside, compression="zstd")
 
@@ -194,6 +195,14 @@ class Recording:
             if len(bad):
                 raise RecordingError(f"{path}: column {name}, row {bad[0]}: {values[bad[0]]}; expected a finite number")
         return cls(info, time, segment, columns)
+
+
+def _is_recording(path: str | Path) -> bool:
+    """Whether a file is Parquet with our metadata."""
+    try:
+        return METADATA_KEY in (pq.read_schema(path).metadata or {})
+    except (pa.ArrowException, OSError):
+        return False
 
 
 def _column(table: pa.Table, name: str, kind: str, path: Path) -> npt.NDArray[Any]:

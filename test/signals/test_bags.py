@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dynssm_ros.errors import BagError
+from dynssm_ros.errors import BagError, UserError
+from dynssm_ros.files import protecting
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.bags import BagMessage, copy_topics, open_bag, write_bag
 
@@ -177,9 +178,16 @@ def test_a_bag_is_replaced_but_nothing_else_is(tmp_path: Path, drive: Any) -> No
     precious = tmp_path / "thesis"
     precious.mkdir()
     (precious / "chapter1.txt").write_text("long")
-    with pytest.raises(BagError, match="thesis: exists and is not a rosbag2 folder; not replaced"):
+    with pytest.raises(UserError, match="thesis: exists and is not a bag that dynssm wrote; not replaced"):
         write(precious, drive(5))
     assert (precious / "chapter1.txt").read_text() == "long"
+    raw = tmp_path / "bag" / "metadata.yaml"
+    raw.write_text(raw.read_text().replace("dynssm_ros", "recorder"))
+    with pytest.raises(UserError, match="bag: exists and is not a bag that dynssm wrote"):
+        write(tmp_path / "bag", drive(5))
+    with protecting([], force=True):
+        write(tmp_path / "bag", drive(5))
+    assert len(read(tmp_path / "bag")[0]) == 15
 
 
 def test_a_bag_whose_writing_fails_leaves_the_older_one(tmp_path: Path, drive: Any) -> None:
