@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from dynssm_ros.control.settings import Objective
     from dynssm_ros.evaluation.open_loop import Evaluation
     from dynssm_ros.identification.calibration import Calibration
-    from dynssm_ros.identification.diagnose import Diagnosis
+    from dynssm_ros.identification.diagnosis import Diagnosis
     from dynssm_ros.learning.models.base import ModelConfig
     from dynssm_ros.learning.stages import Trained
     from dynssm_ros.runtime.artifact import Artifact

@@ -67,7 +67,11 @@ def options() -> dict[str, set[str]]:
     """Options by command."""
     group = typer.main.get_command(app)
     return {
-        name: {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+        name: {
+            option
+            for parameter in (*group.params, *command.params)
+            for option in (*parameter.opts, *parameter.secondary_opts)
+        }
         for name, command in group.commands.items()  # type: ignore[attr-defined]
     }
 

@@ -16,7 +16,7 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.identification.noise import Noise
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
-from dynssm_ros.identification.recordings import LeftOut
+from dynssm_ros.identification.recordings import Folds
 from dynssm_ros.vehicle.effects import EFFECTS
 
 _KNOWN = 2.0  # standard errors that the nominal values must be spared, where left-out units tell nothing
@@ -83,7 +83,7 @@ class LeaveOneOut:
         parts: laps or quarters of the time of each recording.
     """
 
-    def __init__(self, problem: IdentificationProblem, whole: LeftOut, parts: LeftOut) -> None:
+    def __init__(self, problem: IdentificationProblem, whole: Folds, parts: Folds) -> None:
         self._problem, self._whole, self._parts = problem, whole, parts
         self._known: dict[tuple[int, int], tuple[Fit, _Predicted]] = {}
 
@@ -100,7 +100,7 @@ class LeaveOneOut:
         left = after.error[told].sum(axis=0) / np.maximum(before.error[told].sum(axis=0), 1e-300)
         return Confirmation(gain, max(_spread(gain), _spread(by_block)), known, 1.0 - left)
 
-    def _predicted(self, fit: Fit, left_out: LeftOut) -> _Predicted:
+    def _predicted(self, fit: Fit, left_out: Folds) -> _Predicted:
         """Of each window by the fit without its fold; noise and the place of a local effect stay as they were found.
 
         So do effects of single recordings where whole recordings are left out, which tell nothing of them.

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.confirmation import Confirmation
-from dynssm_ros.identification.improvement import Improvement, measure_improvement
-from dynssm_ros.identification.integrator import SearchResult, search_causes
+from dynssm_ros.identification.diagnosis import Cause, Diagnosis
+from dynssm_ros.identification.gate import HeldOut, gated, held_out_errors, held_out_gain, left_behind
+from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
-from dynssm_ros.identification.noise import weights
-from dynssm_ros.identification.problem import IdentificationProblem, per_unit
-from dynssm_ros.identification.recordings import LeftOut, RecordingSet, driven_alike
-from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance, clustered, explained_variance
+from dynssm_ros.identification.problem import per_unit
+from dynssm_ros.identification.recordings import Folds, RecordingSet, driven_alike
 from dynssm_ros.identification.selection import Refined, Search, Selection
 from dynssm_ros.identification.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
 from dynssm_ros.progress import OnProgress
@@ -29,176 +26,11 @@ from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, require_context
 from dynssm_ros.vehicle.single_track import Integrator
 
-Verdict = Literal["effects", "none", "unexplained"]
-
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
-_NO_WORSE = 0.01  # of the error on held-out laps, that the car may be worse with a cause than without
 _MOVED = 3.0  # standard deviations beyond which recalibration is a finding
 _DRIVEN_ALIKE = 0.5  # of a recording, that others must have for causes of it alone
-_SMALL = 0.01  # of the error on held-out rows: less is within the structure of the model
 _HELD = {"zero": "held", "first": "a line from row to row"}
-GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
-
-
-@dataclass(frozen=True)
-class Cause:
-    """An effect that the data ask for.
-
-    Attributes:
-        effect: its name.
-        values: parameters with which it acts.
-        std: standard deviations of those that were fitted.
-        improvement: decrease of twice the negative log-likelihood by it.
-        delta_bic: what is left when its parameters are paid for.
-        heldout_gain: share of the error on the held-out rows that is gone by it.
-        confirmation: what it gains on parts of the fitted rows that were left out.
-        on_bound: its parameters that the data push against a bound: they are at least that far off.
-        alternatives: effects that explain the data as well.
-        only_in: names of the recordings in which it acts; empty: in all.
-        without: what the car with all other causes errs on the held-out rows, at the horizon, ``(W, 3)``.
-    """
-
-    effect: str
-    values: dict[str, float]
-    std: dict[str, float]
-    improvement: float
-    delta_bic: float
-    heldout_gain: float
-    confirmation: Confirmation
-    on_bound: tuple[str, ...]
-    alternatives: tuple[str, ...]
-    only_in: tuple[str, ...] = ()
-    without: Vector = field(default_factory=lambda: np.empty((0, 3)), repr=False)
-
-    @property
-    def small(self) -> bool:
-        """Whether it hardly matters on held-out laps, however sure it is: no model is right to the last per mille."""
-        return self.heldout_gain < _SMALL
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """What the simulation gets wrong, and why.
-
-    Attributes:
-        verdict: ``effects``: causes are named; ``none``: right within noise; ``unexplained``: wrong, and nothing of the
-            library says why.
-        causes: the strongest first.
-        moved: coefficients, and ``m``, that are now more than three of the stated standard deviations off what the vehicle
-            file has; by name, how many.
-        vehicle: the vehicle with effects and refitted nominal values.
-        improvement: on the held-out rows.
-        left: what is systematic in the errors of the extended car, on the rows of the fit.
-        clustered: how those errors are spread over time.
-        minimum_detectable: how far off neutral each effect that is not named would have to be to be named (the unit of its
-            first parameter).
-        selection: how it was found.
-        car: the extended car as fitted.
-        std: standard deviations of the 17 coefficients and of the mass, relative to what was known of them.
-        notes: what limits the diagnosis.
-        protocol: how it was obtained, by name.
-        windows: of the fit.
-        recordings: what was diagnosed.
-    """
-
-    verdict: Verdict
-    causes: tuple[Cause, ...]
-    moved: Mapping[str, float]
-    vehicle: Vehicle
-    improvement: Improvement
-    left: ExplainedVariance
-    clustered: ClusteredResiduals
-    minimum_detectable: Mapping[str, float]
-    selection: Selection
-    car: CarEstimate
-    std: Vector
-    notes: tuple[str, ...]
-    protocol: Mapping[str, str]
-    windows: SimulationWindows
-    recordings: RecordingSet
-
-    @property
-    def recalibrated(self) -> dict[str, tuple[float, float]]:
-        """What :attr:`moved` names: as the vehicle file has it, and now."""
-        given, now = self.car.vehicle, self.vehicle
-        return {
-            name: (given.constants.m, now.constants.m)
-            if name == "m"
-            else (given.coefficients[name].nominal, now.coefficients[name].nominal)
-            for name in self.moved
-        }
-
-    def to_json(self, vehicle_path: str) -> dict[str, Any]:
-        """For programs; ``vehicle_path`` is where the extended vehicle was written."""
-        improvement = self.improvement
-        at = improvement.horizon
-        rmse = {name: by_channel(values[at]) for name, values in improvement.rmse.items()}
-        return {
-            "verdict": self.verdict,
-            "causes": [
-                {
-                    "effect": cause.effect,
-                    "parameters": {
-                        name: {
-                            "value": value,
-                            "std": cause.std.get(name),
-                            "unit": EFFECTS[cause.effect].PARAMETERS[name].unit,
-                        }
-                        for name, value in cause.values.items()
-                    },
-                    "evidence": {
-                        "delta_bic": cause.delta_bic,
-                        "heldout_gain": cause.heldout_gain,
-                        "left_out": {
-                            "gain": cause.confirmation.total,
-                            "std": cause.confirmation.std,
-                            "units": cause.confirmation.gain.tolist(),
-                            "error_gone": by_channel(cause.confirmation.share),
-                        },
-                    },
-                    "on_bound": list(cause.on_bound),
-                    "alternatives": list(cause.alternatives),
-                    "only_in": list(cause.only_in),
-                    "small": cause.small,
-                }
-                for cause in self.causes
-            ],
-            "gain": {
-                "horizon_s": float(improvement.horizons[at]),
-                "before": rmse[GIVEN],
-                "recalibrated": rmse[RECALIBRATED],
-                "after": rmse[EXTENDED],
-                "reduction": by_channel(improvement.reduction[at]),
-                "interval_95": _intervals(improvement.interval[:, at]),
-                "reduction_from_recalibrated": by_channel(improvement.reduction_from(RECALIBRATED)[at]),
-                "interval_95_from_recalibrated": _intervals(improvement.interval_from(RECALIBRATED)[:, at]),
-            },
-            "systematic": {
-                "before": by_channel(improvement.explained_variance[GIVEN][at].share),
-                "recalibrated": by_channel(improvement.explained_variance[RECALIBRATED][at].share),
-                "after": by_channel(improvement.explained_variance[EXTENDED][at].share),
-                "gone": by_channel(improvement.systematic_gone(GIVEN)[at]),
-            },
-            "noticeable": {
-                effect: size if np.isfinite(size) else None for effect, size in self.minimum_detectable.items()
-            },
-            "moved": {
-                name: {"from": was, "to": now, "standard_deviations": self.moved[name]}
-                for name, (was, now) in self.recalibrated.items()
-            },
-            "notes": list(self.notes),
-            "vehicle": vehicle_path,
-        }
-
-
-def by_channel(values: Vector) -> dict[str, float | None]:
-    """Values of the three channels by name; ``None`` where there is none."""
-    return {c: float(value) if np.isfinite(value) else None for c, value in zip(STATE_SIGNALS, values, strict=True)}
-
-
-def _intervals(bounds: Vector) -> dict[str, list[float]]:
-    return {channel: [float(low), float(high)] for channel, low, high in zip(STATE_SIGNALS, *bounds, strict=True)}
 
 
 def diagnose(
@@ -242,9 +74,9 @@ def diagnose(
     groups = _groups(at, suspects)
     found = search_causes(at.fitted, at.car, at.left_out, integrator, on_progress, exclude, groups)
     problem, windows = found.problem, found.problem.windows
-    at = at._replace(unseen=at.unseen.stepped_as(windows))
+    held_out = HeldOut(at.unseen.stepped_as(windows), at.steps)
     on_progress("measuring the improvement on held-out laps")
-    selection, improvement = _gated(found, at)
+    selection, improvement = gated(found, at.car, held_out, at.notes)
     fit = selection.fit
     sizes = minimum_detectable(problem, fit, found.search.found)
     limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
@@ -263,8 +95,8 @@ def diagnose(
             "rows; a live prediction cannot, and errs by that: record them faster, or take the commands"
         )
     limits += [*_hidden(sizes), *_not_live(extended), *_not_written(fit.car, extended)]
-    causes = tuple(_cause(one, selection, found.search, at, std) for one in selection.chosen)
-    left, together = _left(problem, selection)
+    causes = tuple(_cause(one, selection, found.search, at.recordings, held_out, std) for one in selection.chosen)
+    left, together = left_behind(problem, selection)
     return Diagnosis(
         "effects" if causes else "unexplained" if left.is_there or together.is_there else "none",
         causes,
@@ -301,70 +133,6 @@ def _groups(at: _Prepared, suspects: tuple[int, ...]) -> list[tuple[int, ...]]:
     return [group for group, share in alike.items() if suspects or share >= _DRIVEN_ALIKE]
 
 
-def _gated(found: SearchResult, at: _Prepared) -> tuple[Selection, Improvement]:
-    """A selection of which no cause is worse on held-out rows beside the others, nor all together; and what it gains."""
-    selection = found.selection
-    while selection.chosen:
-        gains = [_held_out_gain(*_held_out_errors(one, selection, found.search, at)) for one in selection.chosen]
-        worst = selection.candidates[int(np.argmin(gains))].effect
-        strange = [one.candidate.effect for one in selection.chosen if not one.is_met]
-        if min(gains) <= -_NO_WORSE:
-            at.notes.append(_not_kept(worst))
-            selection = found.search.reject(worst)
-        elif strange and any(rest.is_there for rest in _left(found.problem, selection)):
-            at.notes.append(
-                f"{strange[0]} would be on the side of neutral on which no car has it, and leaves errors that come together: "
-                "it stands for something else, so that nothing of it is kept"
-            )
-            selection = found.search.reject(strange[0])
-        else:
-            break
-    cars = {GIVEN: at.car, RECALIBRATED: selection.base.car, EXTENDED: selection.fit.car}
-    improvement = measure_improvement(at.unseen, cars, at.steps)
-    if selection.chosen and _worse(improvement):
-        at.notes.append(_not_kept(", ".join(one.effect for one in selection.candidates)))
-        return found.search.dropped(()), improvement.ending_with(RECALIBRATED)
-    return selection, improvement
-
-
-def _left(problem: IdentificationProblem, selection: Selection) -> tuple[ExplainedVariance, ClusteredResiduals]:
-    """What the selected car leaves: what is systematic, and what comes together in time."""
-    windows, fit = problem.windows, selection.fit
-    white = fit.noise.whiten(fit.errors)
-    size = weights(white) * (white**2).mean(axis=1)
-    size = size / (np.bincount(windows.number, size) / np.bincount(windows.number))[windows.number]
-    ends = fit.errors.reshape(len(windows), -1, 3)[:, -1]
-    together = clustered(size, windows.time, problem.block, selection.inflation)
-    return explained_variance(windows, ends, problem.block), together
-
-
-def _not_kept(effects: str) -> str:
-    return f"{effects} explained the fitted laps but not the held-out ones, so that nothing of it is kept"
-
-
-def _held_out_errors(one: Refined, selection: Selection, search: Search, at: _Prepared) -> tuple[Vector, Vector]:
-    """Errors at the horizon without one of the causes and with all, each ``(W, 3)``."""
-    without, with_it = (
-        at.unseen.errors(car)[:, at.steps - 1] for car in (search.leave_out(selection, one).car, selection.fit.car)
-    )
-    return without, with_it
-
-
-def _held_out_gain(without: Vector, with_it: Vector) -> float:
-    """Share of the error that is gone, as a mean of the channels."""
-    left = (with_it**2).mean(axis=0) / np.maximum((without**2).mean(axis=0), 1e-300)
-    return float(1.0 - np.sqrt(left.mean()))
-
-
-def _worse(improvement: Improvement) -> bool:
-    """Whether the extended car errs more than the recalibrated one, in the geometric mean of the channels.
-
-    Causes that a recalibration would make up for, such as more mass for less drive, change nothing but noise.
-    """
-    ratio = 1.0 - improvement.reduction_from(RECALIBRATED)[improvement.horizon]
-    return bool(np.log(np.maximum(ratio, 1e-300)).mean() > _NO_WORSE)
-
-
 def _moved(car: CarEstimate) -> dict[str, float]:
     """See :attr:`Diagnosis.moved`."""
     names = (*COEFFICIENTS, "m")
@@ -376,7 +144,7 @@ class _Prepared(NamedTuple):
 
     recordings: RecordingSet
     fitted: SimulationWindows
-    left_out: tuple[LeftOut, LeftOut]
+    left_out: tuple[Folds, Folds]
     steps: int
     unseen: SimulationWindows
     car: CarEstimate
@@ -428,7 +196,9 @@ def _prepare(
     return _Prepared(together, fitted, left_out, asked, unseen, CarEstimate.of(vehicle), notes, protocol)
 
 
-def _cause(one: Refined, selection: Selection, search: Search, at: _Prepared, std: Vector) -> Cause:
+def _cause(
+    one: Refined, selection: Selection, search: Search, recordings: RecordingSet, held_out: HeldOut, std: Vector
+) -> Cause:
     effect, fit = one.candidate.effect, selection.fit
     known = {
         name: float(std[18 + k]) * per_unit(effect, name, fit.car.effects[effect][name])
@@ -436,18 +206,18 @@ def _cause(one: Refined, selection: Selection, search: Search, at: _Prepared, st
         if owner == effect
     }
     assert one.confirmation is not None
-    errors = _held_out_errors(one, selection, search, at)
+    errors = held_out_errors(one, selection, search, held_out)
     return Cause(
         effect,
         dict(fit.car.effects[effect]),
         known,
         one.improvement,
         float(one.delta_bic),
-        _held_out_gain(*errors),
+        held_out_gain(*errors),
         one.confirmation,
         one.bounded,
         tuple(selection.alternatives[effect]),
-        tuple(at.recordings.names[k] for k in one.candidate.only_in),
+        tuple(recordings.names[k] for k in one.candidate.only_in),
         errors[0],
     )
 

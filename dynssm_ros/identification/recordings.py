@@ -23,7 +23,7 @@ _LIKE = 0.5  # spreads of speed, steering and throttle within which two simulati
 _MOST_PARTS = 8  # of a single recording, so that many short laps do not take long
 
 
-class LeftOut(NamedTuple):
+class Folds(NamedTuple):
     """What is left out together, and what counts as one piece of evidence, of each simulation.
 
     Attributes:
@@ -90,7 +90,7 @@ class RecordingSet:
         row = int(np.argmin(np.abs(self.time - time)))
         return self.names[self.number[row]], float(self.clock[row])
 
-    def left_out(self, starts: Indices, line: ClosedLine | None) -> tuple[LeftOut, LeftOut]:
+    def left_out(self, starts: Indices, line: ClosedLine | None) -> tuple[Folds, Folds]:
         """How simulations from the rows ``starts`` are left out: recordings in turn, and parts of each of them in turn.
 
         Parts are laps, or quarters of the time where there are fewer than three. With fewer than three recordings both are
@@ -105,11 +105,11 @@ class RecordingSet:
             else:
                 t = self.clock[own] - self.clock[own[0]]
                 part[whose == k] = np.floor(_QUARTERS * t / (np.ptp(t) + 1e-9))
-        parts = LeftOut(*(np.unique(n, return_inverse=True)[1] for n in (part, whose * (part.max() + 1) + part)))
+        parts = Folds(*(np.unique(n, return_inverse=True)[1] for n in (part, whose * (part.max() + 1) + part)))
         if len(np.unique(whose)) < _LEAST_RECORDINGS:
             return parts, parts
         number = np.unique(whose, return_inverse=True)[1]
-        return LeftOut(number, number), parts
+        return Folds(number, number), parts
 
 
 def driven_alike(windows: SimulationWindows, recordings: Collection[int]) -> float:

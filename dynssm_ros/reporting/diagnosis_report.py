@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.diagnose import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
+from dynssm_ros.identification.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
 from dynssm_ros.identification.residuals import ExplainedVariance
 from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC
 from dynssm_ros.reporting import diagnosis_figures

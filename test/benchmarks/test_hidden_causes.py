@@ -19,7 +19,7 @@ from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
 from dynssm_ros.files import write_json
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.confirmation import Confirmation
-from dynssm_ros.identification.diagnose import Cause
+from dynssm_ros.identification.diagnosis import Cause
 from dynssm_ros.identification.problem import IdentificationProblem
 from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
 from dynssm_ros.simulation.laps import simulate

@@ -89,7 +89,9 @@ def test_a_bag_that_would_replace_something_else_is_refused_and_no_recording_wri
     (tmp_path / "thesis").mkdir()
     out = tmp_path / "out" / "r.parquet"
     arguments = ("--signals", "default", "--rate", 25, "--out", out, "--bag", tmp_path / "thesis")
-    assert_refused(run(write(tmp_path / "bag"), *arguments), out.parent, "thesis: exists and is not a bag that dynssm wrote")
+    assert_refused(
+        run(write(tmp_path / "bag"), *arguments), out.parent, "thesis: exists and is not a bag that dynssm wrote"
+    )
 
 
 def test_several_bags_make_one_recording(tmp_path: Path, run: Run) -> None:

@@ -12,7 +12,8 @@ import pytest
 from benchmarks.hidden_causes.cases import Case, record, size
 from benchmarks.hidden_causes.outcomes import judge
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.identification.diagnose import Diagnosis, diagnose
+from dynssm_ros.identification.diagnose import diagnose
+from dynssm_ros.identification.diagnosis import Diagnosis
 from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.tracks import load_track

@@ -10,7 +10,8 @@ import pytest
 
 from benchmarks.hidden_causes.cases import Case, record
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.diagnose import Diagnosis, diagnose
+from dynssm_ros.identification.diagnose import diagnose
+from dynssm_ros.identification.diagnosis import Diagnosis
 from dynssm_ros.reporting.diagnosis_report import as_text
 
 Spoil = Callable[[dict[str, Vector], Vector], None]

@@ -8,7 +8,8 @@ import pytest
 
 from dynssm_ros.identification import windows
 from dynssm_ros.identification.calibration import calibrate
-from dynssm_ros.identification.diagnose import RECALIBRATED, diagnose
+from dynssm_ros.identification.diagnose import diagnose
+from dynssm_ros.identification.diagnosis import RECALIBRATED
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import load_vehicle

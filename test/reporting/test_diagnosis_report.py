@@ -9,7 +9,7 @@ import pytest
 
 from dynssm_ros.identification.candidates import Candidate
 from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.diagnose import EXTENDED, GIVEN, RECALIBRATED, Diagnosis
+from dynssm_ros.identification.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Diagnosis
 from dynssm_ros.identification.improvement import Improvement, measure_improvement
 from dynssm_ros.identification.minimum_effect import minimum_detectable
 from dynssm_ros.identification.problem import IdentificationProblem

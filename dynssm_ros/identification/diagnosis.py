@@ -1,0 +1,186 @@
+"""What a diagnosis says: causes, what recalibration moved, what is gained, what is left; for people and programs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.confirmation import Confirmation
+from dynssm_ros.identification.improvement import Improvement
+from dynssm_ros.identification.recordings import RecordingSet
+from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance
+from dynssm_ros.identification.selection import Selection
+from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.effects import EFFECTS
+
+Verdict = Literal["effects", "none", "unexplained"]
+
+_SMALL = 0.01  # of the error on held-out rows: less is within the structure of the model
+GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
+
+
+@dataclass(frozen=True)
+class Cause:
+    """An effect that the data ask for.
+
+    Attributes:
+        effect: its name.
+        values: parameters with which it acts.
+        std: standard deviations of those that were fitted.
+        improvement: decrease of twice the negative log-likelihood by it.
+        delta_bic: what is left when its parameters are paid for.
+        heldout_gain: share of the error on the held-out rows that is gone by it.
+        confirmation: what it gains on parts of the fitted rows that were left out.
+        on_bound: its parameters that the data push against a bound: they are at least that far off.
+        alternatives: effects that explain the data as well.
+        only_in: names of the recordings in which it acts; empty: in all.
+        without: what the car with all other causes errs on the held-out rows, at the horizon, ``(W, 3)``.
+    """
+
+    effect: str
+    values: dict[str, float]
+    std: dict[str, float]
+    improvement: float
+    delta_bic: float
+    heldout_gain: float
+    confirmation: Confirmation
+    on_bound: tuple[str, ...]
+    alternatives: tuple[str, ...]
+    only_in: tuple[str, ...] = ()
+    without: Vector = field(default_factory=lambda: np.empty((0, 3)), repr=False)
+
+    @property
+    def small(self) -> bool:
+        """Whether it hardly matters on held-out laps, however sure it is: no model is right to the last per mille."""
+        return self.heldout_gain < _SMALL
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What the simulation gets wrong, and why.
+
+    Attributes:
+        verdict: ``effects``: causes are named; ``none``: right within noise; ``unexplained``: wrong, and nothing of the
+            library says why.
+        causes: the strongest first.
+        moved: coefficients, and ``m``, that are now more than three of the stated standard deviations off what the vehicle
+            file has; by name, how many.
+        vehicle: the vehicle with effects and refitted nominal values.
+        improvement: on the held-out rows.
+        left: what is systematic in the errors of the extended car, on the rows of the fit.
+        clustered: how those errors are spread over time.
+        minimum_detectable: how far off neutral each effect that is not named would have to be to be named (the unit of its
+            first parameter).
+        selection: how it was found.
+        car: the extended car as fitted.
+        std: standard deviations of the 17 coefficients and of the mass, relative to what was known of them.
+        notes: what limits the diagnosis.
+        protocol: how it was obtained, by name.
+        windows: of the fit.
+        recordings: what was diagnosed.
+    """
+
+    verdict: Verdict
+    causes: tuple[Cause, ...]
+    moved: Mapping[str, float]
+    vehicle: Vehicle
+    improvement: Improvement
+    left: ExplainedVariance
+    clustered: ClusteredResiduals
+    minimum_detectable: Mapping[str, float]
+    selection: Selection
+    car: CarEstimate
+    std: Vector
+    notes: tuple[str, ...]
+    protocol: Mapping[str, str]
+    windows: SimulationWindows
+    recordings: RecordingSet
+
+    @property
+    def recalibrated(self) -> dict[str, tuple[float, float]]:
+        """What :attr:`moved` names: as the vehicle file has it, and now."""
+        given, now = self.car.vehicle, self.vehicle
+        return {
+            name: (given.constants.m, now.constants.m)
+            if name == "m"
+            else (given.coefficients[name].nominal, now.coefficients[name].nominal)
+            for name in self.moved
+        }
+
+    def to_json(self, vehicle_path: str) -> dict[str, Any]:
+        """For programs; ``vehicle_path`` is where the extended vehicle was written."""
+        improvement = self.improvement
+        at = improvement.horizon
+        rmse = {name: by_channel(values[at]) for name, values in improvement.rmse.items()}
+        return {
+            "verdict": self.verdict,
+            "causes": [
+                {
+                    "effect": cause.effect,
+                    "parameters": {
+                        name: {
+                            "value": value,
+                            "std": cause.std.get(name),
+                            "unit": EFFECTS[cause.effect].PARAMETERS[name].unit,
+                        }
+                        for name, value in cause.values.items()
+                    },
+                    "evidence": {
+                        "delta_bic": cause.delta_bic,
+                        "heldout_gain": cause.heldout_gain,
+                        "left_out": {
+                            "gain": cause.confirmation.total,
+                            "std": cause.confirmation.std,
+                            "units": cause.confirmation.gain.tolist(),
+                            "error_gone": by_channel(cause.confirmation.share),
+                        },
+                    },
+                    "on_bound": list(cause.on_bound),
+                    "alternatives": list(cause.alternatives),
+                    "only_in": list(cause.only_in),
+                    "small": cause.small,
+                }
+                for cause in self.causes
+            ],
+            "gain": {
+                "horizon_s": float(improvement.horizons[at]),
+                "before": rmse[GIVEN],
+                "recalibrated": rmse[RECALIBRATED],
+                "after": rmse[EXTENDED],
+                "reduction": by_channel(improvement.reduction[at]),
+                "interval_95": _intervals(improvement.interval[:, at]),
+                "reduction_from_recalibrated": by_channel(improvement.reduction_from(RECALIBRATED)[at]),
+                "interval_95_from_recalibrated": _intervals(improvement.interval_from(RECALIBRATED)[:, at]),
+            },
+            "systematic": {
+                "before": by_channel(improvement.explained_variance[GIVEN][at].share),
+                "recalibrated": by_channel(improvement.explained_variance[RECALIBRATED][at].share),
+                "after": by_channel(improvement.explained_variance[EXTENDED][at].share),
+                "gone": by_channel(improvement.systematic_gone(GIVEN)[at]),
+            },
+            "noticeable": {
+                effect: size if np.isfinite(size) else None for effect, size in self.minimum_detectable.items()
+            },
+            "moved": {
+                name: {"from": was, "to": now, "standard_deviations": self.moved[name]}
+                for name, (was, now) in self.recalibrated.items()
+            },
+            "notes": list(self.notes),
+            "vehicle": vehicle_path,
+        }
+
+
+def by_channel(values: Vector) -> dict[str, float | None]:
+    """Values of the three channels by name; ``None`` where there is none."""
+    return {c: float(value) if np.isfinite(value) else None for c, value in zip(STATE_SIGNALS, values, strict=True)}
+
+
+def _intervals(bounds: Vector) -> dict[str, list[float]]:
+    return {channel: [float(low), float(high)] for channel, low, high in zip(STATE_SIGNALS, *bounds, strict=True)}
