@@ -74,3 +74,21 @@ def test_a_vehicle_file_without_a_needed_constant_is_one_line(
     assert status == 1
     assert "constants.l_f" in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_without_a_recording_is_one_line(dynssm: Run, tmp_path: Path) -> None:
+    status, _, err = dynssm("diagnose", "--vehicle", "av21", "--out", tmp_path / "out")
+    assert (status, err.strip()) == (1, "error: no recording given; expected R.parquet or --reference R.parquet")
+
+
+def test_reference_and_suspect_are_compared(dynssm: Run, offset: tuple[Path, Path], tmp_path: Path) -> None:
+    straight = record(Case({}, 2, "euler", 70.0))[0]
+    straight.save(tmp_path / "before.parquet")
+    arguments = ["--vehicle", offset[1], "--out", tmp_path / "out", "--integrator", "euler"]
+    status, out, _ = dynssm("diagnose", "--reference", tmp_path / "before.parquet", "--suspect", offset[0], *arguments)
+    assert status == 0
+    assert out.startswith("The simulation lacks: steering_offset (only in steering_offset/euler/road_course/25Hz/2).\n")
+    (cause,) = json.loads((tmp_path / "out" / "results.json").read_text())["causes"]
+    assert cause["only_in"] == ["steering_offset/euler/road_course/25Hz/2"]
+    (effect,) = load_vehicle(tmp_path / "out" / "vehicle.yaml").effects
+    assert effect.parameters["offset"] == pytest.approx(0.015, abs=0.003)
