@@ -5,6 +5,7 @@ An output never replaces an input of the same command, nor a log, nor what is ne
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import shutil
@@ -20,6 +21,7 @@ from dynssm_ros.errors import UserError
 
 LOG_SUFFIXES = (".mcap", ".db3", ".bag", ".zstd")
 """Of files that recorders write, and we do not."""
+_HERE, _SWAP = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 _INPUTS: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
 _FORCED: ContextVar[bool] = ContextVar("forced", default=False)
 
@@ -100,6 +102,7 @@ def replacing(path: str | Path, may_hold: Collection[str] = ()) -> Iterator[Path
     try:
         yield scratch / target.name
         _require_nothing_else(target, scratch / target.name, may_hold)
+        _settle(scratch / target.name, scratch)
         _put(scratch / target.name, target, scratch / "replaced")
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -116,10 +119,35 @@ def _require_nothing_else(target: Path, aside: Path, may_hold: Collection[str]) 
         )
 
 
+def _settle(aside: Path, scratch: Path) -> None:
+    """Lets others read the files, as the umask says, and brings them to the disk."""
+    usual = scratch / "usual"
+    usual.touch()
+    mode = stat.S_IMODE(usual.stat().st_mode)
+    for file in [path for path in aside.rglob("*") if path.is_file()] if aside.is_dir() else [aside]:
+        file.chmod(mode)
+        with file.open("rb") as content:
+            os.fsync(content.fileno())
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Lets two folders change names in one atomic step, where the system and the file system can."""
+    renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if renameat2 is None:
+        return False
+    done: int = renameat2(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _SWAP)
+    return done == 0
+
+
 def _put(aside: Path, target: Path, replaced: Path) -> None:
-    """Renames ``aside`` to ``target``; a folder cannot be renamed onto a filled one, so that goes to ``replaced``."""
+    """Renames ``aside`` to ``target``.
+
+    A folder cannot be renamed onto a filled one: both change names at once, or the older one goes to ``replaced`` first.
+    """
     try:
         if aside.is_dir() and target.is_dir():
+            if _exchange(aside, target):
+                return
             target.rename(replaced)
         os.replace(aside, target)
     except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -69,6 +70,7 @@ def test_a_folder_that_cannot_be_put_in_place_leaves_the_older_one(
     def run() -> None:
         with replacing(target) as aside:
             folder_of(aside, "new")
+            monkeypatch.setattr("dynssm_ros.files._exchange", lambda *_: False)  # as on a file system that cannot
             monkeypatch.setattr("os.replace", fail)
 
     with pytest.raises(UserError, match=r"out: cannot be written .Input/output error"):
@@ -148,3 +150,36 @@ def test_a_folder_that_holds_something_else_is_not_replaced(tmp_path: Path) -> N
     with replacing(folder, may_hold=("notes.txt",)) as aside:
         folder_of(aside, "new")
     assert text_of(folder) == "new"
+
+
+def test_a_folder_is_there_at_every_instant_while_it_is_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "model"
+    folder_of(target, "0")
+    done, seen, missing = threading.Event(), set(), []
+
+    def look() -> None:
+        try:
+            while not done.is_set():
+                seen.add(text_of(target))
+        except OSError as error:
+            missing.append(error)
+
+    reader = threading.Thread(target=look)
+    reader.start()
+    for number in range(200):
+        with replacing(target) as aside:
+            folder_of(aside, str(number))
+    done.set()
+    reader.join()
+    assert missing == []
+    assert len(seen) > 1
+    assert [p.name for p in tmp_path.iterdir()] == ["model"]
+
+
+def test_files_can_be_read_by_others_whoever_wrote_them(tmp_path: Path) -> None:
+    with replacing(tmp_path / "model") as aside:
+        folder_of(aside, "weights")
+        (aside / "content").chmod(0o600)
+    usual = tmp_path / "usual"
+    usual.touch()
+    assert (tmp_path / "model" / "content").stat().st_mode == usual.stat().st_mode
