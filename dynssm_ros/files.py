@@ -9,6 +9,7 @@ import ctypes
 import json
 import os
 import shutil
+import socket
 import stat
 import tempfile
 from collections.abc import Collection, Iterator
@@ -96,7 +97,8 @@ def replacing(path: str | Path, may_hold: Collection[str] = ()) -> Iterator[Path
     require_no_input(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+        _clear_away(target)
+        scratch = Path(tempfile.mkdtemp(prefix=f"{_scratch(target)}{os.getpid()}.", dir=target.parent))
     except OSError as error:
         raise UserError(f"{target}: cannot be written ({error.strerror}: {error.filename})") from error
     try:
@@ -106,6 +108,20 @@ def replacing(path: str | Path, may_hold: Collection[str] = ()) -> Iterator[Path
         _put(scratch / target.name, target, scratch / "replaced")
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _scratch(target: Path) -> str:
+    """How the names of scratch folders for an output begin, on this machine."""
+    return f".{target.name}.{socket.gethostname()}."
+
+
+def _clear_away(target: Path) -> None:
+    """Removes scratch folders of processes of this machine that were killed."""
+    begin = _scratch(target)
+    for path in target.parent.iterdir():
+        owner = path.name.removeprefix(begin).partition(".")[0]
+        if path.name.startswith(begin) and owner.isdigit() and not Path(f"/proc/{owner}").exists():
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _require_nothing_else(target: Path, aside: Path, may_hold: Collection[str]) -> None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -183,3 +186,29 @@ def test_files_can_be_read_by_others_whoever_wrote_them(tmp_path: Path) -> None:
     usual = tmp_path / "usual"
     usual.touch()
     assert (tmp_path / "model" / "content").stat().st_mode == usual.stat().st_mode
+
+
+def test_what_a_killed_run_left_is_cleared_away(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys\n"
+        "from dynssm_ros.files import replacing\n"
+        "with replacing(sys.argv[1]) as aside:\n"
+        "    aside.write_text('half')\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    target = tmp_path / "laps.json"
+    killed = subprocess.run([sys.executable, "-c", code, str(target)], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".laps.json.")
+    write_json(target, {})
+    assert [p.name for p in tmp_path.iterdir()] == ["laps.json"]
+
+
+def test_the_scratch_of_a_run_that_lives_is_left_alone(tmp_path: Path) -> None:
+    target = tmp_path / "laps.json"
+    with replacing(target) as aside:
+        aside.write_text("slow")
+        write_json(target, {})
+        assert aside.read_text() == "slow"
+    assert target.read_text() == "slow"
