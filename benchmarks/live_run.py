@@ -141,6 +141,9 @@ def node_process(
         node: its module: ``predictor``, ``simulator``, ``controller``.
         parameters: ROS parameters.
         environment: of the process.
+
+    Raises:
+        UserError: a signal ended it (a segmentation fault, say), or it did not end when it was interrupted.
     """
     arguments = [part for name, value in (parameters or {}).items() for part in ("-p", f"{name}:={value}")]
     command = [sys.executable, "-m", f"dynssm_ros.nodes.{node}", *(["--ros-args", *arguments] if arguments else [])]
@@ -150,10 +153,12 @@ def node_process(
     finally:
         process.send_signal(signal.SIGINT)
         try:
-            process.communicate(timeout=10)
+            _, words = process.communicate(timeout=10)
         except subprocess.TimeoutExpired:
             process.kill()
-            process.communicate()
+            _, words = process.communicate()
+    if process.returncode < 0:
+        raise UserError(f"the {node} was ended by {signal.Signals(-process.returncode).name}: {words.strip()}")
 
 
 def predictor_process(

@@ -22,6 +22,7 @@ MATCH_TIMEOUT = 10.0  # s
 _SETTLE = 0.3  # s; the listener's side of a match comes a moment after ours
 _LINGER = 1.0  # s after the last message; best-effort delivery tells no publisher when it is done
 _SPIN_BELOW = 1e-3  # s; shorter waits are not worth a sleep
+_LONGEST_SLEEP = 0.1  # s; after it, whether the context was shut down is looked at
 
 
 class Playback:
@@ -39,6 +40,7 @@ class Playback:
 
     def __init__(self, node: Node, bag: str | Path, topics: tuple[str, ...] = ()) -> None:
         self.bag = Path(bag)
+        self._context = node.context
         with open_bag(bag) as opened:
             types = opened.types
         for topic in topics:
@@ -70,14 +72,14 @@ class Playback:
             spin(0.05)
 
     def play(self, rate: float = 1.0, duration: float = float("inf")) -> Iterator[tuple[BagMessage, float]]:
-        """Publishes message after message at ``rate`` times real time; yields each with the time it went out.
+        """Publishes message after message at ``rate`` times real time, until rclpy is shut down.
 
         Args:
             rate: speed factor.
             duration: of the recording that is played (s).
 
         Yields:
-            The message, and ``time.monotonic()`` just before it was published.
+            Each message, and ``time.monotonic()`` just before it was published.
         """
         with open_bag(self.bag) as opened:
             begin: float | None = None
@@ -88,16 +90,16 @@ class Playback:
                 elapsed = (message.log_time - first) * 1e-9
                 if elapsed > duration:
                     return
-                _wait_until(begin + elapsed / rate)
+                self._wait_until(begin + elapsed / rate)
+                if not self._context.ok():
+                    return
                 sent = time.monotonic()
                 self._publishers[message.topic].publish(message.raw)
                 yield message, sent
 
-
-def _wait_until(due: float) -> None:
-    remaining = due - time.monotonic()
-    if remaining > _SPIN_BELOW:
-        time.sleep(remaining)
+    def _wait_until(self, due: float) -> None:
+        while self._context.ok() and (remaining := due - time.monotonic()) > _SPIN_BELOW:
+            time.sleep(min(remaining, _LONGEST_SLEEP))
 
 
 class PlayerNode(Node):
@@ -119,9 +121,8 @@ class PlayerNode(Node):
             self.get_logger().warning(f"nobody listens to {', '.join(unheard)}")
         while True:
             for _ in self.playback.play(self.rate):
-                if not rclpy.ok():
-                    return
-            if not self.loop:
+                pass
+            if not (self.loop and rclpy.ok()):
                 self._linger()
                 return
 

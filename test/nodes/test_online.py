@@ -1,13 +1,16 @@
 """The online layer live: two tracks in a row over DDS, equal to replay, better after a while; kept for the next stint."""
 
 import dataclasses
+import os
+import signal
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import dynssm_ros
-from benchmarks.live_run import run_live
+from benchmarks.live_run import LiveRun, collecting, isolated_environment, node_process, predictor_process, run_live
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
@@ -97,3 +100,20 @@ def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(model, stints
     assert set(fresh) == set(goes_on)
     first = sorted(fresh)[0]
     assert np.abs(fresh[first] - goes_on[first]).max() > 0.0
+
+
+def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(model, stints, tmp_path: Path):
+    bag, state = tmp_path / "first", tmp_path / "online.safetensors"
+    recording_to_bag(stints[0], bag)
+    os.environ.update(isolated_environment())
+    here = os.environ.copy()
+    with ExitStack() as stack:
+        stack.enter_context(node_process("player", {"bag": bag, "rate": 3.0, "loop": True}, here))
+        for stop in (*(signal.SIGINT,) * 4, signal.SIGTERM) * 3:
+            run = LiveRun(20_000_000)
+            state.unlink(missing_ok=True)
+            with predictor_process(model, {"online_state": state}, here) as process, collecting(run) as collector:
+                assert collector.wait_for(lambda run=run: len(run.predicted) > 20, 30.0)
+                process.send_signal(stop)
+                assert process.wait(10) == 0, process.communicate()[1]
+            assert state.is_file()

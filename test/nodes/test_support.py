@@ -1,0 +1,38 @@
+"""How nodes end. That a busy one can be stopped at any moment is tested with what it keeps, in ``test_online.py``."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.live_run import isolated_environment, node_process
+from dynssm_ros.errors import UserError
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.signals.standard import recording_to_bag
+
+pytestmark = [pytest.mark.live, pytest.mark.timeout(240)]
+
+
+def test_a_player_that_waits_for_a_message_far_away_ends_at_once(laps_bag: Path, tmp_path: Path) -> None:
+    laps = extract([laps_bag], load_signal_map("default"), 50.0)
+    seconds = np.where(np.arange(len(laps.time)) > 0, 10**4, 0)  # after the first row comes a long pause
+    bag = tmp_path / "paused"
+    recording_to_bag(dataclasses.replace(laps, time=laps.time + seconds * 10**9), bag)
+    command = [sys.executable, "-m", "dynssm_ros.nodes.player", "--ros-args", "-p", f"bag:={bag}"]
+    player = subprocess.Popen(command, env=isolated_environment(), stderr=subprocess.PIPE, text=True)
+    assert player.stderr is not None
+    assert "nobody listens" in player.stderr.readline()  # and now it plays
+    player.send_signal(signal.SIGINT)
+    assert player.wait(5.0) == 0
+
+
+def test_a_node_that_a_signal_ended_is_named() -> None:
+    with pytest.raises(UserError, match="the simulator was ended by SIGKILL"), node_process("simulator") as process:
+        process.kill()
