@@ -35,6 +35,8 @@ from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC
 
+_END_TIMEOUT = 10.0  # s
+_CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
 _DRAIN = 2.0  # s without an answer after the last message before the run counts as over
 
 
@@ -143,7 +145,7 @@ def node_process(
         environment: of the process.
 
     Raises:
-        UserError: a signal ended it (a segmentation fault, say), or it did not end when it was interrupted.
+        UserError: it crashed, or it did not end when it was interrupted.
     """
     arguments = [part for name, value in (parameters or {}).items() for part in ("-p", f"{name}:={value}")]
     command = [sys.executable, "-m", f"dynssm_ros.nodes.{node}", *(["--ros-args", *arguments] if arguments else [])]
@@ -153,12 +155,13 @@ def node_process(
     finally:
         process.send_signal(signal.SIGINT)
         try:
-            _, words = process.communicate(timeout=10)
+            _, words = process.communicate(timeout=_END_TIMEOUT)
         except subprocess.TimeoutExpired:
             process.kill()
-            _, words = process.communicate()
-    if process.returncode < 0:
-        raise UserError(f"the {node} was ended by {signal.Signals(-process.returncode).name}: {words.strip()}")
+            process.communicate()
+            raise UserError(f"the {node} did not end within {_END_TIMEOUT:g} s of an interrupt") from None
+    if -process.returncode in _CRASHES:
+        raise UserError(f"the {node} crashed with {signal.Signals(-process.returncode).name}: {words.strip()}")
 
 
 def predictor_process(

@@ -33,6 +33,11 @@ def test_a_player_that_waits_for_a_message_far_away_ends_at_once(laps_bag: Path,
     assert player.wait(5.0) == 0
 
 
-def test_a_node_that_a_signal_ended_is_named() -> None:
-    with pytest.raises(UserError, match="the simulator was ended by SIGKILL"), node_process("simulator") as process:
-        process.kill()
+def test_a_node_that_crashed_is_named() -> None:
+    def crash() -> None:
+        with node_process("simulator") as process:
+            process.send_signal(signal.SIGSEGV)
+            process.wait()
+
+    with pytest.raises(UserError, match="the simulator crashed with SIGSEGV"):
+        crash()
