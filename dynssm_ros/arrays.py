@@ -11,7 +11,7 @@ Vector = npt.NDArray[np.float64]
 """Real numbers in double precision; docstrings say the shape."""
 Indices = npt.NDArray[np.intp]
 """Row numbers."""
-Yes = npt.NDArray[np.bool_]
+Mask = npt.NDArray[np.bool_]
 """Which of them."""
 
 

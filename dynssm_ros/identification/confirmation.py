@@ -16,7 +16,7 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.identification.noise import Noise
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
-from dynssm_ros.identification.recordings import Folds
+from dynssm_ros.identification.recordings import LeftOut
 from dynssm_ros.vehicle.effects import EFFECTS
 
 _KNOWN = 2.0  # standard errors that the nominal values must be spared, where left-out units tell nothing
@@ -79,35 +79,36 @@ class LeaveOneOut:
 
     Args:
         problem: all windows.
-        whole: recordings, if there are enough of them, else as ``parts``.
-        parts: laps or quarters of the time of each recording.
+        left_out: how.
     """
 
-    def __init__(self, problem: IdentificationProblem, whole: Folds, parts: Folds) -> None:
-        self._problem, self._whole, self._parts = problem, whole, parts
-        self._known: dict[tuple[int, int], tuple[Fit, _Predicted]] = {}
+    def __init__(self, problem: IdentificationProblem, left_out: LeftOut) -> None:
+        self._problem, self._left_out = problem, left_out
+        self._known: dict[tuple[int, bool], tuple[Fit, _Predicted]] = {}
 
     def compare(self, without: Fit, fit: Fit) -> Confirmation:
         """What ``fit`` gains over ``without``."""
         only_in = _differ_only_in(without, fit)
-        left_out = self._parts if only_in else self._whole
-        before, after = self._predicted(without, left_out), self._predicted(fit, left_out)
+        by_recordings = not only_in and self._left_out.recordings is not self._left_out.parts
+        before, after = self._predicted(without, by_recordings), self._predicted(fit, by_recordings)
+        unit = (self._left_out.recordings if by_recordings else self._left_out.parts).unit
         number = self._problem.windows.number
         told = np.isin(number, only_in) if only_in else np.ones(len(number), dtype=bool)
         by_window = ((after.likelihood - before.likelihood) / self._problem.tempering)[told]
-        gain, by_block = (_sums(by_window, n[told]) for n in (left_out.unit, self._problem.block))
+        gain, by_block = (_sums(by_window, n[told]) for n in (unit, self._problem.block))
         known = (self._problem.surprise(without) - self._problem.surprise(fit)) / 2.0
         left = after.error[told].sum(axis=0) / np.maximum(before.error[told].sum(axis=0), 1e-300)
         return Confirmation(gain, max(_spread(gain), _spread(by_block)), known, 1.0 - left)
 
-    def _predicted(self, fit: Fit, left_out: Folds) -> _Predicted:
+    def _predicted(self, fit: Fit, by_recordings: bool) -> _Predicted:
         """Of each window by the fit without its fold; noise and the place of a local effect stay as they were found.
 
         So do effects of single recordings where whole recordings are left out, which tell nothing of them.
         """
-        fold, key = left_out.fold, (id(fit), id(left_out))
+        fold = (self._left_out.recordings if by_recordings else self._left_out.parts).fold
+        key = id(fit), by_recordings
         if key not in self._known:
-            near = _held(fit, self._whole is not self._parts and left_out is self._whole)
+            near = _held(fit, by_recordings)
             likelihood, error = np.empty(len(fold)), np.empty((len(fold), 3))
             for number in range(int(fold.max()) + 1):
                 out = fold == number

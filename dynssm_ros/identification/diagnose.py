@@ -11,12 +11,12 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.diagnosis import Cause, Diagnosis
-from dynssm_ros.identification.gate import HeldOut, gated, held_out_errors, held_out_gain, left_behind
+from dynssm_ros.identification.gate import HeldOut, Without, gated
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
 from dynssm_ros.identification.problem import per_unit
-from dynssm_ros.identification.recordings import Folds, RecordingSet, driven_alike
-from dynssm_ros.identification.selection import Refined, Search, Selection
+from dynssm_ros.identification.recordings import LeftOut, RecordingSet, driven_alike
+from dynssm_ros.identification.selection import Refined, Selection
 from dynssm_ros.identification.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.signals.recording import Recording
@@ -74,42 +74,39 @@ def diagnose(
     groups = _groups(at, suspects)
     found = search_causes(at.fitted, at.car, at.left_out, integrator, on_progress, exclude, groups)
     problem, windows = found.problem, found.problem.windows
-    held_out = HeldOut(at.unseen.stepped_as(windows), at.steps)
     on_progress("measuring the improvement on held-out laps")
-    selection, improvement = gated(found, at.car, held_out, at.notes)
+    selection, without, left, improvement = gated(
+        found, at.car, HeldOut(at.unseen.stepped_as(windows), at.steps), at.notes
+    )
     fit = selection.fit
     sizes = minimum_detectable(problem, fit, found.search.found)
-    limits = [f"{name} cannot be judged: {why}" for name, why in found.impossible.items()]
     covariance = problem.covariance(fit)
     extended = fit.car.extended(covariance, suspects[-1] if suspects else None)
     extended = extended.model_copy(update={"integrator": windows.integrator})
     std = np.sqrt(np.diag(covariance))
-    if vehicle.integrator not in (None, windows.integrator):
-        limits.append(
-            f"the vehicle file was calibrated for {vehicle.integrator} steps, the data are closer to {windows.integrator}; "
-            f"calibrate with --integrator {windows.integrator}, else what the steps differ by may be named"
-        )
-    if windows.hold == "first":
-        limits.append(
-            "the car answers to the inputs half a step earlier than if they were held, so that they are interpolated between "
-            "rows; a live prediction cannot, and errs by that: record them faster, or take the commands"
-        )
-    limits += [*_hidden(sizes), *_not_live(extended), *_not_written(fit.car, extended)]
-    causes = tuple(_cause(one, selection, found.search, at.recordings, held_out, std) for one in selection.chosen)
-    left, together = left_behind(problem, selection)
+    causes = tuple(
+        _cause(one, rest, selection, at.recordings, std) for one, rest in zip(selection.chosen, without, strict=True)
+    )
     return Diagnosis(
-        "effects" if causes else "unexplained" if left.is_there or together.is_there else "none",
+        "effects" if causes else "unexplained" if left.is_there else "none",
         causes,
         _moved(fit.car),
         extended,
         improvement,
-        left,
-        together,
+        left.systematic,
+        left.clustered,
         sizes,
         selection,
         fit.car,
         std[:18],
-        (*at.notes, *limits),
+        (
+            *at.notes,
+            *(f"{name} cannot be judged: {why}" for name, why in found.impossible.items()),
+            *_steps_otherwise(vehicle, windows),
+            *_hidden(sizes),
+            *_not_live(extended),
+            *_not_written(fit.car, extended),
+        ),
         at.protocol | {"Integrator": windows.integrator, "Inputs between rows": _HELD[windows.hold]},
         windows,
         at.recordings,
@@ -144,7 +141,7 @@ class _Prepared(NamedTuple):
 
     recordings: RecordingSet
     fitted: SimulationWindows
-    left_out: tuple[Folds, Folds]
+    left_out: LeftOut
     steps: int
     unseen: SimulationWindows
     car: CarEstimate
@@ -196,9 +193,7 @@ def _prepare(
     return _Prepared(together, fitted, left_out, asked, unseen, CarEstimate.of(vehicle), notes, protocol)
 
 
-def _cause(
-    one: Refined, selection: Selection, search: Search, recordings: RecordingSet, held_out: HeldOut, std: Vector
-) -> Cause:
+def _cause(one: Refined, without: Without, selection: Selection, recordings: RecordingSet, std: Vector) -> Cause:
     effect, fit = one.candidate.effect, selection.fit
     known = {
         name: float(std[18 + k]) * per_unit(effect, name, fit.car.effects[effect][name])
@@ -206,20 +201,33 @@ def _cause(
         if owner == effect
     }
     assert one.confirmation is not None
-    errors = held_out_errors(one, selection, search, held_out)
     return Cause(
         effect,
         dict(fit.car.effects[effect]),
         known,
         one.improvement,
         float(one.delta_bic),
-        held_out_gain(*errors),
+        without.gain,
         one.confirmation,
         one.bounded,
         tuple(selection.alternatives[effect]),
         tuple(recordings.names[k] for k in one.candidate.only_in),
-        errors[0],
+        without.errors,
     )
+
+
+def _steps_otherwise(vehicle: Vehicle, windows: SimulationWindows) -> Iterator[str]:
+    """Where the data ask for other steps than the vehicle file was calibrated for, or than a live prediction can make."""
+    if vehicle.integrator not in (None, windows.integrator):
+        yield (
+            f"the vehicle file was calibrated for {vehicle.integrator} steps, the data are closer to {windows.integrator}; "
+            f"calibrate with --integrator {windows.integrator}, else what the steps differ by may be named"
+        )
+    if windows.hold == "first":
+        yield (
+            "the car answers to the inputs half a step earlier than if they were held, so that they are interpolated between "
+            "rows; a live prediction cannot, and errs by that: record them faster, or take the commands"
+        )
 
 
 def _hidden(sizes: Mapping[str, float]) -> Iterator[str]:

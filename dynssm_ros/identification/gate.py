@@ -14,7 +14,7 @@ from dynssm_ros.identification.integrator import SearchResult
 from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import IdentificationProblem
 from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance, clustered, explained_variance
-from dynssm_ros.identification.selection import Refined, Search, Selection
+from dynssm_ros.identification.selection import Search, Selection
 from dynssm_ros.identification.windows import SimulationWindows
 
 _NO_WORSE = 0.01  # of the error on held-out laps, that the car may be worse with a cause than without
@@ -31,9 +31,53 @@ class HeldOut(NamedTuple):
     windows: SimulationWindows
     steps: int
 
+    def errors(self, car: CarEstimate) -> Vector:
+        """What a car errs at the horizon, ``(W, 3)`` (m/s, m/s, rad/s)."""
+        return self.windows.errors(car)[:, self.steps - 1]
 
-def gated(found: SearchResult, given: CarEstimate, at: HeldOut, notes: list[str]) -> tuple[Selection, Improvement]:
-    """A selection of which no cause is worse on held-out rows beside the others, nor all together; and what it gains.
+
+class Without(NamedTuple):
+    """The car with all causes but one.
+
+    Attributes:
+        errors: on the held-out rows at the horizon, ``(W, 3)`` (m/s, m/s, rad/s).
+        gain: share of them that the cause takes away, as a mean of the channels.
+    """
+
+    errors: Vector
+    gain: float
+
+
+class Left(NamedTuple):
+    """What the selected car leaves on the rows of the fit: what is systematic, and what comes together in time."""
+
+    systematic: ExplainedVariance
+    clustered: ClusteredResiduals
+
+    @property
+    def is_there(self) -> bool:
+        """Whether it is more than noise."""
+        return self.systematic.is_there or self.clustered.is_there
+
+
+class Gated(NamedTuple):
+    """What passes the gate.
+
+    Attributes:
+        selection: the causes.
+        without: the car without each of them, in the same order.
+        left: what the car with all of them leaves.
+        improvement: on the held-out rows.
+    """
+
+    selection: Selection
+    without: tuple[Without, ...]
+    left: Left
+    improvement: Improvement
+
+
+def gated(found: SearchResult, given: CarEstimate, at: HeldOut, notes: list[str]) -> Gated:
+    """A selection of which no cause is worse on held-out rows beside the others, nor all together.
 
     Args:
         found: what a search has selected; it goes on without what is not kept.
@@ -42,14 +86,14 @@ def gated(found: SearchResult, given: CarEstimate, at: HeldOut, notes: list[str]
         notes: told what is not kept.
     """
     selection = found.selection
-    while selection.chosen:
-        gains = [held_out_gain(*held_out_errors(one, selection, found.search, at)) for one in selection.chosen]
-        worst = selection.candidates[int(np.argmin(gains))].effect
+    while True:
+        without, left = _without_each(selection, found.search, at), _left_behind(found.problem, selection)
         strange = [one.candidate.effect for one in selection.chosen if not one.is_met]
-        if min(gains) <= -_NO_WORSE:
-            notes.append(_not_kept(worst))
-            selection = found.search.reject(worst)
-        elif strange and any(rest.is_there for rest in left_behind(found.problem, selection)):
+        worst = min(zip(without, selection.candidates, strict=True), key=lambda pair: pair[0].gain, default=None)
+        if worst is not None and worst[0].gain <= -_NO_WORSE:
+            notes.append(_not_kept(worst[1].effect))
+            selection = found.search.reject(worst[1].effect)
+        elif strange and left.is_there:
             notes.append(
                 f"{strange[0]} would be on the side of neutral on which no car has it, and leaves errors that come together: "
                 "it stands for something else, so that nothing of it is kept"
@@ -61,37 +105,32 @@ def gated(found: SearchResult, given: CarEstimate, at: HeldOut, notes: list[str]
     improvement = measure_improvement(at.windows, cars, at.steps)
     if selection.chosen and _worse(improvement):
         notes.append(_not_kept(", ".join(one.effect for one in selection.candidates)))
-        return found.search.dropped(()), improvement.ending_with(RECALIBRATED)
-    return selection, improvement
+        none = found.search.eliminated(())
+        return Gated(none, (), _left_behind(found.problem, none), improvement.ending_with(RECALIBRATED))
+    return Gated(selection, without, left, improvement)
 
 
-def left_behind(problem: IdentificationProblem, selection: Selection) -> tuple[ExplainedVariance, ClusteredResiduals]:
-    """What the selected car leaves: what is systematic, and what comes together in time."""
+def _without_each(selection: Selection, search: Search, at: HeldOut) -> tuple[Without, ...]:
+    with_all = (at.errors(selection.fit.car) ** 2).mean(axis=0)
+    without = [at.errors(search.leave_out(selection, one).car) for one in selection.chosen]
+    return tuple(
+        Without(errors, float(1.0 - np.sqrt((with_all / np.maximum((errors**2).mean(axis=0), 1e-300)).mean())))
+        for errors in without
+    )
+
+
+def _left_behind(problem: IdentificationProblem, selection: Selection) -> Left:
     windows, fit = problem.windows, selection.fit
     white = fit.noise.whiten(fit.errors)
     size = weights(white) * (white**2).mean(axis=1)
     size = size / (np.bincount(windows.number, size) / np.bincount(windows.number))[windows.number]
     ends = fit.errors.reshape(len(windows), -1, 3)[:, -1]
     together = clustered(size, windows.time, problem.block, selection.inflation)
-    return explained_variance(windows, ends, problem.block), together
+    return Left(explained_variance(windows, ends, problem.block), together)
 
 
 def _not_kept(effects: str) -> str:
     return f"{effects} explained the fitted laps but not the held-out ones, so that nothing of it is kept"
-
-
-def held_out_errors(one: Refined, selection: Selection, search: Search, at: HeldOut) -> tuple[Vector, Vector]:
-    """Errors at the horizon without one of the causes and with all, each ``(W, 3)``."""
-    without, with_it = (
-        at.windows.errors(car)[:, at.steps - 1] for car in (search.leave_out(selection, one).car, selection.fit.car)
-    )
-    return without, with_it
-
-
-def held_out_gain(without: Vector, with_it: Vector) -> float:
-    """Share of the error that is gone, as a mean of the channels."""
-    left = (with_it**2).mean(axis=0) / np.maximum((without**2).mean(axis=0), 1e-300)
-    return float(1.0 - np.sqrt(left.mean()))
 
 
 def _worse(improvement: Improvement) -> bool:

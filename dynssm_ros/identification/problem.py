@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from dynssm_ros.arrays import Indices, Vector, Yes, normal_equations
+from dynssm_ros.arrays import Indices, Mask, Vector, normal_equations
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.noise import Noise, NoiseResponse, fit_noise, weights
 from dynssm_ros.identification.windows import SimulationWindows
@@ -241,7 +241,7 @@ class IdentificationProblem:
                 nominal = jacobian[..., :n]
         return Fit(car, free, errors, jacobian, noise, best)
 
-    def select(self, chosen: Indices | Yes) -> IdentificationProblem:
+    def select(self, chosen: Indices | Mask) -> IdentificationProblem:
         """Some of the windows, with the noise responses of all."""
         other = copy(self)
         other.windows = self.windows.select(chosen)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dynssm_ros.arrays import Indices, Vector, Yes
+from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.identification.problem import BLOCK
 from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
 from dynssm_ros.signals.recording import Recording, concatenate
@@ -35,6 +36,13 @@ class Folds(NamedTuple):
     unit: Indices
 
 
+class LeftOut(NamedTuple):
+    """How simulations are left out in turn; with fewer than three recordings both are the same."""
+
+    recordings: Folds
+    parts: Folds
+
+
 @dataclass(frozen=True)
 class RecordingSet:
     """Recordings of one car, one after the other.
@@ -52,7 +60,7 @@ class RecordingSet:
     number: Indices
     names: tuple[str, ...]
     clock: Vector
-    held_out: Yes
+    held_out: Mask
     split: str
 
     @classmethod
@@ -69,7 +77,7 @@ class RecordingSet:
         held = np.concatenate([np.arange(len(one)) >= cut for one, (cut, _) in zip(recordings, cuts, strict=True)])
         return cls(joined, number, _names(recordings), clock, held, _in_words([words for _, words in cuts]))
 
-    @property
+    @cached_property
     def time(self) -> Vector:
         """Time of each row (s), ``(N,)``: each recording follows the one before, at a multiple of :data:`BLOCK`."""
         longest = [self.clock[self.number == k].max() for k in range(len(self.names))]
@@ -90,11 +98,10 @@ class RecordingSet:
         row = int(np.argmin(np.abs(self.time - time)))
         return self.names[self.number[row]], float(self.clock[row])
 
-    def left_out(self, starts: Indices, line: ClosedLine | None) -> tuple[Folds, Folds]:
+    def left_out(self, starts: Indices, line: ClosedLine | None) -> LeftOut:
         """How simulations from the rows ``starts`` are left out: recordings in turn, and parts of each of them in turn.
 
-        Parts are laps, or quarters of the time where there are fewer than three. With fewer than three recordings both are
-        the same.
+        Parts are laps, or quarters of the time where there are fewer than three.
         """
         lap, whose, several = lap_number(self.recording, line), self.number[starts], len(self.names) > 1
         part = np.empty(len(starts), dtype=np.intp)
@@ -107,9 +114,9 @@ class RecordingSet:
                 part[whose == k] = np.floor(_QUARTERS * t / (np.ptp(t) + 1e-9))
         parts = Folds(*(np.unique(n, return_inverse=True)[1] for n in (part, whose * (part.max() + 1) + part)))
         if len(np.unique(whose)) < _LEAST_RECORDINGS:
-            return parts, parts
+            return LeftOut(parts, parts)
         number = np.unique(whose, return_inverse=True)[1]
-        return Folds(number, number), parts
+        return LeftOut(Folds(number, number), parts)
 
 
 def driven_alike(windows: SimulationWindows, recordings: Collection[int]) -> float:

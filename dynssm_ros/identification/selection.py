@@ -23,7 +23,7 @@ from dynssm_ros.identification.candidates import (
 from dynssm_ros.identification.car import CarEstimate, Values
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
-from dynssm_ros.identification.recordings import Folds
+from dynssm_ros.identification.recordings import LeftOut
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS
 
@@ -132,11 +132,11 @@ class Search:
         problem: IdentificationProblem,
         car: CarEstimate,
         found: Sequence[Candidate],
-        left_out: tuple[Folds, Folds],
+        left_out: LeftOut,
         on_progress: OnProgress = lambda words: None,
     ) -> None:
         self._study, self._given, self.found, self._report = problem, car, list(found), on_progress
-        self._parts = left_out
+        self._folds = left_out
         self._price = np.log(3.0 * problem.windows.steps * len(problem.windows))
         on_progress("recalibrating the nominal car")
         self.base = problem.temper(problem.fit(car, ()))
@@ -144,7 +144,7 @@ class Search:
         self._responses = Responses(problem, self.base.car, self.base.errors)
         self._ranked: dict[frozenset[Candidate], list[Refined]] = {}
         self._fits: dict[frozenset[Candidate], Fit] = {frozenset(): self.base}
-        self._left_out = LeaveOneOut(problem, *left_out)
+        self._left_out = LeaveOneOut(problem, left_out)
         self.tried: dict[str, float] = {}
 
     def run(self, start: Fit | None = None) -> Selection:
@@ -161,23 +161,22 @@ class Search:
             chosen.append(best.candidate)
             self._exchange(chosen)
             self._temper(tuple(chosen))
-        return self.dropped(tuple(chosen))
+        return self.eliminated(tuple(chosen))
 
     def reject(self, effect: str) -> Selection:
         """Selects anew without an effect."""
         self.found = [candidate for candidate in self.found if candidate.effect != effect]
         self._study.tempering, self._fits, self._ranked = self._tempering, {frozenset(): self.base}, {}
-        self._left_out = LeaveOneOut(self._study, *self._parts)
+        self._left_out = LeaveOneOut(self._study, self._folds)
         return self.run()
 
-    def dropped(self, chosen: tuple[Candidate, ...]) -> Selection:
-        """What holds of ``chosen``: the weakest is dropped while it does not pay beside the others."""
+    def eliminated(self, chosen: tuple[Candidate, ...]) -> Selection:
+        """Backward elimination: the weakest of ``chosen`` is dropped while it does not pay beside the others."""
         while True:
             found = [self._confirm(self._without(chosen, c), self._against(chosen, c)) for c in chosen]
             weakest = min(found, key=lambda r: (r.gain, r.delta_bic), default=None)
             if weakest is None or _pays(weakest):
                 break
-            self._without(chosen, weakest.candidate)
             chosen = tuple(c for c in chosen if c != weakest.candidate)
         fit = self.fit(chosen) if chosen else self.base
         found = sorted(found, key=lambda r: -r.gain)
@@ -275,7 +274,7 @@ class Search:
         if abs(np.log(inflation / self._study.tempering)) < _ALIKE:
             return
         self._study.tempering = inflation
-        self._ranked, self._left_out = {}, LeaveOneOut(self._study, *self._parts)
+        self._ranked, self._left_out = {}, LeaveOneOut(self._study, self._folds)
         self._fits = {
             frozenset(): self._study.fit(self.base.car, (), self.base),
             frozenset(chosen): self._study.fit(fit.car, fit.free, fit),
@@ -369,7 +368,6 @@ class Search:
 
     def _alternatives(self, chosen: tuple[Candidate, ...], one: Candidate) -> list[str]:
         rest = tuple(c for c in chosen if c != one)
-        self._without(chosen, one)
         fit = self.fit(chosen)
         others = [r for r in self._confirmed(rest) if r.candidate.effect != one.effect]
         return [r.candidate.effect for r in others if self._left_out.compare(r.fit, fit).alike]

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Vector, Yes
+from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.identification.car import CarBatch, CarEstimate
 from dynssm_ros.signals.inputs import applied_inputs
@@ -84,7 +84,7 @@ class SimulationWindows:
     def __len__(self) -> int:
         return len(self.starts)
 
-    def select(self, chosen: Indices | Yes) -> SimulationWindows:
+    def select(self, chosen: Indices | Mask) -> SimulationWindows:
         """Some of the simulations."""
         return replace(self, starts=self.starts[chosen])
 
@@ -225,7 +225,7 @@ def compared_every(steps: int) -> int:
 
 
 def fit_windows(
-    recording: Recording, data: RecordedRows, horizon: float, min_speed: float, held_out: Yes | None = None
+    recording: Recording, data: RecordedRows, horizon: float, min_speed: float, held_out: Mask | None = None
 ) -> SimulationWindows:
     """Simulations for a fit, end to end.
 
@@ -270,7 +270,7 @@ def _spread_evenly(starts: Indices, number: Indices) -> Indices:
 
 
 def held_out_windows(
-    recording: Recording, data: RecordedRows, steps: int, long: int, min_speed: float, held_out: Yes
+    recording: Recording, data: RecordedRows, steps: int, long: int, min_speed: float, held_out: Mask
 ) -> SimulationWindows:
     """Overlapping simulations of ``long`` steps for measuring, on the rows ``held_out``; ``steps``: of those of the fit.
 

@@ -62,9 +62,7 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def _share_in_words(cause: Cause) -> str:
     """Its share of the error in a few words."""
-    if cause.small:
-        return f"small, {percent(cause.heldout_gain)} of the error on held-out laps"
-    return f"{percent(cause.heldout_gain)} of the error on held-out laps"
+    return f"{'small, ' if cause.small else ''}{percent(cause.heldout_gain)} of the error on held-out laps"
 
 
 def _where(cause: Cause) -> str:

@@ -12,7 +12,7 @@ from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.problem import IdentificationProblem
-from dynssm_ros.identification.recordings import Folds
+from dynssm_ros.identification.recordings import Folds, LeftOut
 from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
 from dynssm_ros.identification.windows import SimulationWindows, fit_windows, recorded_rows
 from dynssm_ros.signals.context import recording_context
@@ -43,9 +43,9 @@ def search(**effects: dict[str, float]) -> Search:
     return Search(IdentificationProblem(given, CarEstimate.of(ORCA)), CarEstimate.of(ORCA), FEW, quarters(given))
 
 
-def quarters(given: SimulationWindows) -> tuple[Folds, Folds]:
+def quarters(given: SimulationWindows) -> LeftOut:
     quarter = np.arange(len(given)) * 4 // len(given)
-    return Folds(quarter, quarter), Folds(quarter, quarter)
+    return LeftOut(Folds(quarter, quarter), Folds(quarter, quarter))
 
 
 def test_a_pair_is_found_the_stronger_first_and_with_its_sizes() -> None:
@@ -107,7 +107,7 @@ def test_left_out_parts_are_predicted_by_the_others() -> None:
     without = problem.fit(CarEstimate.of(ORCA), ())
     car = without.car.with_effect("steering_offset", {"offset": 0.03})
     fit = problem.fit(car, FEW[0].free, without)
-    found = LeaveOneOut(problem, *quarters(given)).compare(without, fit)
+    found = LeaveOneOut(problem, quarters(given)).compare(without, fit)
     # as good on rows that were left out as the likelihood of all of them says, but for what was fitted to each
     log_likelihood = (
         problem.log_likelihood(fit.errors, fit.noise) - problem.log_likelihood(without.errors, without.noise)
@@ -115,7 +115,7 @@ def test_left_out_parts_are_predicted_by_the_others() -> None:
     assert found.gain.sum() == pytest.approx(log_likelihood, rel=0.3)
     assert found.holds
     assert len(found.gain) == 4
-    nothing = LeaveOneOut(problem, *quarters(given)).compare(fit, fit)
+    nothing = LeaveOneOut(problem, quarters(given)).compare(fit, fit)
     np.testing.assert_array_equal(nothing.gain, 0.0)
     assert nothing.alike or nothing.std == 0.0
 
