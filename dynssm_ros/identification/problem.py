@@ -19,6 +19,7 @@ Free = tuple[tuple[str, str], ...]
 """Effect and parameter of each value that is fitted beside the nominal ones."""
 
 BLOCK = 3.0  # s; errors farther apart count as independent
+_SPEEDS, _STEERINGS = 3, 4  # bins
 _UNIT = 0.1  # of the way from neutral to the upper bound: in this unit effects are fitted
 _FREE = 10.0  # of these units an effect's parameter may be, as one standard deviation
 _ROUNDS = 30
@@ -120,6 +121,7 @@ class IdentificationProblem:
         self.spread = NoiseResponse.of(windows.transitions(car), speed)
         block = (windows.time // BLOCK).astype(np.intp)
         self.block: Indices = np.unique(block, return_inverse=True)[1]
+        self._regime = _regimes(windows)
         self._channels = np.tile(windows.spread**2, 3)
         self._known = car.prior_precision
         self.tempering = tempering
@@ -247,6 +249,7 @@ class IdentificationProblem:
         other.windows = self.windows.select(chosen)
         other.spread = NoiseResponse(self.spread.group[chosen], self.spread.G)
         other.block = np.unique(self.block[chosen], return_inverse=True)[1]
+        other._regime = self._regime[chosen]
         return other
 
     def part(self, fit: Fit, every: int) -> tuple[IdentificationProblem, Fit]:
@@ -278,12 +281,22 @@ class IdentificationProblem:
         return H, g + known @ p
 
     def covariance(self, fit: Fit) -> Vector:
-        """Covariance of the fitted values in the units of the fit, robust against errors that hang together in blocks.
+        """Covariance of the fitted values in the units of the fit, shape ``(P, P)``.
 
-        Shape ``(P, P)``.
+        It is robust against errors that hang together in time, and against those that go with how the car is driven, as a
+        model makes them that lacks something: another drive would then ask for other values. In the directions in which
+        such errors tell more than independent ones could, it is the cluster-robust covariance (Liang and Zeger 1986) with
+        stretches of like speed and steering as clusters.
         """
-        told = self.information(fit) / self.counted_once(fit)
-        return np.asarray(np.linalg.inv(told + self.prior_precision(fit.position)))
+        once, known = self.counted_once(fit), self.prior_precision(fit.position)
+        information, meat = self._scores(fit, self._regime)
+        root = np.linalg.cholesky(information + _ROUNDING * (np.diag(np.diag(information)) + np.eye(len(information))))
+        white = np.linalg.solve(root, np.linalg.solve(root, meat).T) / once
+        ratio, direction = np.linalg.eigh((white + white.T) / 2)
+        spread = root @ direction
+        told = (spread * np.maximum(ratio, 1.0)) @ spread.T / once
+        inverse = np.linalg.inv(information / once + known)
+        return np.asarray(inverse @ (told + known) @ inverse)
 
     def counted_once(self, fit: Fit) -> float:
         """How many errors that hang together count as one beside ``fit``."""
@@ -291,7 +304,7 @@ class IdentificationProblem:
 
     def information(self, fit: Fit) -> Vector:
         """What the data alone say of the fitted values, ``(P, P)``: the inverse of their covariance."""
-        return self._scores(fit)[0]
+        return self._scores(fit, self.block)[0]
 
     def inflation(self, fit: Fit, last: int = 0) -> float:
         """How many times larger the variance of the scores is than independent errors would make it, at least 1.
@@ -299,7 +312,7 @@ class IdentificationProblem:
         The larger one of the mean over all that the data tell of and, with ``last``, what is sure of that of the last
         values, with what the others can take up projected out.
         """
-        information, meat = self._scores(fit)
+        information, meat = self._scores(fit, self.block)
         values, vectors = np.linalg.eigh(information)
         told = values > 1.0
         ratio = np.einsum("pi,pq,qi->i", vectors[:, told], meat, vectors[:, told]) / values[told]
@@ -314,18 +327,28 @@ class IdentificationProblem:
             inflation = max(inflation, float(np.trace(own)) / last / chance)
         return max(1.0, inflation)
 
-    def _scores(self, fit: Fit) -> tuple[Vector, Vector]:
-        """The information on the fitted values, and what blocks of errors make of it, both ``(P, P)``."""
+    def _scores(self, fit: Fit, cluster: Indices) -> tuple[Vector, Vector]:
+        """The information on the fitted values, and what clusters of errors make of it, both ``(P, P)``."""
         white = fit.noise.whiten(fit.errors)
         root = np.sqrt(weights(white))
         J = fit.noise.whiten(fit.jacobian) * root[:, None, None]
         scores = np.einsum("wnp,wn->wp", J, white * root[:, None])
         flat = J.reshape(-1, J.shape[2])
         information = flat.T @ flat
-        blocks = np.zeros((self.block.max() + 1, len(information)))
-        np.add.at(blocks, self.block, scores)
-        blocks -= blocks.mean(axis=0)
-        return information, blocks.T @ blocks * len(blocks) / max(1, len(blocks) - 1)
+        sums = np.zeros((cluster.max() + 1, len(information)))
+        np.add.at(sums, cluster, scores)
+        sums -= sums.mean(axis=0)
+        return information, sums.T @ sums * len(sums) / max(1, len(sums) - 1)
+
+
+def _regimes(windows: SimulationWindows) -> Indices:
+    """Number of the speed and steering with which each window is driven, ``(W,)``: bins with as many windows each."""
+    rows = windows.data.rows[:, windows.starts[:, None] + np.arange(windows.steps)].mean(axis=2)
+    speed, steering = (
+        np.searchsorted(np.quantile(value, np.linspace(0.0, 1.0, bins + 1)[1:-1]), value)
+        for value, bins in ((rows[0], _SPEEDS), (rows[4] + rows[6], _STEERINGS))
+    )
+    return np.unique(speed * _STEERINGS + steering, return_inverse=True)[1]
 
 
 def _step(H: Vector, g: Vector, lower: Vector, upper: Vector) -> Vector:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import dynssm_ros
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.identification.calibration import calibrate
 from dynssm_ros.runtime.models import SingleTrack
@@ -202,3 +203,21 @@ def test_progress_counts_the_starting_points_and_the_last_fit(drive: Drive, orca
     calls: list[tuple[int, int]] = []
     calibrate(drive(orca, 1500), orca, starts=2, on_progress=lambda *counts: calls.append(counts))
     assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_a_model_that_lacks_something_says_how_little_it_knows_of_other_drives() -> None:
+    """A tyre that gains less force than load makes the yaw inertia depend on how the car is driven, and its error says so."""
+    car = load_vehicle("av21").unmeasured()
+    theta, std = [], []
+    for seed, aggressiveness in ((1, 0.6), (2, 0.85)):
+        run = dynssm_ros.simulate(
+            "av21", "road_course", duration=90.0, plant="rk4", seed=seed, aggressiveness=aggressiveness, variation=0.6,
+            noise=(0.02, 0.02, 0.003), effects={"load_sensitivity": {"exponent": 0.6}},
+        )  # fmt: skip
+        found = calibrate(dynssm_ros.recorded(run), car, integrator="rk4", starts=1)
+        theta.append(found.theta)
+        std.append(found.std)
+    off = (theta[1] - theta[0]) / np.hypot(*std)
+    assert abs(off[COEFFICIENTS.index("I_z")]) < 2.0
+    assert np.all(np.abs(off) < 3.0)
+    assert std[0][COEFFICIENTS.index("I_z")] < 0.05 * theta[0][COEFFICIENTS.index("I_z")]
