@@ -438,6 +438,10 @@ def race(
     start_offset: float = 0.0,
     start_speed: float | None = None,
     on_progress: Callable[[int, int, str], None] | None = None,
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    pose_noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    delay: float = 0.0,
+    seed: int = 0,
 ) -> list[Race]:
     """Drives laps in closed loop: a predictive controller with each model in turn, on a simulated car.
 
@@ -460,6 +464,10 @@ def race(
         start_offset: how far left of the line it starts (m).
         start_speed: how fast (m/s), 0 from standstill; the line's own speed if not given.
         on_progress: called with millimetres driven and the model's name.
+        noise: standard deviations of white noise on the measured ``v_x, v_y`` (m/s), ``omega`` (rad/s).
+        pose_noise: likewise on ``x, y`` (m), ``theta`` (rad).
+        delay: from an instant until the command that answers it acts (s); the controller knows it.
+        seed: of the noise.
 
     Example:
         >>> (lap,) = race("orca", "club", ["true"], speed_scale=0.8)
@@ -467,7 +475,7 @@ def race(
         (True, 0.0)
     """
     require("race", "race")
-    from dynssm_ros.control.race import Course, Start, race
+    from dynssm_ros.control.race import Course, Sensing, Start, race
     from dynssm_ros.control.race_models import load_prediction_model
     from dynssm_ros.control.reference import load_reference
     from dynssm_ros.control.settings import Settings
@@ -483,7 +491,8 @@ def race(
         model.name = name
     reference = load_reference(line, car, road, speed_scale)
     settings = Settings.of(car, objective, horizon, offset_free)
-    course = Course(driven, road, plant, reference, settings, laps, Start(start, start_offset, start_speed))
+    sensing = Sensing(noise, pose_noise, delay, seed)
+    course = Course(driven, road, plant, reference, settings, laps, Start(start, start_offset, start_speed), sensing)
     races = []
     for k, model in enumerate(opened.values()):
 

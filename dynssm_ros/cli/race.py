@@ -19,6 +19,7 @@ from dynssm_ros.cli.console import (
     progress_bar,
     write_results,
 )
+from dynssm_ros.cli.simulate import parse_noise
 from dynssm_ros.extras import require
 
 
@@ -78,6 +79,19 @@ def race(
         float | None,
         typer.Option(help="How fast it starts (m/s); 0: from standstill.", show_default="the line's own speed"),
     ] = None,
+    noise: Annotated[
+        str, typer.Option(help="Standard deviations of the measured v_x,v_y,omega (m/s, m/s, rad/s).")
+    ] = "0,0,0",
+    pose_noise: Annotated[str, typer.Option(help="Likewise of the measured x,y,theta (m, m, rad).")] = "0,0,0",
+    delay: Annotated[
+        float,
+        typer.Option(
+            help="From an instant until the command that answers it acts (ms), in whole sampling times; known to the "
+            "controller.",
+            min=0.0,
+        ),
+    ] = 0.0,
+    seed: Annotated[int, typer.Option(help="Of the noise.", min=0)] = 0,
     animation: Annotated[
         bool, typer.Option("--animation", help="Also write race.gif, the cars on the track at equal times.")
     ] = False,
@@ -92,6 +106,7 @@ def race(
         races = api.race(
             vehicle, track, list(model), plant, objective, laps, line, speed_scale, horizon, along_horizon, offset_free,
             as_effects(effect), scale, lap_length, start, start_offset, start_speed, progress,
+            parse_noise(noise), parse_noise(pose_noise, "--pose-noise"), delay / 1e3, seed,
         )  # fmt: skip
     race_report(races).save(out / "report.html")
     if animation:

@@ -82,8 +82,8 @@ def summary(run: Run) -> dict[str, Any]:
     }
 
 
-def parse_noise(text: str) -> tuple[float, float, float]:
-    """``v_x,v_y,omega`` to three standard deviations.
+def parse_noise(text: str, option: str = "--noise") -> tuple[float, float, float]:
+    """Three standard deviations that an option has, as ``v_x,v_y,omega``.
 
     Raises:
         UserError: not three numbers of at least 0.
@@ -91,7 +91,7 @@ def parse_noise(text: str) -> tuple[float, float, float]:
     try:
         v_x, v_y, omega = (float(part) for part in text.split(","))
     except ValueError as error:
-        raise UserError(f"--noise {text}; expected three numbers, as in 0.02,0.01,0.002") from error
+        raise UserError(f"{option} {text}; expected three numbers, as in 0.02,0.01,0.002") from error
     if not all(0 <= std < float("inf") for std in (v_x, v_y, omega)):
-        raise UserError(f"--noise {text}; expected finite numbers of at least 0")
+        raise UserError(f"{option} {text}; expected finite numbers of at least 0")
     return v_x, v_y, omega

@@ -19,6 +19,7 @@ from dynssm_ros.control.nmpc import Adapted, Nmpc, Plan, Status
 from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
+from dynssm_ros.control.state_estimator import StateEstimator
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Applied, Coefficients, State
 from dynssm_ros.vehicle.effects import require_context
@@ -27,7 +28,9 @@ from dynssm_ros.vehicle.parameters import InputLimits
 from dynssm_ros.vehicle.single_track import settled_effect_states
 
 LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
+MOST_LATE = 20  # steps
 _VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
+_ACTUATORS = slice(STATES.index("r"), STATES.index("delta") + 1)
 _MEASURED = slice(3, len(STATES))  # what a window's row begins with
 _KNOWN = (*STATES[:3], *CONTEXT)  # what effects may read
 
@@ -93,44 +96,94 @@ class Controller:
         horizon = HorizonModel(model.car, settings.N, settings.travel, settings.scale.length / settings.scale.time)
         self._nmpc = Nmpc(horizon, limits, reference, track, settings, clock)
         self._disturbance = Disturbance.of(settings, model.car.T_s)
+        self._estimator = StateEstimator(model.car.T_s)
         self._history: deque[Vector] = deque(maxlen=max(model.H, 1))
+        self._commands: deque[Applied] = deque(maxlen=MOST_LATE + 1)
+        self.forget()
 
     def forget(self) -> None:
         """Begins anew, as after a gap in what was measured: without a window, a plan, or an error of the model."""
         self._history.clear()
+        self._commands.clear()
         self._disturbance.forget()
+        self._estimator.forget()
         self._nmpc.forget()
+        self._age = 0
+        self._past: Vector | None = None  # the estimated state at the last measurement
+        self._expected: Vector | None = None  # by the model, at the next one
 
-    def step(self, t: float, pose: Pose, seen: State, feedback: Applied) -> Decision:
+    def step(self, t: float, pose: Pose, seen: State, feedback: Applied, age: int = 0) -> Decision:
         """One control step.
+
+        What is measured is filtered (:class:`StateEstimator`). From an older measurement the present follows by the model,
+        under the commands that were sent since.
 
         Args:
             t: time since the start of the drive (s).
-            pose: where the car is (m, m, rad).
+            pose: where the car was measured to be (m, m, rad).
             seen: its measured velocities (m/s, m/s, rad/s).
             feedback: what its actuators do now.
+            age: steps of T_s since the measurement, at most :data:`MOST_LATE`. While it grows, as after the start, the
+                measurement counts as the one before.
 
         Returns:
             What to send. It is safe whatever came in: what is not finite counts as measured as it was planned.
         """
         began = self._clock()
         previous = self._nmpc.previous
-        increments = np.zeros(2) if previous is None else previous.u[0]
-        self._history.append(np.array([*seen, *feedback, *increments]))
-        self._disturbance.measured(np.array(seen))
+        self._commands.append(feedback)
+        age = min(age, len(self._commands) - 1)
+        commands = [*self._commands][-1 - age :]
+        sent: Vector = np.diff(np.array(commands), axis=0)  # increments since the measurement
+        at = t - age * self._model.car.T_s  # when it was measured
+        is_new, self._age = self._past is None or age <= self._age, age
+        if is_new:
+            planned = np.zeros(2) if previous is None else previous.u[0]
+            self._history.append(np.array([*seen, *commands[0], *(sent[0] if age else planned)]))
+            self._disturbance.measured(np.array(seen))
         adapted = self._disturbance.added(self._model.read(np.array(self._history), previous))
-        effect_states = (
-            self._settled(t, pose, seen, feedback, adapted) if previous is None else previous.x[0, len(STATES) :]
-        )
-        plan = self._nmpc.plan(np.array([*pose, *seen, *feedback, *effect_states]), adapted, t, began)
+        if is_new or self._past is None:
+            self._past = self._estimated(at, pose, seen, commands[0], adapted)
+        now = self._past
+        for k, increments in enumerate(sent):
+            now = self._nmpc.following(now, increments, adapted, at + k * self._model.car.T_s)
+        plan = self._nmpc.plan(now, adapted, t, began)
         command = self._nmpc.command(plan)
-        measured = plan.x[0, _MEASURED]
-        increments = np.subtract(command, measured[-2:])
-        self._history[-1] = np.array([*measured, *increments])
-        if np.all(np.isfinite([*pose, *seen, *feedback])):
-            self._disturbance.expects(self._nmpc.following(plan.x[0], increments, adapted, t)[_VELOCITIES])
+        self._expect(at, plan, command, sent, adapted, np.array([*pose, *seen, *feedback]))
         self.counts[plan.status] += 1
         return Decision(command, plan, adapted, self._clock() - began)
+
+    def _expect(self, t: float, plan: Plan, command: Applied, sent: Vector, adapted: Adapted, given: Vector) -> None:
+        """Completes the window's last row, and predicts the next measurement.
+
+        Args:
+            t: of the last measurement (s).
+            plan: for the present.
+            command: its first one.
+            sent: increments since the measurement.
+            adapted: what was planned with.
+            given: measured and fed back, in the order of ``STATES``.
+        """
+        past = plan.x[0]
+        if len(sent) and self._past is not None:
+            past = np.where(np.isfinite(self._past), self._past, past)
+        first = sent[0] if len(sent) else np.subtract(command, plan.x[0, _ACTUATORS])
+        row = self._history[-1]
+        row[:5] = np.where(np.isfinite(row[:5]), row[:5], past[_MEASURED])
+        row[5:] = first
+        self._past = past
+        self._expected = self._nmpc.following(past, first, adapted, t)
+        if np.all(np.isfinite(given)):
+            self._disturbance.expects(self._expected[_VELOCITIES])
+
+    def _estimated(self, t: float, pose: Pose, seen: State, feedback: Applied, adapted: Adapted) -> Vector:
+        """The state at the measurement, with the effects' own."""
+        expected = self._expected
+        motion = slice(0, _ACTUATORS.start)
+        moved = None if expected is None or self._past is None else expected[motion] - self._past[motion]
+        state = self._estimator.update(np.array([*pose, *seen]), moved)
+        effect_states = self._settled(t, pose, seen, feedback, adapted) if expected is None else expected[len(STATES) :]
+        return np.array([*state, *feedback, *effect_states])
 
     def _settled(self, t: float, pose: Pose, seen: State, feedback: Applied, adapted: Adapted) -> Vector:
         """The effect states of the model's effects at the start; zeros while that is not known."""

@@ -11,16 +11,18 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.control.controller import LOST, Controller
+from dynssm_ros.control.controller import LOST, MOST_LATE, Controller
 from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.simulation.plant import PlantKind, make_plant, plant_type
@@ -48,6 +50,36 @@ class Start:
 
 
 @dataclass(frozen=True)
+class Sensing:
+    """What comes between the car and its controller.
+
+    Attributes:
+        noise: standard deviations of white noise on the measured ``v_x, v_y`` (m/s), ``omega`` (rad/s).
+        pose_noise: likewise on ``x, y`` (m), ``theta`` (rad).
+        delay: from an instant until the command that answers it acts (s), at most :data:`MOST_LATE` sampling times;
+            rounded up to whole ones. The controller knows it.
+        seed: of the noise.
+    """
+
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pose_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    delay: float = 0.0
+    seed: int = 0
+
+    def steps(self, T_s: float) -> int:
+        """The delay in sampling times (s).
+
+        Raises:
+            ConfigurationError: it is negative, not finite or too long, or a deviation is.
+        """
+        if not all(0.0 <= std < math.inf for std in (*self.noise, *self.pose_noise)):
+            raise ConfigurationError(f"noise {self.noise}, {self.pose_noise}: expected finite numbers of at least 0")
+        if not 0.0 <= self.delay <= MOST_LATE * T_s:
+            raise ConfigurationError(f"delay {self.delay:g} s: expected 0 to {MOST_LATE * T_s:g} s")
+        return math.ceil(self.delay / T_s - 1e-6)
+
+
+@dataclass(frozen=True)
 class Course:
     """What all models drive alike.
 
@@ -59,6 +91,7 @@ class Course:
         settings: of the controller.
         laps: to drive.
         start: where it begins.
+        sensing: what comes between the car and its controller.
     """
 
     vehicle: Vehicle
@@ -68,6 +101,12 @@ class Course:
     settings: Settings
     laps: int = 1
     start: Start = Start()
+    sensing: Sensing = Sensing()
+
+    @property
+    def delay(self) -> float:
+        """From an instant until the command that answers it acts (s)."""
+        return self.sensing.steps(self.vehicle.sampling_time) * self.vehicle.sampling_time
 
     def starting(self) -> tuple[Pose, State]:
         """Pose and motion at the start.
@@ -195,6 +234,9 @@ class _Drive:
         self._car = make_plant(vehicle, course.plant, pose, state, (rolling,), track.length)
         self._course = course
         self._feedback = Applied(0.0, 0.0)
+        self._noise = np.array([*course.sensing.pose_noise, *course.sensing.noise])
+        self._rng = np.random.default_rng([course.sensing.seed, 2])
+        self._seen: deque[Vector] = deque(maxlen=1 + course.sensing.steps(vehicle.sampling_time))
         self._limit = PATIENCE * course.laps * course.reference.lap_time
         self._rows: list[tuple[Any, ...]] = []
         self.s, self._lateral = (float(value) for value in track.project(pose[:2]))
@@ -203,7 +245,9 @@ class _Drive:
     def step(self) -> str | None:
         """Drives on by T_s; once it is over, why: a failure, or nothing."""
         t, car = len(self._rows) * self._course.vehicle.sampling_time, self._car
-        decision = self.pilot.step(t, car.pose, car.measured, self._feedback)
+        self._seen.append(np.array([*car.pose, *car.measured]) + self._noise * self._rng.standard_normal(6))
+        seen = self._seen[0]  # the oldest: what has arrived by now
+        decision = self.pilot.step(t, Pose(*seen[:3]), State(*seen[3:]), self._feedback, len(self._seen) - 1)
         self._rows.append(
             (t, car.pose, car.state, decision.command, self.s, self._lateral, decision.theta, decision.correction,
              decision.seconds)

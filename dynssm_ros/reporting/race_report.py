@@ -43,6 +43,10 @@ def race_json(races: Sequence[Race]) -> dict[str, Any]:
         "horizon": course.settings.N,
         "offset_free": course.settings.offset_free,
         "laps": course.laps,
+        "noise": list(course.sensing.noise),
+        "pose_noise": list(course.sensing.pose_noise),
+        "delay_s": course.delay,
+        "seed": course.sensing.seed,
         "models": {race.name: race.to_json() for race in races},
     }
 
@@ -149,9 +153,25 @@ def _protocol(course: Course) -> dict[str, str]:
         "Controller": f"{settings.objective}, {settings.N} steps of {course.vehicle.sampling_time:g} s, late after "
         f"{1e3 * settings.deadline:g} ms; weights {weights}, in wheelbases and units of {settings.scale.time:.3g} s; what a "
         f"model mispredicts is {'added to it (offset-free)' if settings.offset_free else 'left as it is'}",
+        "Measured": _measured(course),
         "Time": "of a control step: model and plan together, the processor's time on one core",
         "Violation": VIOLATION,
     }
+
+
+def _measured(course: Course) -> str:
+    """What comes between the car and its controller."""
+    sensing = course.sensing
+    if not any((*sensing.noise, *sensing.pose_noise)):
+        noise = "without noise"
+    else:
+        velocities, pose = (", ".join(f"{std:g}" for std in part) for part in (sensing.noise, sensing.pose_noise))
+        noise = (
+            f"with white noise of {velocities} (m/s, m/s, rad/s) and {pose} (m, m, rad), seed {sensing.seed}, which the "
+            "controller filters"
+        )
+    late = f", {1e3 * course.delay:g} ms late, which the controller knows" if course.delay else ""
+    return noise + late
 
 
 def _start(course: Course) -> str:

@@ -13,7 +13,7 @@ SHORT = ("--vehicle", "orca", "--track", "club", "--plant", "euler", "--line", "
 def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
     out, result = tmp_path / "race", tmp_path / "race.json"
     models = ("--model", "true", "--model", "persistence")
-    more = ("--animation", "--offset-free")
+    more = ("--animation", "--offset-free", "--noise", "0.01,0.01,0.03", "--delay", "20", "--seed", "3")
     status, text, _ = dynssm("race", *SHORT, *models, "--out", out, "--json", result, *more)
     assert status == 0
     assert "true" in text
@@ -21,6 +21,8 @@ def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
     assert content == json.loads((out / "results.json").read_text())
     assert (content["track"], content["plant"], content["objective"]) == ("club", "euler", "tracking")
     assert content["offset_free"]
+    assert (content["noise"], content["pose_noise"], content["seed"]) == ([0.01, 0.01, 0.03], [0.0] * 3, 3)
+    assert content["delay_s"] == 0.02
     assert list(content["models"]) == ["true", "persistence"]
     assert content["models"]["true"]["completed"]
     assert (out / "report.html").stat().st_size > 50_000
@@ -40,6 +42,8 @@ def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
         (["--model", "true", "--start-offset", "0.5"], "expected it on the road"),
         (["--model", "true", "--objective", "glory"], "Invalid value for '--objective'"),
         (["--model", "single_track", "--effect", "rocket"], "unknown effect 'rocket'"),
+        (["--model", "true", "--delay", "1000"], "delay 1 s: expected 0 to 0.4 s"),
+        (["--model", "true", "--pose-noise", "1,2"], "--pose-noise 1,2; expected three numbers"),
     ],
 )
 def test_what_cannot_be_raced_is_one_line(dynssm, tmp_path, arguments, complaint):

@@ -1,11 +1,13 @@
 """Laps in closed loop."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dynssm_ros.control.race import Course, Start, _Drive, race
+from dynssm_ros.control import state_estimator
+from dynssm_ros.control.race import Course, Sensing, Start, _Drive, race
 from dynssm_ros.control.race_models import load_prediction_model, true_model
 from dynssm_ros.control.reference import Reference, load_reference
 from dynssm_ros.control.settings import Settings
@@ -56,6 +58,26 @@ def test_the_full_size_car_takes_a_bend_at_its_limit(objective):
     assert np.max(np.abs(beside)) < 2.0
     assert driven.s[-1] > 680.0
     assert driven.infeasible == 0
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.05])
+def test_a_delay_that_is_known_costs_the_true_model_nothing(course, lap, orca, delay):
+    late = race(replace(course, start=Start(lateral=0.05), sensing=Sensing(delay=delay)), true_model(orca, "euler"))
+    assert late.course.delay == pytest.approx(0.02 * math.ceil(delay / 0.02))
+    assert late.lap_times[0] == pytest.approx(lap.lap_times[0], abs=0.02)
+    np.testing.assert_allclose(late.pose[100:250], lap.pose[100:250], atol=1e-3)
+
+
+def test_noise_is_filtered_before_it_is_planned_from(course, lap, orca, monkeypatch):
+    sensing = Sensing(noise=(0.03, 0.03, 0.09), pose_noise=(0.005, 0.005, 0.005), seed=1)
+    noisy = replace(course, start=Start(lateral=0.05), sensing=sensing)
+    filtered = race(noisy, true_model(orca, "euler"))
+    monkeypatch.setattr(state_estimator, "GAINS", (1.0,))
+    raw = race(noisy, true_model(orca, "euler"))
+    own, without, with_it = (float(np.abs(np.diff(one.command[:, 1])).sum()) for one in (lap, filtered, raw))
+    assert without - own < 0.3 * (with_it - own)
+    assert filtered.outside == 0.0
+    assert race(noisy, true_model(orca, "euler")).lap_times == raw.lap_times  # the seed
 
 
 def test_commands_respect_the_actuators(lap, orca):
