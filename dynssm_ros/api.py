@@ -442,6 +442,7 @@ def race(
     pose_noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
     delay: float = 0.0,
     seed: int = 0,
+    as_is: bool = False,
 ) -> list[Race]:
     """Drives laps in closed loop: a predictive controller with each model in turn, on a simulated car.
 
@@ -468,6 +469,7 @@ def race(
         pose_noise: likewise on ``x, y`` (m), ``theta`` (rad).
         delay: from an instant until the command that answers it acts (s); the controller knows it.
         seed: of the noise.
+        as_is: plan with what each model says, whether or not it has predicted better than the calibrated car.
 
     Example:
         >>> (lap,) = race("orca", "club", ["true"], speed_scale=0.8)
@@ -490,7 +492,7 @@ def race(
     for name, model in disambiguated(opened, lambda model: model.name).items():
         model.name = name
     reference = load_reference(line, car, road, speed_scale)
-    settings = Settings.of(car, objective, horizon, offset_free)
+    settings = Settings.of(car, objective, horizon, offset_free, not as_is)
     sensing = Sensing(noise, pose_noise, delay, seed)
     course = Course(driven, road, plant, reference, settings, laps, Start(start, start_offset, start_speed), sensing)
     races = []

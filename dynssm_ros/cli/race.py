@@ -67,6 +67,13 @@ def race(
         bool,
         typer.Option("--offset-free", help="Follow what each model mispredicts, and add it to what the model says."),
     ] = False,
+    as_is: Annotated[
+        bool,
+        typer.Option(
+            "--as-is",
+            help="Plan with what each model says, whether or not it has predicted better than the calibrated car.",
+        ),
+    ] = False,
     effect: EffectOption = None,
     scale: Annotated[float | None, typer.Option(help="Size of the track, for other cars than it was made for.")] = None,
     lap_length: Annotated[
@@ -106,7 +113,7 @@ def race(
         races = api.race(
             vehicle, track, list(model), plant, objective, laps, line, speed_scale, horizon, along_horizon, offset_free,
             as_effects(effect), scale, lap_length, start, start_offset, start_speed, progress,
-            parse_noise(noise), parse_noise(pose_noise, "--pose-noise"), delay / 1e3, seed,
+            parse_noise(noise), parse_noise(pose_noise, "--pose-noise"), delay / 1e3, seed, as_is,
         )  # fmt: skip
     race_report(races).save(out / "report.html")
     if animation:

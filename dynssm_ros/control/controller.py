@@ -14,6 +14,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.disturbance import Disturbance
+from dynssm_ros.control.evidence import SOURCES, Evidence
 from dynssm_ros.control.horizon_model import CONTEXT, STATES, HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Nmpc, Plan, Status
 from dynssm_ros.control.prediction_model import PredictionModel
@@ -29,6 +30,7 @@ from dynssm_ros.vehicle.single_track import settled_effect_states
 
 LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
 MOST_LATE = 20  # steps
+_AS_IT_IS = np.array([float(source == "model") for source in SOURCES])
 _VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
 _ACTUATORS = slice(STATES.index("r"), STATES.index("delta") + 1)
 _MEASURED = slice(3, len(STATES))  # what a window's row begins with
@@ -41,13 +43,15 @@ class Decision(NamedTuple):
     Attributes:
         command: absolute throttle and steering to apply from now on: finite, within the limits and the steering rate.
         plan: whose first step that is.
-        adapted: what was planned with: what the model said, and what was found to be missing from that.
+        adapted: what was planned with: what the model said as far as it has earned it, and what was found to be missing.
+        weights: of :data:`~dynssm_ros.control.evidence.SOURCES` in that, ``(3,)``.
         seconds: that it took, model and plan together, by the controller's clock.
     """
 
     command: Applied
     plan: Plan
     adapted: Adapted
+    weights: Vector
     seconds: float
 
     @property
@@ -97,6 +101,8 @@ class Controller:
         self._nmpc = Nmpc(horizon, limits, reference, track, settings, clock)
         self._disturbance = Disturbance.of(settings, model.car.T_s)
         self._estimator = StateEstimator(model.car.T_s)
+        self._evidence = Evidence(self._nmpc.following, settings.N)
+        self._wants_evidence = settings.evidence
         self._history: deque[Vector] = deque(maxlen=max(model.H, 1))
         self._commands: deque[Applied] = deque(maxlen=MOST_LATE + 1)
         self.forget()
@@ -107,6 +113,7 @@ class Controller:
         self._commands.clear()
         self._disturbance.forget()
         self._estimator.forget()
+        self._evidence.forget()
         self._nmpc.forget()
         self._age = 0
         self._past: Vector | None = None  # the estimated state at the last measurement
@@ -141,7 +148,9 @@ class Controller:
             planned = np.zeros(2) if previous is None else previous.u[0]
             self._history.append(np.array([*seen, *commands[0], *(sent[0] if age else planned)]))
             self._disturbance.measured(np.array(seen))
-        adapted = self._disturbance.added(self._model.read(np.array(self._history), previous))
+        said = self._model.read(np.array(self._history), previous)
+        earned = self._evidence.earned(self._model.calibrated, said) if self._wants_evidence else said
+        adapted = self._disturbance.added(earned)
         if is_new or self._past is None:
             self._past = self._estimated(at, pose, seen, commands[0], adapted)
         now = self._past
@@ -149,11 +158,21 @@ class Controller:
             now = self._nmpc.following(now, increments, adapted, at + k * self._model.car.T_s)
         plan = self._nmpc.plan(now, adapted, t, began)
         command = self._nmpc.command(plan)
-        self._expect(at, plan, command, sent, adapted, np.array([*pose, *seen, *feedback]))
+        first = self._expect(at, plan, command, sent, adapted, np.array([*pose, *seen, *feedback]))
+        if is_new:
+            self._gather(at, first, said)
         self.counts[plan.status] += 1
-        return Decision(command, plan, adapted, self._clock() - began)
+        weights = self._evidence.weights if self._wants_evidence else _AS_IT_IS
+        return Decision(command, plan, adapted, weights, self._clock() - began)
 
-    def _expect(self, t: float, plan: Plan, command: Applied, sent: Vector, adapted: Adapted, given: Vector) -> None:
+    def _gather(self, t: float, increments: Vector, said: Adapted) -> None:
+        """Takes what a model said at the last measurement (s), and what was sent from there on, as evidence."""
+        if said is self._model.calibrated or self._past is None or not np.all(np.isfinite(self._past)):
+            self._evidence.interrupt()
+        elif self._wants_evidence:
+            self._evidence.sent(self._past, increments, self._model.calibrated, said, t)
+
+    def _expect(self, t: float, plan: Plan, command: Applied, sent: Vector, adapted: Adapted, given: Vector) -> Vector:
         """Completes the window's last row, and predicts the next measurement.
 
         Args:
@@ -163,6 +182,9 @@ class Controller:
             sent: increments since the measurement.
             adapted: what was planned with.
             given: measured and fed back, in the order of ``STATES``.
+
+        Returns:
+            The increments that were sent at the measurement.
         """
         past = plan.x[0]
         if len(sent) and self._past is not None:
@@ -175,6 +197,7 @@ class Controller:
         self._expected = self._nmpc.following(past, first, adapted, t)
         if np.all(np.isfinite(given)):
             self._disturbance.expects(self._expected[_VELOCITIES])
+        return np.asarray(first)
 
     def _estimated(self, t: float, pose: Pose, seen: State, feedback: Applied, adapted: Adapted) -> Vector:
         """The state at the measurement, with the effects' own."""

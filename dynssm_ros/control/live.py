@@ -22,6 +22,7 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.controller import LOST, Controller
 from dynssm_ros.control.disturbance import Disturbance
+from dynssm_ros.control.evidence import SOURCES
 from dynssm_ros.control.horizon_model import STATES
 from dynssm_ros.control.nmpc import Status
 from dynssm_ros.control.reference import Reference
@@ -151,6 +152,7 @@ class LiveController:
         self._first = self._planned = 0
         self._heading = 0.0
         self._sent = Applied(0.0, 0.0)
+        self._weights = np.zeros(len(SOURCES))
         self._restart()
         self.remote.forget()
 
@@ -218,6 +220,7 @@ class LiveController:
     def _planned_command(self, t: float, pose: Pose, state: State) -> Applied:
         decision = self._pilot.step(t, pose, state, self._sent)
         self._memory = decision.plan.x[0, len(STATES) :]
+        self._weights = decision.weights
         self.counts[decision.plan.status] += 1
         self._recent.append((decision.seconds, decision.plan.status == "solved"))
         return decision.command
@@ -247,6 +250,7 @@ class LiveController:
         theta, correction = (np.atleast_2d(part)[0] for part in self.remote.planned_with)
         return {
             "coefficients": output.source,
+            **{f"planned with {source}": f"{w:.2f}" for source, w in zip(SOURCES, self._weights, strict=True)},
             "age of the coefficients (s)": f"{output.age:.3f}",
             "step p50 (ms)": f"{1e3 * p50:.3f}",
             "step p99 (ms)": f"{1e3 * p99:.3f}",

@@ -9,7 +9,10 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.horizon_model import INPUTS, STATES, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Plan
-from dynssm_ros.runtime.models import WindowModel
+from dynssm_ros.runtime.learner import OnlineLearner
+from dynssm_ros.runtime.models import OnnxModel, WindowModel, WindowPrediction, corrected
+from dynssm_ros.runtime.online import Seen
+from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import Coefficients, State, Vehicle, step
 
@@ -24,6 +27,8 @@ class PredictionModel(Protocol):
     """The physics that its coefficients are for."""
     H: int
     """Rows of history that it reads; 0: none."""
+    calibrated: Adapted
+    """The car without what the model says of the present: what drives while that has earned nothing."""
 
     def read(self, rows: Vector, previous: Plan | None) -> Adapted:
         """Coefficients and correction for the horizon.
@@ -43,11 +48,11 @@ class Fixed:
     def __init__(self, name: str, car: SteppedCar, theta: Vector) -> None:
         self.name = name
         self.car = car
-        self._adapted = Adapted(theta, np.zeros(3))
+        self.calibrated = Adapted(theta, np.zeros(3))
 
     def read(self, rows: Vector, previous: Plan | None) -> Adapted:
         """The same, whatever happens."""
-        return self._adapted
+        return self.calibrated
 
 
 class Adaptive:
@@ -57,7 +62,7 @@ class Adaptive:
     coefficients corrects the nominal car. Until the window is full the nominal car drives, without a correction.
 
     Args:
-        model: the model.
+        model: the model. Its online layer, if it has one, learns from row to row.
         vehicle: the nominal car of a model that has none of its own.
         along_horizon: reads the model anew at each step of the last plan instead, as if that had been driven.
     """
@@ -66,35 +71,78 @@ class Adaptive:
         own = model.vehicle or vehicle
         card = model.card
         self.name = model.name
-        self.H = model.H
+        self._online: _Online | None = None
+        if isinstance(model, OnnxModel) and model.online is not None:
+            self._online = _Online(OnlineLearner(model, model.online))
+        self.H = model.H + (
+            self._online is not None
+        )  # it learns from rows whose command is known: those before the present
         self.car = SteppedCar.of(own) if card is None else SteppedCar.of(own, card.integrator, card.substeps)
         self._model = model
         self._along_horizon = along_horizon
-        self._nominal = Adapted(own.nominal, np.zeros(3))
+        self.calibrated = Adapted(own.nominal, np.zeros(3))
 
     def read(self, rows: Vector, previous: Plan | None) -> Adapted:
         """See :class:`PredictionModel`. What is not finite is replaced by the nominal car."""
         if len(rows) < self.H:
-            return self._nominal
-        windows = rows[None, -self.H :]
+            if self._online is not None:
+                self._online.interrupt()
+            return self.calibrated
+        H = self._model.H
+        windows = rows[None, -H:]
+        if self._online is not None:
+            self._online.learn(self._read_by(rows[None, -H - 1 : -1])[0])
         if self._along_horizon and previous is not None:
             ahead = np.concatenate([rows, _planned_rows(previous)])
             N = len(previous.u)
-            windows = np.stack([ahead[k : k + self.H] for k in range(len(rows) - self.H, len(rows) - self.H + N)])
-        if self._model.commands == "none":
-            windows = windows.copy()
-            windows[..., 5:] = 0.0
-        adapted = self._of(windows)
-        return adapted if all(np.all(np.isfinite(part)) for part in adapted) else self._nominal
+            windows = np.stack([ahead[k : k + H] for k in range(len(rows) - H, len(rows) - H + N)])
+        adapted = self._of(self._read_by(windows))
+        return adapted if all(np.all(np.isfinite(part)) for part in adapted) else self.calibrated
+
+    def _read_by(self, windows: Vector) -> Vector:
+        """Windows as the model was trained on them."""
+        if self._model.commands != "none":
+            return windows
+        windows = windows.copy()
+        windows[..., 5:] = 0.0
+        return windows
 
     def _of(self, windows: Vector) -> Adapted:
         said = self._model.predict(windows)
-        theta = self._nominal.theta if said.theta is None else said.theta
+        if self._online is not None:
+            said = self._online.corrected(said, windows)
+        theta = self.calibrated.theta if said.theta is None else said.theta
         physics = stepped(self.car, windows[:, -1], theta) if said.physics is None else said.physics
         correction = said.state - physics
         if len(windows) == 1:
             return Adapted(np.atleast_2d(theta)[0], correction[0])
         return Adapted(theta, correction)
+
+
+class _Online:
+    """The online layer of a model that is read once per T_s."""
+
+    def __init__(self, learner: OnlineLearner) -> None:
+        self._learner = learner
+        self._period = round(learner.layer.T_s * 1e9)
+        self._stamp = 0
+
+    def learn(self, window: Vector) -> None:
+        """Takes the next window ``(H, 7)``."""
+        self._stamp += self._period
+        predicted = self._learner.model.predict(window[None])
+        self._learner.corrected(self._stamp, window.copy(), predicted, lambda stamp: Refusal.FILLING)
+
+    def interrupt(self) -> None:
+        """The next window does not follow on the last one."""
+        self._stamp += 2 * self._period
+
+    def corrected(self, said: WindowPrediction, windows: Vector) -> WindowPrediction:
+        """A prediction from windows ``(N, H, 7)`` with what was learned so far; its physics is left out."""
+        assert said.seen is not None
+        learner, first = self._learner, np.zeros(len(windows), dtype=np.intp)
+        known = learner.learned(Seen(said.seen.features[:1], said.seen.physics[:1])).at(first)
+        return corrected(said, windows, learner.layer, known)._replace(physics=None)
 
 
 def stepped(car: SteppedCar, rows: Vector, theta: Vector) -> Vector:

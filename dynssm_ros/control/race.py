@@ -19,6 +19,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.controller import LOST, MOST_LATE, Controller
+from dynssm_ros.control.evidence import SOURCES
 from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
@@ -157,6 +158,7 @@ class Race:
         lateral: beside it (m, positive left), shape ``(n,)``.
         theta: coefficients of the first step of each horizon, shape ``(n, 17)``.
         correction: likewise the correction, shape ``(n, 3)``.
+        weights: shares of :data:`~dynssm_ros.control.evidence.SOURCES` in both, shape ``(n, 3)``.
         solve: time of each control step, model and plan together (s of one core), shape ``(n,)``.
         infeasible: steps at which there was no plan.
         late: steps at which it came too late.
@@ -173,6 +175,7 @@ class Race:
     lateral: Vector
     theta: Vector
     correction: Vector
+    weights: Vector
     solve: Vector
     infeasible: int
     late: int
@@ -208,6 +211,7 @@ class Race:
             "mean_abs_v_y": mean_v_y,
             "mean_abs_omega": mean_omega,
             "steering_total_variation": float(np.sum(np.abs(np.diff(self.command[:, 1], prepend=0.0)))),
+            "planned_with": dict(zip(SOURCES, self.weights.mean(axis=0).tolist(), strict=True)),
             "solve_ms": {"p50": float(p50), "p99": float(p99)},
             "completed": self.completed,
             "failure": self.failure,
@@ -250,7 +254,7 @@ class _Drive:
         decision = self.pilot.step(t, Pose(*seen[:3]), State(*seen[3:]), self._feedback, len(self._seen) - 1)
         self._rows.append(
             (t, car.pose, car.state, decision.command, self.s, self._lateral, decision.theta, decision.correction,
-             decision.seconds)
+             decision.weights, decision.seconds)
         )  # fmt: skip
         failure = self._failure(t)
         if failure or self.s >= self.goal:
@@ -265,12 +269,12 @@ class _Drive:
 
     def result(self, name: str, failure: str) -> Race:
         """What was driven."""
-        time, pose, state, command, s, lateral, theta, correction, solve = (
+        time, pose, state, command, s, lateral, theta, correction, weights, solve = (
             np.array(column) for column in zip(*self._rows, strict=True)
         )
         counts = self.pilot.counts
         return Race(
-            name, self._course, time, pose, state, command, s, lateral, theta, correction, solve,
+            name, self._course, time, pose, state, command, s, lateral, theta, correction, weights, solve,
             counts["infeasible"], counts["late"], failure,
         )  # fmt: skip
 

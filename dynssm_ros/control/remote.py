@@ -64,7 +64,8 @@ class RemoteModel:
         self._disturbance = disturbance or Disturbance.none()
         self._stamp = 0  # of the last odometry (ns)
         self._lower, self._upper = vehicle.lower, vehicle.upper
-        self._nothing = ModelOutput(Adapted(vehicle.nominal, np.zeros(3)), self.NOMINAL, np.inf)
+        self.calibrated = Adapted(vehicle.nominal, np.zeros(3))
+        self._nothing = ModelOutput(self.calibrated, self.NOMINAL, np.inf)
         # all by the predicted instant (ns)
         self._theta: dict[int, Vector] = {}
         self._state: dict[int, Vector] = {}

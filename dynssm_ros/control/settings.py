@@ -99,6 +99,8 @@ class Settings:
         slip: slip angles of front and rear axle that no step is to exceed (rad).
         lag_bound: how far the place where a car that keeps the line's time would be is from this one (m) at most.
         offset_free: whether what the model mispredicts is added to it; see :mod:`dynssm_ros.control.disturbance`.
+        evidence: whether what a model says is planned with only where it has predicted better than the calibrated car; see
+            :mod:`dynssm_ros.control.evidence`.
         travel: what carries the pose over a step.
     """
 
@@ -110,11 +112,17 @@ class Settings:
     slip: tuple[float, float] = (math.inf, math.inf)
     lag_bound: float = 0.0
     offset_free: bool = False
+    evidence: bool = True
     travel: Travel = "middle"
 
     @classmethod
     def of(
-        cls, vehicle: Vehicle, objective: Objective = "tracking", N: int | None = None, offset_free: bool = False
+        cls,
+        vehicle: Vehicle,
+        objective: Objective = "tracking",
+        N: int | None = None,
+        offset_free: bool = False,
+        evidence: bool = True,
     ) -> Settings:
         """For a car: a plan has a control period of time, half the car stays within the borders.
 
@@ -123,6 +131,7 @@ class Settings:
             objective: see above.
             N: steps of the horizon; ``None``: ``HORIZON``.
             offset_free: see above.
+            evidence: see above.
 
         Raises:
             UserError: the car cannot drive, brake or corner.
@@ -133,7 +142,7 @@ class Settings:
         th = Coefficients(*vehicle.nominal)
         slip = _slip(_FRONT_USED, th.B_f, th.C_f, th.E_f), _slip(_REAR_USED, th.B_r, th.C_r, th.E_r)
         lag_bound = _LAG_BOUND_WHEELBASES * scale.length
-        return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip, lag_bound, offset_free)
+        return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip, lag_bound, offset_free, evidence)
 
     @property
     def weights(self) -> Weights:

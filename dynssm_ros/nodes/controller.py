@@ -82,6 +82,13 @@ class ControllerNode(Node):
         offset_free = describe(
             self, "offset_free", False, "Whether what the model mispredicts is added to it.", read_only=True
         )
+        evidence = describe(
+            self,
+            "evidence",
+            True,
+            "Whether what the predictor says is planned with only where it was better than the calibrated car.",
+            read_only=True,
+        )
         max_age = describe(
             self, "max_age", 0.5, "Age to which the predictor's coefficients are held (s).", (0.01, 10.0), read_only=True
         )  # fmt: skip
@@ -90,7 +97,7 @@ class ControllerNode(Node):
         car = load_vehicle(vehicle)
         road = load_track(track).scaled(scale)
         reference = load_reference(line, car, road, speed_scale)
-        settings = Settings.of(car, objective, horizon or None, offset_free)
+        settings = Settings.of(car, objective, horizon or None, offset_free, evidence)
         settings = replace(settings, deadline=car.sampling_time / self._rate)
         driver = LiveController(car, reference, road, settings, max_age, self._watchdog)
         self.get_logger().info(

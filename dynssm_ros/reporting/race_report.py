@@ -42,6 +42,7 @@ def race_json(races: Sequence[Race]) -> dict[str, Any]:
         "line_full_throttle_s": course.reference.full_throttle_time,
         "horizon": course.settings.N,
         "offset_free": course.settings.offset_free,
+        "as_is": not course.settings.evidence,
         "laps": course.laps,
         "noise": list(course.sensing.noise),
         "pose_noise": list(course.sensing.pose_noise),
@@ -116,6 +117,15 @@ def race_report(races: Sequence[Race]) -> Report:
             coefficients(races),
         ),
     ]  # fmt: skip
+    if course.settings.evidence and any(race.weights[:, 0].min() < 1.0 for race in races):
+        sections.append(
+            Section(
+                "Evidence",
+                "How much of each model was planned with. Without evidence it is the calibrated car (0). A model's "
+                "coefficients, and what it adds beside them, count as soon as they have predicted the last horizons better.",
+                evidence(races),
+            )
+        )
     return Report(f"Race on {course.track.name}", summary(races), sections, _protocol(course), race_table(races))
 
 
@@ -152,7 +162,8 @@ def _protocol(course: Course) -> dict[str, str]:
         f"own speed, {course.reference.full_throttle_time:.3f} s with no more than full throttle",
         "Controller": f"{settings.objective}, {settings.N} steps of {course.vehicle.sampling_time:g} s, late after "
         f"{1e3 * settings.deadline:g} ms; weights {weights}, in wheelbases and units of {settings.scale.time:.3g} s; what a "
-        f"model mispredicts is {'added to it (offset-free)' if settings.offset_free else 'left as it is'}",
+        f"model mispredicts is {'added to it (offset-free)' if settings.offset_free else 'left as it is'}; what it adapts is "
+        f"planned with {'where it was better over the last horizons' if settings.evidence else 'as it is'}",
         "Measured": _measured(course),
         "Time": "of a control step: model and plan together, the processor's time on one core",
         "Violation": VIOLATION,
@@ -293,6 +304,16 @@ def coefficients(races: Sequence[Race]) -> Figure:
         or any(np.max(np.abs(race.correction[:, k])) > _MOVED * np.ptp(race.state[:, k]) for race in races)
     ]
     return _panels(races, rows, {labels[name]: values for name, values in driven.items()}, longest)
+
+
+@styled
+def evidence(races: Sequence[Race]) -> Figure:
+    """How much of each model was planned with, over the distance driven."""
+    rows: list[tuple[str, list[Any]]] = [
+        ("coefficients used", [1.0 - race.weights[:, 0] for race in races]),
+        ("additions used", [race.weights[:, 2] for race in races]),
+    ]
+    return _panels(races, rows)
 
 
 def _first_change(theta: npt.NDArray[np.float64]) -> int:

@@ -62,7 +62,7 @@ class OnlineLearner:
         """
         assert predicted.seen is not None
         self._learn(stamp, window, predicted, cut)
-        self._known = self._learned(predicted.seen)
+        self._known = self.learned(predicted.seen)
         self._mean_error = self.layer.mean_error(predicted.seen.features)
         return corrected(predicted, window[None], self.layer, self._known)
 
@@ -125,7 +125,7 @@ class OnlineLearner:
         """Keeps a row for :meth:`judge_paths`."""
         assert predicted.seen is not None
         self.judge_paths()
-        self._unjudged = window.copy(), predicted.seen, self._learned(predicted.seen)
+        self._unjudged = window.copy(), predicted.seen, self.learned(predicted.seen)
 
     def _row_of(self, stamp: int, window: Vector, predicted: WindowPrediction) -> _Row | None:
         """The last row of ``window``; ``None`` if the car was slower than the layer's minimum speed within it."""
@@ -134,7 +134,7 @@ class OnlineLearner:
         assert predicted.seen is not None
         return _Row(stamp, Seen(predicted.seen.features[0], predicted.seen.physics[0]), window[-1].copy())
 
-    def _learned(self, seen: Seen) -> Learned:
+    def learned(self, seen: Seen) -> Learned:
         """What is known now, for a prediction from one window."""
         state = self.state
         return Learned(
