@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Vector
+from dynssm_ros.arrays import Mask, Vector
 from dynssm_ros.control.nmpc import Adapted
 
 Source = Literal["calibrated", "coefficients", "model"]
@@ -32,16 +32,25 @@ _SETTLING = 1.0  # horizons in which 63 % of a switch are made
 _NEAR = 1e-9  # m
 
 Following = Callable[[Vector, Vector, Adapted, float], Vector]
-"""From a state, increments of the inputs, what is said of the car, and the time (s) to the state one T_s later."""
+"""From states ``(n, size)``, increments of the inputs, what holds for each, and the time (s) to the states one T_s later."""
 
 
-class _Rollout(NamedTuple):
-    """Predictions from one measured state, all under way to the end of the horizon."""
+class _Rollouts(NamedTuple):
+    """Predictions under way to the end of their horizons, ``n`` of them, three from each start: one of each source."""
 
-    said: tuple[Adapted, ...]
-    states: list[Vector]
+    states: Vector
+    """``(n, size)``."""
+    said: Adapted
+    """What they are predicted with, ``(n, 17)`` and ``(n, 3)``."""
     distances: Vector
-    done: int
+    """From the measured path so far, summed over the steps (m), ``(n,)``."""
+    left: Vector
+    """Steps to the end, ``(n,)``."""
+
+    def at(self, chosen: Mask) -> _Rollouts:
+        """Some of them."""
+        said = Adapted(self.said.theta[chosen], self.said.correction[chosen])
+        return _Rollouts(self.states[chosen], said, self.distances[chosen], self.left[chosen])
 
 
 class Evidence:
@@ -70,7 +79,7 @@ class Evidence:
 
     def interrupt(self) -> None:
         """Drops what is under way: the next state does not follow on the last one."""
-        self._under_way: list[_Rollout] = []
+        self._under_way: _Rollouts | None = None
         self._since = 0
         self._sent: tuple[Vector, float] | None = None
 
@@ -105,26 +114,41 @@ class Evidence:
             said: by the model at that state.
             t: time (s).
         """
-        if self._sent is not None:
-            self._under_way = [one for one in (self._advanced(one, state) for one in self._under_way) if one]
+        if self._under_way is not None and self._sent is not None:
+            self._under_way = self._advanced(self._under_way, state)
         self._sent = increments, t
         if self._since % self._every == 0:
-            first = _first(calibrated), Adapted(_first(said).theta, _first(calibrated).correction), _first(said)
-            self._under_way.append(_Rollout(first, [state] * len(SOURCES), np.zeros(len(SOURCES)), 0))
+            self._under_way = self._started(state, _first(calibrated), _first(said))
         self._since += 1
 
-    def _advanced(self, one: _Rollout, measured: Vector) -> _Rollout | None:
-        """A rollout one step further; ``None`` once it is at its end."""
+    def _started(self, state: Vector, calibrated: Adapted, said: Adapted) -> _Rollouts:
+        """What is under way, with three more from ``state``."""
+        sources = calibrated, Adapted(said.theta, calibrated.correction), said
+        n = len(SOURCES)
+        new = _Rollouts(
+            np.tile(state, (n, 1)),
+            Adapted(*(np.stack(parts) for parts in zip(*sources, strict=True))),
+            np.zeros(n),
+            np.full(n, float(self._steps)),
+        )
+        old = self._under_way
+        if old is None:
+            return new
+        said = Adapted(*(np.concatenate(parts) for parts in zip(old.said, new.said, strict=True)))
+        parts = ((old.states, new.states), (old.distances, new.distances), (old.left, new.left))
+        states, distances, left = (np.concatenate(pair) for pair in parts)
+        return _Rollouts(states, said, distances, left)
+
+    def _advanced(self, rollouts: _Rollouts, measured: Vector) -> _Rollouts:
+        """All one step further; those at their end are compared with what was measured, and dropped."""
         assert self._sent is not None
-        states = [
-            self._following(state, self._sent[0], said, self._sent[1])
-            for state, said in zip(one.states, one.said, strict=True)
-        ]
-        distances = one.distances + [math.hypot(*(state[:2] - measured[:2])) for state in states]
-        if one.done + 1 < self._steps:
-            return _Rollout(one.said, states, distances, one.done + 1)
-        self._compare(distances)
-        return None
+        states = self._following(rollouts.states, self._sent[0], rollouts.said, self._sent[1])
+        distances = rollouts.distances + np.hypot(*(states[:, :2] - measured[:2]).T)
+        moved = rollouts._replace(states=states, distances=distances, left=rollouts.left - 1.0)
+        done = moved.left <= 0
+        if done.any():
+            self._compare(moved.distances[done])
+        return moved.at(~done)
 
     def _compare(self, distances: Vector) -> None:
         distances = np.nan_to_num(distances, nan=math.inf, posinf=math.inf) + _NEAR

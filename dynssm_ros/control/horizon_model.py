@@ -116,14 +116,15 @@ class HorizonModel:
         self._slips = ca.Function("slip", [x, p], [slips, ca.densify(ca.jacobian(slips, x))]).map(N)
 
     def step(self, x: Vector, u: Vector, p: Vector) -> Vector:
-        """The state one step on, shape ``(size,)``.
+        """The states one step on, shape ``(size,)`` or ``(n, size)``.
 
         Args:
-            x: state in the order of ``STATES`` and the car's effect states, shape ``(size,)``.
+            x: state in the order of ``STATES`` and the car's effect states, shape ``(size,)`` or ``(n, size)``.
             u: increments of throttle and steering, shape ``(2,)``.
-            p: coefficients, correction and context, shape ``(PARAMETERS,)``.
+            p: coefficients, correction and context, shape ``(PARAMETERS,)`` or ``(n, PARAMETERS)``.
         """
-        return np.asarray(self._step(x, u, p)).ravel()
+        following = np.asarray(self._step(x.T, u, p.T))
+        return following.ravel() if x.ndim == 1 else following.T
 
     def linearised(self, x: Vector, u: Vector, p: Vector) -> tuple[Vector, Vector, Vector]:
         """All steps at their own point: the states after them and the Jacobians by state and input.

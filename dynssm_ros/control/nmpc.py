@@ -156,8 +156,19 @@ class Nmpc:
         return plan
 
     def following(self, x: Vector, u: Vector, adapted: Adapted, t: float = 0.0) -> Vector:
-        """The state one T_s after ``x`` with the increments ``u``, by the model and not linearised; see :meth:`plan`."""
-        return self.model.step(x, u, self._parameters(adapted, t)[0])
+        """The states one T_s after ``x`` with the increments ``u``, by the model and not linearised; see :meth:`plan`.
+
+        Args:
+            x: ``(size,)``, or ``(n, size)``.
+            u: of throttle (fraction) and steering (rad), ``(2,)``.
+            adapted: what holds for them: of a horizon, whose first step it is, or for ``n`` states one each.
+            t: time since the start of the drive (s).
+        """
+        first = slice(0, 1) if x.ndim == 1 else slice(None)
+        parts = [np.atleast_2d(part)[first] for part in adapted]
+        context = np.broadcast_to([t, self._on_track, self._track.length], (len(parts[0]), len(CONTEXT)))
+        p = np.concatenate([*parts, context], axis=1)
+        return self.model.step(x, u, p[0] if x.ndim == 1 else p)
 
     def command(self, plan: Plan) -> Applied:
         """Absolute throttle and steering of the plan's first step, within the limits."""

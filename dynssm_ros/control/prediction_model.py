@@ -73,7 +73,7 @@ class Adaptive:
         self.name = model.name
         self._online: _Online | None = None
         if isinstance(model, OnnxModel) and model.online is not None:
-            self._online = _Online(OnlineLearner(model, model.online))
+            self._online = _Online(OnlineLearner(model, model.online, judges=False))
         self.H = model.H + (
             self._online is not None
         )  # it learns from rows whose command is known: those before the present

@@ -26,13 +26,15 @@ class OnlineLearner:
     Args:
         model: predicts the windows.
         layer: the model's.
+        judges: whether paths are judged, on which rollouts hang.
     """
 
-    def __init__(self, model: OnnxModel, layer: OnlineLayer) -> None:
+    def __init__(self, model: OnnxModel, layer: OnlineLayer, judges: bool = True) -> None:
         self.model = model
         self.layer = layer
         self.state: OnlineState = layer.start()
         self.judge = PathJudge(layer)
+        self._judges = judges
         self._period = round(layer.T_s * 1e9)
         self._row: _Row | None = None
         self._known: Learned | None = None
@@ -123,6 +125,8 @@ class OnlineLearner:
 
     def _to_be_judged(self, window: Vector, predicted: WindowPrediction) -> None:
         """Keeps a row for :meth:`judge_paths`."""
+        if not self._judges:
+            return
         assert predicted.seen is not None
         self.judge_paths()
         self._unjudged = window.copy(), predicted.seen, self.learned(predicted.seen)

@@ -22,8 +22,8 @@ def said(theta=0.0, correction=0.0):
 
 
 def following(state, increments, adapted, t):
-    """A car that moves along x by its coefficients and what is added."""
-    return state + np.array([1.0 + adapted.theta[0] + adapted.correction[0], 0.0])
+    """Cars that move along x by its coefficients and what is added."""
+    return state + np.stack([1.0 + adapted.theta[:, 0] + adapted.correction[:, 0], np.zeros(len(state))], axis=1)
 
 
 def driven(evidence, moves, model):
