@@ -1,0 +1,1 @@
+"""The robustness matrix: laps in closed loop, on tracks and cars that nothing was tuned on."""

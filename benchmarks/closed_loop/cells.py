@@ -1,0 +1,155 @@
+"""Cells of the matrix: a car, a track that nothing was tuned on, one hidden change, and how the car is measured.
+
+Every car, track and change is a cell. Plant, noise, delay and objective are drawn by a hash of its name, so that each of them
+meets all others in some cells. Another hash says which cells are for development; decisions are taken on those alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks.generalisation.cells import CARS, NOISE_LEVELS, Training, simulated_car
+from dynssm_ros.control.race import Sensing
+from dynssm_ros.control.settings import Objective
+from dynssm_ros.simulation.plant import PlantKind
+from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.tracks import Track, TrackError, load_track
+from dynssm_ros.vehicle import load_vehicle
+
+TRACKS = (("club", 11), ("club", 12), ("club", 13), ("club_b", 14), ("club_b", 15), ("club_b", 16))
+"""Built-in tracks, and seeds of their variations."""
+CHANGES: dict[str, dict[str, dict[str, float]]] = {
+    "none": {},
+    "grip_patch": {"grip_patch": {"factor": 0.8, "centre": 0.5, "length": 0.3}},
+    "front_grip": {"front_grip": {"factor": 0.85}},
+    "steering": {"steering_offset": {"offset": 0.02}},
+    "mass": {"mass": {"factor": 1.1}},
+    "drag": {},
+}
+"""What is hidden. Of drag it is half of the car's own, see :attr:`Cell.effects`."""
+PLANTS: tuple[PlantKind, ...] = ("rk4", "double_track")
+OBJECTIVES: tuple[Objective, ...] = ("tracking", "progress")
+PACE: dict[Objective, float] = {"tracking": 0.85, "progress": 0.9}
+"""Share of the car's limits in the line's speed."""
+LAPS = 2
+_SCALES = {"orca": 1.0, "racer": 2.8, "av21": 110.0}
+_WIDTHS = {"orca": 0.4, "racer": 1.2, "av21": 15.0}  # m
+_POSE_NOISE = {"orca": (0.002, 0.002, 0.002), "racer": (0.01, 0.01, 0.005), "av21": (0.02, 0.02, 0.002)}
+_HARMONICS = range(2, 7)
+_BENT = 0.2  # of the lap's length over 2 pi, by which the centre line is moved at most by a harmonic
+_TIGHTEST = 0.75  # of the least radius of the built-in track
+_TRIES = 500
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What models drive.
+
+    Attributes:
+        car: one of the generalisation matrix' cars.
+        track: built-in track and seed of its variation.
+        change: what is hidden from the models.
+    """
+
+    car: str
+    track: tuple[str, int]
+    change: str
+
+    @property
+    def name(self) -> str:
+        """Of the cell."""
+        return f"{self.car}-{self.track[0]}_{self.track[1]}-{self.change}"
+
+    def _drawn(self, what: str, options: int) -> int:
+        return int.from_bytes(hashlib.sha256(f"{what} {self.name}".encode()).digest()[:4]) % options
+
+    @property
+    def is_test(self) -> bool:
+        """Whether it is for publishing only."""
+        return self._drawn("part", 2) == 0
+
+    @property
+    def plant(self) -> PlantKind:
+        """How the car is simulated."""
+        return PLANTS[self._drawn("plant", len(PLANTS))]
+
+    @property
+    def objective(self) -> Objective:
+        """Of the controller."""
+        return OBJECTIVES[self._drawn("objective", len(OBJECTIVES))]
+
+    @property
+    def noise(self) -> str:
+        """Level of the sensors' noise."""
+        return list(NOISE_LEVELS)[self._drawn("noise", len(NOISE_LEVELS))]
+
+    @property
+    def late(self) -> bool:
+        """Whether measurements are a step late."""
+        return bool(self._drawn("delay", 2))
+
+    @property
+    def sensing(self) -> Sensing:
+        """What comes between the car and its controller."""
+        level, car = NOISE_LEVELS[self.noise], CARS[self.car]
+        velocities, pose = ((level * a, level * b, level * c) for a, b, c in (car.noise, _POSE_NOISE[self.car]))
+        delay = load_vehicle(car.vehicle).sampling_time if self.late else 0.0
+        return Sensing(velocities, pose, delay, self.track[1])
+
+    @property
+    def training(self) -> Training:
+        """What the models learn from: another track, with the usual noise, of the car without the change."""
+        return Training(f"{self.car}-{self.plant}-usual", CARS[self.car].vehicle, (self.car, self.plant, "usual"))
+
+    @property
+    def effects(self) -> dict[str, dict[str, float]]:
+        """What is hidden, by name, with parameters."""
+        if self.change != "drag":
+            return CHANGES[self.change]
+        return {"drag": {"coefficient": 0.5 * simulated_car(self.car).coefficients["C_r2"].nominal}}
+
+    @property
+    def road(self) -> Track:
+        """The track."""
+        road = variation(load_track(self.track[0]), self.track[1]).scaled(_SCALES[self.car])
+        half = np.full(len(road.width_left), _WIDTHS[self.car] / 2)
+        return replace(road, width_left=half, width_right=half)
+
+
+def cells() -> Iterator[Cell]:
+    """All of them."""
+    for car in CARS:
+        for track in TRACKS:
+            for change in CHANGES:
+                yield Cell(car, track, change)
+
+
+def variation(track: Track, seed: int) -> Track:
+    """A track of the same kind: its centre line is bent by a few waves around the lap.
+
+    Args:
+        track: to vary.
+        seed: of the waves.
+
+    Raises:
+        ValueError: none was found that can be driven.
+    """
+    rng = np.random.default_rng(seed)
+    s, length = track.centre.s, track.length
+    radius = 1.0 / np.abs(track.centre.curvature(s)).max()
+    for _ in range(_TRIES):
+        size, phase = rng.uniform(0.0, 1.0, len(_HARMONICS)), rng.uniform(0.0, 2 * np.pi, len(_HARMONICS))
+        waves = (
+            a / n * np.cos(2 * np.pi * n * s / length + p) for n, a, p in zip(_HARMONICS, size, phase, strict=True)
+        )
+        beside = _BENT * length / (2 * np.pi) * np.sum(list(waves), axis=0)
+        with suppress(TrackError):  # the road overlaps itself
+            bent = replace(track, name=f"{track.name}_{seed}", centre=ClosedLine(track.centre.position(s, beside)))
+            if 1.0 / np.abs(bent.centre.curvature(bent.centre.s)).max() > _TIGHTEST * radius:
+                return bent
+    raise ValueError(f"track {track.name}: no variation with seed {seed} in {_TRIES} tries")

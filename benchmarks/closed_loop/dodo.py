@@ -1,0 +1,98 @@
+"""The robustness matrix as doit's tasks: ``python -m doit -n 2 -f benchmarks/closed_loop/dodo.py``.
+
+Variables: ``out`` (folder), ``trained`` (folder of the generalisation matrix: models are taken from there, and trained there
+if they are missing), ``page`` (folder of the page and its figure), ``only`` (words that names of cells must begin with,
+separated by commas), ``part`` (``development``, the default, or ``all``: test cells too), ``sets`` (as of the generalisation
+matrix). What is done is kept; a kill costs the task under way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from doit import get_var
+from doit.tools import config_changed
+
+from benchmarks.closed_loop.cells import cells
+from benchmarks.closed_loop.page import FIGURE, PAGE, lap_times, page, summary
+from benchmarks.closed_loop.run import cell_file, race_cell, read_cell
+from benchmarks.generalisation.run import drive, drive_file, model_folder, models_of, train_model
+from benchmarks.tasks import doit_config
+from dynssm_ros.errors import UserError
+from dynssm_ros.files import replacing, write_json
+from dynssm_ros.runtime.artifact import CARD
+
+OUT = Path(get_var("out", "out/closed_loop"))
+TRAINED = Path(get_var("trained", "out/generalisation"))
+PAGE_FOLDER = Path(get_var("page", str(OUT)))
+_DEVELOPMENT, _SHIPPED = "development", "shipped"
+VALUES = {"only": get_var("only", ""), "part": get_var("part", _DEVELOPMENT), "sets": get_var("sets", _SHIPPED)}
+USUAL = {"only": "", "part": _DEVELOPMENT, "sets": _SHIPPED}
+ARGUMENTS = [f"{name}={value}" for name, value in VALUES.items() if value != USUAL[name]]
+MODELS = tuple(
+    name for name in models_of(VALUES["sets"].split(",")) if name != "ridge"
+)  # which has no physics to plan with
+DOIT_CONFIG = doit_config(OUT / "doit.json")
+CELLS = [
+    cell
+    for cell in cells()
+    if cell.name.startswith(tuple(VALUES["only"].split(","))) and (VALUES["part"] == "all" or not cell.is_test)
+]
+TRAININGS = {cell.training.name: cell.training for cell in CELLS}
+
+
+def task_drive() -> Iterator[dict[str, Any]]:
+    """Makes the laps of each training."""
+    for training in TRAININGS.values():
+        yield {
+            "name": training.name,
+            "actions": [(drive, [training, TRAINED, Path()])],
+            "targets": [str(drive_file(training, TRAINED))],
+            "uptodate": [config_changed(repr(training))],
+        }
+
+
+def task_train() -> Iterator[dict[str, Any]]:
+    """Trains each model on each training."""
+    for training in TRAININGS.values():
+        for name in MODELS:
+            yield {
+                "name": f"{training.name}:{name}",
+                "actions": [(train_model, [training, name, TRAINED])],
+                "file_dep": [str(drive_file(training, TRAINED))],
+                "targets": [str(model_folder(training, name, TRAINED) / CARD)],
+                "uptodate": [config_changed(repr(training))],
+            }
+
+
+def task_race() -> Iterator[dict[str, Any]]:
+    """Drives each cell."""
+    for cell in CELLS:
+        yield {
+            "name": cell.name,
+            "actions": [(race_cell, [cell, OUT, TRAINED, MODELS])],
+            "file_dep": [str(model_folder(cell.training, name, TRAINED) / CARD) for name in MODELS],
+            "targets": [str(cell_file(cell, OUT))],
+            "uptodate": [config_changed(repr((cell, MODELS)))],
+        }
+
+
+def task_page() -> dict[str, Any]:
+    """Writes the page and the figure of what is there."""
+    return {"actions": [write_page], "task_dep": ["race"], "uptodate": [False], "verbosity": 2}
+
+
+def write_page() -> None:
+    """The summary as JSON, the figure and the page."""
+    known = {cell: outcome for cell in CELLS if (outcome := read_cell(cell, OUT)) is not None}
+    if not known:
+        raise UserError(f"only={VALUES['only']} part={VALUES['part']}: no cell was driven")
+    write_json(OUT / "summary.json", summary(known))
+    with replacing(PAGE_FOLDER / FIGURE) as aside:
+        lap_times(known).savefig(aside, format="png", dpi=130, metadata={"Software": None})
+    text = page(known, ARGUMENTS)
+    with replacing(PAGE_FOLDER / PAGE) as aside:
+        aside.write_text(text, encoding="utf-8")
+    print(text)

@@ -1,0 +1,149 @@
+"""The robustness matrix as numbers, a figure and a page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.closed_loop.cells import LAPS, OBJECTIVES, PACE, Cell
+from benchmarks.closed_loop.run import AS_IS, CALIBRATED
+from dynssm_ros.control.race_models import TRUE
+from dynssm_ros.reporting.evaluation_figures import model_colours
+
+PAGE, FIGURE = "closed_loop.md", "closed_loop.png"
+
+Known = Mapping[Cell, Mapping[str, Any]]
+
+
+def came_round(outcome: Mapping[str, Any]) -> bool:
+    """Whether all laps were driven between the borders."""
+    return bool(outcome["completed"]) and not outcome["violation"]
+
+
+def last_lap(outcome: Mapping[str, Any]) -> float:
+    """Time of the last lap (s); NaN if the car did not come round."""
+    return float(outcome["lap_times_s"][-1]) if came_round(outcome) else float("nan")
+
+
+def ratios(known: Known, model: str, to: str) -> np.ndarray:
+    """Last lap of a model over that of another in each cell; NaN where one of them did not come round."""
+    return np.array([last_lap(models[model]) / last_lap(models[to]) for models in known.values()])
+
+
+def summary(known: Known) -> dict[str, Any]:
+    """For development and test cells: how often models came round, and laps over those of ``true`` and ``calibrated``."""
+    return {part: _summary({c: v for c, v in known.items() if c.is_test == test}) for part, test in _PARTS.items()}
+
+
+_PARTS = {"development": False, "test": True}
+
+
+def _summary(known: Known) -> dict[str, Any]:
+    if not known:
+        return {"cells": 0}
+    possible = {cell: models for cell, models in known.items() if came_round(models[TRUE])}
+    changed = {cell: models for cell, models in possible.items() if cell.change != "none"}
+    out: dict[str, Any] = {"cells": len(known), "possible": len(possible), "models": {}}
+    for model in next(iter(known.values())):
+        over_true, over_calibrated, of_changed = (
+            ratios(part, model, to) for part, to in ((possible, TRUE), (possible, CALIBRATED), (changed, CALIBRATED))
+        )
+        out["models"][model] = {
+            "came_round": sum(came_round(models[model]) for models in possible.values()),
+            "lost": [cell.name for cell, models in possible.items() if not came_round(models[model])],
+            "over_true": _middle_and_worst(over_true),
+            "over_calibrated": _middle_and_worst(over_calibrated),
+            "over_calibrated_changed": _middle_and_worst(of_changed),
+            "slowest": list(possible)[int(np.nanargmax(over_calibrated))].name
+            if np.isfinite(over_calibrated).any()
+            else "",
+            "p99_ms": max(models[model]["solve_ms"]["p99"] for models in known.values()),
+            "missing": sum(models[model]["infeasible"] + models[model]["late"] for models in known.values()),
+        }
+    return out
+
+
+def _middle_and_worst(values: np.ndarray) -> list[float] | None:
+    return [float(np.nanmedian(values)), float(np.nanmax(values))] if np.isfinite(values).any() else None
+
+
+def lap_times(known: Known) -> Figure:
+    """The last lap of each model over the true model's, a row for each cell."""
+    possible = (cell for cell in known if came_round(known[cell][TRUE]))
+    cells = sorted(possible, key=lambda cell: (cell.car, cell.change, cell.name))
+    names = [name for name in next(iter(known.values())) if name != TRUE and not name.endswith(AS_IS)]
+    colours = model_colours([TRUE, *names])
+    figure = Figure(figsize=(9.6, 1.4 + 0.2 * len(cells)), layout="constrained")
+    axes = figure.subplots()
+    for name, marker in zip(names, "osD^v<>", strict=False):
+        over = [last_lap(known[cell][name]) / last_lap(known[cell][TRUE]) for cell in cells]
+        axes.scatter(over, range(len(cells)), s=22, marker=marker, color=colours[name], label=name, alpha=0.8)
+    for row, cell in enumerate(cells):
+        lost = [name for name in names if not came_round(known[cell][name])]
+        if lost:
+            axes.text(1.0, row, f"  lost: {', '.join(lost)}", fontsize=6, va="center")
+    axes.axvline(1.0, color="black", lw=0.8)
+    axes.set_yticks(range(len(cells)), [f"{cell.name}{' *' if cell.is_test else ''}" for cell in cells], fontsize=6)
+    axes.set_ylim(len(cells) - 0.5, -0.5)
+    axes.set_xlabel("last lap over the true model's (* test cell)")
+    axes.legend(loc="upper right", fontsize=7)
+    axes.grid(axis="x", alpha=0.3)
+    return figure
+
+
+def page(known: Known, arguments: Sequence[str]) -> str:
+    """The results as Markdown; ``arguments`` of doit's command that differ from the default."""
+    return "\n".join(_lines(known, arguments)) + "\n"
+
+
+def _lines(known: Known, arguments: Sequence[str]) -> Iterator[str]:
+    yield "# Closed loop"
+    yield ""
+    command = " ".join(["python -m doit -n 2 -f benchmarks/closed_loop/dodo.py", *arguments])
+    tracking, progress = (f"{PACE[objective]:g}" for objective in OBJECTIVES)
+    yield (
+        f"Made by `{command}`. Each cell is {LAPS} laps of one car on a track that nothing was tuned on: a variation of a "
+        "built-in one by a seed. One change of the car is hidden from the models: 20 % less grip on a third of the lap, 15 % "
+        "less front grip, a steering offset of 0.02 rad, 10 % more mass, or half as much drag again. A hash of the cell's "
+        "name draws plant (steps of 1 ms, four wheels), noise (none, usual, three times), delay (none, a step) and objective "
+        f"(tracking at {tracking} of the limits, progress at {progress}). Models were trained on another track, of the car "
+        "without the change."
+    )
+    yield ""
+    yield (
+        "`true` knows the plant and the change. `calibrated` is the single-track car that the training calibrated. Models "
+        "are planned with as far as they have earned it, and once more as they are. Decisions were taken on development "
+        "cells; a hash of the name says which these are."
+    )
+    for label, content in summary(known).items():
+        if not content["cells"]:
+            continue
+        yield ""
+        yield f"## {label.capitalize()} cells ({content['possible']} of {content['cells']})"
+        yield ""
+        yield "Those in which the true model comes round between the borders."
+        yield ""
+        yield (
+            "| model | comes round | last lap over `true`: median, worst | over `calibrated`: median, worst | "
+            "changed cars, over `calibrated`: median, worst | worst p99 (ms) | plans missing |"
+        )
+        yield "| --- | --- | --- | --- | --- | --- | --- |"
+        for model, entry in content["models"].items():
+            over = " | ".join(_both(entry[key]) for key in ("over_true", "over_calibrated", "over_calibrated_changed"))
+            yield (
+                f"| `{model}` | {entry['came_round']} of {content['possible']} | {over} | {entry['p99_ms']:.1f} | "
+                f"{entry['missing']} |"
+            )
+        yield ""
+        for model, entry in content["models"].items():
+            if entry["lost"]:
+                yield f"- `{model}` is lost in {', '.join(entry['lost'])}."
+    yield ""
+    yield f"![Last laps over the true model's]({FIGURE})"
+
+
+def _both(values: Sequence[float] | None) -> str:
+    return "–" if values is None else ", ".join(f"{value:.3f}" for value in values)

@@ -1,0 +1,67 @@
+"""Driving the cells with each model in the controller."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from benchmarks.closed_loop.cells import LAPS, PACE, Cell
+from benchmarks.generalisation.cells import simulated_car
+from benchmarks.generalisation.run import model_folder
+from dynssm_ros.control.prediction_model import Adaptive, PredictionModel
+from dynssm_ros.control.race import Course, race
+from dynssm_ros.control.race_models import TRUE, true_model
+from dynssm_ros.control.reference import load_reference
+from dynssm_ros.control.settings import Settings
+from dynssm_ros.files import write_json
+from dynssm_ros.runtime.models import SingleTrack, load_model
+
+CALIBRATED = "calibrated"
+AS_IS = " as it is"
+"""Ends the name of a model that needs no evidence."""
+
+
+def cell_file(cell: Cell, out: Path) -> Path:
+    """Where the outcome of a cell is."""
+    return out / "cells" / f"{cell.name}.json"
+
+
+def race_cell(cell: Cell, out: Path, trained: Path, models: Iterable[str]) -> None:
+    """Drives a cell with the true model, the calibrated car and all ``models``, each with evidence and as it is.
+
+    Args:
+        cell: to drive.
+        out: folder of the outcomes.
+        trained: folder of the generalisation matrix, which has the models.
+        models: by name.
+    """
+    car, road = simulated_car(cell.car), cell.road
+    driven = car.with_effects(cell.effects.items())
+    reference = load_reference("racing", car, road, PACE[cell.objective])
+    folders = {name: model_folder(cell.training, name, trained) for name in models}
+    calibrated = load_model(next(iter(folders.values()))).vehicle
+    assert calibrated is not None
+    outcomes: dict[str, Any] = {}
+
+    def drive(name: str, model: PredictionModel, evidence: bool = True) -> None:
+        settings = Settings.of(car, cell.objective, evidence=evidence)
+        course = Course(driven, road, cell.plant, reference, settings, LAPS, sensing=cell.sensing)
+        outcomes[name] = race(course, model).to_json()
+
+    drive(TRUE, true_model(driven, cell.plant))
+    drive(CALIBRATED, Adaptive(SingleTrack(calibrated), car))
+    for name, folder in folders.items():
+        drive(name, Adaptive(load_model(folder), car))
+        drive(name + AS_IS, Adaptive(load_model(folder), car), evidence=False)
+    write_json(cell_file(cell, out), {"models": outcomes})
+
+
+def read_cell(cell: Cell, out: Path) -> dict[str, Any] | None:
+    """The outcome of a cell by model; ``None`` if it was not driven."""
+    file = cell_file(cell, out)
+    if not file.exists():
+        return None
+    outcome: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))["models"]
+    return outcome

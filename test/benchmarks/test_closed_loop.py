@@ -1,0 +1,77 @@
+"""The robustness matrix: its cells, their split, its tracks and its page."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from benchmarks.closed_loop.cells import CHANGES, OBJECTIVES, PLANTS, TRACKS, cells, variation
+from benchmarks.closed_loop.page import lap_times, page, summary
+from benchmarks.closed_loop.run import AS_IS, race_cell, read_cell
+from benchmarks.generalisation.cells import CARS, NOISE_LEVELS
+from benchmarks.generalisation.run import model_folder
+from dynssm_ros.track.tracks import load_track
+
+
+def outcome(lap, violation=False, completed=True):
+    return {
+        "completed": completed, "violation": violation, "lap_times_s": [lap + 0.1, lap], "solve_ms": {"p50": 2.0, "p99": 3.0},
+        "infeasible": 0, "late": 1,
+    }  # fmt: skip
+
+
+def test_every_combination_is_a_cell_and_all_that_is_drawn_occurs():
+    every = list(cells())
+    assert len({cell.name for cell in every}) == len(every) == len(CARS) * len(TRACKS) * len(CHANGES)
+    assert 0.35 < np.mean([cell.is_test for cell in every]) < 0.65
+    assert set(Counter(cell.plant for cell in every)) == set(PLANTS)
+    assert set(Counter(cell.noise for cell in every)) == set(NOISE_LEVELS)
+    assert set(Counter((cell.objective, cell.late) for cell in every)) == {
+        (o, d) for o in OBJECTIVES for d in (True, False)
+    }
+
+
+@pytest.mark.parametrize("track", TRACKS)
+def test_a_variation_can_be_driven_and_is_another_track(track):
+    name, seed = track
+    base = load_track(name)
+    bent = variation(base, seed)
+    assert bent.name == f"{name}_{seed}"
+    assert np.abs(base.project(bent.centre.points)[1]).max() > 0.25 * float(base.width_left[0])
+    np.testing.assert_array_equal(bent.centre.points, variation(base, seed).centre.points)
+    assert (
+        1.0 / np.abs(bent.centre.curvature(bent.centre.s)).max()
+        > 0.75 / np.abs(base.centre.curvature(base.centre.s)).max()
+    )
+
+
+def test_the_page_counts_those_that_come_round_and_compares_last_laps():
+    every = list(cells())[:3]
+    known = {
+        every[0]: {"true": outcome(10.0), "calibrated": outcome(11.0), "dynssm": outcome(10.5)},
+        every[1]: {"true": outcome(10.0), "calibrated": outcome(10.0), "dynssm": outcome(10.0, violation=True)},
+        every[2]: {"true": outcome(10.0, completed=False), "calibrated": outcome(9.0), "dynssm": outcome(9.0)},
+    }
+    parts = summary(known).values()
+    assert sum(part["cells"] for part in parts) == 3
+    assert sum(part["possible"] for part in parts if part["cells"]) == 2
+    models = [part["models"]["dynssm"] for part in parts if part["cells"]]
+    assert sum(model["came_round"] for model in models) == 1
+    assert [name for model in models for name in model["lost"]] == [every[1].name]
+    words = page(known, ["part=all"])
+    assert "dodo.py part=all" in words
+    assert every[1].name in words
+    assert len(lap_times(known).axes) == 1
+
+
+@pytest.mark.timeout(300)
+def test_a_cell_is_driven_with_each_model(small_model, tmp_path):
+    (cell,) = [each for each in cells() if each.name == "orca-club_11-none"]
+    folder = model_folder(cell.training, "small", tmp_path / "trained")
+    folder.parent.mkdir(parents=True)
+    folder.symlink_to(small_model)
+    race_cell(cell, tmp_path, tmp_path / "trained", ["small"])
+    found = read_cell(cell, tmp_path)
+    assert list(found) == ["true", "calibrated", "small", "small" + AS_IS]
+    assert found["true"]["completed"]
+    assert len(found["calibrated"]["lap_times_s"]) == 2
