@@ -8,7 +8,10 @@ from benchmarks.hidden_causes.cases import Case, Hidden
 from benchmarks.hidden_causes.outcomes import Outcome, rates
 
 PAGE, FIGURE = "hidden_causes.md", "hidden_causes_confusion.png"
-GOALS = {"named_first": 0.95, "right_size": 0.95, "both_found": 0.85, "false_alarms": 0.05}
+GOALS = {
+    "strictly_first": ">= 95, 80, 80 %", "right_size": ">= 90 %", "covered": "85 to 95 %", "both_found": ">= 80 %",
+    "false_alarms": "<= 2 % each",
+}  # fmt: skip
 _IN_WORDS = {
     "named_first": "the hidden effect, or an alternative reported with it, is named first",
     "strictly_first": "the same without alternatives",
@@ -51,7 +54,7 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
         rate = overall[name]
         if rate["of"]:
             low, high = rate["interval_95"]
-            goal = "" if name not in GOALS else f"{'<=' if name == 'false_alarms' else '>='} {100 * GOALS[name]:.0f} %"
+            goal = GOALS.get(name, "")
             each = " | ".join(f"{one[name]['count']} of {one[name]['of']}" for one in by_plant)
             yield (
                 f"| {words} | {rate['of']} | {100 * rate['share']:.0f} % | {100 * low:.0f} to {100 * high:.0f} % | {goal} "

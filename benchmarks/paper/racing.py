@@ -61,7 +61,7 @@ class DriveLaps(Step):
         if race.lap_length is not None:
             track = track.scaled(race.lap_length / track.length)
         reference = load_reference(str(self._line()), vehicle, track, race.speed_scale)
-        settings = Settings.of(vehicle, race.objective, race.horizon, race.offset_free)
+        settings = Settings.of(vehicle, race.objective, race.horizon, race.offset_free, evidence=False)
         course = Course(driven, track, race.plant, reference, settings, race.laps, Start(speed=race.speed))
         models = [name for name in race.models if self.trained.get(name) in there or name not in self.trained]
         races = [drive(course, self._knowledge(name, driven, root)) for name in models]

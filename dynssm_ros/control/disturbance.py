@@ -3,12 +3,17 @@
 The error of each one-step prediction moves an estimate of a constant disturbance of the velocities, which is then added to
 the model over the whole horizon. A model without error is left as it is; one with a constant error loses it.
 
+How fast the estimate follows is found from the data, as in :mod:`dynssm_ros.control.state_estimator`: estimates of several
+rates run side by side, and the one that has expected the last errors best is added, unless nothing does as well. So noise
+alone adds nothing, and a patch of little grip is felt within a few steps.
+
 Pannocchia, Rawlings, "Disturbance models for offset-free model-predictive control", AIChE Journal 49, 2003.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,40 +21,55 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.control.settings import Settings
 
-SETTLING = 1.0  # in units of the car's time: that after which 63 % of a constant disturbance are found
+SETTLING = (
+    1.0  # in units of the car's time: that after which 63 % of a constant disturbance are found, if it is asked for
+)
+_SHARES = (0.0, 0.05, 0.15, 0.4)  # among which the data choose
+_MEMORY = 2.4  # in units of the car's time, over which they are compared
+_CLEARLY = 0.8  # of the mean square error without an estimate
+_WARM_UP = 5  # errors
 
 
 class Disturbance:
     """An estimate of what is to be added to a model's step in ``v_x, v_y, omega`` (m/s, m/s, rad/s).
 
     Args:
-        share: of the error of each prediction by which the estimate moves; 0: it stays at nothing.
+        shares: of the error of each prediction by which estimates move, the preferred one first; 0: it stays at nothing.
         largest: error of ``v_x, v_y, omega`` up to which a prediction counts, shape ``(3,)``; what is beyond is no error of a
             model, but of the measurement.
+        forget: share by which each error replaces the mean of those before, in the comparison of the estimates.
     """
 
-    def __init__(self, share: float, largest: Vector) -> None:
-        self._share = share
+    def __init__(self, shares: Sequence[float], largest: Vector, forget: float = 1.0) -> None:
+        self._shares = np.array(shares)[:, None]
         self._largest = largest
+        self._forget = forget
         self.forget()
 
     @classmethod
     def none(cls) -> Disturbance:
         """One that stays at nothing."""
-        return cls(0.0, np.zeros(3))
+        return cls((0.0,), np.zeros(3))
 
     @classmethod
     def of(cls, settings: Settings, T_s: float) -> Disturbance:
-        """With the controller's settings; an error counts up to what all the grip of the car makes in a step of T_s (s)."""
+        """With the controller's settings; an error counts up to what all the grip of the car makes in a step of T_s (s).
+
+        It follows as :attr:`Settings.follows` says.
+        """
         length, time = settings.scale.length, settings.scale.time
         velocity = length / time**2 * T_s
-        share = -math.expm1(-T_s / (SETTLING * time)) if settings.offset_free else 0.0
-        return cls(share, np.array([velocity, velocity, 2 * velocity / length]))
+        always = -math.expm1(-T_s / (SETTLING * time))
+        shares = {"always": (always,), "chosen": _SHARES, "never": (0.0,)}[settings.follows]
+        return cls(shares, np.array([velocity, velocity, 2 * velocity / length]), min(1.0, T_s / (_MEMORY * time)))
 
     def forget(self) -> None:
         """Begins anew, as after a gap in what was measured: at nothing."""
         self.value = np.zeros(3)
         """The estimate, shape ``(3,)``."""
+        self._estimates = np.zeros((len(self._shares), 3))
+        self._squares = np.zeros((len(self._shares), 3))
+        self._count = 0
         self.interrupted()
 
     def interrupted(self) -> None:
@@ -69,5 +89,15 @@ class Disturbance:
         if self._expected is not None:
             error = seen - self._expected
             if np.all(np.abs(error) <= self._largest):
-                self.value = self.value + self._share * error
+                self._follow(error + self.value)
         self.interrupted()
+
+    def _follow(self, error: Vector) -> None:
+        """Takes the error of the model itself, shape ``(3,)``."""
+        innovations = error - self._estimates
+        self._count += 1
+        self._squares += max(self._forget, 1.0 / self._count) * (innovations**2 - self._squares)
+        self._estimates = self._estimates + self._shares * innovations
+        best, channels = np.argmin(self._squares, axis=0), np.arange(3)
+        clear = (self._squares[best, channels] < _CLEARLY * self._squares[0]) & (self._count > _WARM_UP)
+        self.value = self._estimates[np.where(clear, best, 0), channels]

@@ -129,7 +129,7 @@ class LiveController:
         """T_s (ns): a command acts that long after the stamp of the odometry that it answers."""
         self.remote = RemoteModel(vehicle, max_age, Disturbance.of(settings, vehicle.sampling_time))
         """What the predictor says; what that mispredicts is told where it is measured, and not from where it is planned."""
-        settings = replace(settings, offset_free=False)
+        settings = replace(settings, follows="never")
         self._pilot = Controller(self.remote, vehicle.inputs, reference, track, settings, clock)
         self._pursuit = Driver(vehicle, reference.line, vehicle_limits(vehicle), _LAUNCH_STYLE)
         self._reference = reference

@@ -20,6 +20,8 @@ from dynssm_ros.vehicle import Coefficients, Vehicle
 from dynssm_ros.vehicle.single_track import lateral_force
 
 Objective = Literal["tracking", "progress"]
+Follows = Literal["chosen", "always", "never"]
+"""How what the model mispredicts is followed."""
 
 HORIZON = 3.5  # in units of the car's time: 15 steps of 20 ms for the 1:43 car, 40 of 40 ms for an Indy car
 # shares of what the tyres can give up to which an axle is used: beyond its peak the front gives less for more steering, and
@@ -98,7 +100,8 @@ class Settings:
         margin: distance to keep between the car's centre and the borders (m).
         slip: slip angles of front and rear axle that no step is to exceed (rad).
         lag_bound: how far the place where a car that keeps the line's time would be is from this one (m) at most.
-        offset_free: whether what the model mispredicts is added to it; see :mod:`dynssm_ros.control.disturbance`.
+        follows: whether what the model mispredicts is added to it: at a rate that the data choose, at a fixed one, or not at
+            all; see :mod:`dynssm_ros.control.disturbance`.
         evidence: whether what a model says is planned with only where it has predicted better than the calibrated car; see
             :mod:`dynssm_ros.control.evidence`.
         travel: what carries the pose over a step.
@@ -111,7 +114,7 @@ class Settings:
     margin: float = 0.0
     slip: tuple[float, float] = (math.inf, math.inf)
     lag_bound: float = 0.0
-    offset_free: bool = False
+    follows: Follows = "chosen"
     evidence: bool = True
     travel: Travel = "middle"
 
@@ -130,8 +133,8 @@ class Settings:
             vehicle: the car as its file describes it.
             objective: see above.
             N: steps of the horizon; ``None``: ``HORIZON``.
-            offset_free: see above.
-            evidence: see above.
+            offset_free: what the model mispredicts is followed at a fixed rate.
+            evidence: see above; without it, and unless ``offset_free``, the model is planned with as it is.
 
         Raises:
             UserError: the car cannot drive, brake or corner.
@@ -142,7 +145,8 @@ class Settings:
         th = Coefficients(*vehicle.nominal)
         slip = _slip(_FRONT_USED, th.B_f, th.C_f, th.E_f), _slip(_REAR_USED, th.B_r, th.C_r, th.E_r)
         lag_bound = _LAG_BOUND_WHEELBASES * scale.length
-        return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip, lag_bound, offset_free, evidence)
+        follows: Follows = "always" if offset_free else "chosen" if evidence else "never"
+        return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip, lag_bound, follows, evidence)
 
     @property
     def weights(self) -> Weights:

@@ -41,7 +41,7 @@ def race_json(races: Sequence[Race]) -> dict[str, Any]:
         "line_lap_time_s": course.reference.lap_time,
         "line_full_throttle_s": course.reference.full_throttle_time,
         "horizon": course.settings.N,
-        "offset_free": course.settings.offset_free,
+        "offset_free": course.settings.follows == "always",
         "as_is": not course.settings.evidence,
         "laps": course.laps,
         "noise": list(course.sensing.noise),
@@ -162,12 +162,17 @@ def _protocol(course: Course) -> dict[str, str]:
         f"own speed, {course.reference.full_throttle_time:.3f} s with no more than full throttle",
         "Controller": f"{settings.objective}, {settings.N} steps of {course.vehicle.sampling_time:g} s, late after "
         f"{1e3 * settings.deadline:g} ms; weights {weights}, in wheelbases and units of {settings.scale.time:.3g} s; what a "
-        f"model mispredicts is {'added to it (offset-free)' if settings.offset_free else 'left as it is'}; what it adapts is "
+        f"model mispredicts is {_FOLLOWED[settings.follows]}; what it adapts is "
         f"planned with {'where it was better over the last horizons' if settings.evidence else 'as it is'}",
         "Measured": _measured(course),
         "Time": "of a control step: model and plan together, the processor's time on one core",
         "Violation": VIOLATION,
     }
+
+
+_FOLLOWED = {
+    "chosen": "added to it at a rate that the data choose", "always": "added to it (offset-free)", "never": "left as it is",
+}  # fmt: skip
 
 
 def _measured(course: Course) -> str:

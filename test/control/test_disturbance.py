@@ -39,9 +39,21 @@ def test_a_constant_error_is_found_in_the_time_stated(settings):
     np.testing.assert_allclose(found, share * CONSTANT, rtol=1e-12)
 
 
-def test_it_stays_at_nothing_unless_asked_for(settings):
-    found = with_errors(Disturbance.of(replace(settings, offset_free=False), 0.02), [CONSTANT] * 5)
+def test_it_stays_at_nothing_where_models_are_planned_with_as_they_are(settings):
+    as_they_are = replace(settings, follows="never")
+    found = with_errors(Disturbance.of(as_they_are, 0.02), [CONSTANT] * 50)
     np.testing.assert_array_equal(found, 0.0)
+
+
+def test_noise_alone_adds_nothing_and_a_sudden_error_is_found_in_a_few_steps(settings):
+    """The model is right for 300 steps of noise, and wrong from then on."""
+    noise = np.array([0.005, 0.01, 0.05]) * np.random.default_rng(3).standard_normal((330, 3))
+    noise[300:] += 5 * CONSTANT
+    disturbance = Disturbance.of(replace(settings, follows="chosen"), 0.02)
+    found = np.array([with_errors(disturbance, [error]) for error in noise])
+    before, after = found[:300], found[310:]
+    assert np.all(np.abs(before).mean(axis=0) < 0.1 * noise[:300].std(axis=0))
+    np.testing.assert_allclose(after.mean(axis=0), 5 * CONSTANT, rtol=0.2)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1e9])
@@ -69,7 +81,7 @@ def test_the_true_model_drives_as_without(orca, club, club_line, settings):
     """On the plant that it is the model of, to rounding, which the car's motion carries on."""
     course = Course(orca, club, "euler", club_line, settings)
     followed = race(course, true_model(orca, "euler"))
-    plain = race(replace(course, settings=replace(settings, offset_free=False)), true_model(orca, "euler"))
+    plain = race(replace(course, settings=replace(settings, follows="never")), true_model(orca, "euler"))
     np.testing.assert_allclose(followed.lap_times, plain.lap_times, rtol=0, atol=1e-9)
     assert np.max(np.abs(followed.correction)) < 1e-9
 
@@ -95,10 +107,10 @@ def test_a_wrong_coefficient_leaves_no_steady_offset(orca, circle, settings):
     believed = Fixed("weak", true_model(orca, "euler").car, wrong)
     beside, found = {}, {}
     _, exact = steady(orca, (track, reference, settings), true_model(orca, "euler"))
-    for offset_free in (False, True):
-        decision, radius = steady(orca, (track, reference, replace(settings, offset_free=offset_free)), believed)
-        beside[offset_free], found[offset_free] = abs(radius - exact), decision.correction
-    assert beside[False] > 1e-3
-    assert beside[True] < 0.05 * beside[False]
-    np.testing.assert_array_equal(found[False], 0.0)
-    assert found[True][2] > 0.1  # a turn that the weak tyre does not explain
+    for follows in ("never", "always", "chosen"):
+        decision, radius = steady(orca, (track, reference, replace(settings, follows=follows)), believed)
+        beside[follows], found[follows] = abs(radius - exact), decision.correction
+    assert beside["never"] > 1e-3
+    assert max(beside["always"], beside["chosen"]) < 0.05 * beside["never"]
+    np.testing.assert_array_equal(found["never"], 0.0)
+    assert found["always"][2] > 0.1  # a turn that the weak tyre does not explain

@@ -162,7 +162,7 @@ def test_answers_of_another_time_do_not_count(remote, theta):
 
 def test_what_the_predictor_misses_is_found_from_the_odometry(orca, theta):
     """A car that turns 0.3 rad/s faster after each step than was expected; a step that was late tells nothing."""
-    remote, missed = RemoteModel(orca, 0.1, Disturbance(0.5, np.full(3, 10.0))), np.array([0.0, 0.0, 0.3])
+    remote, missed = RemoteModel(orca, 0.1, Disturbance((0.5,), np.full(3, 10.0))), np.array([0.0, 0.0, 0.3])
 
     def moved(stamp: int, seen: np.ndarray) -> np.ndarray:
         x = remote.start(Pose(0.0, 0.0, 0.5), State(*seen), APPLIED, CONTEXT, None)
