@@ -457,7 +457,7 @@ def race(
         speed_scale: share of the car's limits in the line's speed; of a file, factor on it.
         horizon: steps of T_s that are planned ahead; as the car needs if not given.
         along_horizon: read the models anew at every step of the horizon.
-        offset_free: follow what each model mispredicts, and add it.
+        offset_free: follow what each model mispredicts at a fixed rate, not at one that the data choose.
         effects: physics that the plant has and no model but ``true`` knows, by name, with parameters.
         scale: of the track.
         lap_length: or the length that it is scaled to (m).

@@ -65,7 +65,9 @@ def race(
     ] = False,
     offset_free: Annotated[
         bool,
-        typer.Option("--offset-free", help="Follow what each model mispredicts, and add it to what the model says."),
+        typer.Option(
+            "--offset-free", help="Follow what each model mispredicts at a fixed rate, not at one that the data choose."
+        ),
     ] = False,
     as_is: Annotated[
         bool,

@@ -101,7 +101,7 @@ class Controller:
         self._nmpc = Nmpc(horizon, limits, reference, track, settings, clock)
         self._disturbance = Disturbance.of(settings, model.car.T_s)
         self._estimator = StateEstimator(model.car.T_s)
-        self._evidence = Evidence(self._nmpc.following, settings.N)
+        self._evidence = Evidence(self._nmpc.following, settings.N, model.car.T_s)
         self._wants_evidence = settings.evidence
         self._history: deque[Vector] = deque(maxlen=max(model.H, 1))
         self._commands: deque[Applied] = deque(maxlen=MOST_LATE + 1)
@@ -119,6 +119,13 @@ class Controller:
         self._past: Vector | None = None  # the estimated state at the last measurement
         self._expected: Vector | None = None  # by the model, at the next one
 
+    def interrupt(self) -> None:
+        """What is measured next is not one T_s after what was measured last."""
+        self._past = self._expected = None
+        self._disturbance.interrupted()
+        self._estimator.forget()
+        self._evidence.interrupt()
+
     def step(self, t: float, pose: Pose, seen: State, feedback: Applied, age: int = 0) -> Decision:
         """One control step.
 
@@ -130,7 +137,7 @@ class Controller:
             pose: where the car was measured to be (m, m, rad).
             seen: its measured velocities (m/s, m/s, rad/s).
             feedback: what its actuators do now.
-            age: steps of T_s since the measurement, at most :data:`MOST_LATE`. While it grows, as after the start, the
+            age: steps of T_s since the measurement, less than :data:`MOST_LATE`. While it grows, as after the start, the
                 measurement counts as the one before.
 
         Returns:
@@ -139,7 +146,8 @@ class Controller:
         began = self._clock()
         previous = self._nmpc.previous
         self._commands.append(feedback)
-        age = min(age, len(self._commands) - 1)
+        while len(self._commands) <= age < MOST_LATE:
+            self._commands.append(feedback)  # what was sent before the start
         commands = [*self._commands][-1 - age :]
         sent: Vector = np.diff(np.array(commands), axis=0)  # increments since the measurement
         at = t - age * self._model.car.T_s  # when it was measured

@@ -25,8 +25,8 @@ SETTLING = (
     1.0  # in units of the car's time: that after which 63 % of a constant disturbance are found, if it is asked for
 )
 _SHARES = (0.0, 0.05, 0.15, 0.4)  # among which the data choose
-_MEMORY = 2.4  # in units of the car's time, over which they are compared
-_CLEARLY = 0.8  # of the mean square error without an estimate
+_MEMORY = 5.0  # in units of the car's time, over which they are compared
+_CLEARLY = 0.7  # of the mean square error without an estimate
 _WARM_UP = 5  # errors
 
 

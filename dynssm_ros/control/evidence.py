@@ -2,8 +2,9 @@
 
 A plan rests on where the car will be at the end of the horizon, and not on the next row. So every few steps the car is
 predicted from where it was measured, once by the calibrated car, once with the adapted coefficients, once with what the model
-adds to them as well. The commands are those that were sent. At the end of the horizon each path is compared with the measured
-one. Without evidence, and where the calibrated car has been as good lately, the calibrated car is planned with.
+adds to them as well. The commands are those that were sent. Both the predicted and the measured path follow from their
+velocities, so that neither the noise of a pose nor its kinematics matter. At the end of the horizon they are compared.
+Without evidence, and where the calibrated car has been as good lately, the calibrated car is planned with.
 
 Choosing by what was predicted before it was seen is prequential model selection (Dawid 1984).
 """
@@ -17,12 +18,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Mask, Vector
+from dynssm_ros.control.horizon_model import STATES
 from dynssm_ros.control.nmpc import Adapted
+from dynssm_ros.vehicle import State
+from dynssm_ros.vehicle.kinematics import Pose, advance_pose
 
 Source = Literal["calibrated", "coefficients", "model"]
 SOURCES: tuple[Source, ...] = ("calibrated", "coefficients", "model")
 """The calibrated car; with the adapted coefficients; with all that the model says."""
 
+_VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
 _AT_ONCE = 4  # horizons under way
 _REMEMBERED = 20  # horizons that the comparison is of
 _FEWEST = 6  # of them, before anything is believed
@@ -40,6 +45,10 @@ class _Rollouts(NamedTuple):
 
     states: Vector
     """``(n, size)``."""
+    paths: Vector
+    """Poses on the way, from the predicted velocities, ``(n, 3)``."""
+    measured: Vector
+    """Poses on the way, from the measured ones, ``(n, 3)``."""
     said: Adapted
     """What they are predicted with, ``(n, 17)`` and ``(n, 3)``."""
     distances: Vector
@@ -50,7 +59,8 @@ class _Rollouts(NamedTuple):
     def at(self, chosen: Mask) -> _Rollouts:
         """Some of them."""
         said = Adapted(self.said.theta[chosen], self.said.correction[chosen])
-        return _Rollouts(self.states[chosen], said, self.distances[chosen], self.left[chosen])
+        states, paths, measured = (part[chosen] for part in (self.states, self.paths, self.measured))
+        return _Rollouts(states, paths, measured, said, self.distances[chosen], self.left[chosen])
 
 
 class Evidence:
@@ -59,10 +69,12 @@ class Evidence:
     Args:
         following: one step of the car.
         steps: of the horizon.
+        T_s: length of a step (s).
     """
 
-    def __init__(self, following: Following, steps: int) -> None:
+    def __init__(self, following: Following, steps: int, T_s: float) -> None:
         self._following = following
+        self._T_s = T_s
         self._steps = steps
         self._every = max(1, steps // _AT_ONCE)
         self._rate = -math.expm1(-1.0 / (_SETTLING * steps))
@@ -81,7 +93,7 @@ class Evidence:
         """Drops what is under way: the next state does not follow on the last one."""
         self._under_way: _Rollouts | None = None
         self._since = 0
-        self._sent: tuple[Vector, float] | None = None
+        self._sent: tuple[Vector, Vector, float] | None = None
 
     @property
     def source(self) -> Source:
@@ -116,7 +128,7 @@ class Evidence:
         """
         if self._under_way is not None and self._sent is not None:
             self._under_way = self._advanced(self._under_way, state)
-        self._sent = increments, t
+        self._sent = state, increments, t
         if self._since % self._every == 0:
             self._under_way = self._started(state, _first(calibrated), _first(said))
         self._since += 1
@@ -127,6 +139,8 @@ class Evidence:
         n = len(SOURCES)
         new = _Rollouts(
             np.tile(state, (n, 1)),
+            np.zeros((n, 3)),
+            np.zeros((n, 3)),
             Adapted(*(np.stack(parts) for parts in zip(*sources, strict=True))),
             np.zeros(n),
             np.full(n, float(self._steps)),
@@ -135,20 +149,36 @@ class Evidence:
         if old is None:
             return new
         said = Adapted(*(np.concatenate(parts) for parts in zip(old.said, new.said, strict=True)))
-        parts = ((old.states, new.states), (old.distances, new.distances), (old.left, new.left))
-        states, distances, left = (np.concatenate(pair) for pair in parts)
-        return _Rollouts(states, said, distances, left)
+        return _Rollouts(
+            np.concatenate([old.states, new.states]),
+            np.concatenate([old.paths, new.paths]),
+            np.concatenate([old.measured, new.measured]),
+            said,
+            np.concatenate([old.distances, new.distances]),
+            np.concatenate([old.left, new.left]),
+        )
 
     def _advanced(self, rollouts: _Rollouts, measured: Vector) -> _Rollouts:
         """All one step further; those at their end are compared with what was measured, and dropped."""
         assert self._sent is not None
-        states = self._following(rollouts.states, self._sent[0], rollouts.said, self._sent[1])
-        distances = rollouts.distances + np.hypot(*(states[:, :2] - measured[:2]).T)
-        moved = rollouts._replace(states=states, distances=distances, left=rollouts.left - 1.0)
+        before, increments, t = self._sent
+        states = self._following(rollouts.states, increments, rollouts.said, t)
+        paths = self._moved(rollouts.paths, rollouts.states, states)
+        reached = self._moved(rollouts.measured, before[None], measured[None])
+        distances = rollouts.distances + np.hypot(*(paths - reached)[:, :2].T)
+        moved = rollouts._replace(
+            states=states, paths=paths, measured=reached, distances=distances, left=rollouts.left - 1.0
+        )
         done = moved.left <= 0
         if done.any():
             self._compare(moved.distances[done])
         return moved.at(~done)
+
+    def _moved(self, poses: Vector, before: Vector, after: Vector) -> Vector:
+        """Poses ``(n, 3)`` one step on, by the velocities of the states ``(n, size)`` before and after it."""
+        first, second = (State(*states[:, _VELOCITIES].T) for states in (before, after))
+        moved = advance_pose(np, Pose(*poses.T), first, second, self._T_s)
+        return np.stack(np.broadcast_arrays(*moved), axis=1)
 
     def _compare(self, distances: Vector) -> None:
         distances = np.nan_to_num(distances, nan=math.inf, posinf=math.inf) + _NEAR

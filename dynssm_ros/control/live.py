@@ -14,14 +14,12 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import get_args
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.controller import LOST, Controller
-from dynssm_ros.control.disturbance import Disturbance
 from dynssm_ros.control.evidence import SOURCES
 from dynssm_ros.control.horizon_model import STATES
 from dynssm_ros.control.nmpc import Status
@@ -41,6 +39,7 @@ _LAUNCH_STYLE = Style(aggressiveness=0.7, variation=0.0)
 _REMEMBERED = 1000  # control steps that the percentiles are of
 _TOLERATED = 0.01  # share of plans that may be missing before it is called a warning
 _LARGEST = 1e6  # m, rad, m/s, rad/s; what is larger is as good as infinite
+_PUNCTUAL = 0.02  # of T_s by which odometry may be off for its difference to the one before to be that of a step
 _EARLY = 0.25  # of T_s that odometry may come before its time; what comes earlier is for a later step
 
 
@@ -127,9 +126,8 @@ class LiveController:
         self.vehicle = vehicle
         self.period = round(vehicle.sampling_time * 1e9)
         """T_s (ns): a command acts that long after the stamp of the odometry that it answers."""
-        self.remote = RemoteModel(vehicle, max_age, Disturbance.of(settings, vehicle.sampling_time))
-        """What the predictor says; what that mispredicts is told where it is measured, and not from where it is planned."""
-        settings = replace(settings, follows="never")
+        self.remote = RemoteModel(vehicle, max_age)
+        """What the predictor says."""
         self._pilot = Controller(self.remote, vehicle.inputs, reference, track, settings, clock)
         self._pursuit = Driver(vehicle, reference.line, vehicle_limits(vehicle), _LAUNCH_STYLE)
         self._reference = reference
@@ -153,6 +151,7 @@ class LiveController:
         self._heading = 0.0
         self._sent = Applied(0.0, 0.0)
         self._weights = np.zeros(len(SOURCES))
+        self._planned_with = self.remote.calibrated
         self._restart()
         self.remote.forget()
 
@@ -185,6 +184,8 @@ class LiveController:
             return None
         if not together:
             self._restart()
+        elif abs(stamp - self._planned - self.period) > _PUNCTUAL * self.period:
+            self._pilot.interrupt()
         if since < 0:
             self.remote.forget()
         if since < 0 or self._last is None:
@@ -203,8 +204,8 @@ class LiveController:
         self.remote.measured(stamp, x, context)
         self.remote.update(stamp)
         following = self.remote.ahead(x, context)
-        ahead = Pose(*following[:3].tolist()), State(*following[3:6].tolist())
-        self._sent = self._pursued(*ahead) or self._planned_command(t + self.period / 1e9, *ahead)
+        pursued = self._pursued(Pose(*following[:3].tolist()), State(*following[3:6].tolist()))
+        self._sent = pursued or self._planned_command(t, Pose(pose.x, pose.y, self._heading), seen)
         return self._sent
 
     def _pursued(self, pose: Pose, state: State) -> Applied | None:
@@ -218,9 +219,10 @@ class LiveController:
         return self._pursuit.command(0.0, pose, state, on_line, self._sent) if launching else None
 
     def _planned_command(self, t: float, pose: Pose, state: State) -> Applied:
-        decision = self._pilot.step(t, pose, state, self._sent)
+        """The pilot's command for one T_s after the odometry at ``t`` (s)."""
+        decision = self._pilot.step(t + self.period / 1e9, pose, state, self._sent, age=1)
         self._memory = decision.plan.x[0, len(STATES) :]
-        self._weights = decision.weights
+        self._weights, self._planned_with = decision.weights, decision.adapted
         self.counts[decision.plan.status] += 1
         self._recent.append((decision.seconds, decision.plan.status == "solved"))
         return decision.command
@@ -247,7 +249,7 @@ class LiveController:
         """All figures by name, for the key-value list of a diagnostic status."""
         p50, p99 = np.percentile([seconds for seconds, _ in self._recent] or [math.nan], [50, 99])
         laps, output = self.laps, self.remote.output
-        theta, correction = (np.atleast_2d(part)[0] for part in self.remote.planned_with)
+        theta, correction = (np.atleast_2d(part)[0] for part in self._planned_with)
         return {
             "coefficients": output.source,
             **{f"planned with {source}": f"{w:.2f}" for source, w in zip(SOURCES, self._weights, strict=True)},

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.control.disturbance import Disturbance
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, STATES, HorizonModel, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Plan
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
@@ -19,7 +18,6 @@ Context = tuple[float, float, float]
 """Time (s), place on the track (m) and length of the lap (m): what effects may read beside the pose."""
 
 _VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
-_PUNCTUAL = 0.02  # of T_s by which odometry may be off for its difference to the one before to be that of a step
 _ROUNDING = 1e-5  # of a coefficient's range: predictors compute in single precision
 
 
@@ -47,7 +45,6 @@ class RemoteModel:
     Args:
         vehicle: the car.
         max_age: how old the odometry behind the coefficients may be (s).
-        disturbance: follows what the next odometry differs by from what was expected, and is added; ``None``: nothing is.
     """
 
     name = "predictor"
@@ -56,13 +53,11 @@ class RemoteModel:
     ADAPTED = "adapted coefficients"
     CORRECTED = "nominal car, corrected"
 
-    def __init__(self, vehicle: Vehicle, max_age: float, disturbance: Disturbance | None = None) -> None:
+    def __init__(self, vehicle: Vehicle, max_age: float) -> None:
         self.car = SteppedCar.of(vehicle)
         self._model = HorizonModel(self.car, 1)
         self._period = round(vehicle.sampling_time * 1e9)
         self._max_age = max_age * 1e9
-        self._disturbance = disturbance or Disturbance.none()
-        self._stamp = 0  # of the last odometry (ns)
         self._lower, self._upper = vehicle.lower, vehicle.upper
         self.calibrated = Adapted(vehicle.nominal, np.zeros(3))
         self._nothing = ModelOutput(self.calibrated, self.NOMINAL, np.inf)
@@ -130,10 +125,6 @@ class RemoteModel:
             context: then.
         """
         self._start[stamp + self._period] = x, context
-        if abs(stamp - self._stamp - self._period) > _PUNCTUAL * self._period:
-            self._disturbance.interrupted()
-        self._disturbance.measured(x[_VELOCITIES])
-        self._stamp = stamp
 
     def update(self, stamp: int) -> None:
         """Chooses what holds for the odometry at ``stamp`` (ns); what is too old for it, or not of its time, is dropped.
@@ -157,26 +148,18 @@ class RemoteModel:
         self.output = ModelOutput(Adapted(theta, correction), source, (following - best) / 1e9)
 
     def read(self, rows: Vector, previous: Plan | None) -> Adapted:
-        """What is planned with; see :class:`~dynssm_ros.control.prediction_model.Knowledge`."""
-        return self.planned_with
-
-    @property
-    def planned_with(self) -> Adapted:
-        """What was chosen, and what was found to be missing from it."""
-        return self._disturbance.added(self.output.adapted)
+        """What was chosen last; see :class:`~dynssm_ros.control.prediction_model.PredictionModel`."""
+        return self.output.adapted
 
     def ahead(self, x: Vector, context: Context) -> Vector:
         """The state one T_s after ``x`` with its actuators held, by what holds now; see :meth:`measured`."""
-        following = self._step(x, context, *self.planned_with)
-        self._disturbance.expects(following[_VELOCITIES])
-        return following
+        return self._step(x, context, *self.output.adapted)
 
     def forget(self) -> None:
         """Drops everything that was heard and measured, as after a jump of time."""
         self._theta.clear()
         self._state.clear()
         self._start.clear()
-        self._disturbance.forget()
         self.output = self._nothing
 
     def _correction(self, stamp: int, theta: Vector) -> Vector:

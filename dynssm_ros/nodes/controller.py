@@ -80,7 +80,7 @@ class ControllerNode(Node):
         )
         horizon = describe(self, "horizon", 0, "Steps of T_s planned ahead; 0: as the car needs.", read_only=True)
         offset_free = describe(
-            self, "offset_free", False, "Whether what the model mispredicts is added to it.", read_only=True
+            self, "offset_free", False, "Whether what is mispredicted is followed at a fixed rate.", read_only=True
         )
         evidence = describe(
             self,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.control.evidence import SOURCES, Evidence
-from dynssm_ros.control.horizon_model import SteppedCar
+from dynssm_ros.control.horizon_model import STATES, SteppedCar
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.control.prediction_model import Fixed
 from dynssm_ros.control.race import Course, race
@@ -21,24 +21,27 @@ def said(theta=0.0, correction=0.0):
     return Adapted(np.full(17, theta), np.full(3, correction))
 
 
-def following(state, increments, adapted, t):
-    """Cars that move along x by its coefficients and what is added."""
-    return state + np.stack([1.0 + adapted.theta[:, 0] + adapted.correction[:, 0], np.zeros(len(state))], axis=1)
+def following(states, increments, adapted, t):
+    """Cars that drive straight on, as fast as their coefficients and what is added say."""
+    moved = states.copy()
+    moved[:, STATES.index("v_x")] = 1.0 + adapted.theta[:, 0] + adapted.correction[:, 0]
+    return moved
 
 
-def driven(evidence, moves, model):
-    """Drives with true ``moves`` (m a step); returns the weights after each step."""
-    state, weights = np.zeros(2), []
-    for k, move in enumerate(moves):
+def driven(evidence, speeds, model):
+    """Drives at true ``speeds`` (m/s); returns the weights after each step."""
+    state, weights = np.zeros(len(STATES)), []
+    for k, speed in enumerate(speeds):
         evidence.earned(CALIBRATED, model)
         evidence.sent(state, np.zeros(2), CALIBRATED, model, 0.1 * k)
         weights.append(evidence.weights)
-        state = state + np.array([move, 0.0])
+        state = state.copy()
+        state[STATES.index("v_x")] = speed
     return np.array(weights)
 
 
 def test_without_evidence_the_calibrated_car_is_planned_with():
-    evidence = Evidence(following, STEPS)
+    evidence = Evidence(following, STEPS, 0.1)
     model = said(theta=0.1, correction=0.2)
     earned = evidence.earned(CALIBRATED, model)
     np.testing.assert_array_equal(earned.theta, CALIBRATED.theta)
@@ -57,7 +60,7 @@ def test_without_evidence_the_calibrated_car_is_planned_with():
     ],
 )
 def test_what_has_predicted_best_is_planned_with_after_a_few_horizons(move, model, source):
-    evidence = Evidence(following, STEPS)
+    evidence = Evidence(following, STEPS, 0.1)
     weights = driven(evidence, [move] * 200, model)
     assert evidence.source == source
     assert weights[-1][SOURCES.index(source)] == pytest.approx(1.0, abs=1e-3)
@@ -67,7 +70,7 @@ def test_what_has_predicted_best_is_planned_with_after_a_few_horizons(move, mode
 
 
 def test_what_has_become_worse_is_left():
-    evidence = Evidence(following, STEPS)
+    evidence = Evidence(following, STEPS, 0.1)
     model = said(theta=0.1)
     weights = driven(evidence, [1.1] * 100 + [1.0] * 100, model)
     assert weights[99][0] < 0.01
@@ -75,7 +78,7 @@ def test_what_has_become_worse_is_left():
 
 
 def test_a_gap_drops_what_is_under_way_and_keeps_what_was_found():
-    evidence = Evidence(following, STEPS)
+    evidence = Evidence(following, STEPS, 0.1)
     driven(evidence, [1.1] * 100, said(theta=0.1))
     evidence.interrupt()
     assert evidence.source == "coefficients"

@@ -41,8 +41,8 @@ def steps(monkeypatch):
     recorded = []
     original = Controller.step
 
-    def step(self, *given):
-        recorded.append((*given, original(self, *given)))
+    def step(self, *given, age):
+        recorded.append((*given, original(self, *given, age=age)))
         return recorded[-1][-1]
 
     monkeypatch.setattr(Controller, "step", step)
@@ -97,11 +97,29 @@ def test_it_plans_from_where_the_car_is_when_the_command_acts(online, orca, club
     for _ in range(40):
         car.answered(controller)
     reached = car.plant.measured
-    _, pose, seen, feedback, decision = steps[-1]
-    np.testing.assert_allclose(seen, reached, atol=1e-12)
-    assert math.hypot(pose.x - car.plant.pose.x, pose.y - car.plant.pose.y) < 2e-3, "Euler's chord against the arc"
+    _, _, _, feedback, decision = steps[-1]
+    x, y, _, *velocities = decision.plan.x[0, :6]
+    np.testing.assert_allclose(velocities, reached, atol=1e-12)
+    assert math.hypot(x - car.plant.pose.x, y - car.plant.pose.y) < 2e-3, "Euler's chord against the arc"
     assert feedback == steps[-2][-1].command, "the command before is what acts until then"
     assert decision.command == car.sent
+
+
+def test_what_the_predictor_says_has_to_earn_its_place_in_the_plan(online, orca, club, steps):
+    """The plant is the nominal car; the predictor's has far less grip."""
+    controller, car = online(), SteppedCar(orca, club)
+    theta = orca.nominal.copy()
+    for axle in ("D_f", "D_r"):
+        theta[COEFFICIENTS.index(axle)] = (
+            0.5 * theta[COEFFICIENTS.index(axle)] + 0.5 * orca.lower[COEFFICIENTS.index(axle)]
+        )
+    for _ in range(100):
+        answered = car.stamp
+        car.answered(controller)
+        controller.remote.adapted(answered + T_S, dict(zip(COEFFICIENTS, theta, strict=True)))
+    assert controller.remote.output.source == RemoteModel.ADAPTED
+    np.testing.assert_array_equal(steps[-1][-1].theta, orca.nominal)
+    assert controller.values()["planned with calibrated"] == "1.00"
 
 
 def test_what_the_predictor_says_reaches_the_plan_and_is_dropped_when_it_falls_silent(online, orca, club, steps):
@@ -119,6 +137,7 @@ def test_what_the_predictor_says_reaches_the_plan_and_is_dropped_when_it_falls_s
     assert float(values["D_f"]) == pytest.approx(theta[COEFFICIENTS.index("D_f")], rel=1e-5)
     assert values["coefficients"] == RemoteModel.ADAPTED
     assert any(float(values[f"added to {name}"]) != 0 for name in State._fields), "the plant is the nominal car"
+    assert values["planned with model"] == "1.00"
 
     for _ in range(8):
         car.answered(controller)

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from dynssm_ros.control.disturbance import Disturbance
 from dynssm_ros.control.prediction_model import stepped
 from dynssm_ros.control.remote import RemoteModel
 from dynssm_ros.simulation.plant import Pose
@@ -158,23 +157,3 @@ def test_answers_of_another_time_do_not_count(remote, theta):
     output(remote, theta, k=100)
     remote.update(STAMP)
     assert remote.output.source == RemoteModel.NOMINAL
-
-
-def test_what_the_predictor_misses_is_found_from_the_odometry(orca, theta):
-    """A car that turns 0.3 rad/s faster after each step than was expected; a step that was late tells nothing."""
-    remote, missed = RemoteModel(orca, 0.1, Disturbance((0.5,), np.full(3, 10.0))), np.array([0.0, 0.0, 0.3])
-
-    def moved(stamp: int, seen: np.ndarray) -> np.ndarray:
-        x = remote.start(Pose(0.0, 0.0, 0.5), State(*seen), APPLIED, CONTEXT, None)
-        remote.measured(stamp, x, CONTEXT)
-        remote.update(stamp)
-        return remote.ahead(x, CONTEXT)[3:6]
-
-    expected = moved(STAMP, np.array(SEEN))
-    expected = moved(STAMP + T_S, expected + missed)
-    adapted = remote.read(np.zeros((1, 7)), None)
-    np.testing.assert_allclose(adapted.correction, 0.5 * missed, atol=1e-12)
-    moved(STAMP + 5 * T_S // 2, expected + missed)
-    np.testing.assert_allclose(remote.read(np.zeros((1, 7)), None).correction, 0.5 * missed, atol=1e-12)
-    remote.forget()
-    np.testing.assert_array_equal(remote.read(np.zeros((1, 7)), None).correction, 0.0)
