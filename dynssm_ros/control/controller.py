@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, get_args
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.disturbance import Disturbance
-from dynssm_ros.control.evidence import SOURCES, Evidence
+from dynssm_ros.control.evidence import SOURCES, Evidence, sources, together
 from dynssm_ros.control.horizon_model import CONTEXT, STATES, HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Nmpc, Plan, Status
 from dynssm_ros.control.prediction_model import PredictionModel
@@ -99,7 +99,7 @@ class Controller:
         self._clock = clock
         horizon = HorizonModel(model.car, settings.N, settings.travel, settings.scale.length / settings.scale.time)
         self._nmpc = Nmpc(horizon, limits, reference, track, settings, clock)
-        self._disturbance = Disturbance.of(settings, model.car.T_s)
+        self._disturbances = [Disturbance.of(settings, model.car.T_s) for _ in SOURCES]
         self._estimator = StateEstimator(model.car.T_s)
         self._evidence = Evidence(self._nmpc.following, settings.N, model.car.T_s)
         self._wants_evidence = settings.evidence
@@ -111,7 +111,8 @@ class Controller:
         """Begins anew, as after a gap in what was measured: without a window, a plan, or an error of the model."""
         self._history.clear()
         self._commands.clear()
-        self._disturbance.forget()
+        for disturbance in self._disturbances:
+            disturbance.forget()
         self._estimator.forget()
         self._evidence.forget()
         self._nmpc.forget()
@@ -122,7 +123,8 @@ class Controller:
     def interrupt(self) -> None:
         """What is measured next is not one T_s after what was measured last."""
         self._past = self._expected = None
-        self._disturbance.interrupted()
+        for disturbance in self._disturbances:
+            disturbance.interrupted()
         self._estimator.forget()
         self._evidence.interrupt()
 
@@ -155,10 +157,11 @@ class Controller:
         if is_new:
             planned = np.zeros(2) if previous is None else previous.u[0]
             self._history.append(np.array([*seen, *commands[0], *(sent[0] if age else planned)]))
-            self._disturbance.measured(np.array(seen))
-        said = self._model.read(np.array(self._history), previous)
-        earned = self._evidence.earned(self._model.calibrated, said) if self._wants_evidence else said
-        adapted = self._disturbance.added(earned)
+            for disturbance in self._disturbances:
+                disturbance.measured(np.array(seen))
+        given = sources(self._model.calibrated, self._model.read(np.array(self._history), previous))
+        said = [disturbance.added(one) for disturbance, one in zip(self._disturbances, given, strict=True)]
+        adapted = self._evidence.earned(said) if self._wants_evidence else said[-1]
         if is_new or self._past is None:
             self._past = self._estimated(at, pose, seen, commands[0], adapted)
         now = self._past
@@ -166,21 +169,35 @@ class Controller:
             now = self._nmpc.following(now, increments, adapted, at + k * self._model.car.T_s)
         plan = self._nmpc.plan(now, adapted, t, began)
         command = self._nmpc.command(plan)
-        first = self._expect(at, plan, command, sent, adapted, np.array([*pose, *seen, *feedback]))
+        first = self._expect(at, plan, command, sent, adapted)
         if is_new:
-            self._gather(at, first, said)
+            self._gather(at, first, said, bool(np.all(np.isfinite([*pose, *seen, *feedback]))))
         self.counts[plan.status] += 1
         weights = self._evidence.weights if self._wants_evidence else _AS_IT_IS
         return Decision(command, plan, adapted, weights, self._clock() - began)
 
-    def _gather(self, t: float, increments: Vector, said: Adapted) -> None:
-        """Takes what a model said at the last measurement (s), and what was sent from there on, as evidence."""
-        if said is self._model.calibrated or self._past is None or not np.all(np.isfinite(self._past)):
-            self._evidence.interrupt()
-        elif self._wants_evidence:
-            self._evidence.sent(self._past, increments, self._model.calibrated, said, t)
+    def _gather(self, t: float, increments: Vector, said: Sequence[Adapted], is_sound: bool) -> None:
+        """Takes what was said at the last measurement (s), and what was sent from there on, as evidence.
 
-    def _expect(self, t: float, plan: Plan, command: Applied, sent: Vector, adapted: Adapted, given: Vector) -> Vector:
+        Args:
+            t: of the measurement.
+            increments: that were sent.
+            said: by each source.
+            is_sound: whether the measurement is finite.
+        """
+        if self._past is None or not is_sound:
+            self._evidence.interrupt()
+            return
+        first = together(said)
+        expected = self._nmpc.following(np.tile(self._past, (len(said), 1)), increments, first, t)
+        for disturbance, state in zip(self._disturbances, expected, strict=True):
+            disturbance.expects(state[_VELOCITIES])
+        if self._wants_evidence and any(np.ptp(part, axis=0).any() for part in first):
+            self._evidence.sent(self._past, increments, said, t)
+        else:
+            self._evidence.interrupt()
+
+    def _expect(self, t: float, plan: Plan, command: Applied, sent: Vector, adapted: Adapted) -> Vector:
         """Completes the window's last row, and predicts the next measurement.
 
         Args:
@@ -189,7 +206,6 @@ class Controller:
             command: its first one.
             sent: increments since the measurement.
             adapted: what was planned with.
-            given: measured and fed back, in the order of ``STATES``.
 
         Returns:
             The increments that were sent at the measurement.
@@ -203,8 +219,6 @@ class Controller:
         row[5:] = first
         self._past = past
         self._expected = self._nmpc.following(past, first, adapted, t)
-        if np.all(np.isfinite(given)):
-            self._disturbance.expects(self._expected[_VELOCITIES])
         return np.asarray(first)
 
     def _estimated(self, t: float, pose: Pose, seen: State, feedback: Applied, adapted: Adapted) -> Vector:

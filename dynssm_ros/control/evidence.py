@@ -4,7 +4,8 @@ A plan rests on where the car will be at the end of the horizon, and not on the 
 predicted from where it was measured, once by the calibrated car, once with the adapted coefficients, once with what the model
 adds to them as well. The commands are those that were sent. Both the predicted and the measured path follow from their
 velocities, so that neither the noise of a pose nor its kinematics matter. At the end of the horizon they are compared.
-Without evidence, and where the calibrated car has been as good lately, the calibrated car is planned with.
+Without evidence, and where the calibrated car has been as good lately, the calibrated car is planned with. What each of them
+mispredicts is followed, and counts as part of it (:mod:`dynssm_ros.control.disturbance`).
 
 Choosing by what was predicted before it was seen is prequential model selection (Dawid 1984).
 """
@@ -12,7 +13,7 @@ Choosing by what was predicted before it was seen is prequential model selection
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -101,59 +102,42 @@ class Evidence:
         best = int(np.argmax(self.advantage))
         return SOURCES[best if self._horizons >= _FEWEST and self.advantage[best] > _CLEARLY else 0]
 
-    def earned(self, calibrated: Adapted, said: Adapted) -> Adapted:
-        """What to plan with.
-
-        Args:
-            calibrated: the car without the model.
-            said: by the model.
-        """
+    def earned(self, said: Sequence[Adapted]) -> Adapted:
+        """What to plan with: a mixture of what each of :data:`SOURCES` says."""
         target = np.array([source == self.source for source in SOURCES], dtype=np.float64)
         self.weights = self.weights + self._rate * (target - self.weights)
-        coefficients = 1.0 - self.weights[0]
-        return Adapted(
-            calibrated.theta + coefficients * (said.theta - calibrated.theta),
-            calibrated.correction + self.weights[2] * (said.correction - calibrated.correction),
-        )
+        parts = [(weight, one) for weight, one in zip(self.weights, said, strict=True) if weight > 0]
+        theta, correction = (sum(weight * one[k] for weight, one in parts) for k in range(2))
+        return Adapted(np.asarray(theta), np.asarray(correction))
 
-    def sent(self, state: Vector, increments: Vector, calibrated: Adapted, said: Adapted, t: float) -> None:
+    def sent(self, state: Vector, increments: Vector, said: Sequence[Adapted], t: float) -> None:
         """Takes the next measured state, and what was sent there.
 
         Args:
             state: estimated from the measurement, ``(size,)``.
             increments: of the inputs, from there on, ``(2,)``.
-            calibrated: the car without the model.
-            said: by the model at that state.
+            said: at that state by each of :data:`SOURCES`.
             t: time (s).
         """
         if self._under_way is not None and self._sent is not None:
             self._under_way = self._advanced(self._under_way, state)
         self._sent = state, increments, t
         if self._since % self._every == 0:
-            self._under_way = self._started(state, _first(calibrated), _first(said))
+            self._under_way = self._started(state, together(said))
         self._since += 1
 
-    def _started(self, state: Vector, calibrated: Adapted, said: Adapted) -> _Rollouts:
-        """What is under way, with three more from ``state``."""
-        sources = calibrated, Adapted(said.theta, calibrated.correction), said
-        n = len(SOURCES)
-        new = _Rollouts(
-            np.tile(state, (n, 1)),
-            np.zeros((n, 3)),
-            np.zeros((n, 3)),
-            Adapted(*(np.stack(parts) for parts in zip(*sources, strict=True))),
-            np.zeros(n),
-            np.full(n, float(self._steps)),
-        )
-        old = self._under_way
+    def _started(self, state: Vector, said: Adapted) -> _Rollouts:
+        """What is under way, with one more from ``state`` for each source."""
+        n, old = len(SOURCES), self._under_way
+        starts = np.tile(state, (n, 1))
+        new = _Rollouts(starts, np.zeros((n, 3)), np.zeros((n, 3)), said, np.zeros(n), np.full(n, float(self._steps)))
         if old is None:
             return new
-        said = Adapted(*(np.concatenate(parts) for parts in zip(old.said, new.said, strict=True)))
         return _Rollouts(
             np.concatenate([old.states, new.states]),
             np.concatenate([old.paths, new.paths]),
             np.concatenate([old.measured, new.measured]),
-            said,
+            Adapted(*(np.concatenate(parts) for parts in zip(old.said, new.said, strict=True))),
             np.concatenate([old.distances, new.distances]),
             np.concatenate([old.left, new.left]),
         )
@@ -190,7 +174,13 @@ class Evidence:
         self.advantage = self.advantage + (ratios - self.advantage) / min(self._horizons, _REMEMBERED)
 
 
-def _first(said: Adapted) -> Adapted:
-    """What is said of the first step, where steps differ."""
-    theta, correction = said
-    return Adapted(theta if theta.ndim == 1 else theta[0], correction if correction.ndim == 1 else correction[0])
+def sources(calibrated: Adapted, said: Adapted) -> tuple[Adapted, ...]:
+    """What each of :data:`SOURCES` says: the calibrated car, its coefficients as a model has them, and all of the model."""
+    return calibrated, Adapted(said.theta, calibrated.correction), said
+
+
+def together(said: Sequence[Adapted]) -> Adapted:
+    """What several say of the first step, ``(n, 17)`` and ``(n, 3)``."""
+    return Adapted(
+        *(np.stack([part if part.ndim == 1 else part[0] for part in each]) for each in zip(*said, strict=True))
+    )

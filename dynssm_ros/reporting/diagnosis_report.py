@@ -27,6 +27,7 @@ _COEFFICIENTS_IN_WORDS = {
 }  # fmt: skip
 _LITTLE = 0.02  # of the squared error; less is not worth a word
 _WIDTH = 110
+_MANY_TIMES = 2.0  # farther off, a percentage says nothing
 _FEW = 4  # parameters of a curve that are shown one by one
 
 
@@ -106,10 +107,13 @@ def moved_in_words(diagnosis: Diagnosis) -> list[str]:
         unit = "kg" if name == "m" else COEFFICIENT_UNITS[name]
         value = text(now) if unit == "1" else f"{text(now)} {unit}"
         what = f"{_COEFFICIENTS_IN_WORDS[name]} ({name})" if name in _COEFFICIENTS_IN_WORDS else name
-        change = f"{abs(now / was - 1):.0%} {'more' if abs(now) > abs(was) else 'less'}" if was * now > 0 else "moved"
+        if was * now > 0 and abs(now / was - 1) < _MANY_TIMES:
+            more = f"{abs(now / was - 1):.0%} {'more' if abs(now) > abs(was) else 'less'}"
+            change = f"{more} than the vehicle file's {text(was)}"
+        else:
+            change = f"where the vehicle file has {text(was)}"
         sentences.append(
-            f"Recalibrated: {what} is {value}, {change} than the vehicle file's {text(was)}: "
-            f"{abs(diagnosis.moved[name]):.0f} of its standard deviations."
+            f"Recalibrated: {what} is {value}, {change}: {abs(diagnosis.moved[name]):.0f} of its standard deviations."
         )
     return sentences
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.control.evidence import SOURCES, Evidence
+from dynssm_ros.control.evidence import SOURCES, Evidence, sources
 from dynssm_ros.control.horizon_model import STATES, SteppedCar
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.control.prediction_model import Fixed
@@ -32,8 +32,8 @@ def driven(evidence, speeds, model):
     """Drives at true ``speeds`` (m/s); returns the weights after each step."""
     state, weights = np.zeros(len(STATES)), []
     for k, speed in enumerate(speeds):
-        evidence.earned(CALIBRATED, model)
-        evidence.sent(state, np.zeros(2), CALIBRATED, model, 0.1 * k)
+        evidence.earned(sources(CALIBRATED, model))
+        evidence.sent(state, np.zeros(2), sources(CALIBRATED, model), 0.1 * k)
         weights.append(evidence.weights)
         state = state.copy()
         state[STATES.index("v_x")] = speed
@@ -43,7 +43,7 @@ def driven(evidence, speeds, model):
 def test_without_evidence_the_calibrated_car_is_planned_with():
     evidence = Evidence(following, STEPS, 0.1)
     model = said(theta=0.1, correction=0.2)
-    earned = evidence.earned(CALIBRATED, model)
+    earned = evidence.earned(sources(CALIBRATED, model))
     np.testing.assert_array_equal(earned.theta, CALIBRATED.theta)
     np.testing.assert_array_equal(earned.correction, CALIBRATED.correction)
     weights = driven(evidence, [1.0] * 200, model)  # the calibrated car is right
