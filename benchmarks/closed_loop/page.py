@@ -116,7 +116,7 @@ def _lines(known: Known, arguments: Sequence[str]) -> Iterator[str]:
     yield (
         "`true` knows the plant and the change. `calibrated` is the single-track car that the training calibrated. Models "
         "are planned with as far as they have earned it, and once more as they are. Decisions were taken on development "
-        "cells; a hash of the name says which these are."
+        "cells; a hash of the name says which these are. Where the network earned nothing, `dynssm` is `rls`."
     )
     for label, content in summary(known).items():
         if not content["cells"]:
