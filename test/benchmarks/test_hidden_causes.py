@@ -146,9 +146,10 @@ def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
     text = page(OF, 7)
     assert "4 simulated drives with hidden effects, seeds 7 to 11, without 1 whose car could not be driven" in text
     assert (
-        "| the hidden effect, or an alternative reported with it, is named first | 2 | 50 % | 9 to 91 % | >= 95 % "
+        "| the hidden effect, or an alternative reported with it, is named first | 2 | 50 % | 9 to 91 % |  "
         "| 1 of 1 | 0 of 1 |" in text
     )
+    assert "| the same without alternatives | 2 | 50 % | 9 to 91 % | >= 95, 80, 80 % | 1 of 1 | 0 of 1 |" in text
     assert "| `b` | drag coefficient 0.3 | mass factor 1.2 |" in text
     assert "| `a` |" not in text
 
