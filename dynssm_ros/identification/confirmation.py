@@ -16,7 +16,7 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.identification.noise import Noise
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
-from dynssm_ros.identification.recordings import LeftOut
+from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.vehicle.effects import EFFECTS
 
 _KNOWN = 2.0  # standard errors that the nominal values must be spared, where left-out units tell nothing
@@ -82,7 +82,7 @@ class LeaveOneOut:
         left_out: how.
     """
 
-    def __init__(self, problem: IdentificationProblem, left_out: LeftOut) -> None:
+    def __init__(self, problem: IdentificationProblem, left_out: CrossValidation) -> None:
         self._problem, self._left_out = problem, left_out
         self._known: dict[tuple[int, bool], tuple[Fit, _Predicted]] = {}
 

@@ -15,7 +15,7 @@ from dynssm_ros.identification.gate import HeldOut, Without, gated
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
 from dynssm_ros.identification.problem import per_unit
-from dynssm_ros.identification.recordings import LeftOut, RecordingSet, driven_alike
+from dynssm_ros.identification.recordings import CrossValidation, RecordingSet, driven_alike
 from dynssm_ros.identification.selection import Refined, Selection
 from dynssm_ros.identification.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
 from dynssm_ros.progress import OnProgress
@@ -141,7 +141,7 @@ class _Prepared(NamedTuple):
 
     recordings: RecordingSet
     fitted: SimulationWindows
-    left_out: LeftOut
+    left_out: CrossValidation
     steps: int
     unseen: SimulationWindows
     car: CarEstimate

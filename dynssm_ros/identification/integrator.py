@@ -16,7 +16,7 @@ import numpy as np
 from dynssm_ros.identification.candidates import candidates
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
-from dynssm_ros.identification.recordings import LeftOut
+from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.identification.selection import Search, Selection
 from dynssm_ros.identification.windows import Hold, SimulationWindows
 from dynssm_ros.vehicle.single_track import Integrator
@@ -54,7 +54,7 @@ class SearchResult(NamedTuple):
 def search_causes(
     windows: SimulationWindows,
     car: CarEstimate,
-    left_out: LeftOut,
+    left_out: CrossValidation,
     integrator: Integrator | None,
     on_progress: Callable[[str], None],
     exclude: Collection[str] = (),

@@ -36,7 +36,7 @@ class Folds(NamedTuple):
     unit: Indices
 
 
-class LeftOut(NamedTuple):
+class CrossValidation(NamedTuple):
     """How simulations are left out in turn; with fewer than three recordings both are the same."""
 
     recordings: Folds
@@ -98,7 +98,7 @@ class RecordingSet:
         row = int(np.argmin(np.abs(self.time - time)))
         return self.names[self.number[row]], float(self.clock[row])
 
-    def left_out(self, starts: Indices, line: ClosedLine | None) -> LeftOut:
+    def left_out(self, starts: Indices, line: ClosedLine | None) -> CrossValidation:
         """How simulations from the rows ``starts`` are left out: recordings in turn, and parts of each of them in turn.
 
         Parts are laps, or quarters of the time where there are fewer than three.
@@ -114,9 +114,9 @@ class RecordingSet:
                 part[whose == k] = np.floor(_QUARTERS * t / (np.ptp(t) + 1e-9))
         parts = Folds(*(np.unique(n, return_inverse=True)[1] for n in (part, whose * (part.max() + 1) + part)))
         if len(np.unique(whose)) < _LEAST_RECORDINGS:
-            return LeftOut(parts, parts)
+            return CrossValidation(parts, parts)
         number = np.unique(whose, return_inverse=True)[1]
-        return LeftOut(Folds(number, number), parts)
+        return CrossValidation(Folds(number, number), parts)
 
 
 def driven_alike(windows: SimulationWindows, recordings: Collection[int]) -> float:

@@ -23,7 +23,7 @@ from dynssm_ros.identification.candidates import (
 from dynssm_ros.identification.car import CarEstimate, Values
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
-from dynssm_ros.identification.recordings import LeftOut
+from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS
 
@@ -132,7 +132,7 @@ class Search:
         problem: IdentificationProblem,
         car: CarEstimate,
         found: Sequence[Candidate],
-        left_out: LeftOut,
+        left_out: CrossValidation,
         on_progress: OnProgress = lambda words: None,
     ) -> None:
         self._study, self._given, self.found, self._report = problem, car, list(found), on_progress

@@ -12,7 +12,7 @@ from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.problem import IdentificationProblem
-from dynssm_ros.identification.recordings import Folds, LeftOut
+from dynssm_ros.identification.recordings import CrossValidation, Folds
 from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
 from dynssm_ros.identification.windows import SimulationWindows, fit_windows, recorded_rows
 from dynssm_ros.signals.context import recording_context
@@ -43,9 +43,9 @@ def search(**effects: dict[str, float]) -> Search:
     return Search(IdentificationProblem(given, CarEstimate.of(ORCA)), CarEstimate.of(ORCA), FEW, quarters(given))
 
 
-def quarters(given: SimulationWindows) -> LeftOut:
+def quarters(given: SimulationWindows) -> CrossValidation:
     quarter = np.arange(len(given)) * 4 // len(given)
-    return LeftOut(Folds(quarter, quarter), Folds(quarter, quarter))
+    return CrossValidation(Folds(quarter, quarter), Folds(quarter, quarter))
 
 
 def test_a_pair_is_found_the_stronger_first_and_with_its_sizes() -> None:
