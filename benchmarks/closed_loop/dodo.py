@@ -18,7 +18,8 @@ from doit.tools import config_changed
 from benchmarks.closed_loop.cells import cells
 from benchmarks.closed_loop.page import FIGURE, PAGE, lap_times, page, summary
 from benchmarks.closed_loop.run import cell_file, race_cell, read_cell
-from benchmarks.generalisation.run import drive, drive_file, model_folder, models_of, train_model
+from benchmarks.generalisation.run import model_folder, models_of
+from benchmarks.generalisation.training_tasks import drive_tasks, train_tasks
 from benchmarks.tasks import doit_config
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import replacing, write_json
@@ -31,9 +32,8 @@ _DEVELOPMENT, _SHIPPED = "development", "shipped"
 VALUES = {"only": get_var("only", ""), "part": get_var("part", _DEVELOPMENT), "sets": get_var("sets", _SHIPPED)}
 USUAL = {"only": "", "part": _DEVELOPMENT, "sets": _SHIPPED}
 ARGUMENTS = [f"{name}={value}" for name, value in VALUES.items() if value != USUAL[name]]
-MODELS = tuple(
-    name for name in models_of(VALUES["sets"].split(",")) if name != "ridge"
-)  # which has no physics to plan with
+# ridge has no physics to plan with
+MODELS = tuple(name for name in models_of(VALUES["sets"].split(",")) if name != "ridge")
 DOIT_CONFIG = doit_config(OUT / "doit.json")
 CELLS = [
     cell
@@ -45,26 +45,12 @@ TRAININGS = {cell.training.name: cell.training for cell in CELLS}
 
 def task_drive() -> Iterator[dict[str, Any]]:
     """Makes the laps of each training."""
-    for training in TRAININGS.values():
-        yield {
-            "name": training.name,
-            "actions": [(drive, [training, TRAINED, Path()])],
-            "targets": [str(drive_file(training, TRAINED))],
-            "uptodate": [config_changed(repr(training))],
-        }
+    yield from drive_tasks(TRAININGS.values(), TRAINED, Path())
 
 
 def task_train() -> Iterator[dict[str, Any]]:
     """Trains each model on each training."""
-    for training in TRAININGS.values():
-        for name in MODELS:
-            yield {
-                "name": f"{training.name}:{name}",
-                "actions": [(train_model, [training, name, TRAINED])],
-                "file_dep": [str(drive_file(training, TRAINED))],
-                "targets": [str(model_folder(training, name, TRAINED) / CARD)],
-                "uptodate": [config_changed(repr(training))],
-            }
+    yield from train_tasks(TRAININGS.values(), MODELS, TRAINED)
 
 
 def task_race() -> Iterator[dict[str, Any]]:

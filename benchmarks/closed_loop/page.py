@@ -108,8 +108,9 @@ def _lines(known: Known, arguments: Sequence[str]) -> Iterator[str]:
         f"Made by `{command}`. Each cell is {LAPS} laps of one car on a track that nothing was tuned on: a variation of a "
         "built-in one by a seed. One change of the car is hidden from the models. It is 20 % less grip on a third of the "
         "lap, 15 % less front grip, a steering offset of 0.02 rad, 10 % more mass, or half as much drag again. A hash of the "
-        "cell's name draws the rest: steps of 1 ms or four wheels; no, usual or three times the usual noise; no delay or a "
-        f"step; tracking at {tracking} of the limits or progress at {progress}. Models were trained on another track, of the "
+        "cell's name draws the rest. The plant has steps of 1 ms or four wheels, noise is none, usual or three times that, "
+        f"and delay none or a step. The car tracks at {tracking} of the limits or progresses at {progress}. Models were "
+        "trained on another track, of the "
         "car without the change."
     )
     yield ""

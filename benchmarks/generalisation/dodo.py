@@ -18,16 +18,8 @@ from doit.tools import config_changed
 
 from benchmarks.generalisation.cells import cells
 from benchmarks.generalisation.page import FIGURE, PAGE, heat_map, page, summary
-from benchmarks.generalisation.run import (
-    cell_file,
-    drive,
-    drive_file,
-    model_folder,
-    models_of,
-    read_cell,
-    score_cell,
-    train_model,
-)
+from benchmarks.generalisation.run import cell_file, model_folder, models_of, read_cell, score_cell
+from benchmarks.generalisation.training_tasks import drive_tasks, train_tasks
 from benchmarks.tasks import doit_config
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import replacing, write_json
@@ -53,26 +45,12 @@ TRAININGS = {cell.training.name: cell.training for cell in CELLS}
 
 def task_drive() -> Iterator[dict[str, Any]]:
     """Makes the laps of each training."""
-    for training in TRAININGS.values():
-        yield {
-            "name": training.name,
-            "actions": [(drive, [training, OUT, DATA])],
-            "targets": [str(drive_file(training, OUT))],
-            "uptodate": [config_changed(repr(training))],
-        }
+    yield from drive_tasks(TRAININGS.values(), OUT, DATA)
 
 
 def task_train() -> Iterator[dict[str, Any]]:
     """Trains each model on each training."""
-    for training in TRAININGS.values():
-        for name, content in models_of(MODEL_SETS).items():
-            yield {
-                "name": f"{training.name}:{name}",
-                "actions": [(train_model, [training, name, OUT])],
-                "file_dep": [str(drive_file(training, OUT))],
-                "targets": [str(model_folder(training, name, OUT) / CARD)],
-                "uptodate": [config_changed(repr((training, content)))],
-            }
+    yield from train_tasks(TRAININGS.values(), models_of(MODEL_SETS), OUT)
 
 
 def task_score() -> Iterator[dict[str, Any]]:

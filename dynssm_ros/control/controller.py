@@ -15,7 +15,7 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.disturbance import Disturbance
 from dynssm_ros.control.evidence import SOURCES, Evidence, sources, together
-from dynssm_ros.control.horizon_model import CONTEXT, STATES, HorizonModel
+from dynssm_ros.control.horizon_model import CONTEXT, STATES, VELOCITIES, HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Nmpc, Plan, Status
 from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
@@ -31,7 +31,6 @@ from dynssm_ros.vehicle.single_track import settled_effect_states
 LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
 MOST_LATE = 20  # steps
 _AS_IT_IS = np.array([float(source == "model") for source in SOURCES])
-_VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
 _ACTUATORS = slice(STATES.index("r"), STATES.index("delta") + 1)
 _MEASURED = slice(3, len(STATES))  # what a window's row begins with
 _KNOWN = (*STATES[:3], *CONTEXT)  # what effects may read
@@ -57,12 +56,12 @@ class Decision(NamedTuple):
     @property
     def theta(self) -> Vector:
         """Coefficients of the horizon's first step, shape ``(17,)``."""
-        return _first(self.adapted.theta)
+        return self.adapted.first.theta
 
     @property
     def correction(self) -> Vector:
         """Likewise the correction (m/s, m/s, rad/s), shape ``(3,)``."""
-        return _first(self.adapted.correction)
+        return self.adapted.first.correction
 
 
 class Controller:
@@ -191,7 +190,7 @@ class Controller:
         first = together(said)
         expected = self._nmpc.following(np.tile(self._past, (len(said), 1)), increments, first, t)
         for disturbance, state in zip(self._disturbances, expected, strict=True):
-            disturbance.expects(state[_VELOCITIES])
+            disturbance.expects(state[VELOCITIES])
         if self._wants_evidence and any(np.ptp(part, axis=0).any() for part in first):
             self._evidence.sent(self._past, increments, said, t)
         else:
@@ -237,11 +236,6 @@ class Controller:
             return np.zeros(len(car.effect_states))
         s = float(self._track.project(pose[:2])[0])
         context = {"t": t, "s": s, "lap_length": self._track.length, **pose._asdict()}
-        theta = Coefficients(*(float(value) for value in _first(adapted.theta)))
+        theta = Coefficients(*(float(value) for value in adapted.first.theta))
         effect_states = settled_effect_states(SCALAR, seen, feedback, theta, car.constants, car.effects, None, context)
         return np.array([effect_states[name] for name in car.effect_states])
-
-
-def _first(values: Vector) -> Vector:
-    """Of one vector for all steps, or of a vector per step."""
-    return values if values.ndim == 1 else np.asarray(values[0])

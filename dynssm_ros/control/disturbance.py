@@ -18,12 +18,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.control.innovations import Innovations
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.control.settings import Settings
 
-SETTLING = (
-    1.0  # in units of the car's time: that after which 63 % of a constant disturbance are found, if it is asked for
-)
+SETTLING = 1.0
+"""Time after which 63 % of a constant disturbance are found if it is asked for, in units of the car's time."""
 _SHARES = (0.0, 0.05, 0.15, 0.4)  # among which the data choose
 _MEMORY = 5.0  # in units of the car's time, over which they are compared
 _CLEARLY = 0.7  # of the mean square error without an estimate
@@ -43,13 +43,8 @@ class Disturbance:
     def __init__(self, shares: Sequence[float], largest: Vector, forget: float = 1.0) -> None:
         self._shares = np.array(shares)[:, None]
         self._largest = largest
-        self._forget = forget
+        self._innovations = Innovations(forget, _CLEARLY, _WARM_UP)
         self.forget()
-
-    @classmethod
-    def none(cls) -> Disturbance:
-        """One that stays at nothing."""
-        return cls((0.0,), np.zeros(3))
 
     @classmethod
     def of(cls, settings: Settings, T_s: float) -> Disturbance:
@@ -68,8 +63,7 @@ class Disturbance:
         self.value = np.zeros(3)
         """The estimate, shape ``(3,)``."""
         self._estimates = np.zeros((len(self._shares), 3))
-        self._squares = np.zeros((len(self._shares), 3))
-        self._count = 0
+        self._innovations.reset(len(self._shares), 3)
         self.interrupted()
 
     def interrupted(self) -> None:
@@ -95,9 +89,6 @@ class Disturbance:
     def _follow(self, error: Vector) -> None:
         """Takes the error of the model itself, shape ``(3,)``."""
         innovations = error - self._estimates
-        self._count += 1
-        self._squares += max(self._forget, 1.0 / self._count) * (innovations**2 - self._squares)
+        self._innovations.update(innovations)
         self._estimates = self._estimates + self._shares * innovations
-        best, channels = np.argmin(self._squares, axis=0), np.arange(3)
-        clear = (self._squares[best, channels] < _CLEARLY * self._squares[0]) & (self._count > _WARM_UP)
-        self.value = self._estimates[np.where(clear, best, 0), channels]
+        self.value = self._estimates[self._innovations.best, np.arange(3)]

@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Mask, Vector
-from dynssm_ros.control.horizon_model import STATES
+from dynssm_ros.control.horizon_model import VELOCITIES
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.vehicle import State
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose
@@ -28,7 +28,6 @@ Source = Literal["calibrated", "coefficients", "model"]
 SOURCES: tuple[Source, ...] = ("calibrated", "coefficients", "model")
 """The calibrated car; with the adapted coefficients; with all that the model says."""
 
-_VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
 _AT_ONCE = 4  # horizons under way
 _REMEMBERED = 20  # horizons that the comparison is of
 _FEWEST = 6  # of them, before anything is believed
@@ -160,7 +159,7 @@ class Evidence:
 
     def _moved(self, poses: Vector, before: Vector, after: Vector) -> Vector:
         """Poses ``(n, 3)`` one step on, by the velocities of the states ``(n, size)`` before and after it."""
-        first, second = (State(*states[:, _VELOCITIES].T) for states in (before, after))
+        first, second = (State(*states[:, VELOCITIES].T) for states in (before, after))
         moved = advance_pose(np, Pose(*poses.T), first, second, self._T_s)
         return np.stack(np.broadcast_arrays(*moved), axis=1)
 
@@ -181,6 +180,4 @@ def sources(calibrated: Adapted, said: Adapted) -> tuple[Adapted, ...]:
 
 def together(said: Sequence[Adapted]) -> Adapted:
     """What several say of the first step, ``(n, 17)`` and ``(n, 3)``."""
-    return Adapted(
-        *(np.stack([part if part.ndim == 1 else part[0] for part in each]) for each in zip(*said, strict=True))
-    )
+    return Adapted(*(np.stack(parts) for parts in zip(*(one.first for one in said), strict=True)))

@@ -45,6 +45,11 @@ class Adapted(NamedTuple):
     correction: Vector
     """Added to the stepped ``v_x, v_y, omega`` (m/s, m/s, rad/s), shape ``(3,)`` or ``(N, 3)``."""
 
+    @property
+    def first(self) -> Adapted:
+        """What it says of the first step, shapes ``(17,)`` and ``(3,)``."""
+        return Adapted(*(part if part.ndim == 1 else part[0] for part in self))
+
 
 @dataclass(frozen=True)
 class Plan:

@@ -74,9 +74,8 @@ class Adaptive:
         self._online: _Online | None = None
         if isinstance(model, OnnxModel) and model.online is not None:
             self._online = _Online(OnlineLearner(model, model.online, judges=False))
-        self.H = model.H + (
-            self._online is not None
-        )  # it learns from rows whose command is known: those before the present
+        # it learns from rows whose command is known: those before the present
+        self.H = model.H + (self._online is not None)
         self.car = SteppedCar.of(own) if card is None else SteppedCar.of(own, card.integrator, card.substeps)
         self._model = model
         self._along_horizon = along_horizon

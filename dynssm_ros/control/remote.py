@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, STATES, HorizonModel, SteppedCar
+from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, VELOCITIES, HorizonModel, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Plan
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose
@@ -17,7 +17,6 @@ from dynssm_ros.vehicle.single_track import settled_effect_states
 Context = tuple[float, float, float]
 """Time (s), place on the track (m) and length of the lap (m): what effects may read beside the pose."""
 
-_VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
 _ROUNDING = 1e-5  # of a coefficient's range: predictors compute in single precision
 
 
@@ -164,7 +163,7 @@ class RemoteModel:
 
     def _correction(self, stamp: int, theta: Vector) -> Vector:
         """What the prediction for ``stamp`` adds to the car's own step with ``theta``; none if that is not finite."""
-        correction = self._state[stamp] - self._step(*self._start[stamp], theta, np.zeros(3))[_VELOCITIES]
+        correction = self._state[stamp] - self._step(*self._start[stamp], theta, np.zeros(3))[VELOCITIES]
         return correction if np.all(np.isfinite(correction)) else np.zeros(3)
 
     def _step(self, x: Vector, context: Context, theta: Vector, correction: Vector) -> Vector:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.control.innovations import Innovations
 
 GAINS = (1.0, 0.6, 0.36, 0.2, 0.1)
 _MEMORY_S = 1.0  # over which expectations are compared
@@ -28,21 +29,17 @@ class StateEstimator:
     """
 
     def __init__(self, T_s: float) -> None:
-        self._forget = min(1.0, T_s / _MEMORY_S)
+        self._innovations = Innovations(min(1.0, T_s / _MEMORY_S), _CLEARLY, _WARM_UP)
         self.forget()
 
     def forget(self) -> None:
         """Begins anew, as after a gap."""
         self._states: Vector | None = None
-        self._squares = np.zeros(0)
-        self._count = 0
 
     @property
     def gains(self) -> Vector:
         """The gain of each channel now."""
-        best = np.argmin(self._squares, axis=0)
-        clear = self._squares[best, np.arange(len(best))] < _CLEARLY * self._squares[0]
-        return np.array(GAINS)[np.where(clear & (self._count > _WARM_UP), best, 0)]
+        return np.array(GAINS)[self._innovations.best]
 
     def update(self, measured: Vector, moved: Vector | None) -> Vector:
         """The state now. Without a finite measurement it is the measured one, and the observers move on.
@@ -54,17 +51,15 @@ class StateEstimator:
         """
         sound = bool(np.all(np.isfinite(measured)))
         if moved is None or self._states is None or not np.all(np.isfinite(moved)):
-            self.forget()
             self._states = np.tile(measured, (len(GAINS), 1)) if sound else None
-            self._squares = np.zeros((len(GAINS), len(measured)))
+            self._innovations.reset(len(GAINS), len(measured))
             return measured
         expected = self._states + moved
         if not sound:
             self._states = expected
             return measured
         innovations = measured - expected
-        self._count += 1
-        self._squares += max(self._forget, 1.0 / self._count) * (innovations**2 - self._squares)
+        self._innovations.update(innovations)
         self._states = expected + np.array(GAINS)[:, None] * innovations
-        rows = [GAINS.index(gain) for gain in self.gains]
-        return np.where(np.array(rows) == 0, measured, self._states[rows, np.arange(len(measured))])
+        best = self._innovations.best
+        return np.where(best == 0, measured, self._states[best, np.arange(len(measured))])
