@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.control.buffered import BufferedRows
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects.base import SLOWEST
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose
@@ -111,10 +112,13 @@ class HorizonModel:
         x, u, p = ca.SX.sym("x", self.size), ca.SX.sym("u", len(INPUTS)), ca.SX.sym("p", PARAMETERS)
         following = self._following(x, u, p)
         outputs = [following, ca.jacobian(following, x), ca.jacobian(following, u)]
-        self._step = ca.Function("step", [x, u, p], [following])
-        self._stages = ca.Function("stage", [x, u, p], [ca.densify(each) for each in outputs]).map(N)
+        self._step = ca.Function("step", [x, u, p], [ca.densify(following)])
+        self._steps: dict[int, BufferedRows] = {}  # by how many states are stepped at once
+        self._stages = BufferedRows(ca.Function("stage", [x, u, p], [ca.densify(each) for each in outputs]), N)
         slips = self._slip_angles(x, p, slowest)
-        self._slips = ca.Function("slip", [x, p], [slips, ca.densify(ca.jacobian(slips, x))]).map(N)
+        self._slips = BufferedRows(
+            ca.Function("slip", [x, p], [ca.densify(slips), ca.densify(ca.jacobian(slips, x))]), N
+        )
 
     def step(self, x: Vector, u: Vector, p: Vector) -> Vector:
         """The states one step on, shape ``(size,)`` or ``(n, size)``.
@@ -124,8 +128,10 @@ class HorizonModel:
             u: increments of throttle and steering, shape ``(2,)``.
             p: coefficients, correction and context, shape ``(PARAMETERS,)`` or ``(n, PARAMETERS)``.
         """
-        following = np.asarray(self._step(x.T, u, p.T))
-        return following.ravel() if x.ndim == 1 else following.T
+        count = len(np.atleast_2d(x))
+        if count not in self._steps:
+            self._steps[count] = BufferedRows(self._step, count)
+        return self._steps[count](x, u, p)[0].reshape(x.shape)
 
     def linearised(self, x: Vector, u: Vector, p: Vector) -> tuple[Vector, Vector, Vector]:
         """All steps at their own point: the states after them and the Jacobians by state and input.
@@ -138,11 +144,11 @@ class HorizonModel:
         Returns:
             Shapes ``(N, size)``, ``(N, size, size)``, ``(N, size, 2)``.
         """
-        following, by_x, by_u = (np.asarray(each) for each in self._stages(x.T, u.T, p.T))
+        following, by_x, by_u = self._stages(x, u, p)
         return (
-            following.T,
-            by_x.reshape(self.size, self.N, self.size).transpose(1, 0, 2),
-            by_u.reshape(self.size, self.N, len(INPUTS)).transpose(1, 0, 2),
+            following,
+            by_x.reshape(self.N, self.size, self.size).transpose(0, 2, 1),
+            by_u.reshape(self.N, len(INPUTS), self.size).transpose(0, 2, 1),
         )
 
     def slip_angles(self, x: Vector, p: Vector) -> tuple[Vector, Vector]:
@@ -155,8 +161,8 @@ class HorizonModel:
         Returns:
             Shapes ``(N, 2)``, and ``(N, 2, size)`` of the Jacobian by the state.
         """
-        slips, by_x = (np.asarray(each) for each in self._slips(x.T, p.T))
-        return slips.T, by_x.reshape(2, self.N, self.size).transpose(1, 0, 2)
+        slips, by_x = self._slips(x, p)
+        return slips, by_x.reshape(self.N, self.size, 2).transpose(0, 2, 1)
 
     def _slip_angles(self, x: Any, p: Any, slowest: float) -> Any:
         import casadi as ca

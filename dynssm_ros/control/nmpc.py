@@ -24,6 +24,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.control.buffered import QuadraticProgram
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, PARAMETERS, STATES, HorizonModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
@@ -71,7 +72,7 @@ class Plan:
 
 
 class _Program(NamedTuple):
-    """A quadratic program: minimise ``z' H z / 2 + g' z`` with ``low <= A z <= high`` and ``z_low <= z <= z_high``."""
+    """What :meth:`QuadraticProgram.solve` takes."""
 
     H: Vector
     g: Vector
@@ -103,8 +104,6 @@ class Nmpc:
         settings: Settings,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        import casadi as ca  # takes a while, and most of the command line does without
-
         if model.N != settings.N:
             raise ValueError(f"the model has {model.N} steps, the settings {settings.N}")
         self.model = model
@@ -118,9 +117,7 @@ class Nmpc:
         N = settings.N
         self._variables = 2 * N + N + 1  # increments, slacks of the steps, slack of the end
         self._rows = 2 * N + 2 * N + 4 * N + 1  # actuators, both borders, both axles to both sides, the end
-        shape = {"h": ca.Sparsity.dense(self._variables, self._variables)}
-        shape["a"] = ca.Sparsity.dense(self._rows, self._variables)
-        self._solver = ca.conic("program", "daqp", shape, {"error_on_fail": False})
+        self._solver = QuadraticProgram(self._variables, self._rows)
 
     @property
     def previous(self) -> Plan | None:
@@ -226,13 +223,9 @@ class Nmpc:
         program = self._program(now, x, offset, slope, p)
         if not all(np.all(np.isfinite(each)) for each in program[:3]):
             return None
-        solution = self._solver(
-            h=program.H, g=program.g, a=program.A, lba=program.low, uba=program.high, lbx=program.z_low,
-            ubx=program.z_high,
-        )  # fmt: skip
-        u = np.asarray(solution["x"]).ravel()[: 2 * self.settings.N]
+        u = self._solver.solve(*program)[: 2 * self.settings.N]
         states = offset + slope @ u
-        if not (self._solver.stats()["success"] and np.all(np.isfinite(u)) and np.all(np.isfinite(states))):
+        if not (np.all(np.isfinite(u)) and np.all(np.isfinite(states))):
             return None
         return Plan(states, u.reshape(-1, len(INPUTS)))
 

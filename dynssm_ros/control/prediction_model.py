@@ -89,13 +89,12 @@ class Adaptive:
             return self.calibrated
         H = self._model.H
         windows = rows[None, -H:]
-        if self._online is not None:
-            self._online.learn(self._read_by(rows[None, -H - 1 : -1])[0])
         if self._along_horizon and previous is not None:
             ahead = np.concatenate([rows, _planned_rows(previous)])
             N = len(previous.u)
             windows = np.stack([ahead[k : k + H] for k in range(len(rows) - H, len(rows) - H + N)])
-        adapted = self._of(self._read_by(windows))
+        before = rows[None, -H - 1 : -1] if self._online is not None else windows[:0]
+        adapted = self._of(self._read_by(np.concatenate([before, windows])), len(before))
         return adapted if all(np.all(np.isfinite(part)) for part in adapted) else self.calibrated
 
     def _read_by(self, windows: Vector) -> Vector:
@@ -106,9 +105,12 @@ class Adaptive:
         windows[..., 5:] = 0.0
         return windows
 
-    def _of(self, windows: Vector) -> Adapted:
+    def _of(self, windows: Vector, known: int) -> Adapted:
+        """What the model says of windows ``(n, H, 7)``, of which the first ``known`` are learned from before."""
         said = self._model.predict(windows)
         if self._online is not None:
+            self._online.learn(windows[0], said.part(slice(0, known)))
+            windows, said = windows[known:], said.part(slice(known, None))
             said = self._online.corrected(said, windows)
         theta = self.calibrated.theta if said.theta is None else said.theta
         physics = stepped(self.car, windows[:, -1], theta) if said.physics is None else said.physics
@@ -126,10 +128,9 @@ class _Online:
         self._period = round(learner.layer.T_s * 1e9)
         self._stamp = 0
 
-    def learn(self, window: Vector) -> None:
-        """Takes the next window ``(H, 7)``."""
+    def learn(self, window: Vector, predicted: WindowPrediction) -> None:
+        """Takes the next window ``(H, 7)``, and what the model predicts from it."""
         self._stamp += self._period
-        predicted = self._learner.model.predict(window[None])
         self._learner.corrected(self._stamp, window.copy(), predicted, lambda stamp: Refusal.FILLING)
 
     def interrupt(self) -> None:

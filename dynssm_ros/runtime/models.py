@@ -36,6 +36,12 @@ class WindowPrediction(NamedTuple):
     seen: Seen | None = None
     """What the online layer sees; ``None`` if the model has no such layer."""
 
+    def part(self, chosen: slice) -> WindowPrediction:
+        """What it says of some of the windows."""
+        theta, physics, variance = (None if array is None else array[chosen] for array in self[1:4])
+        seen = None if self.seen is None else Seen(*(array[chosen] for array in self.seen))
+        return WindowPrediction(self.state[chosen], theta, physics, variance, seen)
+
 
 def corrected(
     prediction: WindowPrediction,
