@@ -100,7 +100,8 @@ class Controller:
         self._nmpc = Nmpc(horizon, limits, reference, track, settings, clock)
         self._disturbances = [Disturbance.of(settings, model.car.T_s) for _ in SOURCES]
         self._estimator = StateEstimator(model.car.T_s)
-        self._evidence = Evidence(self._nmpc.following, settings.N, model.car.T_s)
+        constants = model.car.constants
+        self._evidence = Evidence(self._nmpc.following, settings.N, model.car.T_s, (constants.l_f, -constants.l_r))
         self._wants_evidence = settings.evidence
         self._history: deque[Vector] = deque(maxlen=max(model.H, 1))
         self._commands: deque[Applied] = deque(maxlen=MOST_LATE + 1)
@@ -166,13 +167,14 @@ class Controller:
         now = self._past
         for k, increments in enumerate(sent):
             now = self._nmpc.following(now, increments, adapted, at + k * self._model.car.T_s)
-        plan = self._nmpc.plan(now, adapted, t, began)
+        weights = self._evidence.weights if self._wants_evidence else _AS_IT_IS
+        margins = self._evidence.margins() if self._wants_evidence else None
+        plan = self._nmpc.plan(now, adapted, t, began, margins)
         command = self._nmpc.command(plan)
         first = self._expect(at, plan, command, sent, adapted)
         if is_new:
             self._gather(at, first, said, bool(np.all(np.isfinite([*pose, *seen, *feedback]))))
         self.counts[plan.status] += 1
-        weights = self._evidence.weights if self._wants_evidence else _AS_IT_IS
         return Decision(command, plan, adapted, weights, self._clock() - began)
 
     def _gather(self, t: float, increments: Vector, said: Sequence[Adapted], is_sound: bool) -> None:
@@ -191,7 +193,7 @@ class Controller:
         expected = self._nmpc.following(np.tile(self._past, (len(said), 1)), increments, first, t)
         for disturbance, state in zip(self._disturbances, expected, strict=True):
             disturbance.expects(state[VELOCITIES])
-        if self._wants_evidence and any(np.ptp(part, axis=0).any() for part in first):
+        if self._wants_evidence:
             self._evidence.sent(self._past, increments, said, t)
         else:
             self._evidence.interrupt()

@@ -19,6 +19,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Mask, Vector
+from dynssm_ros.control.caution import Caution, Margins
 from dynssm_ros.control.horizon_model import VELOCITIES
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.vehicle import State
@@ -70,10 +71,13 @@ class Evidence:
         following: one step of the car.
         steps: of the horizon.
         T_s: length of a step (s).
+        axles: distances of the front and the rear axle from the centre of gravity, forwards (m).
     """
 
-    def __init__(self, following: Following, steps: int, T_s: float) -> None:
+    def __init__(self, following: Following, steps: int, T_s: float, axles: tuple[float, float]) -> None:
         self._following = following
+        self._axles = np.array(axles)
+        self._caution = Caution(len(SOURCES), steps)
         self._T_s = T_s
         self._steps = steps
         self._every = max(1, steps // _AT_ONCE)
@@ -87,6 +91,7 @@ class Evidence:
         self.weights = np.array([1.0, 0.0, 0.0])
         """Shares with which each source is planned with, ``(3,)``."""
         self._horizons = 0
+        self._caution.forget()
         self.interrupt()
 
     def interrupt(self) -> None:
@@ -108,6 +113,10 @@ class Evidence:
         parts = [(weight, one) for weight, one in zip(self.weights, said, strict=True) if weight > 0]
         theta, correction = (sum(weight * one[k] for weight, one in parts) for k in range(2))
         return Adapted(np.asarray(theta), np.asarray(correction))
+
+    def margins(self) -> Margins:
+        """For plans with what was :meth:`earned`: by what it would have been wrong lately."""
+        return self._caution.margins(self.weights)
 
     def sent(self, state: Vector, increments: Vector, said: Sequence[Adapted], t: float) -> None:
         """Takes the next measured state, and what was sent there.
@@ -148,7 +157,9 @@ class Evidence:
         states = self._following(rollouts.states, increments, rollouts.said, t)
         paths = self._moved(rollouts.paths, rollouts.states, states)
         reached = self._moved(rollouts.measured, before[None], measured[None])
-        distances = rollouts.distances + np.hypot(*(paths - reached)[:, :2].T)
+        away = paths - reached
+        distances = rollouts.distances + np.hypot(*away[:, :2].T)
+        self._watch(rollouts.left, states, measured, away, reached[:, 2])
         moved = rollouts._replace(
             states=states, paths=paths, measured=reached, distances=distances, left=rollouts.left - 1.0
         )
@@ -156,6 +167,17 @@ class Evidence:
         if done.any():
             self._compare(moved.distances[done])
         return moved.at(~done)
+
+    def _watch(self, left: Vector, states: Vector, measured: Vector, away: Vector, heading: Vector) -> None:
+        """Takes what predictions with ``left`` steps to go were wrong by after the next one."""
+        rows = np.arange(len(left))
+        step = np.asarray(self._steps - left, dtype=np.intp)
+        lateral = np.cos(heading) * away[:, 1] - np.sin(heading) * away[:, 0]
+        v_x, v_y, omega = measured[VELOCITIES]
+        gone = states[:, VELOCITIES]
+        slips = np.arctan2(gone[:, 1:2] + self._axles * gone[:, 2:], gone[:, :1])
+        slip = slips - np.arctan2(v_y + self._axles * omega, v_x)
+        self._caution.update(rows % len(SOURCES), step, lateral, slip)
 
     def _moved(self, poses: Vector, before: Vector, after: Vector) -> Vector:
         """Poses ``(n, 3)`` one step on, by the velocities of the states ``(n, size)`` before and after it."""

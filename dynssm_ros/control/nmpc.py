@@ -25,6 +25,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.buffered import QuadraticProgram
+from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, PARAMETERS, STATES, HorizonModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
@@ -35,6 +36,7 @@ from dynssm_ros.vehicle.parameters import InputLimits
 Status = Literal["solved", "infeasible", "late"]
 
 V_X, R, DELTA = (STATES.index(name) for name in ("v_x", "r", "delta"))
+_ROAD_LEFT, _SLIP_LEFT = 0.5, 0.5  # shares of the road and of the slip's bound that no caution takes
 _FIRST_ROUNDS = 10  # programs that the first plan takes to settle
 
 
@@ -128,7 +130,14 @@ class Nmpc:
         """Drops the last plan."""
         self._plan = None
 
-    def plan(self, now: Vector, adapted: Adapted, t: float = 0.0, began: float | None = None) -> Plan:
+    def plan(
+        self,
+        now: Vector,
+        adapted: Adapted,
+        t: float = 0.0,
+        began: float | None = None,
+        margins: Margins | None = None,
+    ) -> Plan:
         """Plans from ``now`` on.
 
         Args:
@@ -136,12 +145,14 @@ class Nmpc:
             adapted: what the model says; see :class:`Adapted`.
             t: time since the start of the drive (s), for effects that read it.
             began: when the control step began, by the clock, to which the deadline counts; now if not given.
+            margins: by which borders and bounds on the slip are moved inwards; none if not given.
 
         Returns:
             The plan whose first step is to be driven, from ``now`` with what is not finite in it replaced by what was
             planned. It is finite and within the actuators' limits, whatever came in.
         """
         began = self._clock() if began is None else began
+        margins = Margins.none(self.settings.N) if margins is None else margins
         first, sound = self._plan is None, bool(np.all(np.isfinite(now)))
         if not sound:  # what is not measured is taken as it was planned
             now = np.where(np.isfinite(now), now, 0.0 if self._plan is None else self._plan.x[1])
@@ -149,7 +160,7 @@ class Nmpc:
         guess = self._first_guess(now) if self._plan is None else self._plan.shifted()
         plan = guess if sound else None
         for _ in range(_FIRST_ROUNDS if first else 1):
-            plan = None if plan is None else self._improved(now, plan, adapted, t)
+            plan = None if plan is None else self._improved(now, plan, adapted, t, margins)
         if plan is None:
             plan = self._held(now, guess, adapted, t, "infeasible")
         self._plan = plan if sound or not first else None
@@ -212,7 +223,7 @@ class Nmpc:
         return p
 
     @np.errstate(over="ignore", invalid="ignore")  # what comes of it is looked at
-    def _improved(self, now: Vector, guess: Plan, adapted: Adapted, t: float) -> Plan | None:
+    def _improved(self, now: Vector, guess: Plan, adapted: Adapted, t: float, margins: Margins) -> Plan | None:
         """The solution of the program around ``guess``; ``None`` if there is none."""
         x = np.concatenate([now[None], guess.x[1:]])
         p = self._parameters(adapted, t)
@@ -220,7 +231,7 @@ class Nmpc:
         if not all(np.all(np.isfinite(each)) for each in (following, by_x, by_u)):
             return None
         offset, slope = _condensed(x, guess.u, following, by_x, by_u)
-        program = self._program(now, x, offset, slope, p)
+        program = self._program(now, x, offset, slope, p, margins)
         if not all(np.all(np.isfinite(each)) for each in program[:3]):
             return None
         u = self._solver.solve(*program)[: 2 * self.settings.N]
@@ -229,7 +240,9 @@ class Nmpc:
             return None
         return Plan(states, u.reshape(-1, len(INPUTS)))
 
-    def _program(self, now: Vector, guess: Vector, offset: Vector, slope: Vector, p: Vector) -> _Program:
+    def _program(
+        self, now: Vector, guess: Vector, offset: Vector, slope: Vector, p: Vector, margins: Margins
+    ) -> _Program:
         """The program in increments and slacks; states are ``offset + slope @ increments``."""
         N, w = self.settings.N, self.settings.weights
         positions, moves = offset[1:, :2], slope[1:, :2]
@@ -257,8 +270,9 @@ class Nmpc:
             rows = slice(k * N, (k + 1) * N)
             A[rows, k : 2 * N : 2] = np.tri(N)
             low[rows], high[rows] = bounds[0] - held, bounds[1] - held
-        self._add_borders(A[2 * N : 4 * N], low[2 * N : 4 * N], high[2 * N : 4 * N], guess, positions, moves)
-        self._add_slip(A[4 * N : 8 * N], high[4 * N : 8 * N], guess[1:], offset[1:], slope[1:], p)
+        borders, slips = slice(2 * N, 4 * N), slice(4 * N, 8 * N)
+        self._add_borders(A[borders], low[borders], high[borders], guess, positions, moves, margins.lateral)
+        self._add_slip(A[slips], high[slips], guess[1:], offset[1:], slope[1:], p, margins.slip)
         if w.ending > 0:
             A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -length / self.settings.scale.time
             high[-1] = float(self._reference.speed_at(at[-1])) - offset[-1, V_X]
@@ -269,15 +283,18 @@ class Nmpc:
         z_high = np.concatenate([np.tile([span, reach], N), np.full(N + 1, np.inf)])
         return _Program(H, g, A, low, high, z_low, z_high)
 
-    def _add_slip(self, A: Vector, high: Vector, guess: Vector, offset: Vector, slope: Vector, p: Vector) -> None:
-        """The slip angles (rad) of both axles after each step, within their bounds on both sides.
+    def _add_slip(
+        self, A: Vector, high: Vector, guess: Vector, offset: Vector, slope: Vector, p: Vector, margin: Vector
+    ) -> None:
+        """The slip angles (rad) of both axles after each step, within their bounds on both sides less ``margin`` ``(N, 2)``.
 
         They are the model's own, linearised at the guessed states ``(N, size)``.
         """
         N = self.settings.N
         slips, by_x = self.model.slip_angles(guess, p)
         slips = slips + np.einsum("kas,ks->ka", by_x, offset - guess)
-        for axle, bound in enumerate(self.settings.slip):
+        for axle, most in enumerate(self.settings.slip):
+            bound = most - np.minimum(margin[:, axle], (1.0 - _SLIP_LEFT) * most)
             by_u = np.einsum("ks,ksj->kj", by_x[:, axle], slope)
             rows = slice(2 * axle * N, 2 * (axle + 1) * N)
             A[rows, : 2 * N] = np.concatenate([by_u, -by_u])
@@ -291,20 +308,24 @@ class Nmpc:
         return self._reference.project(guess[1:, :2], _along(guess[:, :2], self._on_line))
 
     def _add_borders(
-        self, A: Vector, low: Vector, high: Vector, guess: Vector, positions: Vector, moves: Vector
+        self, A: Vector, low: Vector, high: Vector, guess: Vector, positions: Vector, moves: Vector, margin: Vector
     ) -> None:
-        """Half planes at the feet of the guessed positions on the centre line; both sides share a step's slack."""
+        """Half planes at the feet of the guessed positions on the centre line; both sides share a step's slack.
+
+        They are ``margin`` ``(N,)`` further inwards, where the road is wide enough.
+        """
         N = self.settings.N
         s = self._track.project(guess[1:, :2], _along(guess[:, :2], self._on_track))[0]
         foot = self._track.centre.position(s)
         normal = _directions(self._track.centre.heading(s))[1]
         right, left = (width - self.settings.margin for width in self._track.widths(s))
+        margin = np.minimum(margin, (1.0 - _ROAD_LEFT) * np.maximum(right + left, 0.0) / 2)
         lateral = np.einsum("ki,ki->k", normal, positions - foot)
         by_u = np.einsum("ki,kij->kj", normal, moves)
         A[:, : 2 * N] = np.concatenate([by_u, by_u])
         into_slack = self.settings.scale.length * np.eye(N)
         A[:N, 2 * N : 3 * N], A[N:, 2 * N : 3 * N] = -into_slack, into_slack
-        high[:N], low[N:] = left - lateral, -right - lateral
+        high[:N], low[N:] = left - margin - lateral, margin - right - lateral
 
     def _held(self, now: Vector, guess: Plan, adapted: Adapted, t: float, status: Status) -> Plan:
         """The inputs of ``guess`` from ``now`` on, within the limits, and where they lead."""

@@ -102,8 +102,9 @@ class Settings:
         lag_bound: how far the place where a car that keeps the line's time would be is from this one (m) at most.
         follows: whether what the model mispredicts is added to it: at a rate that the data choose, at a fixed one, or not at
             all; see :mod:`dynssm_ros.control.disturbance`.
-        evidence: whether what a model says is planned with only where it has predicted better than the calibrated car; see
-            :mod:`dynssm_ros.control.evidence`.
+        evidence: whether what a model says is planned with only where it has predicted better than the calibrated car
+            (:mod:`dynssm_ros.control.evidence`), and borders and slip are kept the further off the more was mispredicted
+            (:mod:`dynssm_ros.control.caution`).
         travel: what carries the pose over a step.
     """
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dynssm_ros.control.caution import QUANTILE
 from dynssm_ros.control.evidence import SOURCES, Evidence, sources
 from dynssm_ros.control.horizon_model import STATES, SteppedCar
 from dynssm_ros.control.nmpc import Adapted
@@ -15,6 +16,7 @@ from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
 
 STEPS = 8
+AXLES = (0.03, -0.03)
 CALIBRATED = Adapted(np.zeros(17), np.zeros(3))
 
 
@@ -42,7 +44,7 @@ def driven(evidence, speeds, model):
 
 
 def test_without_evidence_the_calibrated_car_is_planned_with():
-    evidence = Evidence(following, STEPS, 0.1)
+    evidence = Evidence(following, STEPS, 0.1, AXLES)
     model = said(theta=0.1, correction=0.2)
     earned = evidence.earned(sources(CALIBRATED, model))
     np.testing.assert_array_equal(earned.theta, CALIBRATED.theta)
@@ -61,7 +63,7 @@ def test_without_evidence_the_calibrated_car_is_planned_with():
     ],
 )
 def test_what_has_predicted_best_is_planned_with_after_a_few_horizons(move, model, source):
-    evidence = Evidence(following, STEPS, 0.1)
+    evidence = Evidence(following, STEPS, 0.1, AXLES)
     weights = driven(evidence, [move] * 200, model)
     assert evidence.source == source
     assert weights[-1][SOURCES.index(source)] == pytest.approx(1.0, abs=1e-3)
@@ -70,8 +72,29 @@ def test_what_has_predicted_best_is_planned_with_after_a_few_horizons(move, mode
     np.testing.assert_allclose(weights.sum(axis=1), 1.0)
 
 
+def test_caution_is_what_was_mispredicted_step_by_step():
+    """Straight on at 1 m/s; the car is dragged to the side at a constant 0.1 m/s that nobody foresees."""
+    evidence = Evidence(following, STEPS, 0.1, AXLES)
+    assert not any(part.any() for part in evidence.margins())
+    model = said(theta=np.nan)  # a source that says nothing does not count
+    state = np.zeros(len(STATES))
+    state[STATES.index("v_x")] = 1.0
+    for k in range(100):
+        evidence.earned(sources(CALIBRATED, model))
+        evidence.sent(state.copy(), np.zeros(2), sources(CALIBRATED, model), 0.1 * k)
+        state[STATES.index("v_y")] = 0.1 * (k + 1)  # the next horizon begins with what is measured
+    margins = evidence.margins()
+    steps = np.arange(1, STEPS + 1)
+    beside = 0.1 * 0.1 * steps**2 / 2  # twice integrated, by the means of the steps
+    np.testing.assert_allclose(margins.lateral, QUANTILE * beside, rtol=0.02)
+    assert np.all(np.diff(margins.slip, axis=0) > 0)
+    np.testing.assert_allclose(margins.slip[:, 0], margins.slip[:, 1])  # it does not turn
+    evidence.forget()
+    assert not any(part.any() for part in evidence.margins())
+
+
 def test_what_has_become_worse_is_left():
-    evidence = Evidence(following, STEPS, 0.1)
+    evidence = Evidence(following, STEPS, 0.1, AXLES)
     model = said(theta=0.1)
     weights = driven(evidence, [1.1] * 100 + [1.0] * 100, model)
     assert weights[99][0] < 0.01
@@ -79,7 +102,7 @@ def test_what_has_become_worse_is_left():
 
 
 def test_a_gap_drops_what_is_under_way_and_keeps_what_was_found():
-    evidence = Evidence(following, STEPS, 0.1)
+    evidence = Evidence(following, STEPS, 0.1, AXLES)
     driven(evidence, [1.1] * 100, said(theta=0.1))
     evidence.interrupt()
     assert evidence.source == "coefficients"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
+from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.simulation.plant import Pose, make_plant
 from dynssm_ros.vehicle import Applied, Coefficients, State, motion
@@ -104,6 +105,38 @@ def test_borders_bend_the_plan(orca, circle, controller):
     for _ in range(5):
         plan = nmpc.plan(now, nominal(orca))
     assert np.max(np.hypot(*plan.x[:, :2].T)) == pytest.approx(1.18, abs=0.012)  # 2 cm short of the border
+
+
+def test_caution_keeps_later_steps_further_inside(orca, circle, controller):
+    """As far as half of the road between the car's sides is left."""
+    track, _ = circle()
+    _, outside = circle(radius=1.25)
+    now = state_vector((1.15, 0.0, np.pi / 2), (1.5, 0.0, 1.4), (0.2, 0.06))
+    reached = []
+    for most in (0.0, 0.05, 1.0):
+        nmpc = controller(track, outside)
+        margins = Margins(np.linspace(0.0, most, nmpc.settings.N), np.zeros((nmpc.settings.N, 2)))
+        for _ in range(5):
+            plan = nmpc.plan(now, nominal(orca), margins=margins)
+        reached.append(np.hypot(*plan.x[-1, :2]))
+    half = 0.2 - nmpc.settings.margin
+    assert reached[0] - reached[1] == pytest.approx(0.05, abs=0.012)
+    assert reached[2] > 1.0 + half / 2 - 0.03  # not beyond the middle between the line's side and the border
+
+
+def test_caution_bounds_the_slip_earlier(orca, circle, controller):
+    """A turn that is too fast for the tyres is driven with less slip, at least half of what is allowed."""
+    track, line = circle(radius=0.5, speed=2.5)
+    now = state_vector((0.5, 0.0, np.pi / 2), (2.0, 0.0, 4.0), (0.2, 0.1))
+    slips = []
+    for margin in (0.0, 0.05, 1.0):
+        nmpc = controller(track, line)
+        margins = Margins(np.zeros(nmpc.settings.N), np.full((nmpc.settings.N, 2), margin))
+        for _ in range(5):
+            plan = nmpc.plan(now, nominal(orca), margins=margins)
+        slips.append(np.abs(nmpc.model.slip_angles(plan.x[1:], nmpc._parameters(nominal(orca), 0.0))[0]).max(axis=0))
+    assert np.all(slips[1] < slips[0])
+    assert np.all(slips[2] < slips[1])
 
 
 @pytest.mark.parametrize("objective", ["tracking", "progress"])
