@@ -427,7 +427,7 @@ def race(
     objective: Objective = "tracking",
     laps: int = 1,
     line: str = "racing",
-    speed_scale: float = 1.0,
+    speed_scale: float | None = None,
     horizon: int | None = None,
     along_horizon: bool = False,
     offset_free: bool = False,
@@ -443,6 +443,7 @@ def race(
     delay: float = 0.0,
     seed: int = 0,
     as_is: bool = False,
+    learn: bool = False,
 ) -> list[Race]:
     """Drives laps in closed loop: a predictive controller with each model in turn, on a simulated car.
 
@@ -454,7 +455,8 @@ def race(
         objective: ``tracking`` follows the line at its own speed; ``progress`` goes as far as the borders allow.
         laps: to drive.
         line: ``centre``, ``racing``, or a file ``s_m,x_m,y_m,v_mps`` with its own speed.
-        speed_scale: share of the car's limits in the line's speed; of a file, factor on it.
+        speed_scale: share of the car's limits in the line's speed; of a file, factor on it. If not given it is 1, or a safe
+            share to begin with for a car that learns.
         horizon: steps of T_s that are planned ahead; as the car needs if not given.
         along_horizon: read the models anew at every step of the horizon.
         offset_free: follow what each model mispredicts at a fixed rate, not at one that the data choose.
@@ -470,6 +472,7 @@ def race(
         delay: from an instant until the command that answers it acts (s); the controller knows it.
         seed: of the noise.
         as_is: plan with what each model says, whether or not it has predicted better than the calibrated car.
+        learn: drive each section of the lap faster every lap, as far as the laps so far have shown it is safe.
 
     Example:
         >>> (lap,) = race("orca", "club", ["true"], speed_scale=0.8)
@@ -477,6 +480,7 @@ def race(
         (True, 0.0)
     """
     require("race", "race")
+    from dynssm_ros.control.lap_learning import SAFE
     from dynssm_ros.control.race import Course, Sensing, Start, race
     from dynssm_ros.control.race_models import load_prediction_model
     from dynssm_ros.control.reference import load_reference
@@ -491,10 +495,12 @@ def race(
     opened = {text: load_prediction_model(text, car, driven, plant, along_horizon) for text in models}
     for name, model in disambiguated(opened, lambda model: model.name).items():
         model.name = name
-    reference = load_reference(line, car, road, speed_scale)
+    pace = (SAFE if learn else 1.0) if speed_scale is None else speed_scale
+    reference = load_reference(line, car, road, pace)
     settings = Settings.of(car, objective, horizon, offset_free, not as_is)
     sensing = Sensing(noise, pose_noise, delay, seed)
-    course = Course(driven, road, plant, reference, settings, laps, Start(start, start_offset, start_speed), sensing)
+    begins = Start(start, start_offset, start_speed)
+    course = Course(driven, road, plant, reference, settings, laps, begins, sensing, car if learn else None)
     races = []
     for k, model in enumerate(opened.values()):
 

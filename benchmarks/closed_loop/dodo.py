@@ -3,11 +3,13 @@
 Variables: ``out`` (folder), ``trained`` (folder of the generalisation matrix: models are taken from there, and trained there
 if they are missing), ``page`` (folder of the page and its figure), ``only`` (words that names of cells must begin with,
 separated by commas), ``part`` (``development``, the default, or ``all``: test cells too), ``sets`` (as of the generalisation
-matrix). What is done is kept; a kill costs the task under way.
+matrix). What is done is kept; a kill costs the task under way. The tasks ``learn`` and ``learning_page`` run if they are
+named.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,8 +18,8 @@ from doit import get_var
 from doit.tools import config_changed
 
 from benchmarks.closed_loop.cells import cells
-from benchmarks.closed_loop.page import FIGURE, PAGE, lap_times, page, summary
-from benchmarks.closed_loop.run import cell_file, race_cell, read_cell
+from benchmarks.closed_loop.page import FIGURE, LEARNING_PAGE, PAGE, lap_times, learning_page, page, summary
+from benchmarks.closed_loop.run import cell_file, learn_cell, learning_file, race_cell, read_cell
 from benchmarks.generalisation.run import model_folder, models_of
 from benchmarks.generalisation.training_tasks import drive_tasks, train_tasks
 from benchmarks.tasks import doit_config
@@ -34,7 +36,8 @@ USUAL = {"only": "", "part": _DEVELOPMENT, "sets": _SHIPPED}
 ARGUMENTS = [f"{name}={value}" for name, value in VALUES.items() if value != USUAL[name]]
 # ridge has no physics to plan with
 MODELS = tuple(name for name in models_of(VALUES["sets"].split(",")) if name != "ridge")
-DOIT_CONFIG = doit_config(OUT / "doit.json")
+LEARNS = "dynssm"
+DOIT_CONFIG = doit_config(OUT / "doit.json") | {"default_tasks": ["page"]}
 CELLS = [
     cell
     for cell in cells()
@@ -68,6 +71,35 @@ def task_race() -> Iterator[dict[str, Any]]:
 def task_page() -> dict[str, Any]:
     """Writes the page and the figure of what is there."""
     return {"actions": [write_page], "task_dep": ["race"], "uptodate": [False], "verbosity": 2}
+
+
+def task_learn() -> Iterator[dict[str, Any]]:
+    """Drives each cell faster every lap."""
+    for cell in CELLS:
+        yield {
+            "name": cell.name,
+            "actions": [(learn_cell, [cell, OUT, TRAINED, LEARNS])],
+            "file_dep": [str(model_folder(cell.training, LEARNS, TRAINED) / CARD)],
+            "targets": [str(learning_file(cell, OUT))],
+            "uptodate": [config_changed(repr(cell))],
+        }
+
+
+def task_learning_page() -> dict[str, Any]:
+    """Writes the page of what learned."""
+    return {"actions": [write_learning_page], "task_dep": ["learn"], "uptodate": [False], "verbosity": 2}
+
+
+def write_learning_page() -> None:
+    """The page of the cells that were driven faster every lap."""
+    files = {cell: learning_file(cell, OUT) for cell in CELLS}
+    known = {cell: json.loads(file.read_text(encoding="utf-8")) for cell, file in files.items() if file.exists()}
+    if not known:
+        raise UserError(f"only={VALUES['only']} part={VALUES['part']}: no cell was driven")
+    text = learning_page(known, ARGUMENTS)
+    with replacing(PAGE_FOLDER / LEARNING_PAGE) as aside:
+        aside.write_text(text, encoding="utf-8")
+    print(text)
 
 
 def write_page() -> None:

@@ -9,11 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.closed_loop.cells import LAPS, OBJECTIVES, PACE, Cell
-from benchmarks.closed_loop.run import AS_IS, CALIBRATED
+from benchmarks.closed_loop.run import AS_IS, CALIBRATED, LEARNING_LAPS, TRUE_PACES
+from dynssm_ros.control.lap_learning import SAFE
 from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.reporting.evaluation_figures import model_colours
 
-PAGE, FIGURE = "closed_loop.md", "closed_loop.png"
+PAGE, FIGURE, LEARNING_PAGE = "closed_loop.md", "closed_loop.png", "lap_learning.md"
+_GOAL = 1.015
 
 Known = Mapping[Cell, Mapping[str, Any]]
 
@@ -148,3 +150,34 @@ def _lines(known: Known, arguments: Sequence[str]) -> Iterator[str]:
 
 def _both(values: Sequence[float] | None) -> str:
     return "–" if values is None else ", ".join(f"{value:.3f}" for value in values)
+
+
+def learning_page(known: Mapping[Cell, Mapping[str, Any]], arguments: Sequence[str]) -> str:
+    """What learned lap by lap, as Markdown."""
+    command = " ".join(["python -m doit -n 2 -f benchmarks/closed_loop/dodo.py", *arguments, "learning_page"])
+    lines = [
+        "# Faster every lap",
+        "",
+        f"Made by `{command}`. Each cell is driven for {LEARNING_LAPS} laps with `dynssm`, beginning with {SAFE:g} of the "
+        "car's limits ([how](race.md#faster-every-lap)). The cells are those of the [matrix](closed_loop.md). The last "
+        f"lap is compared with the best of the true model, which knows the plant and the change, at "
+        f"{', '.join(f'{pace:g}' for pace in TRUE_PACES)} of the limits.",
+    ]
+    for label, test in _PARTS.items():
+        part = {cell: outcome for cell, outcome in known.items() if cell.is_test == test}
+        if not part:
+            continue
+        lines += ["", f"## {label.capitalize()} cells", ""]
+        lines += ["| change | cells | between the borders | first lap | last lap: median, worst | within 1.5 % |"]
+        lines += ["| --- | --- | --- | --- | --- | --- |"]
+        for change in [*dict.fromkeys(cell.change for cell in part), "all"]:
+            lines.append(_learning_row(change, [v for c, v in part.items() if change in (c.change, "all")]))
+    return "\n".join(lines) + "\n"
+
+
+def _learning_row(change: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
+    safe = [outcome for outcome in outcomes if came_round(outcome["learned"])]
+    pairs = [(o["learned"]["lap_times_s"], o["true_best_s"]) for o in safe if o["true_best_s"] is not None]
+    first, last = (np.array([laps[k] / best for laps, best in pairs]) for k in (0, -1))
+    middle = f"{np.median(first):.3f} | {np.median(last):.3f}, {np.max(last):.3f}" if pairs else "– | –"
+    return f"| {change} | {len(outcomes)} | {len(safe)} | {middle} | {np.sum(last <= _GOAL)} of {len(pairs)} |"

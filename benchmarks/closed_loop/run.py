@@ -10,6 +10,7 @@ from typing import Any
 from benchmarks.closed_loop.cells import LAPS, PACE, Cell
 from benchmarks.generalisation.cells import simulated_car
 from benchmarks.generalisation.run import model_folder
+from dynssm_ros.control.lap_learning import SAFE
 from dynssm_ros.control.prediction_model import Adaptive, PredictionModel
 from dynssm_ros.control.race import Course, race
 from dynssm_ros.control.race_models import TRUE, true_model
@@ -19,6 +20,9 @@ from dynssm_ros.files import write_json
 from dynssm_ros.runtime.models import SingleTrack, load_model
 
 CALIBRATED = "calibrated"
+TRUE_PACES = (0.9, 1.0, 1.1, 1.2)
+"""Shares of the car's limits among which the true model's best is looked for."""
+LEARNING_LAPS = 10
 AS_IS = " as it is"
 """Ends the name of a model that needs no evidence."""
 
@@ -56,6 +60,39 @@ def race_cell(cell: Cell, out: Path, trained: Path, models: Iterable[str]) -> No
         drive(name, Adaptive(load_model(folder), car))
         drive(name + AS_IS, Adaptive(load_model(folder), car), evidence=False)
     write_json(cell_file(cell, out), {"models": outcomes})
+
+
+def learning_file(cell: Cell, out: Path) -> Path:
+    """Where the outcome of a cell that is driven faster every lap is."""
+    return out / "learning" / f"{cell.name}.json"
+
+
+def learn_cell(cell: Cell, out: Path, trained: Path, model: str) -> None:
+    """Drives a cell faster every lap with ``model``, and with the true model at several paces.
+
+    Args:
+        cell: to drive.
+        out: folder of the outcomes.
+        trained: folder of the generalisation matrix, which has the model.
+        model: its name.
+    """
+    car, road = simulated_car(cell.car), cell.road
+    driven = car.with_effects(cell.effects.items())
+    settings = Settings.of(car, cell.objective)
+    best = []
+    for pace in TRUE_PACES:
+        course = Course(
+            driven, road, cell.plant, load_reference("racing", car, road, pace), settings, LAPS, sensing=cell.sensing
+        )
+        outcome = race(course, true_model(driven, cell.plant))
+        if outcome.completed and not outcome.outside:
+            best.append(outcome.lap_times[-1])
+    course = Course(
+        driven, road, cell.plant, load_reference("racing", car, road, SAFE), settings, LEARNING_LAPS, sensing=cell.sensing,
+        learning=car,
+    )  # fmt: skip
+    learned = race(course, Adaptive(load_model(model_folder(cell.training, model, trained)), car))
+    write_json(learning_file(cell, out), {"true_best_s": min(best, default=None), "learned": learned.to_json()})
 
 
 def read_cell(cell: Cell, out: Path) -> dict[str, Any] | None:

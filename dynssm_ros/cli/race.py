@@ -48,9 +48,21 @@ def race(
         str, typer.Option(help="Line to follow: centre, racing, or a file s_m,x_m,y_m,v_mps with its own speed.")
     ] = "racing",
     speed_scale: Annotated[
-        float,
-        typer.Option(help="Share of the car's limits in the line's speed; of a file, factor on it.", min=0.1, max=2.0),
-    ] = 1.0,
+        float | None,
+        typer.Option(
+            help="Share of the car's limits in the line's speed; of a file, factor on it.",
+            min=0.1,
+            max=2.0,
+            show_default="1; with --learn 0.7, to begin with",
+        ),
+    ] = None,
+    learn: Annotated[
+        bool,
+        typer.Option(
+            "--learn",
+            help="Drive each section of the lap faster every lap, as far as the laps so far have shown it is safe.",
+        ),
+    ] = False,
     horizon: Annotated[
         int | None,
         typer.Option(
@@ -115,7 +127,7 @@ def race(
         races = api.race(
             vehicle, track, list(model), plant, objective, laps, line, speed_scale, horizon, along_horizon, offset_free,
             as_effects(effect), scale, lap_length, start, start_offset, start_speed, progress,
-            parse_noise(noise), parse_noise(pose_noise, "--pose-noise"), delay / 1e3, seed, as_is,
+            parse_noise(noise), parse_noise(pose_noise, "--pose-noise"), delay / 1e3, seed, as_is, learn,
         )  # fmt: skip
     race_report(races).save(out / "report.html")
     if animation:

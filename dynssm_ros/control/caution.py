@@ -16,8 +16,8 @@ import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
 
-QUANTILE = 1.0
-"""Standard deviations by which a bound is moved: it holds in 84 % of the horizons, before the next plan corrects it."""
+QUANTILE = 2.0
+"""Standard deviations by which a bound is moved: it holds in 98 % of the horizons, before the next plan corrects it."""
 _REMEMBERED = 20  # horizons that the deviations are of
 
 

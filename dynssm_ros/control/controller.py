@@ -13,6 +13,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.disturbance import Disturbance
 from dynssm_ros.control.evidence import SOURCES, Evidence, sources, together
 from dynssm_ros.control.horizon_model import CONTEXT, STATES, VELOCITIES, HorizonModel
@@ -43,6 +44,7 @@ class Decision(NamedTuple):
         command: absolute throttle and steering to apply from now on: finite, within the limits and the steering rate.
         plan: whose first step that is.
         adapted: what was planned with: what the model said as far as it has earned it, and what was found to be missing.
+        caution: by which it stays away from the borders at the end of the horizon (m).
         weights: of :data:`~dynssm_ros.control.evidence.SOURCES` in that, ``(3,)``.
         seconds: that it took, model and plan together, by the controller's clock.
     """
@@ -50,6 +52,7 @@ class Decision(NamedTuple):
     command: Applied
     plan: Plan
     adapted: Adapted
+    caution: float
     weights: Vector
     seconds: float
 
@@ -94,6 +97,7 @@ class Controller:
         self.counts: dict[Status, int] = dict.fromkeys(get_args(Status), 0)
         """Steps by what became of their plan."""
         self._model = model
+        self._calibrated = model.calibrated
         self._track = track
         self._clock = clock
         horizon = HorizonModel(model.car, settings.N, settings.travel, settings.scale.length / settings.scale.time)
@@ -119,6 +123,11 @@ class Controller:
         self._age = 0
         self._past: Vector | None = None  # the estimated state at the last measurement
         self._expected: Vector | None = None  # by the model, at the next one
+
+    def follow(self, reference: Reference, theta: Vector) -> None:
+        """From now on follows the same line at another speed, with the calibrated car's coefficients ``theta`` ``(17,)``."""
+        self._nmpc.follow(reference)
+        self._calibrated = Adapted(theta, self._calibrated.correction)
 
     def interrupt(self) -> None:
         """What is measured next is not one T_s after what was measured last."""
@@ -159,7 +168,7 @@ class Controller:
             self._history.append(np.array([*seen, *commands[0], *(sent[0] if age else planned)]))
             for disturbance in self._disturbances:
                 disturbance.measured(np.array(seen))
-        given = sources(self._model.calibrated, self._model.read(np.array(self._history), previous))
+        given = sources(self._calibrated, self._model.read(np.array(self._history), previous))
         said = [disturbance.added(one) for disturbance, one in zip(self._disturbances, given, strict=True)]
         adapted = self._evidence.earned(said) if self._wants_evidence else said[-1]
         if is_new or self._past is None:
@@ -168,14 +177,14 @@ class Controller:
         for k, increments in enumerate(sent):
             now = self._nmpc.following(now, increments, adapted, at + k * self._model.car.T_s)
         weights = self._evidence.weights if self._wants_evidence else _AS_IT_IS
-        margins = self._evidence.margins() if self._wants_evidence else None
+        margins = self._evidence.margins() if self._wants_evidence else Margins.none(self._nmpc.settings.N)
         plan = self._nmpc.plan(now, adapted, t, began, margins)
         command = self._nmpc.command(plan)
         first = self._expect(at, plan, command, sent, adapted)
         if is_new:
             self._gather(at, first, said, bool(np.all(np.isfinite([*pose, *seen, *feedback]))))
         self.counts[plan.status] += 1
-        return Decision(command, plan, adapted, weights, self._clock() - began)
+        return Decision(command, plan, adapted, float(margins.lateral[-1]), weights, self._clock() - began)
 
     def _gather(self, t: float, increments: Vector, said: Sequence[Adapted], is_sound: bool) -> None:
         """Takes what was said at the last measurement (s), and what was sent from there on, as evidence.

@@ -126,6 +126,10 @@ class Nmpc:
         """The plan as it stands before the next step: the last one, moved on."""
         return None if self._plan is None else self._plan.shifted()
 
+    def follow(self, reference: Reference) -> None:
+        """From now on follows the same line at another speed."""
+        self._reference = reference
+
     def forget(self) -> None:
         """Drops the last plan."""
         self._plan = None

@@ -18,8 +18,10 @@ from typing import Any
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.control.controller import LOST, MOST_LATE, Controller
+from dynssm_ros.control.caution import QUANTILE
+from dynssm_ros.control.controller import LOST, MOST_LATE, Controller, Decision
 from dynssm_ros.control.evidence import SOURCES
+from dynssm_ros.control.lap_learning import LapLearner, LapLog, LearnedLap
 from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
@@ -93,6 +95,8 @@ class Course:
         laps: to drive.
         start: where it begins.
         sensing: what comes between the car and its controller.
+        learning: the car as its file describes it, if it is to be driven faster every lap
+            (:mod:`dynssm_ros.control.lap_learning`); ``None``: at the reference's speed.
     """
 
     vehicle: Vehicle
@@ -103,6 +107,7 @@ class Course:
     laps: int = 1
     start: Start = Start()
     sensing: Sensing = Sensing()
+    learning: Vehicle | None = None
 
     @property
     def delay(self) -> float:
@@ -163,6 +168,7 @@ class Race:
         infeasible: steps at which there was no plan.
         late: steps at which it came too late.
         failure: why the laps were not completed; empty if they were.
+        learned: lap by lap, what a car that learns was driven with.
     """
 
     name: str
@@ -180,6 +186,7 @@ class Race:
     infeasible: int
     late: int
     failure: str
+    learned: tuple[LearnedLap, ...] = ()
 
     @property
     def completed(self) -> bool:
@@ -220,6 +227,7 @@ class Race:
             "steps": len(self.time),
             "infeasible": self.infeasible,
             "late": self.late,
+            "learned": [lap.to_json() for lap in self.learned],
         }
 
 
@@ -243,6 +251,12 @@ class _Drive:
         self._seen: deque[Vector] = deque(maxlen=1 + course.sensing.steps(vehicle.sampling_time))
         self._limit = PATIENCE * course.laps * course.reference.lap_time
         self._rows: list[tuple[Any, ...]] = []
+        self._learner: LapLearner | None = None
+        self._logged: list[tuple[Any, ...]] = []  # of the lap under way
+        if course.learning is not None:
+            theta = model.calibrated.first.theta
+            self._learner = LapLearner(course.learning, track, course.reference, settings, model.car, theta)
+            self.pilot.follow(self._learner.reference, theta)
         self.s, self._lateral = (float(value) for value in track.project(pose[:2]))
         self.start, self.goal = self.s, self.s + course.laps * track.length
 
@@ -256,6 +270,7 @@ class _Drive:
             (t, car.pose, car.state, decision.command, self.s, self._lateral, decision.theta, decision.correction,
              decision.weights, decision.seconds)
         )  # fmt: skip
+        self._log(t, decision)
         failure = self._failure(t)
         if failure or self.s >= self.goal:
             return failure
@@ -276,7 +291,21 @@ class _Drive:
         return Race(
             name, self._course, time, pose, state, command, s, lateral, theta, correction, weights, solve,
             counts["infeasible"], counts["late"], failure,
+            () if self._learner is None else tuple(self._learner.laps),
         )  # fmt: skip
+
+    def _log(self, t: float, decision: Decision) -> None:
+        """Keeps what was measured at ``t`` (s), and learns from the lap once it is complete."""
+        if self._learner is None:
+            return
+        track, believed = self._course.track, decision.plan.x[0, :2]
+        room = float(track.room(*track.project(believed, near=self.s)))
+        row = (*self._seen[-1][3:], *self._feedback, *np.subtract(decision.command, self._feedback))
+        self._logged.append((t, self.s, room, decision.caution / QUANTILE, row))
+        if self.s >= self.start + (1 + len(self._learner.laps)) * track.length:
+            self._learner.learn(LapLog(*(np.array(column) for column in zip(*self._logged, strict=True))))
+            self.pilot.follow(self._learner.reference, self._learner.theta)
+            del self._logged[:-1]
 
     def _failure(self, t: float) -> str:
         """Why the drive ends before its time; empty if it does not."""

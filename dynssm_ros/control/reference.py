@@ -33,12 +33,14 @@ class Reference:
         line: where to drive.
         speed: at the points of the line (m/s), shape ``(N,)``.
         limits: of the car that follows it; ``None``: it can do anything.
+        share: of the limits' accelerations that the speed asks for; ``None``: the line has a speed of its own.
     """
 
     name: str
     line: ClosedLine
     speed: Vector
     limits: Limits | None = None
+    share: float | None = None
 
     @property
     def standing(self) -> bool:
@@ -144,7 +146,7 @@ def load_reference(name_or_path: str, vehicle: Vehicle, track: Track, speed_scal
     if name_or_path not in ("centre", "racing"):
         raise TrackError(f"line '{name_or_path}' is neither centre, racing nor a file {','.join(COLUMNS)}")
     line = line_of("centre" if name_or_path == "centre" else "racing", vehicle, track)
-    return Reference(name_or_path, line, speed_profile(line, limits.scaled(speed_scale)), limits)
+    return Reference(name_or_path, line, speed_profile(line, limits, speed_scale), limits, speed_scale)
 
 
 def _read(path: Path, speed_scale: float, limits: Limits) -> Reference:

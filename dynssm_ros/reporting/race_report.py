@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from dynssm_ros.control.race import Course, Race
 from dynssm_ros.evaluation.coefficients import coefficient_unit
@@ -23,6 +24,7 @@ _STAMPS = 0.5  # s between the time stamps on the map
 _MOVED = (
     1e-3  # share of its bounds that a coefficient must move, and of a state's range that must be added, to be shown
 )
+_LEARNED = 4  # coefficients in the figure of a car that learns
 _ANSWERS = 6  # coefficients at most in a figure of hidden effects
 VIOLATION = "A violation is the car's centre of gravity outside the borders at any sample."
 
@@ -48,6 +50,7 @@ def race_json(races: Sequence[Race]) -> dict[str, Any]:
         "pose_noise": list(course.sensing.pose_noise),
         "delay_s": course.delay,
         "seed": course.sensing.seed,
+        "learn": course.learning is not None,
         "models": {race.name: race.to_json() for race in races},
     }
 
@@ -125,6 +128,18 @@ def race_report(races: Sequence[Race]) -> Report:
                 "coefficients, and what it adds beside them, count as soon as they have predicted the last horizons better.",
                 evidence(races),
             )
+        )
+    if any(race.learned for race in races):
+        sections.insert(
+            0,
+            Section(
+                "Faster every lap",
+                "Lap times. The share of the file's car's accelerations that each lap was driven with: mean over its "
+                "sections, the least and the largest. How close the car came to a border: 1 is a wheel on it, and from 0.75 "
+                "on a section is driven slower. The coefficients that were calibrated on the laps before, with two standard "
+                "deviations; the dashed line is what the effects of the driven car come to.",
+                learning(races),
+            ),
         )
     return Report(f"Race on {course.track.name}", summary(races), sections, _protocol(course), race_table(races))
 
@@ -309,6 +324,54 @@ def coefficients(races: Sequence[Race]) -> Figure:
         or any(np.max(np.abs(race.correction[:, k])) > _MOVED * np.ptp(race.state[:, k]) for race in races)
     ]
     return _panels(races, rows, {labels[name]: values for name, values in driven.items()}, longest)
+
+
+@styled
+def learning(races: Sequence[Race]) -> Figure:
+    """Lap times, shares of the limits, margins and coefficients, lap by lap."""
+    races = [race for race in races if race.learned]
+    colours = model_colours([race.name for race in races])
+    known = {name for race in races for name in _learned_most(race)}
+    names = [name for name in COEFFICIENTS if name in known]
+    figure = Figure(figsize=(WIDTH, 0.8 + 1.9 * (2 + -(-len(names) // 2))), layout="constrained")
+    panels = figure.subplots(2 + -(-len(names) // 2), 2, sharex=True, squeeze=False)
+    labels = ("lap time (s)", "share of the limits", "margin used", "")
+    for panel, label in zip(panels.flat, labels, strict=False):
+        panel.set_ylabel(label)
+    panels[1, 1].set_visible(False)
+    for race in races:
+        colour, laps = colours[race.name], np.arange(1, len(race.learned) + 1)
+        shares = np.array([lap.shares for lap in race.learned])
+        panels[0, 0].plot(laps, [lap.time for lap in race.learned], "o-", ms=4, color=colour, label=race.name)
+        panels[0, 1].plot(laps, shares.mean(axis=1), "o-", ms=4, color=colour)
+        panels[0, 1].fill_between(laps, shares.min(axis=1), shares.max(axis=1), color=colour, alpha=0.15, lw=0)
+        panels[1, 0].plot(laps, np.minimum([lap.margin_used for lap in race.learned], 1.5), "o-", ms=4, color=colour)
+        for panel, name in zip(panels[2:].flat, names, strict=False):
+            values = np.array([lap.vehicle.coefficients[name].nominal for lap in race.learned])
+            band = 2 * np.array([lap.vehicle.coefficients[name].std or 0.0 for lap in race.learned])
+            panel.plot(laps, values, "o-", ms=4, color=colour)
+            panel.fill_between(laps, values - band, values + band, color=colour, alpha=0.15, lw=0)
+    truth = driven_coefficients(races[0])
+    for panel, name in zip(panels[2:].flat, names, strict=False):
+        unit = coefficient_unit(name)
+        panel.set_ylabel(f"{name} ({unit})" if unit else name)
+        if name in truth:
+            panel.axhline(float(np.nanmedian(truth[name])), color=MEASURED, lw=1.0, ls="--")
+    for spare in list(panels[2:].flat)[len(names) :]:
+        spare.set_visible(False)
+    panels[1, 0].axhline(1.0, color=MEASURED, lw=0.8)
+    for bottom in panels[-1]:
+        bottom.set_xlabel("lap")
+        bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+def _learned_most(race: Race) -> list[str]:
+    """The coefficients whose standard deviations shrank most over the laps."""
+    first, last = (lap.vehicle.coefficients for lap in (race.learned[0], race.learned[-1]))
+    shrunk = {name: (last[name].std or 0.0) / std for name, c in first.items() if (std := c.std)}
+    return sorted(shrunk, key=lambda name: shrunk[name])[:_LEARNED]
 
 
 @styled

@@ -49,7 +49,7 @@ class Driver:
         self.line = line
         self._slower = 0.3 * style.variation
         self._wander = 0.3 * style.variation * room
-        self._profile = speed_profile(line, limits.scaled(style.aggressiveness))
+        self._profile = speed_profile(line, limits, style.aggressiveness)
         self._vehicle = vehicle
         self._theta = Coefficients(*vehicle.nominal.tolist())
         self._stiffness = sum(cornering_stiffness(self._theta))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -39,10 +39,6 @@ class Limits:
         """Highest speed of the table (m/s)."""
         return float(self.speed[-1])
 
-    def scaled(self, share: float) -> Limits:
-        """The same car driven with ``share`` of its accelerations."""
-        return replace(self, lateral=self.lateral * share, drive=self.drive * share, brake=self.brake * share)
-
     def cornering_speed(self, curvature: Vector) -> Vector:
         """Highest speed (m/s) at which ``curvature`` (1/m) stays within the lateral limit; the shape is kept."""
         tightest = self.lateral / self.speed**2  # falls with speed; exact between grid speeds for a constant limit
@@ -74,23 +70,32 @@ def vehicle_limits(vehicle: Vehicle, top_speed: float = TOP_SPEED) -> Limits:
     return limits
 
 
-def speed_profile(line: ClosedLine, limits: Limits) -> Vector:
+def speed_profile(line: ClosedLine, limits: Limits, share: float | Vector = 1.0) -> Vector:
     """Fastest speed (m/s) at the points of ``line``, shape ``(N,)``.
 
     Lateral and longitudinal acceleration share the grip: they stay on the ellipse of their limits.
+
+    Args:
+        line: to drive.
+        limits: of the car.
+        share: of its accelerations that are used, for all points or ``(N,)``.
     """
-    curvature = np.abs(line.curvature(line.s))
+    share = np.broadcast_to(np.asarray(share, dtype=np.float64), line.s.shape)
+    curvature = np.abs(line.curvature(line.s)) / share
     v = limits.cornering_speed(curvature)
     ds = np.diff(line.s, append=line.length)
     # from the slowest corner around once, the end meets the start; then the same in reverse for the brakes
     start = int(np.argmin(v))
     order = np.asarray((start + np.arange(len(v) + 1)) % len(v), dtype=np.intp)
-    v = _forward(v, order, ds, curvature, limits, limits.drive)
-    return _forward(v, order[::-1], np.roll(ds, 1), curvature, limits, limits.brake)
+    v = _forward(v, order, share * ds, curvature, limits, limits.drive)
+    return _forward(v, order[::-1], share * np.roll(ds, 1), curvature, limits, limits.brake)
 
 
 def _forward(v: Vector, order: Indices, ds: Vector, curvature: Vector, limits: Limits, available: Vector) -> Vector:
-    """Caps ``v`` by what ``available`` acceleration (over ``limits.speed``) reaches, point after point in ``order``."""
+    """Caps ``v`` by what ``available`` acceleration (over ``limits.speed``) reaches, point after point in ``order``.
+
+    With a share of the car's accelerations ``curvature`` (1/m) is over that share, and ``ds`` (m) times it.
+    """
     v = v.copy()
     for here, there in pairwise(order):
         used = curvature[here] * v[here] ** 2 / np.interp(v[here], limits.speed, limits.lateral)

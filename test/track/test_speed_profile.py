@@ -23,18 +23,30 @@ def test_circle_is_driven_at_the_lateral_limit():
     np.testing.assert_allclose(speed_profile(circle, CONSTANT), np.sqrt(8.0 * 50), rtol=1e-4)
 
 
-@pytest.mark.parametrize("limits", [CONSTANT, vehicle_limits(load_vehicle("av21")).scaled(0.8)])
+@pytest.mark.parametrize(("limits", "share"), [(CONSTANT, 1.0), (vehicle_limits(load_vehicle("av21")), 0.8)])
 @pytest.mark.parametrize("name", ["oval", "road_course"])
-def test_profile_keeps_all_limits(name, limits):
+def test_profile_keeps_all_limits(name, limits, share):
     line = built_in_track(name).centre
-    v = speed_profile(line, limits)
-    lateral = np.interp(v, limits.speed, limits.lateral)
-    share = np.abs(line.curvature(line.s)) * v**2 / lateral
-    assert np.max(share) <= 1 + 1e-3
+    v = speed_profile(line, limits, share)
+    lateral = share * np.interp(v, limits.speed, limits.lateral)
+    used = np.abs(line.curvature(line.s)) * v**2 / lateral
+    assert np.max(used) <= 1 + 1e-3
     assert np.max(v) <= limits.top_speed
     a = slopes(line, v)
-    assert np.all(a <= np.interp(v, limits.speed, limits.drive) + 1e-9)
-    assert np.all(a >= -np.interp(np.roll(v, -1), limits.speed, limits.brake) - 1e-9)
+    assert np.all(a <= share * np.interp(v, limits.speed, limits.drive) + 1e-9)
+    assert np.all(a >= -share * np.interp(np.roll(v, -1), limits.speed, limits.brake) - 1e-9)
+
+
+def test_a_section_with_a_smaller_share_is_slower_and_is_braked_for():
+    line = built_in_track("club").centre
+    limits = vehicle_limits(load_vehicle("orca"))
+    careful = np.where(np.abs(line.s - line.length / 2) < line.length / 10, 0.5, 1.0)
+    full, v = speed_profile(line, limits), speed_profile(line, limits, careful)
+    assert np.all(v <= full + 1e-12)
+    used = np.abs(line.curvature(line.s)) * v**2 / np.interp(v, limits.speed, limits.lateral)
+    assert np.max(used[careful < 1]) <= 0.5 + 1e-3
+    far = np.abs(line.s - line.length / 2) > 0.4 * line.length
+    np.testing.assert_allclose(v[far], full[far], rtol=1e-9)
 
 
 def test_straights_are_driven_at_full_throttle_or_full_brake():

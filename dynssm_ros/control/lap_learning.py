@@ -1,0 +1,249 @@
+"""Faster every lap: how fast the line is driven next follows from the laps that were driven.
+
+The line's speed has a share of the car's accelerations for each section of the lap. It begins at a safe share. After a lap a
+section is driven a step faster, if the car stayed away from the borders there and was not slower than before. One that came
+too close to a border, and the one before it, go back below what they were driven with, and stay there. One that was slower
+than it has been goes back to what was fastest.
+
+After each lap the coefficients are calibrated on the last ones. No share goes beyond what they allow with what is not known
+of them: the cornering limit that most cars within their covariance reach, over that of the file's car, bounds the shares.
+Where the controller has to stay away from the borders because its model predicts badly, it plans with them instead: if those
+of the laps before have predicted the new lap clearly better than the model's own.
+
+Learning from lap to lap by what a lap measured against the best one is the idea of Rosolia and Borrelli, "Learning model
+predictive control for iterative tasks", 2018, without their terminal set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.control.horizon_model import SteppedCar
+from dynssm_ros.control.prediction_model import stepped
+from dynssm_ros.control.reference import Reference
+from dynssm_ros.control.settings import HORIZON, Settings
+from dynssm_ros.errors import ConfigurationError, RecordingError, UserError
+from dynssm_ros.identification.calibration import calibrate
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS
+from dynssm_ros.signals.recording import Recording, RecordingInfo
+from dynssm_ros.track.speed_profile import speed_profile, vehicle_limits
+from dynssm_ros.track.tracks import Track
+from dynssm_ros.vehicle import State, Vehicle
+from dynssm_ros.vehicle.kinematics import Pose, advance_pose
+
+SAFE = 0.7
+"""Share of the car's accelerations to begin with."""
+_STEP = 0.06
+_MOST = 1.2  # of what the coefficients allow: racing lines ask for less than the borders do
+_CLOSE = 0.75  # half the car's width over the distance from its centre to the border, from which on it is too close
+_SLOWER = 0.01  # share of a section's best time
+_SECTION_HORIZONS = 1.5  # length of a section, in horizons at the line's mean speed
+_FEWEST_SECTIONS, _MOST_SECTIONS = 4, 40
+_REMEMBERED = 3  # laps that coefficients are calibrated on
+_CLEARLY = 0.9  # of the path error of the model's coefficients, below which others are planned with
+_DRAWS, _CAREFUL = 40, 0.1  # cars within the covariance, and the share of them that are allowed to grip less
+
+
+@dataclass(frozen=True)
+class LapLog:
+    """A lap as it was measured.
+
+    Attributes:
+        time: of each row (s), ``(n,)``; the last is the first of the next lap.
+        s: along the centre line, counted on (m), ``(n,)``.
+        room: from the car's centre to the nearer border (m), ``(n,)``.
+        caution: standard deviation of where the car is at the end of a horizon (m), ``(n,)``.
+        rows: with the columns ``WINDOW_COLUMNS``, ``(n, 7)``.
+    """
+
+    time: Vector
+    s: Vector
+    room: Vector
+    caution: Vector
+    rows: Vector
+
+
+@dataclass(frozen=True)
+class LearnedLap:
+    """What a lap has shown.
+
+    Attributes:
+        time: of the lap (s).
+        shares: that it was driven with, ``(sections,)``.
+        allowed: shares that the coefficients allowed, ``(sections,)``.
+        margin_used: half the car's width over the least room less caution; 1: a wheel may have been on the border. The first
+            lap counts without caution, which is only being learned.
+        vehicle: with the coefficients, and what was known of them, before the lap.
+        planned: whether the controller planned with them.
+    """
+
+    time: float
+    shares: Vector
+    allowed: Vector
+    margin_used: float
+    vehicle: Vehicle
+    planned: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "lap_time_s": self.time,
+            "speed_scale": self.shares.tolist(),
+            "allowed": self.allowed.tolist(),
+            "margin_used": self.margin_used,
+            "coefficients_planned_with": self.planned,
+            "coefficients": {
+                name: {"nominal": known.nominal, "std": known.std} for name, known in self.vehicle.coefficients.items()
+            },
+        }
+
+
+class LapLearner:
+    """Chooses the speed along a line lap by lap.
+
+    Args:
+        vehicle: as its file describes it.
+        track: where.
+        reference: the line, at the speed to begin with.
+        settings: of the controller.
+        car: the physics of its model.
+        theta: the model's coefficients, ``(17,)``.
+
+    Raises:
+        ConfigurationError: the line has a speed of its own.
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, track: Track, reference: Reference, settings: Settings, car: SteppedCar, theta: Vector
+    ) -> None:
+        if reference.limits is None or reference.share is None:
+            raise ConfigurationError(
+                f"line {reference.name} has a speed of its own, which is not learned; expected centre or racing"
+            )
+        self._limits = reference.limits
+        self._line = reference
+        self._vehicle = vehicle
+        self._car, self._theta = car, theta
+        self._N = settings.N
+        self._known = vehicle
+        self._planned = False
+        self._half_width = settings.margin
+        horizon = HORIZON * settings.scale.time * track.length / reference.lap_time
+        sections = int(np.clip(track.length / (_SECTION_HORIZONS * horizon), _FEWEST_SECTIONS, _MOST_SECTIONS))
+        self._edges = np.linspace(0.0, track.length, sections + 1)
+        self._at = track.project(reference.line.points)[0]  # of the line's points on the track
+        self._shares = np.full(sections, reference.share)
+        self._ceiling = np.full(sections, np.inf)
+        self._best_time, self._best_share = np.full(sections, np.inf), self._shares.copy()
+        self._logs: list[LapLog] = []
+        self.laps: list[LearnedLap] = []
+        self._allowed = self._allowance()
+
+    @property
+    def reference(self) -> Reference:
+        """The line with the speed for the next lap."""
+        centres = (self._edges[1:] + self._edges[:-1]) / 2
+        share = np.interp(self._at, centres, np.minimum(self._shares, self._allowed), period=self._edges[-1])
+        return replace(self._line, speed=speed_profile(self._line.line, self._limits, share), share=None)
+
+    @property
+    def theta(self) -> Vector:
+        """Coefficients of the calibrated car for the next lap, ``(17,)``."""
+        return self._known.nominal if self._planned else self._theta
+
+    def learn(self, lap: LapLog) -> None:
+        """Takes a lap that was driven with :attr:`reference`."""
+        driven = np.minimum(self._shares, self._allowed)
+        times, used = self._by_section(lap)
+        self.laps.append(
+            LearnedLap(float(lap.time[-1] - lap.time[0]), driven, self._allowed, used.max(), self._known, self._planned)
+        )
+        close = used > _CLOSE
+        if self._logs and (self._planned or close.any()):
+            before = self._path_error(self._known.nominal, lap)  # of coefficients that this lap had no part in
+            self._planned = before < _CLEARLY * self._path_error(self._theta, lap)
+        close |= np.roll(close, -1)  # what leads there
+        slower = ~close & (times > (1 + _SLOWER) * self._best_time)
+        better = ~close & (times < self._best_time)
+        self._best_time = np.where(better, times, self._best_time)
+        self._best_share = np.where(better, driven, self._best_share)
+        self._ceiling = np.where(close, np.minimum(self._ceiling, driven - _STEP / 2), self._ceiling)
+        faster = np.minimum(driven + _STEP, self._ceiling)
+        self._shares = np.where(slower, np.minimum(self._best_share, self._ceiling), faster)
+        self._logs = [*self._logs, lap][-_REMEMBERED:]
+        self._known = self._calibrated()
+        self._allowed = self._allowance()
+
+    def _by_section(self, lap: LapLog) -> tuple[Vector, Vector]:
+        """Time in each section (s), and the margin used there at most."""
+        s = np.maximum.accumulate(lap.s - lap.s[0])
+        first = lap.s[0] % self._edges[-1]
+        marks = np.interp((self._edges - first) % self._edges[-1], s, lap.time)
+        around = lap.time[-1] - lap.time[0]
+        times = np.diff(marks) % around
+        section = np.searchsorted(self._edges, (lap.s % self._edges[-1]), "right") - 1
+        room = lap.room - (lap.caution if self.laps else 0.0)
+        used = np.zeros(len(times))
+        np.maximum.at(used, np.clip(section, 0, len(times) - 1), self._half_width / np.maximum(room, 1e-9))
+        return times, used
+
+    def _calibrated(self) -> Vehicle:
+        """The file's car with the coefficients of the laps so far; what was known before, where they cannot be calibrated."""
+        rows = np.concatenate([log.rows[:-1] for log in self._logs])
+        T_s = self._vehicle.sampling_time
+        info = RecordingInfo(sampling_time=T_s, commands="topics", source=("laps",))
+        stamps = np.round(np.arange(len(rows)) * T_s * 1e9).astype(np.int64)
+        columns = dict(zip(WINDOW_COLUMNS, rows.T, strict=True))
+        recording = Recording(info, stamps, np.zeros(len(rows), dtype=np.int32), columns)
+        try:
+            return calibrate(recording, self._vehicle, integrator=self._car.integrator, starts=1).vehicle
+        except (RecordingError, ConfigurationError):
+            return self._known
+
+    def _path_error(self, theta: Vector, lap: LapLog) -> float:
+        """RMS distance (m) between predicted and measured paths at the end of a horizon, both from their velocities."""
+        starts = np.arange(0, len(lap.rows) - self._N - 1, max(1, self._N // 4))
+        rows = lap.rows[starts]
+        predicted = measured = Pose(*np.zeros((3, len(starts))))
+        for k in range(self._N):
+            following, now, seen = stepped(self._car, rows, theta), lap.rows[starts + k], lap.rows[starts + k + 1]
+            predicted = _moved(predicted, rows, following, self._car.T_s)
+            measured = _moved(measured, now, seen, self._car.T_s)
+            rows = np.concatenate([following, seen[:, 3:]], axis=1)
+        return float(np.sqrt(np.mean((predicted.x - measured.x) ** 2 + (predicted.y - measured.y) ** 2)))
+
+    def _allowance(self) -> Vector:
+        """Largest share of each section, by what is known of the coefficients."""
+        lateral = np.array([np.interp(self._limits.speed, *each) for each in self._possible_limits()])
+        careful = np.quantile(lateral, _CAREFUL, axis=0) / self._limits.lateral
+        speed = speed_profile(self._line.line, self._limits)
+        at_points = np.interp(speed, self._limits.speed, careful)
+        section = np.clip(np.searchsorted(self._edges, self._at, "right") - 1, 0, len(self._shares) - 1)
+        least = np.full(len(self._shares), np.inf)
+        np.minimum.at(least, section, at_points)
+        return _MOST * np.where(np.isfinite(least), least, careful.min())
+
+    def _possible_limits(self) -> Sequence[tuple[Vector, Vector]]:
+        """Speeds and cornering limits of cars within the covariance of the coefficients; the known car's first."""
+        known, rng = self._known, np.random.default_rng(0)
+        std = np.array([c.std or 0.0 for c in known.coefficients.values()])
+        covariance = std[:, None] * known.known_correlation * std
+        drawn = rng.multivariate_normal(known.nominal, covariance, _DRAWS, method="eigh")
+        found = []
+        for theta in (known.nominal, *np.clip(drawn, known.lower, known.upper)):
+            try:
+                limits = vehicle_limits(known.with_nominal(theta))
+            except UserError:
+                continue  # no car that drives
+            found.append((limits.speed, limits.lateral))
+        return found
+
+
+def _moved(pose: Pose, before: Vector, after: Vector, T_s: float) -> Pose:
+    """Poses one step of T_s (s) on, by the velocities of the rows before and after it."""
+    return advance_pose(np, pose, State(*before[:, :3].T), State(*after[:, :3].T), T_s)

@@ -1,0 +1,112 @@
+"""Faster every lap, and never where it was close."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dynssm_ros.control.horizon_model import SteppedCar
+from dynssm_ros.control.lap_learning import SAFE, LapLearner, LapLog
+from dynssm_ros.control.prediction_model import Fixed
+from dynssm_ros.control.race import Course, Sensing, race
+from dynssm_ros.control.reference import load_reference
+from dynssm_ros.control.settings import Settings
+from dynssm_ros.errors import ConfigurationError
+
+STEP = 0.06
+
+
+@pytest.fixture
+def learner(orca, club):
+    """One whose coefficients are known well, so that they bound nothing and are not calibrated anew."""
+    known = orca.with_nominal(orca.nominal, np.full(17, 1e-9))
+    reference = load_reference("racing", known, club, SAFE)
+    built = LapLearner(known, club, reference, Settings.of(known), SteppedCar.of(known), known.nominal)
+    built._calibrated = lambda: known
+    return built
+
+
+def lap(learner, seconds=None, close=()):
+    """A lap that takes ``seconds`` in each section, with the car's side on the border in the sections ``close``."""
+    edges = learner._edges
+    count = len(edges) - 1
+    seconds = np.ones(count) if seconds is None else np.asarray(seconds)
+    s = np.linspace(0.0, edges[-1], 50 * count + 1)
+    section = np.clip(np.searchsorted(edges, s, "right") - 1, 0, count - 1)
+    time = np.interp(s, edges, np.concatenate([[0.0], np.cumsum(seconds)]))
+    room = np.where(np.isin(section, close), 1.0, 5.0) * learner._half_width
+    return LapLog(time, s, room, np.zeros(len(s)), np.zeros((len(s), 7)))
+
+
+def test_the_first_lap_is_safe_and_each_section_is_driven_faster_by_a_step(learner, club, orca):
+    safe = load_reference("racing", orca, club, SAFE)
+    np.testing.assert_allclose(learner.reference.speed, safe.speed, rtol=1e-9)
+    for k in range(1, 4):
+        learner.learn(lap(learner))
+        np.testing.assert_allclose(learner._shares, SAFE + k * STEP)
+    faster = load_reference("racing", orca, club, SAFE + 3 * STEP)
+    np.testing.assert_allclose(learner.reference.speed, faster.speed, rtol=1e-6)
+
+
+def test_where_it_was_close_it_goes_back_and_stays_there(learner):
+    learner.learn(lap(learner))
+    learner.learn(lap(learner, close=[2]))
+    lower = SAFE + STEP - STEP / 2
+    for _ in range(4):
+        np.testing.assert_allclose(learner._shares[[1, 2]], lower)  # and what leads there
+        learner.learn(lap(learner))
+    others = np.delete(learner._shares, [1, 2])
+    np.testing.assert_allclose(others, SAFE + 6 * STEP)
+
+
+def test_a_section_that_was_slower_returns_to_its_best(learner):
+    learner.learn(lap(learner))
+    best = learner._shares.copy()
+    learner.learn(lap(learner, 0.9 * np.ones(len(best))))
+    learner.learn(lap(learner, np.where(np.arange(len(best)) == 1, 1.0, 0.9)))
+    assert learner._shares[1] == pytest.approx(best[1])
+    assert learner._shares[0] > best[0]
+
+
+def test_caution_counts_from_the_second_lap_on(learner):
+    unsure = replace(lap(learner), caution=np.full(50 * len(learner._shares) + 1, 4.0 * learner._half_width))
+    learner.learn(unsure)
+    assert np.all(learner._shares > SAFE)
+    learner.learn(unsure)
+    assert np.all(learner._shares < SAFE + STEP)
+
+
+def test_no_share_goes_beyond_what_the_coefficients_allow(orca, club):
+    reference = load_reference("racing", orca, club, SAFE)
+    allowed = []
+    for std in (1e-9, 0.02):
+        known = orca.with_nominal(orca.nominal, std * np.abs(orca.nominal) + 1e-12)
+        learner = LapLearner(known, club, reference, Settings.of(known), SteppedCar.of(known), known.nominal)
+        allowed.append(learner._allowed.min())
+    assert allowed[0] == pytest.approx(1.2, abs=1e-3)
+    assert 1.1 < allowed[1] < 1.18  # 10 % of such cars grip less by 2 % or more
+
+
+def test_a_line_with_a_speed_of_its_own_is_refused(orca, club):
+    own = replace(load_reference("racing", orca, club), share=None)
+    with pytest.raises(ConfigurationError, match="has a speed of its own"):
+        LapLearner(orca, club, own, Settings.of(orca), SteppedCar.of(orca), orca.nominal)
+
+
+def test_a_car_with_less_grip_than_its_file_learns_it_and_comes_round_faster(orca, club):
+    """The front tyres grip 15 % less than the controller's model has it."""
+    driven = orca.with_effect("front_grip", {"factor": 0.85})
+    settings, line = replace(Settings.of(orca, "progress"), deadline=np.inf), load_reference("racing", orca, club, SAFE)
+    sensing = Sensing((0.01, 0.01, 0.03), (0.002, 0.002, 0.002), 0.02)
+    course = Course(driven, club, "rk4", line, settings, 5, sensing=sensing, learning=orca)
+    outcome = race(course, Fixed("file", SteppedCar.of(orca, "rk4", 2), orca.nominal))
+    assert outcome.completed
+    assert outcome.outside == 0
+    assert outcome.lap_times[-1] < 0.975 * outcome.lap_times[0]
+    first, last = outcome.learned[0], outcome.learned[-1]
+    known = last.vehicle.coefficients["D_f"]
+    assert known.std < 0.5 * first.vehicle.coefficients["D_f"].std
+    assert known.nominal == pytest.approx(0.85 * orca.coefficients["D_f"].nominal, rel=0.03)
+    assert last.allowed.min() < 0.95 * first.allowed.min()
+    assert last.planned
+    assert len(outcome.to_json()["learned"]) == 5
