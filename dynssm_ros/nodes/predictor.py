@@ -27,6 +27,7 @@ from dynssm_ros.runtime.health import Health
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.runtime.online import expert_weights
 from dynssm_ros.runtime.predictor import Prediction, Predictor
+from dynssm_ros.runtime.wiring import Wiring
 from dynssm_ros.signals.decoding import TopicDecoder, decoders, header_stamp_ns
 from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, twist_covariance
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -82,7 +83,8 @@ class PredictorNode(Node):
 
         signal_map = self._predictor.signal_map
         by_topic = decoders(signal_map)
-        self._health = Health(tuple(by_topic), max(max_age, signal_map.max_gap))
+        self._health = Health(tuple(by_topic), max(max_age, signal_map.max_gap), self._predictor.model.T_s)
+        self._set_wiring()
         # actuators come first: when several messages wait, the executor serves subscriptions in this order
         for topic, decoder in by_topic.items():
             receive = self._on_odometry if topic == signal_map.odometry_topic else self._on_actuator
@@ -99,23 +101,29 @@ class PredictorNode(Node):
 
     def _on_actuator(self, decoder: TopicDecoder, message: Any) -> None:
         now = time.monotonic()
-        self._health.arrived(decoder.topic, now)
-        refusal = self._predictor.observe(self._stamp(message), decoder.decode(message))
+        stamp = self._stamp(message)
+        self._health.arrived(decoder.topic, now, stamp)
+        refusal = self._predictor.observe(stamp, decoder.decode(message))
         if refusal is not None:
             self._health.refused(refusal, now)
 
     def _on_odometry(self, decoder: TopicDecoder, message: Any) -> None:
         now = time.monotonic()
-        self._health.arrived(decoder.topic, now)
         stamp = self._stamp(message)
+        self._health.arrived(decoder.topic, now, stamp)
         outcome = self._predictor.predict(stamp, decoder.decode(message))
         if not isinstance(outcome, Prediction):
             self._health.refused(outcome, now)
             return
         self._publish(outcome, message)
         done = time.monotonic()
-        self._health.predicted(done - now, outcome.residual_share, done)
+        self._health.predicted(done - now, outcome.residual_share, done, self._health.queued(decoder.topic))
         self._predictor.finish()
+        self._wiring.add(stamp, self._predictor.history.current[-1])
+
+    def _set_wiring(self) -> None:
+        model = self._predictor.model
+        self._wiring = Wiring(model.artifact.card.vehicle, model.T_s)
 
     def _publish(self, prediction: Prediction, message: Any) -> None:
         odometry = self._prediction
@@ -153,6 +161,7 @@ class PredictorNode(Node):
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Opens a new model before it is accepted; a bad one changes nothing."""
+        self._swap = None  # what was refused with others is not to be installed by a later set
         for parameter in parameters:
             if parameter.name == "model":
                 try:
@@ -168,9 +177,10 @@ class PredictorNode(Node):
         for parameter in parameters:
             if parameter.name == "horizon":
                 self._horizon = parameter.value
-        if self._swap is not None:
+        if self._swap is not None and any(parameter.name == "model" for parameter in parameters):
             self._predictor.swap(self._swap)
             self._swap = None
+            self._set_wiring()
             self.get_logger().info(
                 f"model swapped: {self._predictor.model.name} from {self._predictor.model.artifact.path}"
             )
@@ -190,9 +200,12 @@ class PredictorNode(Node):
 
     def _diagnose(self) -> None:
         now = time.monotonic()
+        self._health.wiring = self._wiring.verdict()
+        self._health.publishers = {topic: self.count_publishers(topic) for topic in self._health.topics}
         level, words = self._health.verdict(now)
         values = {"model": self._predictor.model.name, "model folder": str(self._predictor.model.artifact.path)}
         vehicle = self._predictor.model.artifact.card.vehicle.name
+        values["implausible"] = self._predictor.plausibility.last
         if (state := self._predictor.online) is not None:
             values["online steps"] = str(state.steps)
             experts = expert_weights(state.layer, state.mean)

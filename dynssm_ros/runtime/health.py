@@ -12,6 +12,10 @@ import numpy as np
 from dynssm_ros.signals.history import Refusal
 
 _REMEMBERED = 1000
+_JUDGED = 100  # outcomes that the verdict is of
+_NOW = 5  # of which the last, all refused, mean that there is no prediction now
+_MANY = 0.05  # share of them refused, from which on it is said
+_OTHER_CLOCK_S = 0.5
 
 
 class Level(IntEnum):
@@ -29,36 +33,53 @@ class Health:
     Attributes:
         topics: the inputs that are expected.
         max_silence: longest time without odometry that is still called healthy (s).
+        period: T_s (s), by which an answer may wait in a queue and is not late.
+        publishers: of each input, as far as known.
+        wiring: what is wired wrongly, in words; empty if nothing is known to be.
+        late: answers that were late.
     """
 
     topics: tuple[str, ...]
     max_silence: float
+    period: float = np.inf
+    publishers: dict[str, int] = field(default_factory=dict)
+    wiring: str = ""
+    late: int = 0
     refusals: Counter[Refusal] = field(default_factory=Counter)
     predictions: int = 0
     _arrivals: dict[str, deque[float]] = field(default_factory=dict)
     _latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     _shares: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
-    _last_refusal: tuple[float, Refusal] | None = None
-    _last_prediction: float = -np.inf
+    _outcomes: deque[Refusal | None] = field(default_factory=lambda: deque(maxlen=_JUDGED))
+    _delays: dict[str, deque[float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._arrivals = {topic: deque(maxlen=100) for topic in self.topics}
+        self._delays = {topic: deque(maxlen=_REMEMBERED) for topic in self.topics}
 
-    def arrived(self, topic: str, now: float) -> None:
-        """A message of ``topic`` came in."""
+    def arrived(self, topic: str, now: float, stamp: int | None = None) -> None:
+        """A message of ``topic`` came in, with ``stamp`` (ns)."""
         self._arrivals[topic].append(now)
+        if stamp is not None:
+            self._delays[topic].append(now - stamp / 1e9)
+
+    def queued(self, topic: str) -> float:
+        """How much longer the last message of ``topic`` took to come than the fastest one lately (s)."""
+        delays = self._delays[topic]
+        return delays[-1] - min(delays) if delays else 0.0
 
     def refused(self, refusal: Refusal, now: float) -> None:
         """A sample or a prediction was refused."""
         self.refusals[refusal] += 1
-        self._last_refusal = (now, refusal)
+        self._outcomes.append(refusal)
 
-    def predicted(self, latency: float, residual_share: float, now: float) -> None:
-        """A prediction went out ``latency`` seconds after its odometry came in."""
+    def predicted(self, latency: float, residual_share: float, now: float, queued: float = 0.0) -> None:
+        """A prediction went out ``latency`` seconds after its odometry came in, which had waited ``queued`` seconds."""
         self.predictions += 1
+        self.late += queued + latency > self.period
+        self._outcomes.append(None)
         self._latencies.append(latency)
         self._shares.append(residual_share)
-        self._last_prediction = now
 
     def rate(self, topic: str, now: float) -> float:
         """Messages per second of ``topic`` over its last hundred messages, 0 once it is silent."""
@@ -84,12 +105,36 @@ class Health:
             for topic, age in silent.items()
             if age > self.max_silence
         ]
+        words += self._clocks()
         if words:
             return Level.ERROR, "; ".join(words)
-        if self._last_refusal is not None and self._last_refusal[0] > self._last_prediction:
-            refusal = self._last_refusal[1]
-            return (Level.WARN if refusal is Refusal.FILLING else Level.ERROR), refusal.value
+        if self.wiring:
+            return Level.ERROR, self.wiring
+        refused = [outcome for outcome in self._outcomes if outcome is not None]
+        recent = list(self._outcomes)[-_NOW:]
+        if recent and None not in recent:
+            newest = refused[-1]
+            return (Level.WARN if newest is Refusal.FILLING else Level.ERROR), newest.value
+        several = [f"{topic}: {count} publishers" for topic, count in self.publishers.items() if count > 1]
+        if several:
+            return Level.WARN, "; ".join(several)
+        share = len(refused) / max(len(self._outcomes), 1)
+        most = Counter(refused).most_common(1)
+        if share > _MANY and most[0][0] is not Refusal.FILLING:
+            return Level.WARN, f"{share:.0%} of the last messages refused, mostly: {most[0][0].value}"
         return Level.OK, "predicting"
+
+    def _clocks(self) -> list[str]:
+        """Topics whose stamps are on another clock than those of most others."""
+        delays = {topic: min(list(values)[-10:]) for topic, values in self._delays.items() if values}
+        if len(delays) < 2:
+            return []
+        usual = sorted(delays.values())[(len(delays) - 1) // 2]
+        return [
+            f"{topic}: its stamps are {abs(off):.3g} s {'behind' if off > 0 else 'ahead of'} those of other topics"
+            for topic, delay in delays.items()
+            if abs(off := delay - usual) > self.max_silence + _OTHER_CLOCK_S
+        ]
 
     def values(self, now: float) -> dict[str, str]:
         """All figures by name, for the key-value list of the diagnostic status."""
@@ -97,6 +142,7 @@ class Health:
             "predictions": str(self.predictions),
             "latency p50 (ms)": f"{1e3 * self.latency(50):.3f}",
             "latency p99 (ms)": f"{1e3 * self.latency(99):.3f}",
+            "late answers": str(self.late),
             "share of the residual": f"{float(np.mean(self._shares)) if self._shares else 0.0:.3f}",
         }
         for topic in self.topics:

@@ -18,7 +18,9 @@ from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.learner import OnlineLearner
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.runtime.online import OnlineState
+from dynssm_ros.runtime.plausibility import Plausibility
 from dynssm_ros.signals.history import History, Refusal
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import SignalMap
 from dynssm_ros.vehicle import State
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose, advance_pose
@@ -74,16 +76,24 @@ class Predictor:
         return None if self._learner is None else self._learner.state
 
     def check_swap(self, model: OnnxModel) -> None:
-        """Checks that ``model`` can take the place of the present one.
+        """Checks that ``model`` can take the place of the present one, and predicts from what is measured now.
 
         Raises:
-            ArtifactError: it needs other commands.
+            ArtifactError: it needs other commands, or what it predicts is not finite.
         """
         if model.commands != self.model.commands:
             raise ArtifactError(
                 f"{model.artifact.path}: trained with commands '{model.commands}', but the node runs with "
                 f"'{self.model.commands}'; restart it with this model"
             )
+        rows = np.zeros((model.H, len(WINDOW_COLUMNS)))
+        recent = self.history.current[-model.H :]
+        if np.all(np.isfinite(recent)):
+            rows[-len(recent) :] = recent
+            rows[: -len(recent)] = recent[0]
+        for part in model.predict(rows[None])[:4]:
+            if part is not None and not np.all(np.isfinite(part)):
+                raise ArtifactError(f"{model.artifact.path}: what it predicts is not finite; expected numbers")
 
     def swap(self, model: OnnxModel) -> None:
         """Exchanges the model between two predictions; the samples received so far are kept.
@@ -123,19 +133,23 @@ class Predictor:
         else:
             self._learner = OnlineLearner(model, layer)
         self.model = model
+        self.plausibility = Plausibility(model.artifact.card.vehicle)
         self._scale = model.artifact.card.normalisation.increment_scale
         self._period = round(model.T_s * 1e9)
 
     def observe(self, stamp: int, values: dict[str, float]) -> Refusal | None:
-        """Takes the samples of one message; see :meth:`History.add`."""
-        return self.history.add(stamp, values)
+        """Takes the samples of one message; see :meth:`History.add`. What the car cannot have produced is refused."""
+        refusal = self.plausibility.check(stamp, values) or self.history.add(stamp, values)
+        if refusal is Refusal.JUMPED_BACK:
+            self.plausibility.forget()
+            if self._learner is not None:
+                self._learner.reset()
+        return refusal
 
     def predict(self, stamp: int, values: dict[str, float]) -> Prediction | Refusal:
         """Takes the odometry sample ``values`` at ``stamp`` (ns) and predicts the instant ``stamp + T_s``."""
-        refusal = self.history.add(stamp, values)
+        refusal = self.observe(stamp, values)
         if refusal is not None:
-            if refusal is Refusal.JUMPED_BACK and self._learner is not None:
-                self._learner.reset()
             return refusal
         if not _finite(values.values()):  # the pose, which is no part of the window
             return Refusal.NOT_FINITE

@@ -28,6 +28,9 @@ class Refusal(Enum):
     NOT_FINITE = "a sample is not finite"
     REPEATED = "a stamp repeats or is older than the newest"
     JUMPED_BACK = "time jumped back; the window starts anew"
+    OUTLIER = "a stamp is far from the last ones, and no second message confirms it"
+    IMPLAUSIBLE = "a sample is beyond what the car can do"
+    JUMPED = "a sample is farther from the last one than the car can move"
     BAD_PREDICTION = "the model's output is not finite"
 
 
@@ -108,16 +111,18 @@ class History:
         T_s: sampling time of the window (s).
         H: number of rows of the window.
         max_age: how much older than the requested instant the newest sample of a signal may be (s).
-        jump_back: stamps that step back by more than this mean that time was set back, not disorder (s).
+        jump: stamps that step back by more than this mean that time was set back, not disorder (s). They are believed, as
+            those that are further ahead, when a second message confirms them.
     """
 
-    def __init__(self, signal_map: SignalMap, T_s: float, H: int, max_age: float = 0.2, jump_back: float = 0.5) -> None:
+    def __init__(self, signal_map: SignalMap, T_s: float, H: int, max_age: float = 0.2, jump: float = 0.5) -> None:
         self.names = tuple(signal_map.active_signals())
         self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
         self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
         self._max_gap = float(signal_map.max_gap_ns)
         self._max_age = max_age * 1e9
-        self._jump_back = jump_back * 1e9
+        self._jump = max(jump * 1e9, 2 * self._max_gap)
+        self._suspect: tuple[int, dict[str, float]] | None = None  # a message whose stamp (ns) may be an outlier
         self._epoch: int | None = None
         self.resize(T_s, H)
 
@@ -126,7 +131,7 @@ class History:
         self._offsets = -np.arange(H - 1, -1, -1, dtype=np.float64) * (T_s * 1e9)
         self._span = H * T_s * 1e9 + self._max_age + self._max_gap
         self._slack = _BRIDGE * T_s * 1e9
-        self._window = np.empty((H, 7))
+        self._window = np.zeros((H, 7))
 
     def add(self, stamp: int, values: dict[str, float]) -> Refusal | None:
         """Takes the samples of one message.
@@ -136,35 +141,58 @@ class History:
             values: by signal name, SI units; signals that are not part of the window are ignored.
 
         Returns:
-            ``None`` if they were taken, else why not. After ``JUMPED_BACK`` the older samples are forgotten and these
-            are the first of the new window.
+            ``None`` if they were taken, else why not. After ``JUMPED_BACK`` the older samples are forgotten, and the new
+            window begins with these and those of the message that they confirm.
         """
+        known = {name: value for name, value in values.items() if name in self._buffers}
         if self._epoch is None:
             self._epoch = stamp
+        jump = self._jump_of(stamp, known)
+        if jump == 0.0:
+            if self._suspect is not None and known.keys() & self._suspect[1].keys():
+                self._suspect = None
+            return self._take(stamp, known)
+        suspect, self._suspect = self._suspect, (stamp, known)
+        if suspect is None or abs(stamp - suspect[0]) > self._jump:
+            return Refusal.OUTLIER
+        if jump < 0.0:
+            self.clear()
+            self._epoch = suspect[0]
+        self._suspect = None
+        self._take(*suspect)
+        refusal = self._take(stamp, known)
+        return Refusal.JUMPED_BACK if jump < 0.0 else refusal
+
+    def _jump_of(self, stamp: int, values: dict[str, float]) -> float:
+        """How far a message's stamp is beyond what can follow the last ones (ns): negative back, positive ahead, else 0."""
+        assert self._epoch is not None
         time = float(stamp - self._epoch)
-        refusal: Refusal | None = None
+        newest = max((self._buffers[name].newest for name in values), default=-np.inf)
+        if newest == -np.inf:
+            return 0.0
+        latest = max(buffer.newest for buffer in self._buffers.values())  # a signal may be silent while others go on
+        return min(time - (newest - self._jump), 0.0) or max(time - (latest + self._jump), 0.0)
+
+    def _take(self, stamp: int, values: dict[str, float]) -> Refusal | None:
+        """Appends the samples of one message, as far as they are newer than all others of their signals."""
+        assert self._epoch is not None
+        time, refusal = float(stamp - self._epoch), None
         for name, value in values.items():
-            buffer = self._buffers.get(name)
-            if buffer is None:
-                continue
+            buffer = self._buffers[name]
             if not isfinite(value):
                 refusal = refusal or Refusal.NOT_FINITE
                 continue
-            newest = buffer.newest
-            if time <= newest:
-                if newest - time <= self._jump_back:
-                    refusal = refusal or Refusal.REPEATED
-                    continue
-                self.clear()
-                self._epoch, time, newest = stamp, 0.0, -np.inf
-                refusal = Refusal.JUMPED_BACK
-            if time - newest > self._max_gap:
+            if time <= buffer.newest:
+                refusal = refusal or Refusal.REPEATED
+                continue
+            if time - buffer.newest > self._max_gap:
                 self._unbroken[name] = time
             buffer.append(time, value, self._span)
         return refusal
 
     def clear(self) -> None:
         """Forgets everything, as after a jump of time."""
+        self._suspect = None
         for buffer in self._buffers.values():
             buffer.clear()
         self._unbroken = dict.fromkeys(self._buffers, -np.inf)

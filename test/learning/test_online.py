@@ -166,7 +166,8 @@ def test_it_is_kept_over_a_gap_and_forgotten_when_time_jumps_back(noisy_laps, no
     for stamp in (20_000_000_000, 20_020_000_000):  # a gap of 16 s
         assert isinstance(predictor.predict(stamp, {"v_x": 2.0, "v_y": 0.0, "omega": 0.0}), Refusal)
     np.testing.assert_array_equal(predictor.online.mean, mean)
-    assert predictor.predict(0, {"v_x": 2.0, "v_y": 0.0, "omega": 0.0}) is Refusal.JUMPED_BACK
+    assert predictor.predict(0, {"v_x": 2.0, "v_y": 0.0, "omega": 0.0}) is Refusal.OUTLIER
+    assert predictor.predict(20_000_000, {"v_x": 2.0, "v_y": 0.0, "omega": 0.0}) is Refusal.JUMPED_BACK
     assert predictor.online.steps == 0
 
 

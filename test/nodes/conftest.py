@@ -10,10 +10,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 from nav_msgs.msg import Odometry
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
@@ -95,15 +96,23 @@ class Car:
         return self.collector.wait_for(lambda: any(words in m for _, m, _ in self.run.diagnostics[seen:]), timeout)
 
     def set_parameter(self, name: str, value: object) -> tuple[bool, str]:
-        client = self.collector.create_client(SetParameters, "/dynssm/set_parameters")
+        result = self._call(SetParameters, "set_parameters", [(name, value)]).results[0]
+        return result.successful, result.reason
+
+    def set_atomically(self, values: list[tuple[str, object]]) -> tuple[bool, str]:
+        """Sets several parameters at once: all of them or none."""
+        result = self._call(SetParametersAtomically, "set_parameters_atomically", values).result
+        return result.successful, result.reason
+
+    def _call(self, service: Any, name: str, values: list[tuple[str, object]]) -> Any:
+        client = self.collector.create_client(service, f"/dynssm/{name}")
         assert client.wait_for_service(10.0)
-        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        parameters = [Parameter(key, value=value).to_parameter_msg() for key, value in values]
         done = threading.Event()
-        future = client.call_async(request)
+        future = client.call_async(service.Request(parameters=parameters))
         future.add_done_callback(lambda _: done.set())
         assert done.wait(10.0)
-        result = future.result().results[0]
-        return result.successful, result.reason
+        return future.result()
 
     def _stamp(self, message: Odometry | JointState) -> None:
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.stamp, 1_000_000_000)

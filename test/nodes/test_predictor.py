@@ -63,6 +63,55 @@ def test_bad_samples_yield_no_prediction_and_the_node_recovers_by_itself(start_c
     assert all(np.isfinite(state).all() for state in car.run.predicted.values())
 
 
+@pytest.mark.parametrize("off", [-1.0, 1.0, 10.0])
+def test_a_single_stamp_far_off_costs_its_message_alone(start_car, off: float) -> None:
+    car = start_car()
+    car.drive_until_answered()
+    right = car.stamp
+    car.stamp += round(off * 1e9)
+    wrong = car.odometry(1.0)
+    car.stamp = right
+    assert car.answered(car.step())
+    assert wrong not in car.run.predicted
+
+
+def test_a_speed_that_no_car_has_is_refused_and_named(start_car) -> None:
+    car = start_car()
+    car.drive_until_answered()
+    bad = [car.step(v_x=1e4) for _ in range(10)]
+    assert car.diagnosed("a sample is beyond what the car can do")
+    assert "v_x = 1e+04; expected" in car.run.diagnostics[-1][2]["implausible"]
+    car.drive_until_answered()
+    assert not any(stamp in car.run.predicted for stamp in bad)
+
+
+def test_more_than_one_publisher_of_an_input_is_named(start_car) -> None:
+    from nav_msgs.msg import Odometry
+
+    from dynssm_ros.nodes.support import SENSOR_QOS
+
+    car = start_car()
+    second = car.collector.create_publisher(Odometry, "/vehicle/odometry", SENSOR_QOS)
+    for _ in range(30):
+        car.drive_until_answered()
+        if car.diagnosed("") and "/vehicle/odometry: 2 publishers" in car.run.diagnostics[-1][1]:
+            break
+    else:
+        pytest.fail(f"not named: {car.run.diagnostics[-1]}")
+    car.collector.destroy_publisher(second)
+
+
+def test_a_refused_set_of_parameters_leaves_no_model_behind(start_car, small_model: Path, tmp_path: Path) -> None:
+    """The first model is good, but another one in the same atomic set is not; a later set is of something else."""
+    car = start_car()
+    car.drive_until_answered()
+    other = shutil.copytree(small_model, tmp_path / "other")
+    assert not car.set_atomically([("model", str(other)), ("model", str(tmp_path / "none"))])[0]
+    assert car.set_parameter("horizon", 0.1) == (True, "")
+    assert car.diagnosed("")
+    assert car.run.diagnostics[-1][2]["model folder"] != str(other)
+
+
 def test_time_that_jumps_back_restarts_the_window(start_car) -> None:
     car = start_car()
     car.drive_until_answered()

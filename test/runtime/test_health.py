@@ -49,9 +49,50 @@ def test_silence_is_an_error_and_has_no_rate(health: Health) -> None:
 
 
 @pytest.mark.parametrize(("refusal", "level"), [(Refusal.FILLING, Level.WARN), (Refusal.STALE, Level.ERROR)])
-def test_a_refusal_is_told_until_a_prediction_goes_out_again(health: Health, refusal: Refusal, level: Level) -> None:
-    health.refused(refusal, 1.02)
+def test_refusals_are_told_until_a_prediction_goes_out_again(health: Health, refusal: Refusal, level: Level) -> None:
+    for _ in range(5):
+        assert health.verdict(1.03) == (Level.OK, "predicting"), "a single one is none"
+        health.refused(refusal, 1.02)
     assert health.verdict(1.03) == (level, refusal.value)
-    assert health.values(1.03)[f"refused: {refusal.name.lower()}"] == "1"
+    assert health.values(1.03)[f"refused: {refusal.name.lower()}"] == "5"
     health.predicted(0.001, 0.0, 1.04)
     assert health.verdict(1.05) == (Level.OK, "predicting")
+
+
+def test_the_verdict_follows_the_share_that_is_refused(health: Health) -> None:
+    for k in range(100):
+        (health.refused(Refusal.IMPLAUSIBLE, 1.0) if k % 4 == 0 else health.predicted(0.001, 0.0, 1.0))
+    assert health.verdict(1.05) == (
+        Level.WARN, f"25% of the last messages refused, mostly: {Refusal.IMPLAUSIBLE.value}",
+    )  # fmt: skip
+
+
+def test_more_than_one_publisher_is_named(health: Health) -> None:
+    health.publishers = {ODOMETRY: 2, FEEDBACK: 1}
+    assert health.verdict(1.05) == (Level.WARN, "/odometry: 2 publishers")
+
+
+def test_a_wrong_wiring_is_an_error(health: Health) -> None:
+    health.wiring = "the steering's sign is swapped"
+    assert health.verdict(1.05) == (Level.ERROR, "the steering's sign is swapped")
+
+
+def test_a_topic_on_another_clock_is_named() -> None:
+    health = Health((FEEDBACK, "/command", ODOMETRY), 0.25)
+    for k in range(100):
+        for topic, off in ((FEEDBACK, -1000), ("/command", 0), (ODOMETRY, 0)):
+            health.arrived(topic, 50.0 + k / 100, (2000 + off) * 10**9 + k * 10**7)
+        health.predicted(0.001, 0.0, 50.0 + k / 100)
+    level, words = health.verdict(51.0)
+    assert level is Level.ERROR
+    assert words == "/feedback: its stamps are 1e+03 s behind those of other topics"
+
+
+def test_answers_to_messages_that_waited_longer_than_a_step_are_late() -> None:
+    health = Health((ODOMETRY,), 0.25, period=0.02)
+    for k in range(50):
+        delay = 0.03 if k % 10 == 9 else 0.001
+        health.arrived(ODOMETRY, k / 50 + delay, k * 20_000_000)
+        health.predicted(0.001, 0.0, k / 50 + delay, health.queued(ODOMETRY))
+    assert health.late == 5
+    assert health.values(1.0)["late answers"] == "5"

@@ -325,3 +325,28 @@ def test_a_pose_is_propagated_along_a_circle_to_second_order() -> None:
     errors = [np.abs(end(steps) - truth).max() for steps in (4, 8)]
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
     assert propagate_pose({"x": 0.0}, (1.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.1) is None
+
+
+@pytest.mark.parametrize("wrong", [{"v_x": 1e4}, {"omega": 500.0}])
+def test_implausible_samples_yield_no_prediction_and_cost_no_window(drive: Drive, wrong) -> None:
+    for _ in range(H + 1):
+        drive.step()
+    for name, value in wrong.items():
+        stamp = drive.stamp + 1
+        state = {"v_x": 2.0, "v_y": 0.0, "omega": 0.0, "x": 0.0, "y": 0.0, "theta": 0.0} | {name: value}
+        assert drive.predictor.predict(stamp, state) is Refusal.IMPLAUSIBLE
+        assert name in drive.predictor.plausibility.last
+    assert isinstance(drive.step(), Prediction)
+
+
+def test_a_model_whose_predictions_are_not_finite_is_not_swapped_in(
+    drive: Drive, small_model: Path, monkeypatch
+) -> None:
+    for _ in range(H + 1):
+        drive.step()
+    candidate = OnnxModel(open_artifact(small_model))
+    good = candidate.predict
+    monkeypatch.setattr(candidate, "predict", lambda windows: good(windows)._replace(state=np.full((1, 3), np.nan)))
+    with pytest.raises(ArtifactError, match="is not finite"):
+        drive.predictor.swap(candidate)
+    assert isinstance(drive.step(), Prediction)

@@ -89,21 +89,36 @@ class PlainHistory:
     def __init__(self, T_s: float, H: int) -> None:
         self.offsets = [round(k * T_s * SECOND) for k in range(H - 1, -1, -1)]
         self.samples: dict[str, list[tuple[int, float]]] = {name: [] for name in SIGNALS}
+        self.suspect: tuple[int, dict[str, float]] | None = None
 
     def add(self, stamp: int, values: dict[str, float]) -> Refusal | None:
+        values = {name: value for name, value in values.items() if name in self.samples}
+        own = [samples[-1][0] for name, samples in self.samples.items() if samples and name in values]
+        every = [samples[-1][0] for samples in self.samples.values() if samples]
+        back = bool(own) and stamp < max(own) - round(JUMP_BACK * SECOND)
+        if not (back or (own and stamp > max(every) + round(JUMP_BACK * SECOND))):
+            if self.suspect is not None and set(values) & set(self.suspect[1]):
+                self.suspect = None
+            return self.take(stamp, values)
+        before, self.suspect = self.suspect, (stamp, values)
+        if before is None or abs(before[0] - stamp) > round(JUMP_BACK * SECOND):
+            return Refusal.OUTLIER
+        self.suspect = None
+        if back:
+            self.samples = {other: [] for other in SIGNALS}
+        self.take(*before)
+        refusal = self.take(stamp, values)
+        return Refusal.JUMPED_BACK if back else refusal
+
+    def take(self, stamp: int, values: dict[str, float]) -> Refusal | None:
         refusal = None
         for name, value in values.items():
-            if name not in self.samples:
-                continue
             if not isfinite(value):
                 refusal = refusal or Refusal.NOT_FINITE
                 continue
             if self.samples[name] and stamp <= self.samples[name][-1][0]:
-                if self.samples[name][-1][0] - stamp <= JUMP_BACK * SECOND:
-                    refusal = refusal or Refusal.REPEATED
-                    continue
-                self.samples = {other: [] for other in SIGNALS}
-                refusal = Refusal.JUMPED_BACK
+                refusal = refusal or Refusal.REPEATED
+                continue
             self.samples[name].append((stamp, value))
         return refusal
 
@@ -375,9 +390,10 @@ def test_a_repeated_or_slightly_older_stamp_is_refused_and_changes_nothing(back:
 
 def test_a_jump_back_in_time_forgets_what_was_before() -> None:
     history, _ = filled()
+    assert history.add(START + 99_000_000, feedback(7.0)) is Refusal.OUTLIER
     assert history.add(START + 100_000_000, odometry(7.0)) is Refusal.JUMPED_BACK
-    assert history.window(START + 100_000_000) is Refusal.MISSING
-    assert history.ages(START + 100_000_000)["v_x"] == 0.0
+    assert history.window(START + 100_000_000) is Refusal.FILLING
+    assert history.ages(START + 100_000_000) == pytest.approx(dict.fromkeys(SIGNALS, 0.0), abs=0.001)
     for k in range(1, 20):
         stamp = START + 100_000_000 + k * 10_000_000
         assert history.add(stamp, feedback(7.0)) is None
@@ -402,16 +418,34 @@ def test_a_late_message_from_before_the_jump_delays_recovery_but_does_not_stop_i
     np.testing.assert_array_equal(answers[-1][:, [0, 3]], 7.0)
 
 
-def test_a_stamp_far_in_the_future_delays_recovery_but_does_not_stop_it() -> None:
+@pytest.mark.parametrize("off", [-3600.0, -1.0, 1.0, 10.0, 3600.0])
+@pytest.mark.parametrize("message", ["odometry", "feedback"])
+def test_a_single_stamp_far_off_costs_its_message_alone(off: float, message: str) -> None:
     history, last = filled()
-    history.add(last + 3600 * SECOND, odometry(99.0))
+    sample = odometry(99.0) if message == "odometry" else feedback(99.0)
+    for k in range(1, 40):
+        stamp = last + k * 10_000_000
+        if k == 5:
+            assert history.add(stamp + round(off * SECOND), sample) is Refusal.OUTLIER
+        history.add(stamp, feedback(7.0))
+        history.add(stamp, odometry(7.0))
+        assert not isinstance(history.window(stamp), Refusal)
+    window = history.window(stamp)
+    assert not isinstance(window, Refusal)
+    assert window[:, [0, 3]].max() <= 7.0
+
+
+def test_a_publisher_on_another_clock_does_not_cost_the_window() -> None:
+    """Two publishers share the odometry topic, and one of them counts from the start of its computer."""
+    history, last = filled()
     for k in range(1, 40):
         stamp = last + k * 10_000_000
         history.add(stamp, feedback(7.0))
         history.add(stamp, odometry(7.0))
-    window = history.window(stamp)
-    assert not isinstance(window, Refusal)
-    np.testing.assert_array_equal(window[:, [0, 3]], 7.0)
+        assert history.add(stamp - START // 2, odometry(99.0)) is Refusal.OUTLIER
+        window = history.window(stamp)
+        assert not isinstance(window, Refusal)
+        assert window[:, 0].max() <= 7.0
 
 
 def test_every_reason_says_itself_in_words() -> None:

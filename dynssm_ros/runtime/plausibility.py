@@ -1,0 +1,117 @@
+"""Samples that the car cannot have produced: beyond what it can do, or farther from the last one than it can move.
+
+A jump is believed when a second sample confirms it, as after a collision or where a filter was set anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from dynssm_ros.errors import UserError
+from dynssm_ros.signals.history import Refusal
+from dynssm_ros.track.speed_profile import vehicle_limits
+from dynssm_ros.vehicle import Vehicle
+
+_BEYOND = 1.5  # times a limit
+_SPIN = 3.0  # times the yaw rate of the tightest corner at the limit
+_HARD = 4.0  # times the car's accelerations: kerbs, hits
+_NOISE = 0.5  # jump that is no sign of anything, in units of the car's own speed and yaw rate
+_ACTUATOR_RANGE_S = 0.01  # an actuator that crosses its range faster than this, does not
+
+
+class Range(NamedTuple):
+    """What one signal can be.
+
+    Attributes:
+        low, high: its values.
+        rate: change per second.
+        noise: change that is always possible.
+    """
+
+    low: float
+    high: float
+    rate: float
+    noise: float
+
+
+def ranges(vehicle: Vehicle) -> dict[str, Range]:
+    """What the signals of a car can be, by name: from its limits, generously; empty for a car that cannot drive."""
+    try:
+        limits = vehicle_limits(vehicle)
+    except UserError:
+        return {}
+    inputs, constants = vehicle.inputs, vehicle.constants
+    wheelbase = constants.l_f + constants.l_r
+    grip = float(max(limits.lateral.max(), limits.brake.max(), limits.drive.max()))
+    radius = wheelbase / math.tan(min(max(map(abs, inputs.steering)), 1.2))
+    top, yaw = _BEYOND * limits.top_speed, _SPIN * math.sqrt(grip / radius)
+    speed_noise, yaw_noise = _NOISE * math.sqrt(grip * wheelbase), _NOISE * math.sqrt(grip / wheelbase)
+    turning = _HARD * grip / wheelbase
+    found = {
+        "v_x": Range(-top, top, _HARD * grip, speed_noise),
+        "v_y": Range(-top, top, _HARD * grip, speed_noise),
+        "omega": Range(-yaw, yaw, turning, yaw_noise),
+    }
+    throttle = min(inputs.throttle[0], -1.0), max(inputs.throttle[1], 1.0)  # a fraction, whatever this car uses of it
+    for actuator, (low, high) in (("throttle", throttle), ("steering", inputs.steering)):
+        middle, half = (low + high) / 2, (high - low) / 2
+        of_actuator = Range(middle - _BEYOND * half, middle + _BEYOND * half, 2 * half / _ACTUATOR_RANGE_S, 2 * half)
+        found |= dict.fromkeys((f"{actuator}_feedback", f"{actuator}_command"), of_actuator)
+    return found
+
+
+class Plausibility:
+    """Checks samples as they come.
+
+    Args:
+        vehicle: whose limits hold.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._ranges = ranges(vehicle)
+        self.last = ""
+        """What was refused last, in words."""
+        self.forget()
+
+    def forget(self) -> None:
+        """The next samples are the first."""
+        self._accepted: dict[str, tuple[int, float]] = {}
+        self._suspect: dict[str, tuple[int, float]] = {}
+
+    def check(self, stamp: int, values: Mapping[str, float]) -> Refusal | None:
+        """Judges the samples of a message.
+
+        Args:
+            stamp: of the message (ns).
+            values: by signal name, SI units.
+
+        Returns:
+            ``None`` if the car can have produced them, else why not.
+        """
+        for name, value in values.items():
+            limit = self._ranges.get(name)
+            if limit is not None and math.isfinite(value) and not limit.low <= value <= limit.high:
+                self.last = f"{name} = {value:.4g}; expected {limit.low:.4g} to {limit.high:.4g}"
+                return Refusal.IMPLAUSIBLE
+        refusal: Refusal | None = None
+        for name, value in values.items():
+            limit = self._ranges.get(name)
+            if limit is None or not math.isfinite(value):
+                continue
+            before = self._accepted.get(name)
+            if before is not None and not _can_follow(before, stamp, value, limit):
+                suspect, self._suspect[name] = self._suspect.get(name), (stamp, value)
+                if suspect is None or suspect[0] == stamp or not _can_follow(suspect, stamp, value, limit):
+                    self.last = f"{name} = {value:.4g} after {before[1]:.4g}"
+                    refusal = Refusal.JUMPED
+                    continue
+            self._suspect.pop(name, None)
+            self._accepted[name] = stamp, value
+        return refusal
+
+
+def _can_follow(before: tuple[int, float], stamp: int, value: float, limit: Range) -> bool:
+    elapsed = abs(stamp - before[0]) / 1e9
+    return abs(value - before[1]) <= limit.noise + limit.rate * elapsed

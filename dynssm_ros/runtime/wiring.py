@@ -1,0 +1,131 @@
+"""Wrong signs, units and wheelbases, found by comparing seconds of driving with the single-track model.
+
+The car of the model is stepped ahead from measured rows under the measured inputs, as they are and with one signal changed
+the way that wiring goes wrong. If a change makes the predicted lateral velocity and yaw rate much better, it is named.
+Nothing is corrected: somebody has to look. A wheelbase that is off by less than a third is not found.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
+from dynssm_ros.vehicle import Coefficients, State, Vehicle, step
+
+_SECONDS = 6.0  # that are compared
+_FEWEST = 60  # rows, before anything is said
+_STARTS = 40  # rows that are stepped from
+_AHEAD_S = 0.1
+_CLEARLY = 0.25  # of the mean square error as it is, below which a change is named
+_TURNING = 0.05  # share of the yaw rate of the tightest corner, below which nothing can be said
+_CONFIRMED = 3  # times that something is found before it is said
+_WHEELBASES = (0.5, 0.7, 1.4, 2.0)
+
+_V_X, _V_Y, _OMEGA, _DELTA, _DELTA_CMD = (
+    WINDOW_COLUMNS.index(name) for name in ("v_x", "v_y", "omega", "delta_fb", "delta_cmd")
+)
+
+
+def _scaled(columns: tuple[int, ...], factor: float) -> Callable[[Vector], Vector]:
+    def change(rows: Vector) -> Vector:
+        rows = rows.copy()
+        rows[..., list(columns)] *= factor
+        return rows
+
+    return change
+
+
+_CHANGES: dict[str, Callable[[Vector], Vector]] = {
+    "the steering's sign is swapped": _scaled((_DELTA, _DELTA_CMD), -1.0),
+    "the yaw rate's sign is swapped": _scaled((_OMEGA,), -1.0),
+    "the lateral velocity's sign is swapped": _scaled((_V_Y,), -1.0),
+    "left and right are swapped in lateral velocity and yaw rate": _scaled((_V_Y, _OMEGA), -1.0),
+    "the steering is in degrees": _scaled((_DELTA, _DELTA_CMD), np.pi / 180),
+    "the steering is that of the steering wheel, or its unit is wrong": _scaled((_DELTA, _DELTA_CMD), 1 / 15),
+    "the yaw rate is in degrees per second": _scaled((_OMEGA,), np.pi / 180),
+    "the speed is in km/h": _scaled((_V_X, _V_Y), 1 / 3.6),
+    "the speed is in mph": _scaled((_V_X, _V_Y), 0.44704),
+}
+
+
+class Wiring:
+    """Keeps the last seconds of driving and says what their signals look like.
+
+    Args:
+        vehicle: the car that they should be of.
+        T_s: time between rows (s).
+    """
+
+    def __init__(self, vehicle: Vehicle, T_s: float) -> None:
+        self._vehicle = vehicle
+        self._T_s = T_s
+        self._ahead = max(1, round(_AHEAD_S / T_s))
+        self._rows: deque[Vector] = deque(maxlen=max(_FEWEST, round(_SECONDS / T_s)))
+        self._last: int | None = None
+        self._found: deque[str] = deque(maxlen=_CONFIRMED)
+
+    def add(self, stamp: int, row: Vector) -> None:
+        """Takes the newest row of a window, with the columns ``WINDOW_COLUMNS`` ``(7,)``; ``stamp`` in ns."""
+        period = self._T_s * 1e9
+        if self._last is not None:
+            elapsed = stamp - self._last
+            if 0 <= elapsed < 0.99 * period:
+                return
+            if not 0 <= elapsed < 1.5 * period:
+                self._rows.clear()
+        self._last = stamp
+        self._rows.append(row.copy())
+
+    def verdict(self) -> str:
+        """What is wired wrongly, in words, once it was found three times in a row; to be asked about once a second.
+
+        Empty if nothing stands out, or too little was driven in corners.
+        """
+        self._found.append(self._judged())
+        return self._found[-1] if self._found.count(self._found[-1]) == _CONFIRMED else ""
+
+    def _judged(self) -> str:
+        if len(self._rows) < max(_FEWEST, self._ahead + 2):
+            return ""
+        rows = np.array(self._rows)
+        if not np.abs(rows[:, _V_X]).min() >= self._vehicle.minimum_speed:
+            return ""
+        wheelbase = self._vehicle.constants.l_f + self._vehicle.constants.l_r
+        steering = max(map(abs, self._vehicle.inputs.steering))
+        with np.errstate(all="ignore"):
+            cornering = np.sqrt(np.mean((np.abs(rows[:, _V_X]) * np.tan(steering) / wheelbase) ** 2))
+            if not np.std(rows[:, _OMEGA]) + np.std(rows[:, _DELTA]) > _TURNING * min(cornering, steering):
+                return ""
+            as_it_is = self._error(rows, self._vehicle)
+            errors = {words: self._error(change(rows), self._vehicle) for words, change in _CHANGES.items()}
+            for factor in _WHEELBASES:
+                words = f"the wheelbase is not {wheelbase:.3g} m, but about {factor * wheelbase:.2g} m"
+                errors[words] = self._error(rows, self._with_wheelbase(factor))
+        best = min(errors, key=lambda words: errors[words])
+        return best if errors[best] < _CLEARLY * as_it_is else ""
+
+    def _with_wheelbase(self, factor: float) -> Vehicle:
+        constants = self._vehicle.constants
+        longer = constants.model_copy(update={"l_f": constants.l_f * factor, "l_r": constants.l_r * factor})
+        return self._vehicle.model_copy(update={"constants": longer})
+
+    def _error(self, rows: Vector, vehicle: Vehicle) -> float:
+        """Mean square of the predicted changes' errors in yaw rate and lateral velocity, over those measured."""
+        starts = np.linspace(0, len(rows) - 1 - self._ahead, _STARTS).astype(np.intp)
+        state, theta = rows[starts, :3], Coefficients(*vehicle.nominal)
+        moved = np.zeros_like(state)
+        for k in range(self._ahead):
+            now = np.concatenate([state, rows[starts + k, 3:]], axis=1).T
+            following = np.stack(
+                step(np, State(*now[:3]), applied_inputs(now), theta, vehicle.constants, self._T_s, (), "rk4", 2),
+                axis=1,
+            )
+            moved, state = moved + following - state, following
+        measured = rows[starts + self._ahead, :3] - rows[starts, :3]
+        spread = np.mean(rows[:, 1:3] ** 2, axis=0) + 1e-12
+        error = np.mean((moved - measured)[:, 1:] ** 2, axis=0) / spread
+        return float(np.sum(error)) if np.all(np.isfinite(error)) else np.inf
