@@ -135,7 +135,10 @@ def _is_free(domain: int) -> bool:
 
 @contextmanager
 def node_process(
-    node: str, parameters: Mapping[str, object] | None = None, environment: Mapping[str, str] | None = None
+    node: str,
+    parameters: Mapping[str, object] | None = None,
+    environment: Mapping[str, str] | None = None,
+    namespace: str = "",
 ) -> Iterator[subprocess.Popen[str]]:
     """Starts a node of this package as a process of its own; interrupts it in the end.
 
@@ -143,11 +146,13 @@ def node_process(
         node: its module: ``predictor``, ``simulator``, ``controller``.
         parameters: ROS parameters.
         environment: of the process.
+        namespace: of the node; none if empty.
 
     Raises:
         UserError: it crashed, or it did not end when it was interrupted.
     """
     arguments = [part for name, value in (parameters or {}).items() for part in ("-p", f"{name}:={value}")]
+    arguments += ["-r", f"__ns:=/{namespace}"] if namespace else []
     command = [sys.executable, "-m", f"dynssm_ros.nodes.{node}", *(["--ros-args", *arguments] if arguments else [])]
     process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)  # noqa: S603 - own module
     try:
@@ -165,10 +170,13 @@ def node_process(
 
 
 def predictor_process(
-    model: Path, parameters: Mapping[str, object] | None = None, environment: Mapping[str, str] | None = None
+    model: Path,
+    parameters: Mapping[str, object] | None = None,
+    environment: Mapping[str, str] | None = None,
+    namespace: str = "",
 ) -> AbstractContextManager[subprocess.Popen[str]]:
     """Starts the predictor with a model folder; see :func:`node_process`."""
-    return node_process("predictor", {"model": model, **(parameters or {})}, environment)
+    return node_process("predictor", {"model": model, **(parameters or {})}, environment, namespace)
 
 
 @contextmanager

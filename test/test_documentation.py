@@ -255,7 +255,7 @@ def test_the_parameters_of_the_controller_are_those_of_its_page() -> None:
 
 def test_the_topics_are_those_of_the_default_signal_map_and_of_the_node() -> None:
     topics = {cells[0].strip("`"): cells[1].strip("`") for cells in _topic_rows()}
-    default = {source.topic: source.type for source in load_signal_map("default").signals.values()}
+    default = {source.recorded: source.type for source in load_signal_map("default").signals.values()}
     published = {messages.PREDICTION_TOPIC, messages.PARAMETERS_TOPIC, messages.HORIZON_TOPIC, "/diagnostics"}
     assert {topic: kind for topic, kind in topics.items() if topic in default} == default
     assert set(topics) == set(default) | published

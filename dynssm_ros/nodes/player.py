@@ -15,7 +15,7 @@ import rclpy
 from rclpy.node import Node
 
 from dynssm_ros.errors import BagError
-from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class, run
+from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class, relative, run
 from dynssm_ros.signals.bags import BagMessage, open_bag
 
 MATCH_TIMEOUT = 10.0  # s
@@ -48,7 +48,8 @@ class Playback:
                 raise BagError(f"{bag}: topic {topic} is missing; the bag has {', '.join(sorted(types))}")
         self.topics = topics or tuple(types)
         self._publishers = {
-            topic: node.create_publisher(message_class(types[topic]), topic, SENSOR_QOS) for topic in self.topics
+            topic: node.create_publisher(message_class(types[topic]), relative(topic), SENSOR_QOS)
+            for topic in self.topics
         }
 
     def wait_for_listeners(self, spin: Callable[[float], None], timeout: float = MATCH_TIMEOUT) -> tuple[str, ...]:

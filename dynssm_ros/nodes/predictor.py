@@ -21,7 +21,16 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError, UserError
-from dynssm_ros.nodes.support import SENSOR_QOS, describe, diagnostics, message_class, run, set_pose, set_stamp
+from dynssm_ros.nodes.support import (
+    SENSOR_QOS,
+    describe,
+    diagnostics,
+    message_class,
+    relative,
+    run,
+    set_pose,
+    set_stamp,
+)
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.health import Health
 from dynssm_ros.runtime.models import OnnxModel
@@ -76,19 +85,22 @@ class PredictorNode(Node):
 
         self._prediction = Odometry()
         self._adapted = JointState(name=list(COEFFICIENTS))
-        self._publish_prediction = self.create_publisher(Odometry, PREDICTION_TOPIC, SENSOR_QOS).publish
-        self._publish_parameters = self.create_publisher(JointState, PARAMETERS_TOPIC, SENSOR_QOS).publish
-        self._publish_horizon = self.create_publisher(Path, HORIZON_TOPIC, SENSOR_QOS).publish
+        self._publish_prediction = self.create_publisher(Odometry, relative(PREDICTION_TOPIC), SENSOR_QOS).publish
+        self._publish_parameters = self.create_publisher(JointState, relative(PARAMETERS_TOPIC), SENSOR_QOS).publish
+        self._publish_horizon = self.create_publisher(Path, relative(HORIZON_TOPIC), SENSOR_QOS).publish
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
 
         signal_map = self._predictor.signal_map
         by_topic = decoders(signal_map)
-        self._health = Health(tuple(by_topic), max(max_age, signal_map.max_gap), self._predictor.model.T_s)
+        self._names = {topic: self.resolve_topic_name(decoder.subscribed) for topic, decoder in by_topic.items()}
+        self._health = Health(tuple(self._names.values()), max(max_age, signal_map.max_gap), self._predictor.model.T_s)
         self._set_wiring()
         # actuators come first: when several messages wait, the executor serves subscriptions in this order
         for topic, decoder in by_topic.items():
             receive = self._on_odometry if topic == signal_map.odometry_topic else self._on_actuator
-            self.create_subscription(message_class(decoder.msgtype), topic, partial(receive, decoder), SENSOR_QOS)
+            self.create_subscription(
+                message_class(decoder.msgtype), decoder.subscribed, partial(receive, decoder), SENSOR_QOS
+            )
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self.create_timer(period, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -102,7 +114,7 @@ class PredictorNode(Node):
     def _on_actuator(self, decoder: TopicDecoder, message: Any) -> None:
         now = time.monotonic()
         stamp = self._stamp(message)
-        self._health.arrived(decoder.topic, now, stamp)
+        self._health.arrived(self._names[decoder.topic], now, stamp)
         refusal = self._predictor.observe(stamp, decoder.decode(message))
         if refusal is not None:
             self._health.refused(refusal, now)
@@ -110,14 +122,16 @@ class PredictorNode(Node):
     def _on_odometry(self, decoder: TopicDecoder, message: Any) -> None:
         now = time.monotonic()
         stamp = self._stamp(message)
-        self._health.arrived(decoder.topic, now, stamp)
+        self._health.arrived(self._names[decoder.topic], now, stamp)
         outcome = self._predictor.predict(stamp, decoder.decode(message))
         if not isinstance(outcome, Prediction):
             self._health.refused(outcome, now)
             return
         self._publish(outcome, message)
         done = time.monotonic()
-        self._health.predicted(done - now, outcome.residual_share, done, self._health.queued(decoder.topic))
+        self._health.predicted(
+            done - now, outcome.residual_share, done, self._health.queued(self._names[decoder.topic])
+        )
         self._predictor.finish()
         self._wiring.add(stamp, self._predictor.history.current[-1])
 

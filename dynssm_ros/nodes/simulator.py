@@ -19,7 +19,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, run, set_pose, set_stamp
+from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, relative, run, set_pose, set_stamp
 from dynssm_ros.signals.decoding import decoders
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -77,13 +77,13 @@ class SimulatorNode(Node):
         self._commands = CommandHolder(self._vehicle, watchdog, lambda: time.monotonic() * self._rate)
         self._obeyed = self._on_road = True
 
-        self._publish_feedback = self.create_publisher(JointState, FEEDBACK_TOPIC, SENSOR_QOS).publish
-        self._publish_odometry = self.create_publisher(Odometry, ODOMETRY_TOPIC, SENSOR_QOS).publish
+        self._publish_feedback = self.create_publisher(JointState, relative(FEEDBACK_TOPIC), SENSOR_QOS).publish
+        self._publish_odometry = self.create_publisher(Odometry, relative(ODOMETRY_TOPIC), SENSOR_QOS).publish
         if self._driver == "pure_pursuit":
-            self._publish_command = self.create_publisher(JointState, COMMAND_TOPIC, SENSOR_QOS).publish
+            self._publish_command = self.create_publisher(JointState, relative(COMMAND_TOPIC), SENSOR_QOS).publish
         else:
             self._decoder = decoders(load_signal_map("default"))[COMMAND_TOPIC]
-            self.create_subscription(JointState, COMMAND_TOPIC, self._on_command, SENSOR_QOS)
+            self.create_subscription(JointState, relative(COMMAND_TOPIC), self._on_command, SENSOR_QOS)
         self._samples = self._drive()
         self._first_stamp = int(self.get_clock().now().nanoseconds)
         self._begin, self._count = time.monotonic(), 0

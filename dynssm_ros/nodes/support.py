@@ -43,6 +43,11 @@ def message_class(msgtype: str) -> Any:
         ) from error
 
 
+def relative(topic: str) -> str:
+    """A topic of a bag as a node names it: in the node's namespace, which is the same name without one."""
+    return topic.removeprefix("/")
+
+
 def describe(
     node: Node,
     name: str,

@@ -19,15 +19,24 @@ class _Reading:
 
 
 class TopicDecoder:
-    """Reads all mapped signals of one topic out of its messages."""
+    """Reads all mapped signals of one topic out of its messages.
+
+    Args:
+        topic: absolute name.
+        msgtype: of its messages.
+        signal_map: which signals it carries.
+    """
 
     def __init__(self, topic: str, msgtype: str, signal_map: SignalMap) -> None:
         self.topic = topic
         self.msgtype = msgtype
+        sources = (source.topic for source in signal_map.active_signals().values() if source.recorded == topic)
+        self.subscribed = next(sources, topic)
+        """The name as the map has it: relative ones are in the namespace of a node."""
         self._readings = [
             _Reading(name, source.field, compile_field(source.field), source.scale, source.offset)
             for name, source in signal_map.active_signals().items()
-            if source.topic == topic
+            if source.recorded == topic
         ]
 
     @property
@@ -61,7 +70,7 @@ class TopicDecoder:
 
 def decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
     """A decoder for each topic of the map, actuators first so that a node serves them before the odometry."""
-    types = {source.topic: source.type for source in signal_map.active_signals().values()}
+    types = {source.recorded: source.type for source in signal_map.active_signals().values()}
     order = sorted(types, key=lambda topic: topic == signal_map.odometry_topic)
     return {topic: TopicDecoder(topic, types[topic], signal_map) for topic in order}
 

@@ -87,18 +87,18 @@ def read_streams(
     streams: dict[str, Stream] = {}
     for name, source in signal_map.active_signals().items():
         stream = Stream(np.frombuffer(stamps[name], dtype=np.int64), np.frombuffer(values[name], dtype=np.float64))
-        where = f"{bag.path}: topic {source.topic}"
+        where = f"{bag.path}: topic {source.recorded}"
         stream, dropped = clean(stream, f"{where}: {name}", drop_bad)
         if dropped:
             notes.append(f"{name}: dropped {dropped}")
         if len(stream.stamps):
             streams[name] = stream
             continue
-        counted = bag.counts[source.topic]
+        counted = bag.counts[source.recorded]
         lack = f"has no good sample of '{source.field}'" if dropped else f"never carries '{source.field}'"
         if name not in POSE_SIGNALS or not counted:
             raise BagError(f"{where} {lack if counted else 'has no messages'}, needed for {name}")
-        notes.append(f"{name}: topic {source.topic} {lack}; left out")
+        notes.append(f"{name}: topic {source.recorded} {lack}; left out")
     return streams, notes
 
 

@@ -31,11 +31,19 @@ _FIELD = re.compile(rf"^(?:yaw\((?P<yaw>{_PATH})\)|(?P<path>{_PATH}))\Z")
 class Source(StrictModel):
     """Where one signal comes from; its value is ``scale * field + offset`` in SI units."""
 
-    topic: str = Field(pattern=r"^/[\w/]*\w$", description="absolute topic name")
+    topic: str = Field(
+        pattern=r"^/?(?:\w+/)*\w+$",
+        description="topic name; relative names, without a slash in front, are in the namespace of the node",
+    )
     type: str = Field(pattern=r"^\w+/msg/\w+$", description="message type, package/msg/Name")
     field: str = Field(description="dotted path; position[steering] picks by name or index; yaw(path) of a quaternion")
     scale: float = 1.0
     offset: float = 0.0
+
+    @property
+    def recorded(self) -> str:
+        """The topic's absolute name in a bag of one car."""
+        return f"/{self.topic.removeprefix('/')}"
 
     @field_validator("field")
     @classmethod
@@ -64,14 +72,14 @@ class SignalMap(StrictModel):
             raise ValueError(f"signals: missing {', '.join(missing)} (commands: {self.commands})")
         types: dict[str, str] = {}
         for source in self.signals.values():
-            if types.setdefault(source.topic, source.type) != source.type:
+            if types.setdefault(source.recorded, source.type) != source.type:
                 raise ValueError(f"signals: topic {source.topic} is given two types")
         return self
 
     @property
     def odometry_topic(self) -> str:
         """The topic whose messages trigger predictions and anchor the time grid: the one that carries ``v_x``."""
-        return self.signals["v_x"].topic
+        return self.signals["v_x"].recorded
 
     @property
     def max_gap_ns(self) -> int:

@@ -179,7 +179,7 @@ def test_every_kind_of_bad_bag_ends_with_one_line_and_no_output(tmp_path: Path, 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("/vehicle/odometry", "/odom"), "topic /odom is missing; the bag has /vehicle/actuator_command"),
+        (("vehicle/odometry", "odom"), "topic /odom is missing; the bag has /vehicle/actuator_command"),
         (("nav_msgs/msg/Odometry", "nav_msgs/msg/Path"), "the signal map expects nav_msgs/msg/Path"),
         (("linear.x", "linear.speed"), "has no field 'twist.twist.linear.speed' for signal v_x"),
         (("position[throttle]", "position[gas]"), "never carries 'position[gas]', needed for throttle"),

@@ -72,7 +72,7 @@ def test_what_is_not_there_is_one_line_and_leaves_nothing(
     monkeypatch.chdir(tmp_path)
     other = yaml.safe_load((config_root() / "signals" / "default.yaml").read_text())
     for source in other["signals"].values():
-        source["topic"] = source["topic"].replace("/vehicle/odometry", "/other/odometry")
+        source["topic"] = source["topic"].replace("vehicle/odometry", "/other/odometry")
     Path("other.yaml").write_text(yaml.safe_dump(other))
     given = {"bag": str(laps_bag), "model": str(small_model), "signals": "default"} | changes
     options = ("--model", given["model"], "--signals", given["signals"], "--out", "out")

@@ -41,7 +41,8 @@ def test_shipped_maps_load(name: str) -> None:
 def test_the_default_map_is_that_of_the_contracts() -> None:
     signal_map = load_signal_map("default")
     assert signal_map.odometry_topic == "/vehicle/odometry"
-    assert {s.topic for s in signal_map.signals.values()} == {
+    assert not any(s.topic.startswith("/") for s in signal_map.signals.values()), "in the namespace of a node"
+    assert {s.recorded for s in signal_map.signals.values()} == {
         "/vehicle/odometry",
         "/vehicle/actuator_feedback",
         "/vehicle/actuator_command",
@@ -62,10 +63,11 @@ def test_the_av21_scales_turn_wheel_degrees_and_kilopascals_into_radians_and_fra
         ("signals.v_x", ..., ["missing v_x"]),
         ("signals.steering_command", ..., ["missing steering_command", "commands: topics"]),
         ("signals.speed", {"topic": "/a", "type": "b/msg/C", "field": "d"}, ["unknown 'speed'", "v_x"]),
-        ("signals.v_x.topic", "odometry", ["signals.v_x.topic", "'odometry'"]),
+        ("signals.v_x.topic", "odo metry", ["signals.v_x.topic", "'odo metry'"]),
+        ("signals.v_x.topic", "//odometry", ["signals.v_x.topic", "'//odometry'"]),
         ("signals.v_x.topic", "/odometry/", ["signals.v_x.topic", "'/odometry/'"]),
         ("signals.v_x.type", "nav_msgs/Odometry", ["signals.v_x.type", "'nav_msgs/Odometry'"]),
-        ("signals.v_x.type", "std_msgs/msg/Float64", ["topic /vehicle/odometry is given two types"]),
+        ("signals.v_x.type", "std_msgs/msg/Float64", ["topic vehicle/odometry is given two types"]),
         ("signals.v_x.field", "twist..x", ["signals.v_x.field", "dotted path", "'twist..x'"]),
         ("signals.v_x.field", "position[", ["signals.v_x.field", "'position['"]),
         ("signals.v_x.field", "yaw(pose", ["signals.v_x.field", "'yaw(pose'"]),
