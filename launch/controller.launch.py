@@ -1,7 +1,7 @@
 """Drives laps end to end: ``ros2 launch dynssm_ros controller.launch.py model:=MODEL_DIR track:=club``.
 
 Starts the controller, the simulated car (``simulator:=false`` where there is a real one), and the predictor if it is given
-a model.
+a model. An argument that is left empty overrides neither the parameters file nor the node's own default.
 """
 
 from launch import LaunchContext, LaunchDescription
@@ -9,23 +9,26 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-ARGUMENTS = {  # name: default, description, nodes that take it as a parameter
-    "vehicle": ("orca", "Vehicle: shipped name or file.", ("controller", "simulator")),
-    "track": ("club", "Track: built-in name or CSV file.", ("controller", "simulator")),
-    "scale": ("1.0", "Size of the track.", ("controller", "simulator")),
-    "rate": ("1.0", "Speed of the simulated car's time over real time.", ("controller", "simulator")),
-    "line": ("racing", "What is followed: centre, racing or a file with speeds.", ("controller",)),
-    "speed_scale": ("0.9", "Share of the car's limits in the line's speed.", ("controller",)),
-    "objective": ("tracking", "tracking or progress.", ("controller",)),
-    "plant": ("euler", "How the car is simulated: euler, rk4 or double_track.", ("simulator",)),
-    "effects": ("", "Physics that only the simulated car has: NAME[:k=v,...], apart by blanks.", ("simulator",)),
-    "model": ("", "Model folder; without one no predictor is started.", ("predictor",)),
+ARGUMENTS = {  # name: description, nodes that take it as a parameter
+    "vehicle": ("Vehicle: shipped name or file.", ("controller", "simulator")),
+    "track": ("Track: built-in name or CSV file.", ("controller", "simulator")),
+    "scale": ("Size of the track.", ("controller", "simulator")),
+    "rate": ("Speed of the simulated car's time over real time.", ("controller", "simulator")),
+    "line": ("What is followed: centre, racing or a file with speeds.", ("controller",)),
+    "speed_scale": ("Share of the car's limits in the line's speed.", ("controller",)),
+    "objective": ("tracking or progress.", ("controller",)),
+    "plant": ("How the car is simulated: euler, rk4 or double_track.", ("simulator",)),
+    "effects": ("Physics that only the simulated car has: NAME[:k=v,...], apart by blanks.", ("simulator",)),
+    "model": ("Model folder; without one no predictor is started.", ("predictor",)),
+    "use_sim_time": ("true: follow /clock, as when a bag is played with it.", ("controller", "simulator", "predictor")),
 }
 NUMBERS = ("scale", "rate", "speed_scale")
 
 
 def stack(context: LaunchContext) -> list[Node]:
-    given = {name: LaunchConfiguration(name).perform(context) for name in (*ARGUMENTS, "simulator")}
+    given = {
+        name: LaunchConfiguration(name).perform(context) for name in (*ARGUMENTS, "simulator", "params_file", "respawn")
+    }
     names = {"controller": "controller"}
     if given["simulator"] == "true":
         names["simulator"] = "simulator"
@@ -36,8 +39,10 @@ def stack(context: LaunchContext) -> list[Node]:
             package="dynssm_ros",
             executable=executable,
             name=name,
-            namesspeed_scale=LaunchConfiguration("namesspeed_scale"),
-            parameters=[_parameters(executable, given)],
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[*([given["params_file"]] if given["params_file"] else []), _parameters(executable, given)],
+            respawn=given["respawn"] == "true",
+            respawn_delay=1.0,
             ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",
         )
@@ -45,12 +50,14 @@ def stack(context: LaunchContext) -> list[Node]:
     ]
 
 
-def _parameters(executable: str, given: dict[str, str]) -> dict[str, str | float]:
-    values: dict[str, str | float] = {
+def _parameters(executable: str, given: dict[str, str]) -> dict[str, str | float | bool]:
+    values: dict[str, str | float | bool] = {
         name: float(given[name]) if name in NUMBERS else given[name]
-        for name, (_, _, nodes) in ARGUMENTS.items()
-        if executable in nodes
+        for name, (_, nodes) in ARGUMENTS.items()
+        if executable in nodes and given[name]
     }
+    if "use_sim_time" in values:
+        values["use_sim_time"] = values["use_sim_time"] == "true"
     return values | ({"driver": "external"} if executable == "simulator" else {})
 
 
@@ -58,13 +65,17 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *(
-                DeclareLaunchArgument(name, default_value=default, description=description)
-                for name, (default, description, _) in ARGUMENTS.items()
+                DeclareLaunchArgument(name, default_value="", description=description)
+                for name, (description, _) in ARGUMENTS.items()
             ),
             DeclareLaunchArgument(
                 "simulator", default_value="true", choices=["true", "false"], description="Start the simulated car."
             ),
-            DeclareLaunchArgument("namesspeed_scale", default_value="", description="Namesspeed_scale of the nodes."),
+            DeclareLaunchArgument("params_file", default_value="", description="ROS parameters file of the nodes."),
+            DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes."),
+            DeclareLaunchArgument(
+                "respawn", default_value="false", choices=["true", "false"], description="Start a node that ended anew."
+            ),
             DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn or error."),
             OpaqueFunction(function=stack),
         ]

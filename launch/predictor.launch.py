@@ -9,7 +9,10 @@ from launch_ros.substitutions import FindPackageShare
 
 def predictor(context: LaunchContext) -> list[Node]:
     """The node; an argument that was left empty does not override what the parameters file says."""
-    given = {name: LaunchConfiguration(name).perform(context) for name in ("model", "signals", "use_sim_time")}
+    given = {
+        name: LaunchConfiguration(name).perform(context) for name in ("model", "signals", "use_sim_time", "respawn")
+    }
+    respawn = given.pop("respawn") == "true"
     overrides = {name: value for name, value in given.items() if value}
     if "use_sim_time" in overrides:
         overrides["use_sim_time"] = overrides["use_sim_time"] == "true"
@@ -21,6 +24,8 @@ def predictor(context: LaunchContext) -> list[Node]:
             namespace=LaunchConfiguration("namespace"),
             parameters=[LaunchConfiguration("params_file"), overrides],
             ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+            respawn=respawn,
+            respawn_delay=1.0,
             output="screen",
         )
     ]
@@ -40,6 +45,9 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument("params_file", default_value=parameters, description="ROS parameters file."),
             DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node."),
+            DeclareLaunchArgument(
+                "respawn", default_value="false", choices=["true", "false"], description="Start a node that ended anew."
+            ),
             DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn or error."),
             OpaqueFunction(function=predictor),
         ]

@@ -243,6 +243,19 @@ class Recorder:
         return context.launch_configurations[self.positional[0]]
 
 
+class NodeRecorder(Recorder):
+    """A launch_ros Node, which refuses arguments that it does not have."""
+
+    ARGUMENTS = (
+        "package", "executable", "name", "namespace", "parameters", "remappings", "ros_arguments", "arguments", "output",
+        "respawn", "respawn_delay",
+    )  # fmt: skip
+
+    def __init__(self, **named: Any) -> None:
+        assert set(named) <= set(self.ARGUMENTS), named
+        super().__init__(**named)
+
+
 @pytest.fixture
 def load_launch(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
     """Loads a launch file over recording stand-ins of launch and launch_ros."""
@@ -257,7 +270,7 @@ def load_launch(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
     for module_name, classes in names.items():
         module = ModuleType(module_name)
         for name in classes:
-            setattr(module, name, type(name, (Recorder,), {}))
+            setattr(module, name, type(name, (NodeRecorder if name == "Node" else Recorder,), {}))
         monkeypatch.setitem(sys.modules, module_name, module)
     return lambda name: execute(ROOT / "launch" / name)
 
@@ -282,7 +295,7 @@ def launched(launch_file: ModuleType, **given: str) -> Recorder:
 def test_launch_file_declares_described_arguments(launch_file: ModuleType) -> None:
     *declared, function = launch_file.generate_launch_description().positional[0]
     assert [argument.positional for argument in declared] == [
-        ("model",), ("signals",), ("use_sim_time",), ("params_file",), ("namespace",), ("log_level",),
+        ("model",), ("signals",), ("use_sim_time",), ("params_file",), ("namespace",), ("respawn",), ("log_level",),
     ]  # fmt: skip
     assert all(argument.named["description"] for argument in declared)
     assert type(function).__name__ == "OpaqueFunction"
@@ -343,7 +356,20 @@ def test_controller_launch_file_passes_only_parameters_that_there_are(
 ) -> None:
     for node in all_launched(load_launch("controller.launch.py"), model="out/model"):
         known = declared_parameters(node.named["executable"])
+        assert set(node.named["parameters"][0]) <= {"driver", "model"}, "what is left empty overrides nothing"
         for name, value in node.named["parameters"][0].items():
             assert type(value) is type(known[name]), name
-            if name not in ("driver", "model"):
-                assert value == known[name], "the launch file's defaults are the node's"
+
+
+def test_controller_launch_file_has_namespace_parameters_file_time_and_respawn(
+    load_launch: Callable[[str], ModuleType],
+) -> None:
+    given = {"params_file": "mine.yaml", "use_sim_time": "true", "respawn": "true", "rate": "0.5"}
+    for node in all_launched(load_launch("controller.launch.py"), model="out/model", **given):
+        assert node.named["namespace"].positional == ("namespace",)
+        assert node.named["respawn"] is True
+        file, parameters = node.named["parameters"]
+        assert file == "mine.yaml"
+        assert parameters["use_sim_time"] is True
+        if node.named["executable"] != "predictor":
+            assert parameters["rate"] == 0.5
