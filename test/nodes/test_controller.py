@@ -165,6 +165,26 @@ def test_three_processes_drive_laps_and_the_predictor_may_die(stand: Stand, smal
     assert_possible(stand.commands)
 
 
+def test_the_car_stops_without_its_controller_and_the_controller_brakes_without_its_car(stand: Stand) -> None:
+    """Each of the two is killed in turn; the controller comes back in between."""
+    rate = possible_rate()
+    simulator = stand.start("simulator", driver="external", rate=rate)
+    controller = stand.control(line="centre", speed_scale=0.5, rate=rate, watchdog=1.0)
+
+    def speed() -> float:
+        return float(stand.odometry[-1].twist.twist.linear.x)
+
+    assert stand.wait_for(lambda: bool(stand.odometry) and speed() > 0.5)  # on the straight after the start
+    controller.kill()
+    assert stand.wait_for(lambda: speed() < 0.05), "without commands the car brakes until it stands"
+    stand.control(line="centre", speed_scale=0.5, rate=rate, watchdog=1.0)
+    assert stand.wait_for(lambda: speed() > 0.5), "a controller that was started again drives on"
+    simulator.kill()
+    assert stand.diagnosed("/vehicle/odometry: silent for")
+    assert stand.wait_for(lambda: stand.newest[0] == load_vehicle("orca").inputs.throttle[0])
+    assert_possible(stand.commands)
+
+
 def test_it_brakes_without_odometry_drives_with_it_and_brakes_when_it_falls_silent(stand: Stand) -> None:
     lowest = load_vehicle("orca").inputs.throttle[0]
     stand.control()
