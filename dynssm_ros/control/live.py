@@ -29,10 +29,10 @@ from dynssm_ros.control.settings import Settings
 from dynssm_ros.runtime.health import Level
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.track.driver import Driver, Style
-from dynssm_ros.track.speed_profile import vehicle_limits
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
+from dynssm_ros.vehicle.limits import vehicle_limits
 
 LAUNCH = 0.3, 0.7  # shares of the line's speed: below the first pursuit takes over, above the second it ends
 _LAUNCH_STYLE = Style(aggressiveness=0.7, variation=0.0)

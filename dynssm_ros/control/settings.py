@@ -15,8 +15,8 @@ import numpy as np
 
 from dynssm_ros.control.horizon_model import Travel
 from dynssm_ros.track.racing_line import CAR_WIDTH
-from dynssm_ros.track.speed_profile import vehicle_limits
 from dynssm_ros.vehicle import Coefficients, Vehicle
+from dynssm_ros.vehicle.limits import vehicle_limits
 from dynssm_ros.vehicle.single_track import lateral_force
 
 Objective = Literal["tracking", "progress"]

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.signals.history import Refusal
-from dynssm_ros.track.speed_profile import vehicle_limits
 from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.limits import vehicle_limits
 
 _BEYOND = 1.5  # times a limit
 _SPIN = 3.0  # times the yaw rate of the tightest corner at the limit

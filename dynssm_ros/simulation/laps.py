@@ -22,10 +22,10 @@ from dynssm_ros.signals.standard import write_standard_bag
 from dynssm_ros.simulation.plant import PlantKind, make_plant
 from dynssm_ros.track.driver import Driver, Style
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.track.speed_profile import vehicle_limits
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Applied, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
+from dynssm_ros.vehicle.limits import vehicle_limits
 
 START_TIME = 1_000_000_000_000_000_000  # ns: the stamp of the first sample; a fixed one, so that runs repeat
 DEFAULT_STYLE = Style()

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.track.speed_profile import Limits, speed_profile
+from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
+from dynssm_ros.vehicle.limits import Limits
 from dynssm_ros.vehicle.single_track import cornering_stiffness
 
 

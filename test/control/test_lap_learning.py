@@ -87,6 +87,15 @@ def test_no_share_goes_beyond_what_the_coefficients_allow(orca, club):
     assert 1.1 < allowed[1] < 1.18  # 10 % of such cars grip less by 2 % or more
 
 
+def test_a_car_that_nobody_measured_begins_slower_still(orca, club):
+    unknown = orca.model_copy(
+        update={"coefficients": {n: c.model_copy(update={"std": None}) for n, c in orca.coefficients.items()}}
+    )
+    reference = load_reference("racing", orca, club, SAFE)
+    learner = LapLearner(unknown, club, reference, Settings.of(orca), SteppedCar.of(orca), orca.nominal)
+    assert learner.reference.lap_time > 1.05 * reference.lap_time
+
+
 def test_a_line_with_a_speed_of_its_own_is_refused(orca, club):
     own = replace(load_reference("racing", orca, club), share=None)
     with pytest.raises(ConfigurationError, match="has a speed of its own"):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dynssm_ros.control.reference import load_reference
-from dynssm_ros.track.speed_profile import Limits
 from dynssm_ros.track.tracks import TrackError
+from dynssm_ros.vehicle.limits import Limits
 
 
 def test_at_constant_speed_arc_length_is_speed_times_time(circle):

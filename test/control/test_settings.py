@@ -9,9 +9,9 @@ from dynssm_ros.control.horizon_model import HorizonModel, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Nmpc
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Scale, Settings
-from dynssm_ros.track.speed_profile import vehicle_limits
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle.limits import vehicle_limits
 
 SIZE = 9.0
 

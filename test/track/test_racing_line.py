@@ -8,9 +8,10 @@ from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.track.layouts import LAYOUTS
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.track.racing_line import border_margin, box_qp, curvature_integral, line_of, racing_line
-from dynssm_ros.track.speed_profile import speed_profile, vehicle_limits
+from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.track.tracks import Track, TrackError, load_track
 from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle.limits import vehicle_limits
 
 PUBLISHED = {"ethz": "orca", "ethz_mobil": "orca", "austin": "av21", "ims": "av21"}
 BUILT_IN = {name: "orca" if name.startswith("club") else "av21" for name in LAYOUTS}

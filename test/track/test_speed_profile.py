@@ -5,9 +5,10 @@ import pytest
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.track.speed_profile import Limits, speed_profile, vehicle_limits
+from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.track.tracks import built_in_track
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
+from dynssm_ros.vehicle.limits import Limits, vehicle_limits
 
 CONSTANT = Limits(np.linspace(0.1, 100, 50), np.full(50, 8.0), np.full(50, 3.0), np.full(50, 6.0))
 
