@@ -207,6 +207,14 @@ def test_shipped_models_are_valid(name: str) -> None:
     assert load_model_config(name).name == name
 
 
+@pytest.mark.parametrize("node", ["predictor", "controller", "simulator", "player"])
+def test_each_node_has_a_parameters_file_with_its_defaults(node: str) -> None:
+    content = yaml.safe_load((ROOT / "config" / f"{node}.yaml").read_text(encoding="utf-8"))["/**"]["ros__parameters"]
+    declared = declared_parameters(node)
+    assert content == declared
+    assert {name: type(value) for name, value in content.items()} == {n: type(v) for n, v in declared.items()}
+
+
 def test_parameters_file_fits_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same parser as the node's reads it, and the types are those that the node declares."""
     rclpy = pytest.importorskip("rclpy")

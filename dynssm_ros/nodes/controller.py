@@ -22,7 +22,7 @@ from dynssm_ros.control.live import LiveController
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, diagnostics, relative, run
+from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, diagnostics, output, relative, run
 from dynssm_ros.runtime.health import Health, Level
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.history import Refusal
@@ -56,7 +56,7 @@ class ControllerNode(Node):
         self._decoder = decoders(load_signal_map("default"))[ODOMETRY_TOPIC]
         self._newest: int | None = None  # stamp of the odometry
 
-        self._publish_command = self.create_publisher(JointState, relative(COMMAND_TOPIC), SENSOR_QOS).publish
+        self._publish_command = output(self, JointState, COMMAND_TOPIC)
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
         # when several messages wait, the executor serves subscriptions in this order
         self.create_subscription(Odometry, relative(PREDICTION_TOPIC), self._on_prediction, SENSOR_QOS)

@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from builtin_interfaces.msg import Time
 from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class, relative, run
@@ -32,13 +34,14 @@ class Playback:
         node: that publishes.
         bag: rosbag2 folder or file.
         topics: to publish; all of the bag if empty.
+        clock: whether the time at which messages were recorded goes to ``/clock``.
 
     Raises:
         BagError: unreadable, or a topic is missing.
         ConfigurationError: a message type is not installed.
     """
 
-    def __init__(self, node: Node, bag: str | Path, topics: tuple[str, ...] = ()) -> None:
+    def __init__(self, node: Node, bag: str | Path, topics: tuple[str, ...] = (), clock: bool = False) -> None:
         self.bag = Path(bag)
         self._context = node.context
         with open_bag(bag) as opened:
@@ -51,6 +54,7 @@ class Playback:
             topic: node.create_publisher(message_class(types[topic]), relative(topic), SENSOR_QOS)
             for topic in self.topics
         }
+        self._tell_time = node.create_publisher(Clock, "/clock", 10).publish if clock else None
 
     def wait_for_listeners(self, spin: Callable[[float], None], timeout: float = MATCH_TIMEOUT) -> tuple[str, ...]:
         """Waits until every topic has a subscription.
@@ -72,28 +76,35 @@ class Playback:
                 return waiting
             spin(0.05)
 
-    def play(self, rate: float = 1.0, duration: float = float("inf")) -> Iterator[tuple[BagMessage, float]]:
+    def play(
+        self, rate: float = 1.0, duration: float = float("inf"), start: float = 0.0
+    ) -> Iterator[tuple[BagMessage, float]]:
         """Publishes message after message at ``rate`` times real time, until rclpy is shut down.
 
         Args:
             rate: speed factor.
             duration: of the recording that is played (s).
+            start: of the recording that is left out before (s).
 
         Yields:
             Each message, and ``time.monotonic()`` just before it was published.
         """
         with open_bag(self.bag) as opened:
-            begin: float | None = None
-            first = 0
+            begin = first = None
             for message in opened.messages(self.topics):
-                if begin is None:
-                    begin, first = time.monotonic(), message.log_time
-                elapsed = (message.log_time - first) * 1e-9
+                first = message.log_time if first is None else first
+                elapsed = (message.log_time - first) * 1e-9 - start
+                if elapsed < 0:
+                    continue
+                begin = time.monotonic() if begin is None else begin
                 if elapsed > duration:
                     return
                 self._wait_until(begin + elapsed / rate)
                 if not self._context.ok():
                     return
+                if self._tell_time is not None:
+                    seconds, nanoseconds = divmod(message.log_time, 1_000_000_000)
+                    self._tell_time(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
                 sent = time.monotonic()
                 self._publishers[message.topic].publish(message.raw)
                 yield message, sent
@@ -111,9 +122,14 @@ class PlayerNode(Node):
         bag = describe(self, "bag", "", "rosbag2 folder or file to play.", read_only=True)
         self.rate = describe(self, "rate", 1.0, "Speed factor.", (0.01, 100.0), read_only=True)
         self.loop = describe(self, "loop", False, "Begin again at the end.", read_only=True)
+        self.start_offset = describe(
+            self, "start_offset", 0.0, "What is left out at the start (s).", (0.0, 1e6), read_only=True
+        )
+        topics = describe(self, "topics", "", "Topics to play, apart by blanks; empty: all.", read_only=True)
+        clock = describe(self, "clock", False, "Publish the time of the recording on /clock.", read_only=True)
         if not bag:
             raise BagError("parameter bag: not set; expected a rosbag2 folder, e.g. -p bag:=out/laps")
-        self.playback = Playback(self, bag)
+        self.playback = Playback(self, bag, tuple(topics.split()), clock)
 
     def play(self) -> None:
         """Plays the bag, once or in a loop, when somebody listens."""
@@ -121,7 +137,7 @@ class PlayerNode(Node):
         if unheard:
             self.get_logger().warning(f"nobody listens to {', '.join(unheard)}")
         while True:
-            for _ in self.playback.play(self.rate):
+            for _ in self.playback.play(self.rate, start=self.start_offset):
                 pass
             if not (self.loop and rclpy.ok()):
                 self._linger()

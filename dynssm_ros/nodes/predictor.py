@@ -26,7 +26,7 @@ from dynssm_ros.nodes.support import (
     describe,
     diagnostics,
     message_class,
-    relative,
+    output,
     run,
     set_pose,
     set_stamp,
@@ -85,9 +85,9 @@ class PredictorNode(Node):
 
         self._prediction = Odometry()
         self._adapted = JointState(name=list(COEFFICIENTS))
-        self._publish_prediction = self.create_publisher(Odometry, relative(PREDICTION_TOPIC), SENSOR_QOS).publish
-        self._publish_parameters = self.create_publisher(JointState, relative(PARAMETERS_TOPIC), SENSOR_QOS).publish
-        self._publish_horizon = self.create_publisher(Path, relative(HORIZON_TOPIC), SENSOR_QOS).publish
+        self._publish_prediction = output(self, Odometry, PREDICTION_TOPIC)
+        self._publish_parameters = output(self, JointState, PARAMETERS_TOPIC)
+        self._publish_horizon = output(self, Path, HORIZON_TOPIC)
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
 
         signal_map = self._predictor.signal_map
@@ -179,7 +179,7 @@ class PredictorNode(Node):
         for parameter in parameters:
             if parameter.name == "model":
                 try:
-                    model = OnnxModel(open_artifact(parameter.value))
+                    model = OnnxModel(open_artifact(pathlib.Path(parameter.value).expanduser()))
                     self._predictor.check_swap(model)
                 except UserError as error:
                     self.get_logger().error(str(error))

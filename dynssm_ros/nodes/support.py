@@ -7,6 +7,8 @@ import math
 import signal
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar
 
 import rclpy
@@ -15,8 +17,10 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import JointState
 
+from dynssm_ros.configuration import config_root
 from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.extras import load_plugins
 from dynssm_ros.vehicle import Applied
@@ -25,6 +29,16 @@ NodeType = TypeVar("NodeType", bound=Node)
 
 # sensor data, but deep enough that a pause of the process (a model swap, a busy core) loses nothing
 SENSOR_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=100)
+
+
+# what the nodes publish: who asks for best effort gets that
+_OUTPUT_QOS = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=100)
+
+
+def output(node: Node, msgtype: Any, topic: str) -> Callable[[Any], None]:
+    """Publishes in the node's namespace, reliably unless ``qos_overrides`` say otherwise; returns what sends a message."""
+    overriding = QoSOverridingOptions.with_default_policies()
+    return node.create_publisher(msgtype, relative(topic), _OUTPUT_QOS, qos_overriding_options=overriding).publish
 
 
 def message_class(msgtype: str) -> Any:
@@ -56,10 +70,11 @@ def describe(
     bounds: tuple[float, float] | None = None,
     read_only: bool = False,
 ) -> Any:
-    """Declares a described, typed, bounded parameter and returns its value."""
+    """Declares a described, typed, bounded parameter and returns its value; ``~/`` in front of a path is the home."""
     ranges = [FloatingPointRange(from_value=bounds[0], to_value=bounds[1])] if bounds else []
     descriptor = ParameterDescriptor(description=description, floating_point_range=ranges, read_only=read_only)
-    return node.declare_parameter(name, default, descriptor).value
+    value = node.declare_parameter(name, default, descriptor).value
+    return str(Path(value).expanduser()) if isinstance(value, str) and value.startswith("~/") else value
 
 
 def choose(node: Node, name: str, default: str, allowed: tuple[str, ...], description: str) -> Any:
@@ -120,8 +135,11 @@ def run(
 ) -> None:
     """Starts rclpy, lets a node ``work`` until it is done or interrupted, and ends cleanly.
 
-    A user error becomes one line and exit status 1.
+    A user error becomes one line and exit status 1. ``--help`` prints what the node is and its parameters.
     """
+    if {"-h", "--help"} & set(sys.argv[1:] if args is None else args):
+        print(_help(sys.modules[make_node.__module__]))
+        return
     interrupt = signal.signal(signal.SIGINT, _leave_it_to_rclpy)
     rclpy.init(args=args)
     node: NodeType | None = None
@@ -142,6 +160,12 @@ def run(
             node.destroy_node()
         rclpy.try_shutdown()
         signal.signal(signal.SIGINT, interrupt)
+
+
+def _help(module: ModuleType) -> str:
+    """The docstring of a node's module, and its parameters as its shipped file explains them."""
+    file = config_root() / f"{Path(module.__file__ or '').stem}.yaml"
+    return f"{(module.__doc__ or '').strip()}\n\nParameters, as in {file}:\n\n{file.read_text(encoding='utf-8')}"
 
 
 def _leave_it_to_rclpy(*_: object) -> None:

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.live_run import LiveRun, collecting, isolated_environment, predictor_process
-from dynssm_ros.signals.messages import PREDICTION_TOPIC
+from dynssm_ros.signals.decoding import header_stamp_ns
+from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PREDICTION_TOPIC
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
@@ -35,6 +36,32 @@ def test_player_and_predictor_work_as_separate_processes(small_model: Path, laps
         assert collector.wait_for(lambda: last in run.predicted, 5.0)
         assert collector.count_publishers(PREDICTION_TOPIC) == 1
     assert len(run.predicted) == 1001 - 4
+
+
+def test_a_part_of_a_bag_is_played_with_its_clock(laps_bag: Path) -> None:
+    """The last second of the odometry alone; /clock has the times at which it was recorded."""
+    from nav_msgs.msg import Odometry
+    from rosgraph_msgs.msg import Clock
+
+    from dynssm_ros.nodes.support import SENSOR_QOS
+
+    os.environ.update(isolated_environment())
+    stamps: list[int] = []
+    times: list[int] = []
+    with collecting(LiveRun(20_000_000)) as collector:
+        collector.create_subscription(
+            Odometry, ODOMETRY_TOPIC, lambda m: stamps.append(header_stamp_ns(m) or 0), SENSOR_QOS
+        )
+        collector.create_subscription(
+            Clock, "/clock", lambda m: times.append(m.clock.sec * 10**9 + m.clock.nanosec), 10
+        )
+        given = ("rate:=4.0", "start_offset:=19.0", f"topics:={ODOMETRY_TOPIC}", "clock:=true")
+        player = subprocess.Popen(_player(f"bag:={laps_bag}", *given), env=os.environ.copy())
+        assert player.wait(60) == 0
+        assert collector.wait_for(lambda: len(stamps) == 51, 5.0), len(stamps)
+        assert collector.wait_for(lambda: len(times) >= 40, 5.0), len(times)
+    assert stamps[0] == 1_000_000_000_000_000_000 + 19 * 10**9
+    assert set(times) <= {stamp + 2000 for stamp in stamps}, "odometry is logged 2 us after its stamp"
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,14 @@ from dynssm_ros.vehicle import COEFFICIENTS
 pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
 H = 5
+ACTUATORS = ("r_fb", "delta_fb", "r_cmd", "delta_cmd")
+
+
+def predictions(model: Path, bag: Path) -> dict[int, Prediction]:
+    """What replay predicts, by the stamp of the predicted instant."""
+    predictor = Predictor(OnnxModel(open_artifact(model)), load_signal_map("default"))
+    with open_bag(bag) as opened:
+        return {o.outcome.stamp: o.outcome for o in replay(opened, predictor) if isinstance(o.outcome, Prediction)}
 
 
 @pytest.mark.parametrize(("rate", "speed"), [(50.0, 1.0), (100.0, 1.0), (100.0, 2.0)])
@@ -30,7 +39,8 @@ def test_every_odometry_message_after_the_first_window_gets_a_prediction_as_repl
     small_model: Path, laps_bag: Path, tmp_path: Path, rate: float, speed: float
 ) -> None:
     bag = tmp_path / "resampled"
-    recording_to_bag(extract([laps_bag], load_signal_map("default"), rate), bag)
+    recording = extract([laps_bag], load_signal_map("default"), rate)
+    recording_to_bag(recording, bag)
     run = run_live(small_model, bag, 0.02, rate=speed, duration=4.0 * speed)
     assert len(run.sent) >= 4.0 * speed * rate
     assert run.missing() == []
@@ -38,17 +48,20 @@ def test_every_odometry_message_after_the_first_window_gets_a_prediction_as_repl
     late = min(run.predicted) - run.T_s - sorted(run.sent)[round((H - 1) * 0.02 * rate)]
     assert 0 <= late <= 0.2e9
 
-    predictor = Predictor(OnnxModel(open_artifact(small_model)), load_signal_map("default"))
-    with open_bag(bag) as opened:
-        offline = {o.outcome.stamp: o.outcome for o in replay(opened, predictor) if isinstance(o.outcome, Prediction)}
-    live = np.array([run.predicted[stamp] for stamp in sorted(run.predicted)])
-    expected = np.array([offline[stamp].state for stamp in sorted(run.predicted)])
+    offline = predictions(small_model, bag)
+    stamps = sorted(run.predicted)
+    live, expected = np.array([run.predicted[s] for s in stamps]), np.array([offline[s].state for s in stamps])
     # DDS keeps the order within a topic but not between topics: where odometry overtakes its actuators, the samples
     # before are held, and the node's prediction is another than that from the bag's order
     same = np.abs(live - expected).max(axis=1) < 1e-9
     assert same.mean() > 0.99
-    np.testing.assert_allclose(live[~same], expected[~same], atol=0.02)
-    some = sorted(run.predicted)[int(np.flatnonzero(same)[0])]
+    overtaken = tmp_path / "overtaken"
+    held = {name: np.r_[np.repeat(c[:1], 3), c[:-3]] for name, c in recording.columns.items() if name in ACTUATORS}
+    recording_to_bag(replace(recording, columns=recording.columns | held), overtaken)
+    always = predictions(small_model, overtaken)
+    farthest = np.abs(np.array([always[s].state for s in stamps]) - expected).max(axis=0)
+    assert (np.abs(live - expected) <= farthest).all()
+    some = stamps[int(np.flatnonzero(same)[0])]
     np.testing.assert_allclose(run.parameters[some], offline[some].theta, atol=1e-12)
     assert len(run.parameters[some]) == len(COEFFICIENTS)
 
@@ -61,6 +74,15 @@ def test_bad_samples_yield_no_prediction_and_the_node_recovers_by_itself(start_c
     assert car.answered(good)
     assert nan not in car.run.predicted
     assert all(np.isfinite(state).all() for state in car.run.predicted.values())
+
+
+@pytest.mark.parametrize("asked", ["reliable", "best_effort"])
+def test_outputs_are_reliable_unless_asked_otherwise(start_car, asked: str) -> None:
+    given = {} if asked == "reliable" else {"qos_overrides./dynssm/prediction.publisher.reliability": asked}
+    car = start_car(**given)
+    car.drive_until_answered()
+    (info,) = car.collector.get_publishers_info_by_topic("/dynssm/prediction")
+    assert info.qos_profile.reliability.short_key == asked
 
 
 @pytest.mark.parametrize("off", [-1.0, 1.0, 10.0])
@@ -92,12 +114,12 @@ def test_more_than_one_publisher_of_an_input_is_named(start_car) -> None:
 
     car = start_car()
     second = car.collector.create_publisher(Odometry, "/vehicle/odometry", SENSOR_QOS)
-    for _ in range(30):
+
+    def is_named() -> bool:
         car.drive_until_answered()
-        if car.diagnosed("") and "/vehicle/odometry: 2 publishers" in car.run.diagnostics[-1][1]:
-            break
-    else:
-        pytest.fail(f"not named: {car.run.diagnostics[-1]}")
+        return car.diagnosed("") and "/vehicle/odometry: 2 publishers" in car.run.diagnostics[-1][1]
+
+    assert any(is_named() for _ in range(30)), car.run.diagnostics[-1]
     car.collector.destroy_publisher(second)
 
 

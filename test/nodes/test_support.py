@@ -41,3 +41,17 @@ def test_a_node_that_crashed_is_named() -> None:
 
     with pytest.raises(UserError, match="the simulator crashed with SIGSEGV"):
         crash()
+
+
+@pytest.mark.parametrize("node", ["predictor", "controller", "simulator", "player"])
+def test_help_says_what_a_node_is_and_explains_its_parameters(node: str) -> None:
+    command = [sys.executable, "-m", f"dynssm_ros.nodes.{node}", "--help"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert f"ros2 run dynssm_ros {node}" in ended.stdout
+    assert "  rate: 1.0" in ended.stdout or "max_age: 0.2" in ended.stdout
+    assert not ended.stderr
+
+
+def test_a_path_may_begin_at_home(refused_start) -> None:
+    line = refused_start("predictor", "model:=~/no_such_model")
+    assert line.startswith(f"error: {Path.home() / 'no_such_model'}: no such model folder")
