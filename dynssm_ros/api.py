@@ -481,10 +481,11 @@ def race(
     """
     require("race", "race")
     from dynssm_ros.control.lap_learning import SAFE
-    from dynssm_ros.control.race import Course, Sensing, Start, race
+    from dynssm_ros.control.race import Course, Start, race
     from dynssm_ros.control.race_models import load_prediction_model
     from dynssm_ros.control.reference import load_reference
     from dynssm_ros.control.settings import Settings
+    from dynssm_ros.simulation.sensing import Sensing
 
     car = _vehicle(vehicle)
     driven = car.with_effects((name, dict(values)) for name, values in (effects or {}).items())

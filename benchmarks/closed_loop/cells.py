@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.generalisation.cells import CARS, NOISE_LEVELS, Training, simulated_car
-from dynssm_ros.control.race import Sensing
 from dynssm_ros.control.settings import Objective
 from dynssm_ros.simulation.plant import PlantKind
+from dynssm_ros.simulation.sensing import Sensing
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.track.tracks import Track, TrackError, load_track
 from dynssm_ros.vehicle import load_vehicle
@@ -96,10 +96,7 @@ class Cell:
     @property
     def sensing(self) -> Sensing:
         """What comes between the car and its controller."""
-        level, car = NOISE_LEVELS[self.noise], CARS[self.car]
-        velocities, pose = ((level * a, level * b, level * c) for a, b, c in (car.noise, _POSE_NOISE[self.car]))
-        delay = load_vehicle(car.vehicle).sampling_time if self.late else 0.0
-        return Sensing(velocities, pose, delay, self.track[1])
+        return sensing(self.car, NOISE_LEVELS[self.noise], self.late, self.track[1])
 
     @property
     def training(self) -> Training:
@@ -119,6 +116,19 @@ class Cell:
         road = variation(load_track(self.track[0]), self.track[1]).scaled(_SCALES[self.car])
         half = np.full(len(road.width_left), _WIDTHS[self.car] / 2)
         return replace(road, width_left=half, width_right=half)
+
+
+def sensing(car: str, level: float, late: bool, seed: int = 0) -> Sensing:
+    """What comes between a car and its controller.
+
+    Args:
+        car: of the generalisation matrix.
+        level: of the noise; 1: usual.
+        late: whether measurements are a step late.
+        seed: of the noise.
+    """
+    velocities, pose = ((level * a, level * b, level * c) for a, b, c in (CARS[car].noise, _POSE_NOISE[car]))
+    return Sensing(velocities, pose, load_vehicle(CARS[car].vehicle).sampling_time if late else 0.0, seed)
 
 
 def cells() -> Iterator[Cell]:

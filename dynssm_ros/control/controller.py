@@ -22,6 +22,7 @@ from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.control.state_estimator import StateEstimator
+from dynssm_ros.simulation.sensing import MOST_LATE
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Applied, Coefficients, State
 from dynssm_ros.vehicle.effects import require_context
@@ -30,7 +31,6 @@ from dynssm_ros.vehicle.parameters import InputLimits
 from dynssm_ros.vehicle.single_track import settled_effect_states
 
 LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
-MOST_LATE = 20  # steps
 _AS_IT_IS = np.array([float(source == "model") for source in SOURCES])
 _ACTUATORS = slice(STATES.index("r"), STATES.index("delta") + 1)
 _MEASURED = slice(3, len(STATES))  # what a window's row begins with
@@ -128,6 +128,11 @@ class Controller:
         """From now on follows the same line at another speed, with the calibrated car's coefficients ``theta`` ``(17,)``."""
         self._nmpc.follow(reference)
         self._calibrated = Adapted(theta, self._calibrated.correction)
+
+    @property
+    def expected(self) -> Vector | None:
+        """The state at the next measurement, by what was planned with; ``None`` while there is none."""
+        return self._expected
 
     def interrupt(self) -> None:
         """What is measured next is not one T_s after what was measured last."""

@@ -1,8 +1,9 @@
 """The controller of a car that does not wait: plans for the instant at which the command will act, and tells how it goes.
 
-The odometry of an instant is answered while the car drives on, under the command that was sent before; the answer acts one
-T_s later. So each step first carries the measured state to that instant, by what the predictor says of the car, and plans
-from there. The command is stamped with that instant, which is how recordings pair commands with states.
+The odometry of an instant is answered while the car drives on, under the commands that were sent before; the answer acts
+one T_s later, or more where odometry comes late. So each step first carries the measured state to that instant, by what the
+predictor says of the car, and plans from there. The command is stamped with that instant, which is how recordings pair
+commands with states.
 
 From far below the line's speed, as from standstill or after a spin, a short horizon sees no way that leads back to the line.
 So pure pursuit drives until the car is up to speed.
@@ -26,8 +27,10 @@ from dynssm_ros.control.nmpc import Status
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.remote import RemoteModel
 from dynssm_ros.control.settings import Settings
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.runtime.health import Level
 from dynssm_ros.signals.history import Refusal
+from dynssm_ros.simulation.sensing import MOST_LATE, steps_late
 from dynssm_ros.track.driver import Driver, Style
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, State, Vehicle
@@ -107,10 +110,11 @@ class LiveController:
         settings: of the controller.
         max_age: how old the odometry behind the predictor's coefficients may be (s).
         max_gap: longest time between two odometry messages that is no gap (s).
+        delay: from the stamp of an odometry message until it arrives (s), in whole T_s.
         clock: time now (s), of any origin, for the deadline.
 
     Raises:
-        ConfigurationError: the vehicle has effects on signals that there are not.
+        ConfigurationError: the vehicle has effects on signals that there are not; the delay is too long.
     """
 
     def __init__(
@@ -121,11 +125,17 @@ class LiveController:
         settings: Settings,
         max_age: float = 0.5,
         max_gap: float = 0.2,
+        delay: float = 0.0,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.vehicle = vehicle
         self.period = round(vehicle.sampling_time * 1e9)
-        """T_s (ns): a command acts that long after the stamp of the odometry that it answers."""
+        """T_s (ns)."""
+        self._age = 1 + steps_late(delay, vehicle.sampling_time)  # of the odometry, when the command acts
+        if self._age >= MOST_LATE:
+            raise ConfigurationError(f"delay {delay:g} s: expected less than {MOST_LATE - 1} times T_s")
+        self.answered_after = self._age * self.period
+        """A command acts that long after the stamp of the odometry that it answers (ns)."""
         self.remote = RemoteModel(vehicle, max_age)
         """What the predictor says."""
         self._pilot = Controller(self.remote, vehicle.inputs, reference, track, settings, clock)
@@ -149,7 +159,8 @@ class LiveController:
         self._last: int | None = None  # stamp of the newest odometry (ns)
         self._first = self._planned = 0
         self._heading = 0.0
-        self._sent = Applied(0.0, 0.0)
+        # commands from the one that acts at the stamp of the newest odometry to the last
+        self._sent = deque([Applied(0.0, 0.0)] * self._age, maxlen=self._age)
         self._weights = np.zeros(len(SOURCES))
         self._planned_with = self.remote.calibrated
         self._restart()
@@ -170,8 +181,8 @@ class LiveController:
             seen: its velocities (m/s, m/s, rad/s).
 
         Returns:
-            The command from ``stamp + period`` on, finite and within the limits; why the message is refused; or nothing if
-            it is too early for a new plan.
+            The command from ``stamp + answered_after`` on, finite and within the limits; why the message is refused; or
+            nothing if it is too early for a new plan.
         """
         if not all(abs(value) < _LARGEST for value in (*pose, *seen)):
             return Refusal.NOT_FINITE
@@ -200,13 +211,14 @@ class LiveController:
             return self.brake()
         self._heading += math.remainder(pose.theta - self._heading, 2 * math.pi)
         context = t, self.laps.s % self._track.length, self._track.length
-        x = self.remote.start(Pose(pose.x, pose.y, self._heading), seen, self._sent, context, self._memory)
+        x = self.remote.start(Pose(pose.x, pose.y, self._heading), seen, self._sent[0], context, self._memory)
         self.remote.measured(stamp, x, context)
         self.remote.update(stamp)
-        following = self.remote.ahead(x, context)
-        pursued = self._pursued(Pose(*following[:3].tolist()), State(*following[3:6].tolist()))
-        self._sent = pursued or self._planned_command(t, Pose(pose.x, pose.y, self._heading), seen)
-        return self._sent
+        for command in self._sent:
+            x = self.remote.ahead(np.array([*x[:6], *command, *x[len(STATES) :]]), context)
+        pursued = self._pursued(Pose(*x[:3].tolist()), State(*x[3:6].tolist()))
+        self._sent.append(pursued or self._planned_command(t, Pose(pose.x, pose.y, self._heading), seen))
+        return self._sent[-1]
 
     def _pursued(self, pose: Pose, state: State) -> Applied | None:
         """The command of a launch; ``None`` while there is none."""
@@ -216,12 +228,12 @@ class LiveController:
         if launching != self._launching:
             self._restart()
             self._launching = launching
-        return self._pursuit.command(0.0, pose, state, on_line, self._sent) if launching else None
+        return self._pursuit.command(0.0, pose, state, on_line, self._sent[-1]) if launching else None
 
     def _planned_command(self, t: float, pose: Pose, state: State) -> Applied:
-        """The pilot's command for one T_s after the odometry at ``t`` (s)."""
-        decision = self._pilot.step(t + self.period / 1e9, pose, state, self._sent, age=1)
-        self._memory = decision.plan.x[0, len(STATES) :]
+        """The pilot's command for when it acts, from the odometry at ``t`` (s)."""
+        decision = self._pilot.step(t + self.answered_after / 1e9, pose, state, self._sent[-1], age=self._age)
+        self._memory = None if self._pilot.expected is None else self._pilot.expected[len(STATES) :]
         self._weights, self._planned_with = decision.weights, decision.adapted
         self.counts[decision.plan.status] += 1
         self._recent.append((decision.seconds, decision.plan.status == "solved"))
@@ -230,8 +242,8 @@ class LiveController:
     def brake(self) -> Applied:
         """The command for when there is nothing to plan from: full brakes, the steering held."""
         self._restart()
-        self._sent = Applied(self._brakes, self._sent.delta)
-        return self._sent
+        self._sent.append(Applied(self._brakes, self._sent[-1].delta))
+        return self._sent[-1]
 
     def verdict(self) -> tuple[Level, str]:
         """How it goes, in words."""

@@ -11,24 +11,23 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.caution import QUANTILE
-from dynssm_ros.control.controller import LOST, MOST_LATE, Controller, Decision
+from dynssm_ros.control.controller import LOST, Controller, Decision
 from dynssm_ros.control.evidence import SOURCES
 from dynssm_ros.control.lap_learning import LapLearner, LapLog, LearnedLap
 from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
-from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.simulation.plant import PlantKind, make_plant, plant_type
+from dynssm_ros.simulation.sensing import Sensing, Sensors
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Applied, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
@@ -50,36 +49,6 @@ class Start:
     s: float = 0.0
     lateral: float = 0.0
     speed: float | None = None
-
-
-@dataclass(frozen=True)
-class Sensing:
-    """What comes between the car and its controller.
-
-    Attributes:
-        noise: standard deviations of white noise on the measured ``v_x, v_y`` (m/s), ``omega`` (rad/s).
-        pose_noise: likewise on ``x, y`` (m), ``theta`` (rad).
-        delay: from an instant until the command that answers it acts (s), at most :data:`MOST_LATE` sampling times;
-            rounded up to whole ones. The controller knows it.
-        seed: of the noise.
-    """
-
-    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    pose_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    delay: float = 0.0
-    seed: int = 0
-
-    def steps(self, T_s: float) -> int:
-        """The delay in sampling times (s).
-
-        Raises:
-            ConfigurationError: it is negative, not finite or too long, or a deviation is.
-        """
-        if not all(0.0 <= std < math.inf for std in (*self.noise, *self.pose_noise)):
-            raise ConfigurationError(f"noise {self.noise}, {self.pose_noise}: expected finite numbers of at least 0")
-        if not 0.0 <= self.delay <= MOST_LATE * T_s:
-            raise ConfigurationError(f"delay {self.delay:g} s: expected 0 to {MOST_LATE * T_s:g} s")
-        return math.ceil(self.delay / T_s - 1e-6)
 
 
 @dataclass(frozen=True)
@@ -106,7 +75,7 @@ class Course:
     settings: Settings
     laps: int = 1
     start: Start = Start()
-    sensing: Sensing = Sensing()
+    sensing: Sensing = field(default_factory=Sensing)
     learning: Vehicle | None = None
 
     @property
@@ -246,9 +215,7 @@ class _Drive:
         self._car = make_plant(vehicle, course.plant, pose, state, (rolling,), track.length)
         self._course = course
         self._feedback = Applied(0.0, 0.0)
-        self._noise = np.array([*course.sensing.pose_noise, *course.sensing.noise])
-        self._rng = np.random.default_rng([course.sensing.seed, 2])
-        self._seen: deque[Vector] = deque(maxlen=1 + course.sensing.steps(vehicle.sampling_time))
+        self._sensors = Sensors(course.sensing, vehicle.sampling_time)
         self._limit = PATIENCE * course.laps * course.reference.lap_time
         self._rows: list[tuple[Any, ...]] = []
         self._learner: LapLearner | None = None
@@ -263,9 +230,9 @@ class _Drive:
     def step(self) -> str | None:
         """Drives on by T_s; once it is over, why: a failure, or nothing."""
         t, car = len(self._rows) * self._course.vehicle.sampling_time, self._car
-        self._seen.append(np.array([*car.pose, *car.measured]) + self._noise * self._rng.standard_normal(6))
-        seen = self._seen[0]  # the oldest: what has arrived by now
-        decision = self.pilot.step(t, Pose(*seen[:3]), State(*seen[3:]), self._feedback, len(self._seen) - 1)
+        self._sensors.measure(car.pose, car.measured)
+        pose, seen, age = self._sensors.arrived
+        decision = self.pilot.step(t, pose, seen, self._feedback, age)
         self._rows.append(
             (t, car.pose, car.state, decision.command, self.s, self._lateral, decision.theta, decision.correction,
              decision.weights, decision.seconds)
@@ -300,7 +267,7 @@ class _Drive:
             return
         track, believed = self._course.track, decision.plan.x[0, :2]
         room = float(track.room(*track.project(believed, near=self.s)))
-        row = (*self._seen[-1][3:], *self._feedback, *np.subtract(decision.command, self._feedback))
+        row = (*self._sensors.newest[1], *self._feedback, *np.subtract(decision.command, self._feedback))
         self._logged.append((t, self.s, room, decision.caution / QUANTILE, row))
         if self.s >= self.start + (1 + len(self._learner.laps)) * track.length:
             self._learner.learn(LapLog(*(np.array(column) for column in zip(*self._logged, strict=True))))

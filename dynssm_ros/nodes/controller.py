@@ -89,6 +89,9 @@ class ControllerNode(Node):
             "Whether what the predictor says is planned with only where it was better than the calibrated car.",
             read_only=True,
         )
+        delay = describe(
+            self, "delay", 0.0, "From the stamp of the odometry until it arrives (s).", (0.0, 10.0), read_only=True
+        )
         max_age = describe(
             self, "max_age", 0.5, "Age to which the predictor's coefficients are held (s).", (0.01, 10.0), read_only=True
         )  # fmt: skip
@@ -99,7 +102,7 @@ class ControllerNode(Node):
         reference = load_reference(line, car, road, speed_scale)
         settings = Settings.of(car, objective, horizon or None, offset_free, evidence)
         settings = replace(settings, deadline=car.sampling_time / self._rate)
-        driver = LiveController(car, reference, road, settings, max_age, self._watchdog)
+        driver = LiveController(car, reference, road, settings, max_age, self._watchdog, delay)
         self.get_logger().info(
             f"{car.name} on {road.name} ({road.length:.4g} m), {objective} of the {reference.name} line "
             f"({reference.lap_time:.4g} s a lap at its own speed), {settings.N} steps of {car.sampling_time:g} s"
@@ -137,7 +140,7 @@ class ControllerNode(Node):
         self._health.arrived(ODOMETRY_TOPIC, self._now())  # now: a step that took long is no silence of the odometry
         self._newest = stamp
         if outcome is not None:
-            self._publish_command(actuators(stamp + self._driver.period, outcome))
+            self._publish_command(actuators(stamp + self._driver.answered_after, outcome))
 
     def _watch(self) -> None:
         """Brakes while odometry is silent."""
@@ -146,7 +149,9 @@ class ControllerNode(Node):
         if self._newest is None:
             stamp = int(self.get_clock().now().nanoseconds)
         else:
-            stamp = self._newest + self._driver.period + round(self._health.age(ODOMETRY_TOPIC, self._now()) * 1e9)
+            stamp = (
+                self._newest + self._driver.answered_after + round(self._health.age(ODOMETRY_TOPIC, self._now()) * 1e9)
+            )
         self._publish_command(actuators(stamp, self._driver.brake()))
 
     def _silent(self) -> bool:

@@ -12,27 +12,41 @@ import time
 from collections.abc import Iterator
 from typing import Any, Literal, get_args
 
-import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, relative, run, set_pose, set_stamp
+from dynssm_ros.nodes.support import (
+    SENSOR_QOS,
+    actuators,
+    choose,
+    describe,
+    diagnostics,
+    relative,
+    run,
+    set_pose,
+    set_stamp,
+)
+from dynssm_ros.runtime.health import Level
 from dynssm_ros.signals.decoding import decoders
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
 from dynssm_ros.simulation.laps import Sample, drive
 from dynssm_ros.simulation.plant import PLANTS, PlantKind
+from dynssm_ros.simulation.sensing import Sensing, Sensors
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.racing_line import LineKind, line_of
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, State, load_vehicle
 from dynssm_ros.vehicle.effects import parse_effect
+from dynssm_ros.vehicle.kinematics import Pose
 
 DriverKind = Literal["pure_pursuit", "external"]
+_DIAGNOSTICS = 1.0  # s between them
 _LATE = 1.0  # s; a node that was held up for longer goes on from there and does not catch up
 
 
@@ -56,6 +70,12 @@ class SimulatorNode(Node):
         noise = describe(
             self, "noise", [0.0, 0.0, 0.0], "Of v_x, v_y (m/s), omega (rad/s): deviations.", read_only=True
         )
+        pose_noise = describe(
+            self, "pose_noise", [0.0, 0.0, 0.0], "Likewise of x, y (m), heading (rad).", read_only=True
+        )
+        delay = describe(
+            self, "delay", 0.0, "By which odometry is sent late, in the car's time (s).", (0.0, 10.0), read_only=True
+        )
         aggressiveness = describe(
             self, "aggressiveness", 0.95, "Share of the limits in use.", (0.1, 1.2), read_only=True
         )
@@ -65,15 +85,13 @@ class SimulatorNode(Node):
             self, "watchdog", 0.2, "Age of an external command, in the car's time, at which it brakes (s).", (0.01, 10.0),
             read_only=True,
         )  # fmt: skip
-        if len(noise) != 3 or not all(0 <= std < math.inf for std in noise):
-            raise ConfigurationError(f"parameter noise: {list(noise)}; expected three finite numbers of at least 0")
         if self._seed < 0:
             raise ConfigurationError(f"parameter seed: {self._seed}; expected at least 0")
         self._vehicle = load_vehicle(vehicle).with_effects(map(parse_effect, effects.split()))
         self._track = load_track(track).scaled(scale)
         self._style = Style(aggressiveness, variation)
-        self._noise = np.array(noise)
-        self._rng = np.random.default_rng([self._seed, 1])  # apart from the driver's, as in `dynssm simulate`
+        sensing = Sensing(tuple(noise), tuple(pose_noise), delay, self._seed)
+        self._sensors = Sensors(sensing, self._vehicle.sampling_time)
         self._commands = CommandHolder(self._vehicle, watchdog, lambda: time.monotonic() * self._rate)
         self._obeyed = self._on_road = True
 
@@ -84,11 +102,15 @@ class SimulatorNode(Node):
         else:
             self._decoder = decoders(load_signal_map("default"))[COMMAND_TOPIC]
             self.create_subscription(JointState, relative(COMMAND_TOPIC), self._on_command, SENSOR_QOS)
+        self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
+        self._least = math.inf  # room to the borders that there ever was (m)
         self._samples = self._drive()
         self._first_stamp = int(self.get_clock().now().nanoseconds)
         self._begin, self._count = time.monotonic(), 0
         self._period = self._vehicle.sampling_time / self._rate
-        self.create_timer(self._period, self._on_time, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(self._period, self._on_time, clock=steady)
+        self.create_timer(_DIAGNOSTICS, self._diagnose, clock=steady)
         self.get_logger().info(
             f"{self._vehicle.name} on {self._track.name} ({self._track.length:.4g} m), plant {self._plant}, "
             f"driver {self._driver}, {1 / self._period:.4g} Hz"
@@ -122,14 +144,32 @@ class SimulatorNode(Node):
         """Actuators first, as a predictor needs them when the odometry arrives."""
         stamp = self._first_stamp + round(self._count * self._vehicle.sampling_time * 1e9)
         self._count += 1
+        self._newest = sample
+        self._least = min(self._least, float(self._track.room(sample.s, sample.lateral)))
         self._publish_feedback(actuators(stamp, sample.feedback))
         if self._driver == "pure_pursuit":
             self._publish_command(actuators(stamp, sample.command))
         else:
             self._tell(sample)
-        self._publish_odometry(
-            _odometry(stamp, sample, State(*(sample.measured + self._noise * self._rng.standard_normal(3))))
-        )
+        self._sensors.measure(sample.pose, State(*sample.measured))
+        if self._sensors.is_full:
+            pose, measured, age = self._sensors.arrived
+            self._publish_odometry(_odometry(stamp - age * round(self._vehicle.sampling_time * 1e9), pose, measured))
+
+    def _diagnose(self) -> None:
+        """Tells what is true of the car, whatever is measured."""
+        if not self._count:
+            return
+        sample = self._newest
+        is_on_road = self._track.room(sample.s, sample.lateral) >= 0
+        level, words = (Level.OK, "on the road") if is_on_road else (Level.WARN, "off the road")
+        values = {
+            "driven (laps)": f"{sample.s / self._track.length:.3f}",
+            "place on the track (m)": f"{sample.s % self._track.length:.3f}",
+            "beside the centre line (m)": f"{sample.lateral:.4f}",
+            "least room to the borders so far (m)": f"{self._least:.4f}",
+        }
+        self._publish_diagnostics(diagnostics(self, "car", self._vehicle.name, level, words, values))
 
     def _tell(self, sample: Sample) -> None:
         """Logs when an external driver falls silent, comes back, leaves the road or returns to it."""
@@ -143,11 +183,11 @@ class SimulatorNode(Node):
         self._obeyed, self._on_road = obeyed, on_road
 
 
-def _odometry(stamp: int, sample: Sample, measured: State) -> Odometry:
+def _odometry(stamp: int, pose: Pose, measured: State) -> Odometry:
     message = Odometry(child_frame_id="base_link")
     message.header.frame_id = "map"
     set_stamp(message.header, stamp)
-    set_pose(message.pose.pose, *sample.pose)
+    set_pose(message.pose.pose, *pose)
     twist = message.twist.twist
     twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in measured)
     return message

@@ -8,10 +8,11 @@ import pytest
 from dynssm_ros.control.horizon_model import SteppedCar
 from dynssm_ros.control.lap_learning import SAFE, LapLearner, LapLog
 from dynssm_ros.control.prediction_model import Fixed
-from dynssm_ros.control.race import Course, Sensing, race
+from dynssm_ros.control.race import Course, race
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.simulation.sensing import Sensing
 
 STEP = 0.06
 

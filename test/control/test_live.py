@@ -13,6 +13,7 @@ from dynssm_ros.control.live import Laps, LiveController
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.remote import RemoteModel
 from dynssm_ros.control.settings import Settings
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.runtime.health import Level
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
@@ -50,18 +51,20 @@ def steps(monkeypatch):
 
 
 class SteppedCar:
-    """The simulated car, rolling at first, that obeys each command one step late."""
+    """The simulated car, rolling at first, that obeys each command one step late, and whose odometry may be late too."""
 
-    def __init__(self, vehicle, track, v_x=1.5):
+    def __init__(self, vehicle, track, v_x=1.5, late=0):
         start = Pose(*(float(v) for v in track.centre.position(0.0)), float(track.centre.heading(0.0)))
         self.plant = make_plant(vehicle, "euler", start, State(v_x, 0.0, 0.0), lap_length=track.length)
         self.stamp, self.sent = STAMP, Applied(0.0, 0.0)
+        self.on_the_way, self.late = [], late
 
     def answered(self, online: LiveController):
         """One odometry message and its answer, and the car drives on."""
         pose = self.plant.pose
         wrapped = pose._replace(theta=math.remainder(pose.theta, 2 * math.pi))
-        outcome = online.step(self.stamp, wrapped, self.plant.measured)
+        self.on_the_way.append((self.stamp, wrapped, self.plant.measured))
+        outcome = online.step(*self.on_the_way.pop(0)) if len(self.on_the_way) > self.late else None
         self.plant.advance(self.sent)
         self.stamp += T_S
         if isinstance(outcome, Applied):
@@ -91,8 +94,10 @@ def test_laps_from_a_standing_start_stay_between_the_borders(online, orca, club)
     assert controller.counts["solved"] > 0.8 * k
 
 
-def test_it_plans_from_where_the_car_is_when_the_command_acts(online, orca, club, steps):
-    controller, car = online(), SteppedCar(orca, club)
+@pytest.mark.parametrize("late", [0, 1, 4])
+def test_it_plans_from_where_the_car_is_when_the_command_acts(online, orca, club, steps, late):
+    controller, car = online(delay=late * orca.sampling_time), SteppedCar(orca, club, late=late)
+    assert controller.answered_after == (1 + late) * T_S
     steps.clear()
     for _ in range(40):
         car.answered(controller)
@@ -100,7 +105,7 @@ def test_it_plans_from_where_the_car_is_when_the_command_acts(online, orca, club
     _, _, _, feedback, decision = steps[-1]
     x, y, _, *velocities = decision.plan.x[0, :6]
     np.testing.assert_allclose(velocities, reached, atol=1e-12)
-    assert math.hypot(x - car.plant.pose.x, y - car.plant.pose.y) < 2e-3, "Euler's chord against the arc"
+    assert math.hypot(x - car.plant.pose.x, y - car.plant.pose.y) < 2e-3 * (1 + late), "Euler's chord against the arc"
     assert feedback == steps[-2][-1].command, "the command before is what acts until then"
     assert decision.command == car.sent
 
@@ -236,6 +241,13 @@ def test_far_off_the_road_it_brakes_and_says_so(online, orca, club):
     car.stamp += T_S
     car.answered(controller)
     assert controller.verdict()[0] != Level.ERROR
+
+
+def test_a_delay_beyond_what_can_be_carried_over_is_refused(online):
+    with pytest.raises(ConfigurationError, match=r"delay 0.38 s: expected less than 19 times T_s"):
+        online(delay=0.38)
+    with pytest.raises(ConfigurationError, match=r"delay -1 s: expected 0 to 0.4 s"):
+        online(delay=-1.0)
 
 
 def test_brakes_hold_the_steering(online, orca, club):

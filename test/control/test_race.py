@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.control import state_estimator
-from dynssm_ros.control.race import Course, Sensing, Start, _Drive, race
+from dynssm_ros.control.race import Course, Start, _Drive, race
 from dynssm_ros.control.race_models import load_prediction_model, true_model
 from dynssm_ros.control.reference import Reference, load_reference
 from dynssm_ros.control.settings import Settings
@@ -21,6 +21,7 @@ from dynssm_ros.reporting.race_report import (
     summary,
 )
 from dynssm_ros.simulation.laps import SimulationError
+from dynssm_ros.simulation.sensing import Sensing
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, State, load_vehicle
 

@@ -16,6 +16,7 @@ import pytest
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 
+from benchmarks.live_laps import drive_live
 from benchmarks.live_run import LiveRun, collecting, isolated_environment, node_process
 from dynssm_ros.nodes.support import SENSOR_QOS, set_pose, set_stamp
 from dynssm_ros.signals.decoding import header_stamp_ns
@@ -163,6 +164,13 @@ def test_three_processes_drive_laps_and_the_predictor_may_die(stand: Stand, smal
     assert float(values["most outside the borders (m)"]) == 0.0
     assert_on_the_road(stand.odometry)
     assert_possible(stand.commands)
+
+
+def test_a_lap_with_noise_delay_and_a_patch_of_little_grip_stays_on_the_road(small_model: Path) -> None:
+    driven = drive_live("orca", 2, small_model, rate=possible_rate())
+    assert driven.least_room > 0
+    assert driven.lap_times[1] < 6.0
+    assert driven.controller.startswith("drives, adapted coefficients")
 
 
 def test_the_car_stops_without_its_controller_and_the_controller_brakes_without_its_car(stand: Stand) -> None:

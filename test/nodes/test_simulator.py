@@ -140,6 +140,25 @@ def test_predictor_answers_each_odometry_message_of_the_simulated_car(start_pit:
         assert np.sqrt(np.mean(np.square(errors))) < 0.1
 
 
+def test_odometry_comes_late_and_noisy_and_the_diagnostics_tell_the_truth(start_pit: StartPit) -> None:
+    pit = start_pit("driver:=external", "delay:=0.06", "pose_noise:=[0.01, 0.02, 0.0]", "seed:=1")
+    assert pit.wait_for(lambda: len(pit.odometry) >= 200)
+    behind = [(max(pit.feedback) - (header_stamp_ns(pit.odometry[-1]) or 0)) / PERIOD]
+    for count in range(201, 220):
+        assert pit.wait_for(lambda count=count: len(pit.odometry) >= count)
+        behind.append((max(pit.feedback) - (header_stamp_ns(pit.odometry[-1]) or 0)) / PERIOD)
+    assert np.median(behind) == pytest.approx(3, abs=1)
+    places = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in pit.odometry])  # it stands
+    np.testing.assert_allclose(places.std(axis=0), [0.01, 0.02], rtol=0.3)
+    assert pit.wait_for(lambda: any("driven (laps)" in values for _, _, values in pit.run.diagnostics))
+    _, words, values = next(told for told in pit.run.diagnostics if "driven (laps)" in told[2])
+    assert words == "on the road"
+    assert (values["beside the centre line (m)"], values["least room to the borders so far (m)"]) == (
+        "0.0000",
+        "0.2000",
+    )
+
+
 def test_external_driver_is_obeyed_and_its_silence_stops_the_car(start_pit: StartPit) -> None:
     pit = start_pit("driver:=external")
     assert pit.wait_for(lambda: len(pit.odometry) > 20)
@@ -190,7 +209,9 @@ def test_a_car_that_cannot_hold_the_road_ends_in_one_line() -> None:
         ("plant:=rk5", "parameter plant: 'rk5'; expected euler or rk4 or double_track"),
         ("driver:=nobody", "parameter driver: 'nobody'; expected pure_pursuit or external"),
         ("line:=left", "parameter line: 'left'; expected centre or racing"),
-        ("noise:=[0.1, -0.2, 0.0]", "parameter noise: [0.1, -0.2, 0.0]; expected three finite numbers"),
+        ("noise:=[0.1, -0.2, 0.0]", "noise 0.1, -0.2, 0: expected three finite numbers of at least 0"),
+        ("pose_noise:=[0.1]", "pose_noise 0.1: expected three finite numbers of at least 0"),
+        ("delay:=1.0", "delay 1 s: expected 0 to 0.4 s"),
         ("seed:=-1", "parameter seed: -1; expected at least 0"),
         ("effects:=drag:size=2", "effect drag has no parameter 'size'"),
     ],

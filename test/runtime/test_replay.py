@@ -84,7 +84,7 @@ def test_the_covariance_in_the_bag_is_the_one_stated_with_each_prediction(
 def test_a_bag_without_the_topics_leaves_nothing_behind(predictor: Predictor, orca_bag: Path, tmp_path: Path) -> None:
     other = load_signal_map("default").model_dump()
     for source in other["signals"].values():
-        source["topic"] = source["topic"].replace("/vehicle", "/car")
+        source["topic"] = source["topic"].replace("vehicle", "car")
     renamed = Predictor(predictor.model, type(DEFAULT).model_validate(other))
     with pytest.raises(BagError, match="topic /car/actuator_feedback is missing"):
         replay_to_bag(orca_bag, renamed, tmp_path / "out")
