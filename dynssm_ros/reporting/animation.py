@@ -1,33 +1,43 @@
-"""The race as an animation: the cars on the track as they are at the same time."""
+"""The race as an animation: the cars on the track as they are at the same time, what they believed, and what they did."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.animation import PillowWriter
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.control.race import Race
+from dynssm_ros.evaluation.coefficients import coefficient_unit
 from dynssm_ros.files import replacing
 from dynssm_ros.reporting.evaluation_figures import MEASURED, STYLE, model_colours
-from dynssm_ros.reporting.race_report import widths
+from dynssm_ros.reporting.race_report import driven_coefficients, widths
 from dynssm_ros.track.racing_line import CAR_WIDTH
+from dynssm_ros.vehicle import COEFFICIENTS
 
 FRAMES = 120  # at most; a GIF of more is slow to write and large
 RATE = 25.0  # frames per second, at most
-_TRAIL = 1.0  # s of the path behind a car
+_TRAIL = 0.6  # s of the path behind a car
 _LENGTH = 1.5  # of a car in wheelbases
-_SMALLEST = 0.015  # of the picture: a car is drawn at least that long
+_SMALLEST = 0.03  # of the picture: a car is drawn at least that long
+_CHANGED = 0.02  # share of a coefficient's bounds by which a stretch of the road has to change it to be marked
 
 
 def animate(races: Sequence[Race], path: str | Path) -> None:
     """Writes a GIF, atomically; a car whose drive has ended stays where it ended.
+
+    Beside the map, over the time: the coefficient that hidden physics moves most, as planned with (dashed: the driven
+    car's); the speed; and the room between the car's centre and the nearer border. A stretch of the road on which the car
+    is another is marked.
 
     Args:
         races: on one course.
@@ -36,13 +46,19 @@ def animate(races: Sequence[Race], path: str | Path) -> None:
     duration = max(float(race.time[-1]) for race in races)
     count = int(min(FRAMES, max(2.0, RATE * duration)))
     with mpl.rc_context(STYLE):
-        figure, cars = _scene(races)
+        figure = Figure(figsize=(10.0, 5.0), layout="constrained")
+        FigureCanvasAgg(figure)
+        grid = figure.add_gridspec(3, 2, width_ratios=(3, 2))
+        road, strips = figure.add_subplot(grid[:, 0]), [figure.add_subplot(grid[k, 1]) for k in range(3)]
+        show: list[Callable[[float], None]] = [car.show for car in _cars(races, road)]
+        show += [curve.show for curve in _curves(races, strips)]
+        figure.legend(*road.get_legend_handles_labels(), loc="outside upper left", ncols=5)
     writer = PillowWriter(fps=max(2, round(min(RATE, count / duration))))
     with replacing(path) as aside, writer.saving(figure, str(aside), dpi=90):
         for t in np.linspace(0.0, duration, count):
-            for car in cars:
-                car.show(float(t))
-            figure.axes[0].set_title(f"{t:.2f} s")
+            for part in show:
+                part(float(t))
+            road.set_title(f"{t:.2f} s", fontsize=10)
             writer.grab_frame()
 
 
@@ -64,15 +80,31 @@ class _Car:
         self._trail.set_data(*pose[behind, :2].T)
 
 
-def _scene(races: Sequence[Race]) -> tuple[Figure, list[_Car]]:
+@dataclass(frozen=True)
+class _Curve:
+    """A figure of a car over the time that has passed."""
+
+    line: Line2D
+    time: Vector
+    values: Vector
+
+    def show(self, t: float) -> None:
+        """Up to time ``t`` (s)."""
+        past = self.time <= t
+        self.line.set_data(self.time[past], self.values[past])
+
+
+def _cars(races: Sequence[Race], axes: Axes) -> list[_Car]:
+    """The track, and the cars on it."""
     course, colours = races[0].course, model_colours([race.name for race in races])
-    borders = [course.track.left_border, course.track.right_border]
-    extent = np.ptp(np.concatenate(borders), axis=0)
-    figure = Figure(figsize=(7.0, 1.0 + 6.2 * float(np.clip(extent[1] / extent[0], 0.3, 1.2))), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    for border in borders:
+    track = course.track
+    for border in (track.left_border, track.right_border):
         axes.plot(*np.concatenate([border, border[:1]]).T, color=MEASURED, lw=1.0)
+    extent = np.ptp(np.concatenate([track.left_border, track.right_border]), axis=0)
+    changed = _changed_stretch(_longest(races))
+    if changed.any() and not changed.all():
+        x, y = np.where(changed[:, None], track.centre.position(track.centre.s), np.nan).T
+        axes.plot(x, y, color=MEASURED, alpha=0.2, lw=8, solid_capstyle="butt", label="the car is another here")
     wheelbase = course.vehicle.constants.l_f + course.vehicle.constants.l_r
     size = max(_LENGTH * wheelbase, _SMALLEST * float(np.max(extent)))
     cars = []
@@ -84,5 +116,63 @@ def _scene(races: Sequence[Race]) -> tuple[Figure, list[_Car]]:
         cars.append(_Car(race, body, trail, size))
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
     axes.grid(visible=False)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure, cars
+    return cars
+
+
+def _curves(races: Sequence[Race], strips: Sequence[Axes]) -> list[_Curve]:
+    """Belief, speed and room over time."""
+    longest, colours = _longest(races), model_colours([race.name for race in races])
+    name, truth = _most_changed(longest)
+    column = COEFFICIENTS.index(name)
+    unit = coefficient_unit(name)
+    strips[0].set_title(
+        f"{name} planned with{f' ({unit})' if unit else ''}; dashed: of the car", loc="left", fontsize=9
+    )
+    strips[1].set_title("speed (m/s)", loc="left", fontsize=9)
+    strips[2].set_title("from the car's centre to the border (m)", loc="left", fontsize=9)
+    strips[2].set_xlabel("time (s)")
+    strips[2].axhline(0.0, color=MEASURED, lw=0.8)
+    for strip in strips[:2]:
+        strip.tick_params(labelbottom=False)
+    curves = []
+    for race, width in zip(races, widths(len(races)), strict=True):
+        room = race.course.track.room(race.s, race.lateral)
+        shown = (race.theta[:, column], np.hypot(*race.state[:, :2].T), room)
+        for strip, values in zip(strips, shown, strict=True):
+            (line,) = strip.plot(race.time, values, color=colours[race.name], lw=width)
+            curves.append(_Curve(line, race.time, values))
+    (line,) = strips[0].plot(longest.time, truth, color=MEASURED, lw=1.0, ls="--", zorder=1)
+    for strip in strips:
+        strip.set(xlim=(0.0, float(longest.time[-1])), ylim=strip.get_ylim())
+    return [*curves, _Curve(line, longest.time, truth)]
+
+
+def _longest(races: Sequence[Race]) -> Race:
+    return max(races, key=lambda race: race.time[-1])
+
+
+def _most_changed(race: Race) -> tuple[str, Vector]:
+    """The coefficient that hidden physics moves most, and its values in the driven car; the front peak if it moves none."""
+    vehicle, driven = race.course.vehicle, driven_coefficients(race)
+    if not driven:
+        return "D_f", np.full(len(race.time), vehicle.coefficients["D_f"].nominal)
+
+    def moved(name: str) -> float:
+        coefficient = vehicle.coefficients[name]
+        return float(np.nanmax(np.abs(driven[name] - coefficient.nominal)) / np.ptp(coefficient.bounds))
+
+    name = max(driven, key=moved)
+    return name, driven[name]
+
+
+def _changed_stretch(race: Race) -> np.ndarray:
+    """Whether hidden physics changes the car at each point of the centre line, as far as ``race`` has shown it, ``(n,)``."""
+    name, truth = _most_changed(race)
+    track, coefficient = race.course.track, race.course.vehicle.coefficients[name]
+    off = np.abs(truth - coefficient.nominal) > _CHANGED * np.ptp(coefficient.bounds)
+    known = np.isfinite(truth)
+    if not known.any():
+        return np.zeros(len(track.centre.s), dtype=bool)
+    nearest = np.abs((race.s[known][:, None] - track.centre.s) % track.length)
+    nearest = np.minimum(nearest, track.length - nearest)
+    return np.asarray(off[known][np.argmin(nearest, axis=0)])
