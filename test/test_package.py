@@ -215,6 +215,20 @@ def test_each_node_has_a_parameters_file_with_its_defaults(node: str) -> None:
     assert {name: type(value) for name, value in content.items()} == {n: type(v) for n, v in declared.items()}
 
 
+def test_the_aggregator_takes_the_status_of_each_node_once() -> None:
+    content = yaml.safe_load((ROOT / "config" / "aggregator.yaml").read_text(encoding="utf-8"))
+    analyzers = [a for a in content["analyzers"]["ros__parameters"].values() if isinstance(a, dict)]
+    said = {}
+    for file in sorted((ROOT / "dynssm_ros" / "nodes").glob("*.py")):
+        found = re.search(r'diagnostics\(\s*self, "(\w+)"', file.read_text(encoding="utf-8"))
+        if found:
+            said[file.stem] = f"/car1/{file.stem}: {found[1]}"  # as nodes/support.py writes it
+    assert set(said) == {"controller", "predictor", "simulator"}
+    for status in said.values():
+        assert len([a for a in analyzers if any(part in status for part in a["contains"])]) == 1, status
+    assert {a["type"] for a in analyzers} == {"diagnostic_aggregator/GenericAnalyzer"}
+
+
 def test_parameters_file_fits_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same parser as the node's reads it, and the types are those that the node declares."""
     rclpy = pytest.importorskip("rclpy")
