@@ -43,7 +43,9 @@ def test_every_odometry_message_after_the_first_window_gets_a_prediction(
     assert len(run.sent) >= seconds * rate
     assert run.missing() == []
     before_the_first = round((open_artifact(model).card.window - 1) * 0.04 * rate)
-    assert min(run.predicted) - run.T_s == sorted(run.sent)[before_the_first]
+    # the first window begins with the first odometry that its actuators have not been overtaken by
+    late = min(run.predicted) - run.T_s - sorted(run.sent)[before_the_first]
+    assert 0 <= late <= 0.2e9
     # and they are predictions of this car: two epochs do not beat persistence everywhere, but they are as close
     rows = {int(t): k for k, t in enumerate(driving.time)}
     stamps = [s for s in run.predicted if s in rows and s - run.T_s in rows]
