@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks.closed_loop.cells import CHANGES, Cell, sensing
 from benchmarks.generalisation.cells import CARS
-from benchmarks.live_run import LiveRun, collecting, isolated_environment, node_process
+from benchmarks.live_run import LiveRun, check_running, collecting, isolated_environment, node_process
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.control.race import PATIENCE
 from dynssm_ros.control.reference import load_reference
@@ -75,7 +75,7 @@ class _Listener:
         """Takes what is new; whether there was a new lap."""
         count = len(self.lap_times)
         for _, words, values in self._run.diagnostics[self._read :]:
-            node = next((node for key, node in _NODES.items() if key in values), "")
+            node = next(node for key, node in _NODES.items() if key in values)
             self.values[node], self.words[node] = values, words
             if node == "controller" and int(values["laps"]) > len(self.lap_times):
                 self.lap_times.append(float(values["last lap (s)"]))
@@ -123,9 +123,7 @@ def drive_live(
             if progress is not None:
                 progress(len(listener.lap_times), laps)
             for node, process in processes.items():
-                if process.poll() is not None:
-                    assert process.stderr is not None
-                    raise UserError(f"the {node} stopped: {process.stderr.read().strip()}")
+                check_running(node, process)
             if time.monotonic() > deadline:
                 done = len(listener.lap_times)
                 raise UserError(f"{car}: no lap in {patience:.3g} s after {done}: {listener.words['controller']}")

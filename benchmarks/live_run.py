@@ -169,6 +169,17 @@ def node_process(
         raise UserError(f"the {node} crashed with {signal.Signals(-process.returncode).name}: {words.strip()}")
 
 
+def check_running(node: str, process: subprocess.Popen[str]) -> None:
+    """Makes sure that a node of :func:`node_process` has not ended.
+
+    Raises:
+        UserError: it has; carries its own words.
+    """
+    if process.poll() is not None:
+        assert process.stderr is not None
+        raise UserError(f"the {node} stopped: {process.stderr.read().strip() or 'no message'}")
+
+
 def predictor_process(
     model: Path,
     parameters: Mapping[str, object] | None = None,
@@ -229,9 +240,7 @@ def run_live(
         playback = Playback(collector, bag)
         deadline = time.monotonic() + 3 * MATCH_TIMEOUT
         while playback.wait_for_listeners(time.sleep, timeout=0.2):
-            if process.poll() is not None:
-                assert process.stderr is not None
-                raise UserError(f"the predictor stopped: {process.stderr.read().strip() or 'no message'}")
+            check_running("predictor", process)
             if time.monotonic() > deadline:
                 raise UserError("the predictor did not subscribe to the bag's topics within 30 s")
         collector.wait_for(lambda: collector.count_publishers(PREDICTION_TOPIC) > 0, MATCH_TIMEOUT)

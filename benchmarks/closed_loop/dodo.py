@@ -9,17 +9,16 @@ named.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from doit import get_var
 from doit.tools import config_changed
 
-from benchmarks.closed_loop.cells import cells
+from benchmarks.closed_loop.cells import Cell, cells
 from benchmarks.closed_loop.page import FIGURE, LEARNING_PAGE, PAGE, lap_times, learning_page, page, summary
-from benchmarks.closed_loop.run import cell_file, learn_cell, learning_file, race_cell, read_cell
+from benchmarks.closed_loop.run import cell_file, learn_cell, learning_file, race_cell, read_cell, read_learning
 from benchmarks.generalisation.run import model_folder, models_of
 from benchmarks.generalisation.training_tasks import drive_tasks, train_tasks
 from benchmarks.tasks import doit_config
@@ -92,25 +91,28 @@ def task_learning_page() -> dict[str, Any]:
 
 def write_learning_page() -> None:
     """The page of the cells that were driven faster every lap."""
-    files = {cell: learning_file(cell, OUT) for cell in CELLS}
-    known = {cell: json.loads(file.read_text(encoding="utf-8")) for cell, file in files.items() if file.exists()}
-    if not known:
-        raise UserError(f"only={VALUES['only']} part={VALUES['part']}: no cell was driven")
-    text = learning_page(known, ARGUMENTS)
-    with replacing(PAGE_FOLDER / LEARNING_PAGE) as aside:
-        aside.write_text(text, encoding="utf-8")
-    print(text)
+    _write(LEARNING_PAGE, learning_page(_known(read_learning), ARGUMENTS))
 
 
 def write_page() -> None:
     """The summary as JSON, the figure and the page."""
-    known = {cell: outcome for cell in CELLS if (outcome := read_cell(cell, OUT)) is not None}
-    if not known:
-        raise UserError(f"only={VALUES['only']} part={VALUES['part']}: no cell was driven")
+    known = _known(read_cell)
     write_json(OUT / "summary.json", summary(known))
     with replacing(PAGE_FOLDER / FIGURE) as aside:
         lap_times(known).savefig(aside, format="png", dpi=130, metadata={"Software": None})
-    text = page(known, ARGUMENTS)
-    with replacing(PAGE_FOLDER / PAGE) as aside:
+    _write(PAGE, page(known, ARGUMENTS))
+
+
+def _known(read: Callable[[Cell, Path], dict[str, Any] | None]) -> dict[Cell, dict[str, Any]]:
+    """The outcomes that there are."""
+    known = {cell: outcome for cell in CELLS if (outcome := read(cell, OUT)) is not None}
+    if not known:
+        raise UserError(f"only={VALUES['only']} part={VALUES['part']}: no cell was driven")
+    return known
+
+
+def _write(name: str, text: str) -> None:
+    """Writes a page and prints it."""
+    with replacing(PAGE_FOLDER / name) as aside:
         aside.write_text(text, encoding="utf-8")
     print(text)

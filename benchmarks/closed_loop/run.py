@@ -97,8 +97,14 @@ def learn_cell(cell: Cell, out: Path, trained: Path, model: str) -> None:
 
 def read_cell(cell: Cell, out: Path) -> dict[str, Any] | None:
     """The outcome of a cell by model; ``None`` if it was not driven."""
-    file = cell_file(cell, out)
-    if not file.exists():
-        return None
-    outcome: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))["models"]
-    return outcome
+    outcome = _read(cell_file(cell, out))
+    return None if outcome is None else outcome["models"]
+
+
+def read_learning(cell: Cell, out: Path) -> dict[str, Any] | None:
+    """The outcome of a cell that was driven faster every lap; ``None`` if it was not."""
+    return _read(learning_file(cell, out))
+
+
+def _read(file: Path) -> dict[str, Any] | None:
+    return json.loads(file.read_text(encoding="utf-8")) if file.exists() else None

@@ -29,6 +29,7 @@ from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import HORIZON, Settings
 from dynssm_ros.errors import ConfigurationError, RecordingError, UserError
 from dynssm_ros.identification.calibration import calibrate
+from dynssm_ros.identification.car import prior_std
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.track.speed_profile import speed_profile
@@ -47,7 +48,6 @@ _SECTION_HORIZONS = 1.5  # length of a section, in horizons at the line's mean s
 _FEWEST_SECTIONS, _MOST_SECTIONS = 4, 40
 _REMEMBERED = 3  # laps that coefficients are calibrated on
 _CLEARLY = 0.9  # of the path error of the model's coefficients, below which others are planned with
-_UNKNOWN = 0.25  # standard deviation of a coefficient of which only the bounds are known, over their distance
 _DRAWS, _CAREFUL = 40, 0.1  # cars within the covariance, and the share of them that are allowed to grip less
 
 
@@ -233,7 +233,7 @@ class LapLearner:
     def _possible_limits(self) -> Sequence[tuple[Vector, Vector]]:
         """Speeds and cornering limits of cars within the covariance of the coefficients; the known car's first."""
         known, rng = self._known, np.random.default_rng(0)
-        std = np.array([_UNKNOWN * np.ptp(c.bounds) if c.std is None else c.std for c in known.coefficients.values()])
+        std = prior_std(known)
         covariance = std[:, None] * known.known_correlation * std
         drawn = rng.multivariate_normal(known.nominal, covariance, _DRAWS, method="eigh")
         found = []

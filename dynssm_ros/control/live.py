@@ -214,8 +214,8 @@ class LiveController:
         x = self.remote.start(Pose(pose.x, pose.y, self._heading), seen, self._sent[0], context, self._memory)
         self.remote.measured(stamp, x, context)
         self.remote.update(stamp)
-        for command in self._sent:
-            x = self.remote.ahead(np.array([*x[:6], *command, *x[len(STATES) :]]), context)
+        for increments in np.diff(np.array([self._sent[0], *self._sent]), axis=0):
+            x = self.remote.ahead(x, context, increments)
         pursued = self._pursued(Pose(*x[:3].tolist()), State(*x[3:6].tolist()))
         self._sent.append(pursued or self._planned_command(t, Pose(pose.x, pose.y, self._heading), seen))
         return self._sent[-1]

@@ -17,6 +17,7 @@ from dynssm_ros.vehicle.single_track import settled_effect_states
 Context = tuple[float, float, float]
 """Time (s), place on the track (m) and length of the lap (m): what effects may read beside the pose."""
 
+_HELD = np.zeros(len(INPUTS))
 _ROUNDING = 1e-5  # of a coefficient's range: predictors compute in single precision
 
 
@@ -150,9 +151,15 @@ class RemoteModel:
         """What was chosen last; see :class:`~dynssm_ros.control.prediction_model.PredictionModel`."""
         return self.output.adapted
 
-    def ahead(self, x: Vector, context: Context) -> Vector:
-        """The state one T_s after ``x`` with its actuators held, by what holds now; see :meth:`measured`."""
-        return self._step(x, context, *self.output.adapted)
+    def ahead(self, x: Vector, context: Context, increments: Vector = _HELD) -> Vector:
+        """The state one T_s after ``x``, by what holds now; see :meth:`measured`.
+
+        Args:
+            x: the controller's state, shape ``(size,)``.
+            context: then.
+            increments: of its actuators, which are held if not given, shape ``(2,)``.
+        """
+        return self._step(x, context, *self.output.adapted, increments)
 
     def forget(self) -> None:
         """Drops everything that was heard and measured, as after a jump of time."""
@@ -166,5 +173,7 @@ class RemoteModel:
         correction = self._state[stamp] - self._step(*self._start[stamp], theta, np.zeros(3))[VELOCITIES]
         return correction if np.all(np.isfinite(correction)) else np.zeros(3)
 
-    def _step(self, x: Vector, context: Context, theta: Vector, correction: Vector) -> Vector:
-        return self._model.step(x, np.zeros(len(INPUTS)), np.concatenate([theta, correction, context]))
+    def _step(
+        self, x: Vector, context: Context, theta: Vector, correction: Vector, increments: Vector = _HELD
+    ) -> Vector:
+        return self._model.step(x, increments, np.concatenate([theta, correction, context]))

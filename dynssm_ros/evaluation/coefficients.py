@@ -56,6 +56,12 @@ def coefficient_unit(name: str) -> str:
     return "" if unit == "1" else unit
 
 
+def coefficient_label(name: str) -> str:
+    """Name of a coefficient with its unit."""
+    unit = coefficient_unit(name)
+    return f"{name} ({unit})" if unit else name
+
+
 def coefficient_statistics(theta: Vector | None, vehicle: Vehicle | None) -> CoefficientStatistics | None:
     """Statistics of the coefficients ``theta`` ``(N, 17)`` between the bounds of ``vehicle``.
 

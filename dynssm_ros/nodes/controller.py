@@ -135,7 +135,7 @@ class ControllerNode(Node):
         pose, seen = Pose(*map(values.__getitem__, Pose._fields)), State(*map(values.__getitem__, State._fields))
         outcome = self._driver.step(stamp, pose, seen)
         if isinstance(outcome, Refusal):
-            self._health.refused(outcome, self._now())
+            self._health.refused(outcome)
             return
         self._health.arrived(ODOMETRY_TOPIC, self._now())  # now: a step that took long is no silence of the odometry
         self._newest = stamp
@@ -149,9 +149,8 @@ class ControllerNode(Node):
         if self._newest is None:
             stamp = int(self.get_clock().now().nanoseconds)
         else:
-            stamp = (
-                self._newest + self._driver.answered_after + round(self._health.age(ODOMETRY_TOPIC, self._now()) * 1e9)
-            )
+            silence = self._health.age(ODOMETRY_TOPIC, self._now())
+            stamp = self._newest + self._driver.answered_after + round(silence * 1e9)
         self._publish_command(actuators(stamp, self._driver.brake()))
 
     def _silent(self) -> bool:

@@ -25,6 +25,7 @@ from dynssm_ros.nodes.support import (
     SENSOR_QOS,
     describe,
     diagnostics,
+    expanded,
     message_class,
     output,
     run,
@@ -90,17 +91,8 @@ class PredictorNode(Node):
         self._publish_horizon = output(self, Path, HORIZON_TOPIC)
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
 
-        signal_map = self._predictor.signal_map
-        by_topic = decoders(signal_map)
-        self._names = {topic: self.resolve_topic_name(decoder.subscribed) for topic, decoder in by_topic.items()}
-        self._health = Health(tuple(self._names.values()), max(max_age, signal_map.max_gap), self._predictor.model.T_s)
         self._set_wiring()
-        # actuators come first: when several messages wait, the executor serves subscriptions in this order
-        for topic, decoder in by_topic.items():
-            receive = self._on_odometry if topic == signal_map.odometry_topic else self._on_actuator
-            self.create_subscription(
-                message_class(decoder.msgtype), decoder.subscribed, partial(receive, decoder), SENSOR_QOS
-            )
+        self._listen(max_age)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self.create_timer(period, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -111,13 +103,26 @@ class PredictorNode(Node):
             f"{model.name} ({model.parameters} parameters): {model.H} rows of {model.T_s:g} s, commands {model.commands}"
         )
 
+    def _listen(self, max_age: float) -> None:
+        """Subscribes to what the signal map names, none of which may be silent for longer than ``max_age`` (s) or its gap."""
+        signal_map = self._predictor.signal_map
+        by_topic = decoders(signal_map)
+        self._names = {topic: self.resolve_topic_name(decoder.subscribed) for topic, decoder in by_topic.items()}
+        self._health = Health(tuple(self._names.values()), max(max_age, signal_map.max_gap), self._predictor.model.T_s)
+        # actuators come first: when several messages wait, the executor serves subscriptions in this order
+        for topic, decoder in by_topic.items():
+            receive = self._on_odometry if topic == signal_map.odometry_topic else self._on_actuator
+            self.create_subscription(
+                message_class(decoder.msgtype), decoder.subscribed, partial(receive, decoder), SENSOR_QOS
+            )
+
     def _on_actuator(self, decoder: TopicDecoder, message: Any) -> None:
         now = time.monotonic()
         stamp = self._stamp(message)
         self._health.arrived(self._names[decoder.topic], now, stamp)
         refusal = self._predictor.observe(stamp, decoder.decode(message))
         if refusal is not None:
-            self._health.refused(refusal, now)
+            self._health.refused(refusal)
 
     def _on_odometry(self, decoder: TopicDecoder, message: Any) -> None:
         now = time.monotonic()
@@ -125,13 +130,11 @@ class PredictorNode(Node):
         self._health.arrived(self._names[decoder.topic], now, stamp)
         outcome = self._predictor.predict(stamp, decoder.decode(message))
         if not isinstance(outcome, Prediction):
-            self._health.refused(outcome, now)
+            self._health.refused(outcome)
             return
         self._publish(outcome, message)
-        done = time.monotonic()
-        self._health.predicted(
-            done - now, outcome.residual_share, done, self._health.queued(self._names[decoder.topic])
-        )
+        queued = self._health.queued(self._names[decoder.topic])
+        self._health.predicted(time.monotonic() - now, outcome.residual_share, queued)
         self._predictor.finish()
         self._wiring.add(stamp, self._predictor.history.current[-1])
 
@@ -179,7 +182,7 @@ class PredictorNode(Node):
         for parameter in parameters:
             if parameter.name == "model":
                 try:
-                    model = OnnxModel(open_artifact(pathlib.Path(parameter.value).expanduser()))
+                    model = OnnxModel(open_artifact(expanded(parameter.value)))
                     self._predictor.check_swap(model)
                 except UserError as error:
                     self.get_logger().error(str(error))

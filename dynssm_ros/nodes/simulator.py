@@ -67,15 +67,6 @@ class SimulatorNode(Node):
             self, "driver", "pure_pursuit", get_args(DriverKind), f"The own one, or whoever sends {COMMAND_TOPIC}."
         )
         self._seed = describe(self, "seed", 0, "Of the driver's variation and the noise.", read_only=True)
-        noise = describe(
-            self, "noise", [0.0, 0.0, 0.0], "Of v_x, v_y (m/s), omega (rad/s): deviations.", read_only=True
-        )
-        pose_noise = describe(
-            self, "pose_noise", [0.0, 0.0, 0.0], "Likewise of x, y (m), heading (rad).", read_only=True
-        )
-        delay = describe(
-            self, "delay", 0.0, "By which odometry is sent late, in the car's time (s).", (0.0, 10.0), read_only=True
-        )
         aggressiveness = describe(
             self, "aggressiveness", 0.95, "Share of the limits in use.", (0.1, 1.2), read_only=True
         )
@@ -90,8 +81,7 @@ class SimulatorNode(Node):
         self._vehicle = load_vehicle(vehicle).with_effects(map(parse_effect, effects.split()))
         self._track = load_track(track).scaled(scale)
         self._style = Style(aggressiveness, variation)
-        sensing = Sensing(tuple(noise), tuple(pose_noise), delay, self._seed)
-        self._sensors = Sensors(sensing, self._vehicle.sampling_time)
+        self._sensors = self._make_sensors()
         self._commands = CommandHolder(self._vehicle, watchdog, lambda: time.monotonic() * self._rate)
         self._obeyed = self._on_road = True
 
@@ -103,7 +93,7 @@ class SimulatorNode(Node):
             self._decoder = decoders(load_signal_map("default"))[COMMAND_TOPIC]
             self.create_subscription(JointState, relative(COMMAND_TOPIC), self._on_command, SENSOR_QOS)
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
-        self._least = math.inf  # room to the borders that there ever was (m)
+        self._room = self._least = math.inf  # to the borders: now, and the least so far (m)
         self._samples = self._drive()
         self._first_stamp = int(self.get_clock().now().nanoseconds)
         self._begin, self._count = time.monotonic(), 0
@@ -115,6 +105,20 @@ class SimulatorNode(Node):
             f"{self._vehicle.name} on {self._track.name} ({self._track.length:.4g} m), plant {self._plant}, "
             f"driver {self._driver}, {1 / self._period:.4g} Hz"
         )
+
+    def _make_sensors(self) -> Sensors:
+        """What the parameters ask for."""
+        noise = describe(
+            self, "noise", [0.0, 0.0, 0.0], "Of v_x, v_y (m/s), omega (rad/s): deviations.", read_only=True
+        )
+        pose_noise = describe(
+            self, "pose_noise", [0.0, 0.0, 0.0], "Likewise of x, y (m), heading (rad).", read_only=True
+        )
+        delay = describe(
+            self, "delay", 0.0, "By which odometry is sent late, in the car's time (s).", (0.0, 10.0), read_only=True
+        )
+        sensing = Sensing(tuple(noise), tuple(pose_noise), delay, self._seed)
+        return Sensors(sensing, self._vehicle.sampling_time)
 
     def _drive(self) -> Iterator[Sample]:
         if self._driver == "external":
@@ -142,10 +146,9 @@ class SimulatorNode(Node):
 
     def _publish(self, sample: Sample) -> None:
         """Actuators first, as a predictor needs them when the odometry arrives."""
-        stamp = self._first_stamp + round(self._count * self._vehicle.sampling_time * 1e9)
-        self._count += 1
-        self._newest = sample
-        self._least = min(self._least, float(self._track.room(sample.s, sample.lateral)))
+        stamp = self._stamp_of(self._count)
+        self._newest, self._room = sample, float(self._track.room(sample.s, sample.lateral))
+        self._least = min(self._least, self._room)
         self._publish_feedback(actuators(stamp, sample.feedback))
         if self._driver == "pure_pursuit":
             self._publish_command(actuators(stamp, sample.command))
@@ -154,15 +157,19 @@ class SimulatorNode(Node):
         self._sensors.measure(sample.pose, State(*sample.measured))
         if self._sensors.is_full:
             pose, measured, age = self._sensors.arrived
-            self._publish_odometry(_odometry(stamp - age * round(self._vehicle.sampling_time * 1e9), pose, measured))
+            self._publish_odometry(_odometry(self._stamp_of(self._count - age), pose, measured))
+        self._count += 1
+
+    def _stamp_of(self, count: int) -> int:
+        """Stamp (ns) of the sample with this number."""
+        return self._first_stamp + round(count * self._vehicle.sampling_time * 1e9)
 
     def _diagnose(self) -> None:
         """Tells what is true of the car, whatever is measured."""
         if not self._count:
             return
         sample = self._newest
-        is_on_road = self._track.room(sample.s, sample.lateral) >= 0
-        level, words = (Level.OK, "on the road") if is_on_road else (Level.WARN, "off the road")
+        level, words = (Level.OK, "on the road") if self._room >= 0 else (Level.WARN, "off the road")
         values = {
             "driven (laps)": f"{sample.s / self._track.length:.3f}",
             "place on the track (m)": f"{sample.s % self._track.length:.3f}",
@@ -176,7 +183,7 @@ class SimulatorNode(Node):
         obeyed = self._commands.fresh
         if obeyed != self._obeyed:
             self.get_logger().info(f"obeys {COMMAND_TOPIC}" if obeyed else f"{COMMAND_TOPIC} is silent: brakes")
-        on_road = bool(self._track.room(sample.s, sample.lateral) >= 0)
+        on_road = self._room >= 0
         if on_road != self._on_road:
             words = "is back on" if on_road else "leaves"
             self.get_logger().warning(f"{self._vehicle.name} {words} the road at s = {sample.s:.4g} m")

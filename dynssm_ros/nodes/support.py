@@ -73,7 +73,11 @@ def describe(
     """Declares a described, typed, bounded parameter and returns its value; ``~/`` in front of a path is the home."""
     ranges = [FloatingPointRange(from_value=bounds[0], to_value=bounds[1])] if bounds else []
     descriptor = ParameterDescriptor(description=description, floating_point_range=ranges, read_only=read_only)
-    value = node.declare_parameter(name, default, descriptor).value
+    return expanded(node.declare_parameter(name, default, descriptor).value)
+
+
+def expanded(value: Any) -> Any:
+    """A parameter's value with the home directory for ``~/`` in front of a path."""
     return str(Path(value).expanduser()) if isinstance(value, str) and value.startswith("~/") else value
 
 

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
-from dynssm_ros.arrays import Vector
+from dynssm_ros.arrays import Mask, Vector
 from dynssm_ros.control.race import Race
-from dynssm_ros.evaluation.coefficients import coefficient_unit
+from dynssm_ros.evaluation.coefficients import coefficient_label
 from dynssm_ros.files import replacing
 from dynssm_ros.reporting.evaluation_figures import MEASURED, STYLE, model_colours
 from dynssm_ros.reporting.race_report import driven_coefficients, widths
@@ -43,15 +43,19 @@ def animate(races: Sequence[Race], path: str | Path) -> None:
         races: on one course.
         path: of the file.
     """
-    duration = max(float(race.time[-1]) for race in races)
+    longest = max(races, key=lambda race: float(race.time[-1]))
+    name, truth = _most_changed(longest)
+    duration = float(longest.time[-1])
     count = int(min(FRAMES, max(2.0, RATE * duration)))
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 5.0), layout="constrained")
         FigureCanvasAgg(figure)
         grid = figure.add_gridspec(3, 2, width_ratios=(3, 2))
         road, strips = figure.add_subplot(grid[:, 0]), [figure.add_subplot(grid[k, 1]) for k in range(3)]
-        show: list[Callable[[float], None]] = [car.show for car in _cars(races, road)]
-        show += [curve.show for curve in _curves(races, strips)]
+        show: list[Callable[[float], None]] = [
+            car.show for car in _cars(races, road, _changed_stretch(longest, name, truth))
+        ]
+        show += [curve.show for curve in _curves(races, strips, name, longest.time, truth)]
         figure.legend(*road.get_legend_handles_labels(), loc="outside upper left", ncols=5)
     writer = PillowWriter(fps=max(2, round(min(RATE, count / duration))))
     with replacing(path) as aside, writer.saving(figure, str(aside), dpi=90):
@@ -94,14 +98,13 @@ class _Curve:
         self.line.set_data(self.time[past], self.values[past])
 
 
-def _cars(races: Sequence[Race], axes: Axes) -> list[_Car]:
-    """The track, and the cars on it."""
+def _cars(races: Sequence[Race], axes: Axes, changed: Mask) -> list[_Car]:
+    """The track, marked where it is ``changed``, and the cars on it."""
     course, colours = races[0].course, model_colours([race.name for race in races])
     track = course.track
     for border in (track.left_border, track.right_border):
         axes.plot(*np.concatenate([border, border[:1]]).T, color=MEASURED, lw=1.0)
     extent = np.ptp(np.concatenate([track.left_border, track.right_border]), axis=0)
-    changed = _changed_stretch(_longest(races))
     if changed.any() and not changed.all():
         x, y = np.where(changed[:, None], track.centre.position(track.centre.s), np.nan).T
         axes.plot(x, y, color=MEASURED, alpha=0.2, lw=8, solid_capstyle="butt", label="the car is another here")
@@ -119,15 +122,10 @@ def _cars(races: Sequence[Race], axes: Axes) -> list[_Car]:
     return cars
 
 
-def _curves(races: Sequence[Race], strips: Sequence[Axes]) -> list[_Curve]:
-    """Belief, speed and room over time."""
-    longest, colours = _longest(races), model_colours([race.name for race in races])
-    name, truth = _most_changed(longest)
-    column = COEFFICIENTS.index(name)
-    unit = coefficient_unit(name)
-    strips[0].set_title(
-        f"{name} planned with{f' ({unit})' if unit else ''}; dashed: of the car", loc="left", fontsize=9
-    )
+def _curves(races: Sequence[Race], strips: Sequence[Axes], name: str, time: Vector, truth: Vector) -> list[_Curve]:
+    """The coefficient ``name`` as planned with, beside its ``truth`` over ``time`` (s), then speed and room."""
+    colours, column = model_colours([race.name for race in races]), COEFFICIENTS.index(name)
+    strips[0].set_title(f"{coefficient_label(name)} planned with; dashed: of the car", loc="left", fontsize=9)
     strips[1].set_title("speed (m/s)", loc="left", fontsize=9)
     strips[2].set_title("from the car's centre to the border (m)", loc="left", fontsize=9)
     strips[2].set_xlabel("time (s)")
@@ -141,14 +139,10 @@ def _curves(races: Sequence[Race], strips: Sequence[Axes]) -> list[_Curve]:
         for strip, values in zip(strips, shown, strict=True):
             (line,) = strip.plot(race.time, values, color=colours[race.name], lw=width)
             curves.append(_Curve(line, race.time, values))
-    (line,) = strips[0].plot(longest.time, truth, color=MEASURED, lw=1.0, ls="--", zorder=1)
+    (line,) = strips[0].plot(time, truth, color=MEASURED, lw=1.0, ls="--", zorder=1)
     for strip in strips:
-        strip.set(xlim=(0.0, float(longest.time[-1])), ylim=strip.get_ylim())
-    return [*curves, _Curve(line, longest.time, truth)]
-
-
-def _longest(races: Sequence[Race]) -> Race:
-    return max(races, key=lambda race: race.time[-1])
+        strip.set(xlim=(0.0, float(time[-1])), ylim=strip.get_ylim())
+    return [*curves, _Curve(line, time, truth)]
 
 
 def _most_changed(race: Race) -> tuple[str, Vector]:
@@ -165,9 +159,8 @@ def _most_changed(race: Race) -> tuple[str, Vector]:
     return name, driven[name]
 
 
-def _changed_stretch(race: Race) -> np.ndarray:
-    """Whether hidden physics changes the car at each point of the centre line, as far as ``race`` has shown it, ``(n,)``."""
-    name, truth = _most_changed(race)
+def _changed_stretch(race: Race, name: str, truth: Vector) -> Mask:
+    """Whether the coefficient ``name`` is another, by its ``truth`` in ``race``, at each point of the centre line, ``(n,)``."""
     track, coefficient = race.course.track, race.course.vehicle.coefficients[name]
     off = np.abs(truth - coefficient.nominal) > _CHANGED * np.ptp(coefficient.bounds)
     known = np.isfinite(truth)

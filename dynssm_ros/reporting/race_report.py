@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dynssm_ros.control.race import Course, Race
-from dynssm_ros.evaluation.coefficients import coefficient_unit
+from dynssm_ros.evaluation.coefficients import coefficient_label
 from dynssm_ros.reporting.evaluation_figures import MEASURED, SYMBOLS, UNITS, WIDTH, model_colours, styled
 from dynssm_ros.reporting.page import Report, Section
 from dynssm_ros.reporting.tables import Column, Table, Value
@@ -315,15 +315,14 @@ def coefficients(races: Sequence[Race]) -> Figure:
     moving = [k for k, name in enumerate(COEFFICIENTS) if moves[k] > _MOVED or name in driven]
     if driven:
         moving = sorted(moving, key=lambda k: (COEFFICIENTS[k] not in driven, -moves[k]))[:_ANSWERS]
-    labels = {name: f"{name} ({unit})" if (unit := coefficient_unit(name)) else name for name in COEFFICIENTS}
-    rows = [(labels[COEFFICIENTS[k]], [race.theta[:, k] for race in races]) for k in moving]
+    rows = [(coefficient_label(COEFFICIENTS[k]), [race.theta[:, k] for race in races]) for k in moving]
     rows += [
         (f"{SYMBOLS[c]} added ({UNITS[c]})", [race.correction[:, k] for race in races])
         for k, c in enumerate(STATE_SIGNALS)
         if not moving
         or any(np.max(np.abs(race.correction[:, k])) > _MOVED * np.ptp(race.state[:, k]) for race in races)
     ]
-    return _panels(races, rows, {labels[name]: values for name, values in driven.items()}, longest)
+    return _panels(races, rows, {coefficient_label(name): values for name, values in driven.items()}, longest)
 
 
 @styled
@@ -353,8 +352,7 @@ def learning(races: Sequence[Race]) -> Figure:
             panel.fill_between(laps, values - band, values + band, color=colour, alpha=0.15, lw=0)
     truth = driven_coefficients(races[0])
     for panel, name in zip(panels[2:].flat, names, strict=False):
-        unit = coefficient_unit(name)
-        panel.set_ylabel(f"{name} ({unit})" if unit else name)
+        panel.set_ylabel(coefficient_label(name))
         if name in truth:
             panel.axhline(float(np.nanmedian(truth[name])), color=MEASURED, lw=1.0, ls="--")
     for spare in list(panels[2:].flat)[len(names) :]:

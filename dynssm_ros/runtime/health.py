@@ -68,12 +68,12 @@ class Health:
         delays = self._delays[topic]
         return delays[-1] - min(delays) if delays else 0.0
 
-    def refused(self, refusal: Refusal, now: float) -> None:
+    def refused(self, refusal: Refusal) -> None:
         """A sample or a prediction was refused."""
         self.refusals[refusal] += 1
         self._outcomes.append(refusal)
 
-    def predicted(self, latency: float, residual_share: float, now: float, queued: float = 0.0) -> None:
+    def predicted(self, latency: float, residual_share: float, queued: float = 0.0) -> None:
         """A prediction went out ``latency`` seconds after its odometry came in, which had waited ``queued`` seconds."""
         self.predictions += 1
         self.late += queued + latency > self.period

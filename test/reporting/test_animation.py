@@ -19,7 +19,7 @@ def races():
 
 
 def test_the_stretch_on_which_the_car_is_another_is_marked(races):
-    marked, track = _changed_stretch(races[0]), races[0].course.track
+    marked, track = _changed_stretch(races[0], *_most_changed(races[0])), races[0].course.track
     assert marked.mean() == pytest.approx(0.3, abs=0.05)
     assert np.median(track.centre.s[marked]) == pytest.approx(0.5 * track.length, rel=0.05)
 
@@ -30,7 +30,7 @@ def test_belief_is_shown_against_what_is_true(races):
     assert name in ("D_f", "D_r")
     assert np.nanmin(truth) == pytest.approx(0.8 * nominal, rel=1e-3)  # its ends are smooth
     (healthy,) = race("orca", "club", ["true"], plant="euler", line="centre", speed_scale=0.6)
-    assert not _changed_stretch(healthy).any()
+    assert not _changed_stretch(healthy, *_most_changed(healthy)).any()
     assert set(_most_changed(healthy)[1]) == {healthy.course.vehicle.coefficients["D_f"].nominal}
 
 

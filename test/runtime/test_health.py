@@ -19,7 +19,7 @@ def health() -> Health:
         if k % 2 == 0:
             health.arrived(FEEDBACK, now)
         health.arrived(ODOMETRY, now)
-        health.predicted(0.001 + 0.00001 * k, 0.25, now + 0.001)
+        health.predicted(0.001 + 0.00001 * k, 0.25)
     return health
 
 
@@ -52,16 +52,16 @@ def test_silence_is_an_error_and_has_no_rate(health: Health) -> None:
 def test_refusals_are_told_until_a_prediction_goes_out_again(health: Health, refusal: Refusal, level: Level) -> None:
     for _ in range(5):
         assert health.verdict(1.03) == (Level.OK, "predicting"), "a single one is none"
-        health.refused(refusal, 1.02)
+        health.refused(refusal)
     assert health.verdict(1.03) == (level, refusal.value)
     assert health.values(1.03)[f"refused: {refusal.name.lower()}"] == "5"
-    health.predicted(0.001, 0.0, 1.04)
+    health.predicted(0.001, 0.0)
     assert health.verdict(1.05) == (Level.OK, "predicting")
 
 
 def test_the_verdict_follows_the_share_that_is_refused(health: Health) -> None:
     for k in range(100):
-        (health.refused(Refusal.IMPLAUSIBLE, 1.0) if k % 4 == 0 else health.predicted(0.001, 0.0, 1.0))
+        (health.refused(Refusal.IMPLAUSIBLE) if k % 4 == 0 else health.predicted(0.001, 0.0))
     assert health.verdict(1.05) == (
         Level.WARN, f"25% of the last messages refused, mostly: {Refusal.IMPLAUSIBLE.value}",
     )  # fmt: skip
@@ -82,7 +82,7 @@ def test_a_topic_on_another_clock_is_named() -> None:
     for k in range(100):
         for topic, off in ((FEEDBACK, -1000), ("/command", 0), (ODOMETRY, 0)):
             health.arrived(topic, 50.0 + k / 100, (2000 + off) * 10**9 + k * 10**7)
-        health.predicted(0.001, 0.0, 50.0 + k / 100)
+        health.predicted(0.001, 0.0)
     level, words = health.verdict(51.0)
     assert level is Level.ERROR
     assert words == "/feedback: its stamps are 1e+03 s behind those of other topics"
@@ -93,6 +93,6 @@ def test_answers_to_messages_that_waited_longer_than_a_step_are_late() -> None:
     for k in range(50):
         delay = 0.03 if k % 10 == 9 else 0.001
         health.arrived(ODOMETRY, k / 50 + delay, k * 20_000_000)
-        health.predicted(0.001, 0.0, k / 50 + delay, health.queued(ODOMETRY))
+        health.predicted(0.001, 0.0, health.queued(ODOMETRY))
     assert health.late == 5
     assert health.values(1.0)["late answers"] == "5"
