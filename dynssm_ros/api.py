@@ -141,7 +141,7 @@ def calibrate(
     horizon: float | None = None,
     min_speed: float | None = None,
     holdout: float = 0.0,
-    integrator: Integrator = "euler",
+    integrator: Integrator | None = None,
     starts: int = 3,
     seed: int = 0,
     commands: Commands | None = None,
@@ -155,7 +155,7 @@ def calibrate(
         horizon: length of the simulations that are compared with the laps (s); if not given, 0.5, less for short logs.
         min_speed: slower rows are left out (m/s); the vehicle file's if not given.
         holdout: last fraction of each recording that is left out.
-        integrator: of the model.
+        integrator: of the model; if not given, Runge-Kutta unless Euler is clearly closer to the data.
         starts: starting points of the search.
         seed: of the random ones.
         commands: source of the command inputs; the recording's own if not given.
@@ -225,7 +225,7 @@ def train(
     checkpoint = checkpoint_of(folder)
     trained = train(
         _joined(recordings, commands, holdout), config, _vehicle(vehicle), checkpoint, device, on_progress,
-        lambda data, car: calibrate(data, car, integrator=config.stepping[0]).vehicle,
+        lambda data, car, integrator: calibrate(data, car, integrator=integrator).vehicle,
     )  # fmt: skip
     artifact = save_artifact(trained, folder, {"holdout": holdout, "device": device})
     for path in checkpoints(config, checkpoint):

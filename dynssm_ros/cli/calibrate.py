@@ -31,8 +31,9 @@ def calibrate(
         ),
     ] = None,
     integrator: Annotated[
-        Integrator, typer.Option(help="Steps of the model: T_s as in the paper, or finer.")
-    ] = "euler",
+        Integrator | None,
+        typer.Option(help="Steps of the model.", show_default="rk4, unless euler is clearly closer to the laps"),
+    ] = None,
     min_speed: Annotated[
         float | None,
         typer.Option(help="Leave out slower rows (m/s).", min=0.0, show_default="the vehicle file's minimum_speed"),
@@ -54,7 +55,8 @@ def calibrate(
     save_vehicle(
         result.vehicle,
         out,
-        f"Calibrated on {source} (simulations of {result.horizon:g} s, {integrator}, {result.rows} rows, seed {seed}).",
+        f"Calibrated on {source} (simulations of {result.horizon:g} s, {result.vehicle.integrator} steps, "
+        f"{result.rows} rows, seed {seed}).",
     )
     if json is not None:
         write_json(json, as_json(result))

@@ -58,17 +58,22 @@ class SteppedCar:
 
     @classmethod
     def of(
-        cls, vehicle: Vehicle, integrator: Integrator = "euler", substeps: int = 1, first: Sequence[StageEffect] = ()
+        cls,
+        vehicle: Vehicle,
+        integrator: Integrator | None = None,
+        substeps: int = 1,
+        first: Sequence[StageEffect] = (),
     ) -> SteppedCar:
         """The car of a vehicle file, also at low speed, where a step of T_s is too long for the tyres.
 
         Args:
             vehicle: the car with its effects.
-            integrator: of the step.
+            integrator: of the step; ``None``: the vehicle's.
             substeps: of the integrator.
             first: acts before the vehicle's own effects.
         """
         effects = (*first, *vehicle.active_effects, LowSpeedRolling(vehicle, vehicle.sampling_time))
+        integrator = integrator or vehicle.model_integrator
         return cls(vehicle.constants, vehicle.sampling_time, effects, integrator, substeps)
 
     @property

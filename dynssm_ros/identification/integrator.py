@@ -7,7 +7,7 @@ closer to the data with either by chance, so that the choice is made anew with t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,14 +15,13 @@ import numpy as np
 
 from dynssm_ros.identification.candidates import candidates
 from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.problem import Fit, IdentificationProblem
+from dynssm_ros.identification.problem import Fit, IdentificationProblem, closest
 from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.identification.selection import Search, Selection
 from dynssm_ros.identification.windows import Hold, SimulationWindows
 from dynssm_ros.vehicle.single_track import Integrator
 
 _TRIED = 300  # windows with which the integrator is chosen at first
-_CLEARLY = 20.0  # difference of twice the log-likelihood for which another integrator is taken than Runge-Kutta
 
 
 class Stepping(NamedTuple):
@@ -84,7 +83,7 @@ def search_causes(
     fits = {}
     for one in options:
         windows_of[one], fits[one] = _stepped(windows, car, one)
-    first = _closest(fits)
+    first = closest(fits)
     found = search(windows_of[first])
     fit = found.selection.fit
     fits = {
@@ -93,15 +92,8 @@ def search_causes(
         else IdentificationProblem(windows_of[one], car, found.problem.tempering).fit(fit.car, fit.free)
         for one in options
     }
-    closest = _closest(fits)
-    return found if closest == first else search(windows_of[closest], fits[first])
-
-
-def _closest(fits: Mapping[Stepping, Fit]) -> Stepping:
-    """What is closest to the data; not the first option only if that is clear."""
-    given = next(iter(fits))
-    best = min(fits, key=lambda one: fits[one].objective)
-    return best if fits[best].objective < fits[given].objective - _CLEARLY else given
+    last = closest(fits)
+    return found if last == first else search(windows_of[last], fits[first])
 
 
 def _stepped(windows: SimulationWindows, car: CarEstimate, stepping: Stepping) -> tuple[SimulationWindows, Fit]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -29,6 +30,9 @@ _LARGEST_NOISE_SHARE, _LEAST = 1e-2, 1e-12  # of the variance of a channel: more
 _DAMPING = (0.0, 0.03, 0.3, 3.0, 30.0)
 _ROUNDING = 1e-12  # of second derivatives, that keeps them positive where nothing was excited
 _CONVERGED = 0.3  # of the squared error
+_CLEARLY = 20.0  # difference of twice the log-likelihood for which another option is taken than the first
+
+Option = TypeVar("Option")
 
 
 def unit(effect: str, parameter: str) -> float:
@@ -80,6 +84,13 @@ class Fit:
     def position(self) -> Vector:
         """The fitted values: 18 of the nominal car and those of ``free``."""
         return position(self.car, self.free)
+
+
+def closest(fits: Mapping[Option, Fit]) -> Option:
+    """What is closest to the data; not the first option only if that is clear."""
+    first = next(iter(fits))
+    best = min(fits, key=lambda one: fits[one].objective)
+    return best if fits[best].objective < fits[first].objective - _CLEARLY else first
 
 
 def position(car: CarEstimate, free: Free) -> Vector:

@@ -102,7 +102,7 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
         if trained.start is not None:
             metrics["start"] = _metrics(trained.start)
         (folder / METRICS).write_text(json.dumps(metrics, indent=1), encoding="utf-8")
-        integrator, substeps = config.stepping
+        integrator, substeps = config.with_physics.stepping(trained.vehicle)
         card = ModelCard(
             name=config.name,
             kind=config.kind,

@@ -202,8 +202,7 @@ def fit_layer(
         for k, part in enumerate(parts)
     ]
 
-    vehicle, physics = features.physics.vehicle, features.physics.config
-    stepping = physics.integrator, physics.substeps
+    vehicle, stepping = features.physics.vehicle, features.physics.stepping
     nothing = BlockErrors(np.ones(CHANNELS), np.ones(CHANNELS))
     whole = joined(parts)
     usual = CoefficientEstimator(vehicle, s_delta, nothing, *stepping, config.spread).usual_errors(*whole[1:])

@@ -13,7 +13,6 @@ from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.learning.dataset import TrainingWindows, normalisation, split_windows
 from dynssm_ros.learning.earned_layer import LayerBase, earned_layer
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
-from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.models.registry import build_model
 from dynssm_ros.learning.online import OnlineFeatures
 from dynssm_ros.learning.optimisation import History, Optimisation, OptimisationResult, rollout_steps
@@ -22,9 +21,10 @@ from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.online import OnlineLayer
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.single_track import Integrator
 
-Calibrate = Callable[[Recording, Vehicle], Vehicle]
-"""Fits the nominal values of a vehicle to a recording."""
+Calibrate = Callable[[Recording, Vehicle, Integrator | None], Vehicle]
+"""Fits the nominal values of a vehicle to a recording, for an integrator or, ``None``, the one that is closest to it."""
 
 _SHORTER = 4  # how many times fewer epochs the models have that only tell how large errors are on unknown laps
 
@@ -35,7 +35,7 @@ class Trained:
 
     config: ModelConfig
     vehicle: Vehicle
-    """The car as the model has it; see :meth:`ModelConfig.modelled_vehicle`."""
+    """The car as the model has it; see :meth:`PhysicsConfig.modelled`."""
     recording: Recording
     model: TrainableModel
     normalisation: Normalisation
@@ -83,7 +83,7 @@ def train(
         device: ``cpu`` or ``cuda``.
         progress: called after each epoch.
         calibrate: from the data of a stage and the vehicle to the calibrated one, for models whose physics asks for it;
-            ``None``: the vehicle is taken as calibrated.
+            ``None``: the vehicle is taken as calibrated. All stages step as the first.
 
     Raises:
         RecordingError: another sampling time than the vehicle's, or too little data.
@@ -99,10 +99,12 @@ def train(
 
     stages = (_epochs(config), *(_epochs(shorter) for _ in rests))
 
-    def run(data: Recording, of: ModelConfig, stage: int, name: str) -> Trained:
+    physics = config.with_physics
+    calibrates = physics.nominal == "calibrated" or config.online is not None
+
+    def run(data: Recording, of: ModelConfig, stage: int, name: str, integrator: Integrator | None) -> Trained:
         """One stage, from what the model starts from on."""
-        wanted = calibrate is not None and (of.calibrates or of.online is not None)
-        car = calibrate(data, vehicle) if calibrate is not None and wanted else vehicle
+        car = calibrate(data, vehicle, integrator) if calibrate is not None and calibrates else vehicle
         report, file, start = _stage(progress, name, stage, stages), files[stage], None
         if len(stages) == 1 and of.start is None:
             report = progress
@@ -112,13 +114,13 @@ def train(
             report = _stage(progress, name, stage, stages, start.config.training.effort[0])
         return _train(data, of, car, file, device, report, start)
 
-    trained = run(recording, config, 0, config.name)
+    trained = run(recording, config, 0, config.name, physics.integrator)
     if config.online is None:
         return trained
     if not trained.model.LEARNS:
         return _with_layer(trained, [(trained.model, part) for part in left_out])
     others = [
-        run(rest, shorter, k, f"{config.name} without part {k} of {len(parts)}").model
+        run(rest, shorter, k, f"{config.name} without part {k} of {len(parts)}", trained.vehicle.integrator).model
         for k, rest in enumerate(rests, 1)
     ]
     return _with_layer(trained, list(zip(others, left_out, strict=False)))
@@ -137,8 +139,7 @@ def _start_of(checkpoint: Path) -> Path:
 def _with_layer(trained: Trained, left_out: list[tuple[TrainableModel, Recording]]) -> Trained:
     """The model with its online layer; ``left_out``: parts of the laps, each with a model that was trained without it."""
     assert trained.config.online is not None
-    integrator, substeps = trained.config.stepping
-    physics = PhysicsConfig(integrator=integrator, substeps=substeps)
+    physics = trained.config.with_physics
     base = LayerBase(trained.vehicle, physics, trained.normalisation, trained.H, trained.config.online)
     features, layer, gain = earned_layer(base, trained.model, trained.recording, left_out)
     return replace(trained, features=features, online=layer, network_gain=gain)
@@ -209,7 +210,7 @@ def _train(
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
     torch.set_num_threads(1)  # batches are small: more threads wait for each other longer than they compute
     torch.manual_seed(config.training.seed)
-    vehicle = config.modelled_vehicle(vehicle)
+    vehicle = config.with_physics.modelled(vehicle)
     H = config.rows(vehicle.sampling_time)
     plain, _ = _split(recording, config, vehicle)
     scale = normalisation(recording, plain) if start is None else start.normalisation

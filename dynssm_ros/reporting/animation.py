@@ -160,7 +160,7 @@ def _most_changed(race: Race) -> tuple[str, Vector]:
 
 
 def _changed_stretch(race: Race, name: str, truth: Vector) -> Mask:
-    """Whether the coefficient ``name`` is another, by its ``truth`` in ``race``, at each point of the centre line, ``(n,)``."""
+    """Whether the coefficient ``name``, truly ``truth``, is another at each point of the centre line, shape ``(n,)``."""
     track, coefficient = race.course.track, race.course.vehicle.coefficients[name]
     off = np.abs(truth - coefficient.nominal) > _CHANGED * np.ptp(coefficient.bounds)
     known = np.isfinite(truth)

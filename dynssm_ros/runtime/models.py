@@ -150,14 +150,13 @@ class SingleTrack:
     card: ModelCard | None = None
     parameters = 0
 
-    def __init__(self, vehicle: Vehicle, integrator: Integrator = "euler", substeps: int = 1) -> None:
+    def __init__(self, vehicle: Vehicle, integrator: Integrator | None = None, substeps: int = 1) -> None:
         self.vehicle = vehicle
         self.T_s = vehicle.sampling_time
         self._theta = vehicle.nominal
         self._effects = vehicle.active_effects
         self._carries = carries(self._effects)
-        self._integrator: Integrator = integrator
-        self._substeps = substeps
+        self._stepping: tuple[Integrator, int] = integrator or vehicle.model_integrator, substeps
         self.H = 1 + (round(CARRIED_S / self.T_s) if self._carries else 0)
         self.flops = count_operations(self.predict, np.ones((1, self.H, len(WINDOW_COLUMNS))))
 
@@ -178,7 +177,7 @@ class SingleTrack:
             rows = [windows[:, k].T for k in range(windows.shape[1])]
             moved = increments_along(
                 np, [State(*row[:3]) for row in rows], [applied_inputs(row) for row in rows], Applied(*rows[0][3:5]), theta,
-                self.vehicle.constants, self.T_s, self._effects, self._integrator, self._substeps,
+                self.vehicle.constants, self.T_s, self._effects, *self._stepping,
             )[-latest:]  # fmt: skip
             increments = np.stack([np.stack(each, axis=-1) for each in moved], axis=1)
             return np.asarray(windows[:, -latest:, :3] + increments)
@@ -186,7 +185,7 @@ class SingleTrack:
         effect_states = initial_effect_states(self._effects, now[3], now[4])
         state, _ = step_with_effect_states(
             np, State(*now[:3]), effect_states, applied_inputs(now), theta, self.vehicle.constants, self.T_s,
-            self._effects, self._integrator, self._substeps,
+            self._effects, *self._stepping,
         )  # fmt: skip
         return np.stack(state, axis=-1)
 
@@ -202,7 +201,7 @@ class SingleTrackEwma(SingleTrack):
     rows = 31
     decay = 0.9
 
-    def __init__(self, vehicle: Vehicle, integrator: Integrator = "euler", substeps: int = 1) -> None:
+    def __init__(self, vehicle: Vehicle, integrator: Integrator | None = None, substeps: int = 1) -> None:
         super().__init__(vehicle, integrator, substeps)
         self.H += self.rows - 1
         self.flops = count_operations(self.predict, np.ones((1, self.H, len(WINDOW_COLUMNS))))

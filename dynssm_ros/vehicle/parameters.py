@@ -129,6 +129,11 @@ class Vehicle(StrictModel):
     )
     effects: tuple[EffectEntry, ...] = ()
 
+    @property
+    def model_integrator(self) -> Integrator:
+        """Of models of this car: that of its calibration; else Euler steps of T_s, as in the paper."""
+        return self.integrator or "euler"
+
     @field_validator("coefficients")
     @classmethod
     def _complete(cls, value: dict[str, Coefficient]) -> dict[str, Coefficient]:

@@ -40,7 +40,18 @@ def wrong_car(folder: Path, **bounds: tuple[float, float]) -> Path:
 
 def test_a_wrong_car_becomes_the_right_one(dynssm: Run, laps: Path, tmp_path: Path) -> None:
     car, out_json = tmp_path / "car.yaml", tmp_path / "car.json"
-    arguments = ["--vehicle", wrong_car(tmp_path), "--starts", 1, "--out", car, "--json", out_json]
+    arguments = [
+        "--vehicle",
+        wrong_car(tmp_path),
+        "--starts",
+        1,
+        "--integrator",
+        "euler",
+        "--out",
+        car,
+        "--json",
+        out_json,
+    ]
     status, out, err = dynssm("calibrate", laps, *arguments)
     assert (status, err) == (0, "")
     found, truth = load_vehicle(car), load_vehicle("orca")

@@ -15,10 +15,12 @@ from dynssm_ros.runtime.models import SingleTrack
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle
 
 Drive = Callable[..., Recording]
 NOISE = (2e-4, 2e-4, 5e-3)
+SENSORS = (0.01, 0.01, 0.03)
 
 
 def unknown(vehicle: Vehicle, **changes: dict[str, object]) -> Vehicle:
@@ -86,6 +88,18 @@ def test_effects_of_the_vehicle_are_part_of_the_model(drive: Drive, orca: Vehicl
     recording = drive(car, 1500, steering=0.09)
     assert calibrate(recording, mid_range(car), starts=1).rmse_after.max() < 1e-6
     assert calibrate(recording, orca).rmse_before.max() > 1e-2
+
+
+@pytest.mark.parametrize(("plant", "chosen"), [("euler", "euler"), ("rk4", "rk4")])
+def test_the_data_choose_how_the_model_steps(orca: Vehicle, plant: PlantKind, chosen: str) -> None:
+    """Euler steps fitted to a continuous car make a yaw inertia of their own."""
+    laps = dynssm_ros.recorded(dynssm_ros.simulate(orca, "club", duration=40.0, plant=plant, noise=SENSORS, seed=3))
+    found = calibrate(laps, mid_range(orca), starts=1)
+    assert (found.vehicle.integrator, found.vehicle.model_integrator) == (chosen, chosen)
+    assert found.vehicle.coefficients["I_z"].nominal == pytest.approx(orca.coefficients["I_z"].nominal, rel=0.05)
+    if plant == "rk4":
+        wrong = calibrate(laps, mid_range(orca), integrator="euler", starts=1)
+        assert wrong.vehicle.coefficients["I_z"].nominal > 1.2 * orca.coefficients["I_z"].nominal
 
 
 # --- with noise ---------------------------------------------------------------------------------
@@ -199,10 +213,10 @@ def test_another_sampling_time_is_refused(drive: Drive, orca: Vehicle) -> None:
         calibrate(drive(orca, 200), load_vehicle("av21"))
 
 
-def test_progress_counts_the_starting_points_and_the_last_fit(drive: Drive, orca: Vehicle) -> None:
+def test_progress_counts_the_starting_points_of_each_integrator_and_the_last_fit(drive: Drive, orca: Vehicle) -> None:
     calls: list[tuple[int, int]] = []
     calibrate(drive(orca, 1500), orca, starts=2, on_progress=lambda *counts: calls.append(counts))
-    assert calls == [(1, 3), (2, 3), (3, 3)]
+    assert calls == [(1, 5), (2, 5), (3, 5), (4, 5), (5, 5)]
 
 
 def test_a_model_that_lacks_something_says_how_little_it_knows_of_other_drives() -> None:

@@ -12,7 +12,6 @@ import torch
 
 from dynssm_ros.learning.earned_layer import LayerBase
 from dynssm_ros.learning.models.base import ModelConfig
-from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.stages import checkpoints, train
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
@@ -41,7 +40,7 @@ def test_the_layer_is_fitted_to_what_models_say_of_parts_that_they_did_not_know(
         known.append(
             (train(recording.select(~part), other, orca, tmp_path / f"{part[0]}.pt").model, recording.select(part))
         )
-    physics = PhysicsConfig(integrator=config.stepping[0], substeps=config.stepping[1])
+    physics = config.with_physics
     base = LayerBase(trained.vehicle, physics, trained.normalisation, trained.H, config.online)
     layer = base.fitted(base.features(True), known).layer
     np.testing.assert_array_equal(layer.mean, trained.online.mean)

@@ -17,10 +17,10 @@ from typing_extensions import Self
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.learning.dataset import SplitConfig, TrainingWindows
 from dynssm_ros.learning.losses import LossConfig, Output, Scales, objective
+from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.coefficients import SPREAD
 from dynssm_ros.vehicle import Vehicle
-from dynssm_ros.vehicle.single_track import Integrator
 
 
 class AugmentationConfig(StrictModel):
@@ -90,14 +90,9 @@ class ModelConfig(StrictModel):
         return steps_of(self.history, T_s)
 
     @property
-    def calibrates(self) -> bool:
-        """Whether the vehicle is to be calibrated on the training data first."""
-        return False
-
-    @property
-    def stepping(self) -> tuple[Integrator, int]:
-        """Integrator and substeps of the model's physics."""
-        return "euler", 1
+    def with_physics(self) -> PhysicsConfig:
+        """Its physics; of a model without any, what its online layer takes the car for."""
+        return PhysicsConfig()
 
     @property
     def start(self) -> ModelConfig | None:
@@ -113,10 +108,6 @@ class ModelConfig(StrictModel):
         """The same model with other training settings; those that it does not have are left out."""
         known = {name: value for name, value in changes.items() if name in type(self.training).model_fields}
         return self.model_copy(update={"training": self.training.model_copy(update=known)})
-
-    def modelled_vehicle(self, vehicle: Vehicle) -> Vehicle:
-        """The car as the model's physics has it, which is the one that its coefficients are for."""
-        return vehicle
 
 
 class TrainableModel(nn.Module):

@@ -21,7 +21,6 @@ from dynssm_ros.learning.models.base import GruConfig, ModelConfig, TrainableMod
 from dynssm_ros.learning.models.physics import INPUTS, PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
-from dynssm_ros.vehicle.single_track import Integrator
 
 
 class DenseConfig(StrictModel):
@@ -42,18 +41,9 @@ class DdmConfig(ModelConfig):
     training: TrainingConfig
 
     @property
-    def calibrates(self) -> bool:
-        """As the physics says."""
-        return self.physics.nominal == "calibrated"
-
-    @property
-    def stepping(self) -> tuple[Integrator, int]:
-        """Those of the physics."""
-        return self.physics.integrator, self.physics.substeps
-
-    def modelled_vehicle(self, vehicle: Vehicle) -> Vehicle:
-        """Without load transfer, if the physics has none."""
-        return self.physics.modelled(vehicle)
+    def with_physics(self) -> PhysicsConfig:
+        """The block ``physics``."""
+        return self.physics
 
 
 class DDM(TrainableModel):

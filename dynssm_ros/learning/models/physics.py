@@ -21,7 +21,10 @@ INPUTS = len(WINDOW_COLUMNS)
 class PhysicsConfig(StrictModel):
     """Analytical dynamics layer."""
 
-    integrator: Integrator = "euler"
+    integrator: Integrator | None = Field(
+        default=None,
+        description="null: the vehicle file's, which a calibration chooses by the data; Euler if it has none",
+    )
     substeps: int = Field(default=1, ge=1)
     nominal: Literal["vehicle", "mid_range", "calibrated"] = Field(
         default="vehicle",
@@ -29,6 +32,10 @@ class PhysicsConfig(StrictModel):
         "on the training data finds",
     )
     load_transfer: bool = Field(default=True, description="false: no load transfer, also if the vehicle file has it")
+
+    def stepping(self, vehicle: Vehicle) -> tuple[Integrator, int]:
+        """Integrator and substeps of the physics of ``vehicle``."""
+        return self.integrator or vehicle.model_integrator, self.substeps
 
     def modelled(self, vehicle: Vehicle) -> Vehicle:
         """The car as this physics has it."""
@@ -65,7 +72,7 @@ class PhysicsLayer(nn.Module):
     def __init__(self, vehicle: Vehicle, config: PhysicsConfig) -> None:
         super().__init__()
         self.vehicle = vehicle
-        self.config = config
+        self.stepping = config.stepping(vehicle)
         self.effects = vehicle.active_effects
         self.carries = carries(self.effects)
 
@@ -85,8 +92,7 @@ class PhysicsLayer(nn.Module):
             self.vehicle.constants,
             self.vehicle.sampling_time,
             self.effects,
-            self.config.integrator,
-            self.config.substeps,
+            *self.stepping,
         )
         return torch.cat(list(moved), dim=-1)
 
@@ -111,7 +117,6 @@ class PhysicsLayer(nn.Module):
             self.vehicle.constants,
             self.vehicle.sampling_time,
             self.effects,
-            self.config.integrator,
-            self.config.substeps,
+            *self.stepping,
         )[-latest:]
         return torch.stack([torch.cat(list(increments), dim=-1) for increments in moved], dim=1)

@@ -16,7 +16,6 @@ from dynssm_ros.learning.models.base import ModelConfig, OnlineConfig, Trainable
 from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
-from dynssm_ros.vehicle.single_track import Integrator
 
 
 class RlsConfig(ModelConfig):
@@ -28,18 +27,9 @@ class RlsConfig(ModelConfig):
     training: SplitConfig = Field(default_factory=SplitConfig)
 
     @property
-    def calibrates(self) -> bool:
-        """As the physics says."""
-        return self.physics.nominal == "calibrated"
-
-    @property
-    def stepping(self) -> tuple[Integrator, int]:
-        """Those of the physics."""
-        return self.physics.integrator, self.physics.substeps
-
-    def modelled_vehicle(self, vehicle: Vehicle) -> Vehicle:
-        """Without load transfer, if the physics has none."""
-        return self.physics.modelled(vehicle)
+    def with_physics(self) -> PhysicsConfig:
+        """The block ``physics``."""
+        return self.physics
 
 
 class Rls(TrainableModel):

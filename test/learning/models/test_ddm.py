@@ -119,8 +119,8 @@ def test_the_prediction_is_a_step_of_the_single_track_model_without_load_transfe
 
 def test_a_model_with_load_transfer_leaves_the_vehicle_as_it_is(make_config: MakeConfig) -> None:
     car = load_vehicle("av21")
-    assert make_config().modelled_vehicle(car) is car
-    assert make_config(physics=None, adaptation=None).modelled_vehicle(car) is car
+    assert make_config().with_physics.modelled(car) is car
+    assert make_config(physics=None, adaptation=None).with_physics.modelled(car) is car
 
 
 def test_it_learns_a_car_from_its_laps(make_ddm: MakeConfig, laps: Recording, orca: Vehicle, tmp_path: Path) -> None:

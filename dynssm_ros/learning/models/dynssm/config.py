@@ -11,8 +11,6 @@ from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.losses import LossConfig
 from dynssm_ros.learning.models.base import GruConfig, ModelConfig, TrainingConfig, steps_of
 from dynssm_ros.learning.models.physics import PhysicsConfig
-from dynssm_ros.vehicle import Vehicle
-from dynssm_ros.vehicle.single_track import Integrator
 
 
 class SsmConfig(StrictModel):
@@ -110,18 +108,9 @@ class DynssmConfig(ModelConfig):
         return self.inputs.features == "increments" or self.inputs.physics_errors
 
     @property
-    def calibrates(self) -> bool:
-        """As the physics says."""
-        return self.physics is not None and self.physics.nominal == "calibrated"
-
-    @property
-    def stepping(self) -> tuple[Integrator, int]:
-        """Those of the physics."""
-        return (self.physics.integrator, self.physics.substeps) if self.physics else super().stepping
-
-    def modelled_vehicle(self, vehicle: Vehicle) -> Vehicle:
-        """Without load transfer, if the physics has none."""
-        return vehicle if self.physics is None else self.physics.modelled(vehicle)
+    def with_physics(self) -> PhysicsConfig:
+        """The block ``physics``, if there is one."""
+        return self.physics or super().with_physics
 
     def check_rows(self, T_s: float) -> None:
         """Checks that all parts of the window fit into it at the sampling time ``T_s`` (s).
