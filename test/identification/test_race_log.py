@@ -34,3 +34,9 @@ def test_yaw_is_found_to_come_late_and_the_extended_car_errs_less(
     assert found.improvement.horizons[at] == pytest.approx(0.6)
     assert found.improvement.reduction[at, 1] >= 0.3
     assert found.improvement.reduction_from(RECALIBRATED)[at, 1] >= 0.3
+
+
+def test_a_race_car_is_not_taken_for_one_that_moves_in_euler_steps(putnam: Path) -> None:
+    """Euler steps are closer to its one-step errors, and explain them no better than Runge-Kutta."""
+    recording = extract([putnam], load_signal_map("av21"), 25.0)
+    assert calibrate(recording, load_vehicle("av21"), starts=1).vehicle.integrator == "rk4"
