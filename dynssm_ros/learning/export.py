@@ -111,6 +111,7 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
             sampling_time=trained.vehicle.sampling_time,
             window=trained.H,
             commands=trained.recording.info.commands,
+            held=trained.recording.info.held,
             integrator=integrator,
             substeps=substeps,
             normalisation=trained.normalisation,

@@ -59,6 +59,10 @@ class ModelCard(StrictModel):
     window: int = Field(gt=0, description="H, rows of the history window")
     columns: tuple[str, ...] = WINDOW_COLUMNS
     commands: Commands = Field(description="command protocol of the training data")
+    held: tuple[str, ...] = Field(
+        default=(),
+        description="signals that kept their last sample until the next in the training data; live they do too",
+    )
     integrator: Integrator = "euler"
     substeps: int = Field(default=1, ge=1)
     normalisation: Normalisation

@@ -65,7 +65,7 @@ class Predictor:
 
     def __init__(self, model: OnnxModel, signal_map: SignalMap, max_age: float = 0.2, online: bool = True) -> None:
         self.signal_map = live_signal_map(model, signal_map)
-        self.history = History(self.signal_map, model.T_s, model.H, max_age)
+        self.history = History(self.signal_map, model.T_s, model.H, max_age, held=model.card.held)
         self._learner: OnlineLearner | None = None
         self._learns = online
         self._set_model(model)
@@ -101,7 +101,7 @@ class Predictor:
         What was learned online is kept by a model with the same prior, and forgotten by another.
         """
         self.check_swap(model)
-        self.history.resize(model.T_s, model.H)
+        self.history.resize(model.T_s, model.H, model.card.held)
         self._set_model(model)
 
     def finish(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,9 @@ from dynssm_ros.signals.bags import Bag, open_bag
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import Stream, resample
-from dynssm_ros.signals.signal_map import POSE_SIGNALS, SignalMap
+from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, SignalMap
+
+_SLOW = 1.5  # periods of the grid between samples, from which on a signal is slower than it
 
 
 def extract(
@@ -41,15 +43,32 @@ def extract(
     for path in bags:
         with open_bag(path) as bag:
             streams, notes = read_streams(bag, signal_map, drop_bad, progress)
+        held = held_signals(signal_map, streams, 1e9 / rate)
         info = RecordingInfo(
             sampling_time=1 / rate,
             commands=signal_map.commands,
             source=(Path(path).name,),
             signal_map=signal_map.name,
+            held=held,
             notes=tuple(notes),
         )
         recordings.append(resample(streams, rate, signal_map.max_gap, signal_map.commands, info))
     return concatenate(recordings)
+
+
+def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: float) -> tuple[str, ...]:
+    """The signals that keep their last sample until the next, on a grid of ``period`` (ns).
+
+    Actuators that come more slowly than the rows would else look ahead of what a live node knows.
+    """
+    held = []
+    for name, source in signal_map.active_signals().items():
+        stamps = streams[name].stamps if name in streams else np.empty(0, np.int64)
+        slow = len(stamps) > 1 and float(np.median(np.diff(stamps))) > _SLOW * period
+        usual = "zero" if slow and name not in (*STATE_SIGNALS, *POSE_SIGNALS) else "first"
+        if (source.hold or usual) == "zero":
+            held.append(name)
+    return tuple(held)
 
 
 def read_streams(

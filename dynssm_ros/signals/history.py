@@ -1,12 +1,13 @@
 """The live counterpart of resampling: raw samples in ring buffers, a window on the model's grid at any instant.
 
 The window is sampled back from a given stamp at ``T_s``, so odometry of any rate and jitter works. Between samples it
-interpolates linearly as the extractor does; what is newer than a signal's last sample is not known yet, and that last
+interpolates or holds as the extractor does. What is newer than a signal's last sample is not known yet, and that last
 sample is held.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from enum import Enum
 from math import isfinite
 
@@ -14,9 +15,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.inputs import model_inputs
-from dynssm_ros.signals.signal_map import STATE_SIGNALS, SignalMap
-
-_BRIDGE = 1e-6  # fraction of T_s by which float rounding may miss the first sample of a window
+from dynssm_ros.signals.signal_map import ROUNDING, STATE_SIGNALS, SignalMap
 
 
 class Refusal(Enum):
@@ -79,6 +78,11 @@ class RingBuffer:
         sampled: Vector = np.interp(grid, self._times[stored], self._values[stored])
         return sampled
 
+    def held(self, grid: Vector) -> Vector:
+        """The last values at or before the times ``grid`` (ns since the epoch); the oldest one for times before it."""
+        values: Vector = self.values[np.maximum(np.searchsorted(self.times, grid, side="right") - 1, 0)]
+        return values
+
     def append(self, time: float, value: float, span: float) -> None:
         """Adds a sample newer than all others, growing if the buffer would forget samples younger than ``span`` ns."""
         if self._count == self._capacity and time - self.times[1] < span:
@@ -110,12 +114,21 @@ class History:
         signal_map: which signals there are; its ``max_gap`` restarts the window after a hole in the data.
         T_s: sampling time of the window (s).
         H: number of rows of the window.
+        held: signals that keep their last sample until the next; the others are interpolated.
         max_age: how much older than the requested instant the newest sample of a signal may be (s).
         jump: stamps that step back by more than this mean that time was set back, not disorder (s). They are believed, as
             those that are further ahead, when a second message confirms them.
     """
 
-    def __init__(self, signal_map: SignalMap, T_s: float, H: int, max_age: float = 0.2, jump: float = 0.5) -> None:
+    def __init__(
+        self,
+        signal_map: SignalMap,
+        T_s: float,
+        H: int,
+        max_age: float = 0.2,
+        jump: float = 0.5,
+        held: Collection[str] = (),
+    ) -> None:
         self.names = tuple(signal_map.active_signals())
         self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
         self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
@@ -124,13 +137,14 @@ class History:
         self._jump = max(jump * 1e9, 2 * self._max_gap)
         self._suspect: tuple[int, dict[str, float]] | None = None  # a message whose stamp (ns) may be an outlier
         self._epoch: int | None = None
-        self.resize(T_s, H)
+        self.resize(T_s, H, held)
 
-    def resize(self, T_s: float, H: int) -> None:
+    def resize(self, T_s: float, H: int, held: Collection[str] = ()) -> None:
         """Changes the grid of the window; the samples are kept, so a longer window fills on from what is there."""
+        self._held = frozenset(held)
         self._offsets = -np.arange(H - 1, -1, -1, dtype=np.float64) * (T_s * 1e9)
         self._span = H * T_s * 1e9 + self._max_age + self._max_gap
-        self._slack = _BRIDGE * T_s * 1e9
+        self._slack = ROUNDING * T_s * 1e9
         self._window = np.zeros((H, 7))
 
     def add(self, stamp: int, values: dict[str, float]) -> Refusal | None:
@@ -217,7 +231,11 @@ class History:
         if filling:
             return Refusal.FILLING
         grid = self._offsets + now
-        sampled = {name: buffer.interpolate(grid) for name, buffer in self._buffers.items()}
+        late = grid + self._slack
+        sampled = {
+            name: buffer.held(late) if name in self._held else buffer.interpolate(grid)
+            for name, buffer in self._buffers.items()
+        }
         for column, values in enumerate((*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled))):
             self._window[:, column] = values
         return self._window

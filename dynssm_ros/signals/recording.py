@@ -36,6 +36,9 @@ class RecordingInfo(StrictModel):
     commands: Commands = Field(description="where u_t comes from")
     source: tuple[str, ...] = Field(default=(), description="names of the bags or simulations")
     signal_map: str = ""
+    held: tuple[str, ...] = Field(
+        default=(), description="signals that keep their last sample until the next; the others are interpolated"
+    )
     notes: tuple[str, ...] = Field(default=(), description="what was recovered, dropped or bridged")
 
 
@@ -237,6 +240,7 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
         update={
             "source": tuple(s for r in recordings for s in r.info.source),
             "notes": tuple(n for r in recordings for n in r.info.notes),
+            "held": tuple(dict.fromkeys(name for r in recordings for name in r.info.held)),
         }
     )
     return Recording(

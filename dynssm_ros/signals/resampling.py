@@ -12,10 +12,9 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.signals.inputs import lookahead_commands, model_inputs
 from dynssm_ros.signals.recording import Recording, RecordingInfo
-from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, Commands
+from dynssm_ros.signals.signal_map import POSE_SIGNALS, ROUNDING, STATE_SIGNALS, Commands, Hold
 
 Stamps = npt.NDArray[np.int64]
-_ROUNDING = 1e-6  # periods by which a float may miss the last instant of a stretch
 
 
 @dataclass(frozen=True)
@@ -26,10 +25,13 @@ class Stream:
     values: Vector
 
 
-def interpolate(stream: Stream, grid: Stamps, max_gap: int) -> tuple[Vector, npt.NDArray[np.int64]]:
-    """Linear interpolation at ``grid`` (int64 ns) inside the stream's stretches.
+def sample(
+    stream: Stream, grid: Stamps, max_gap: int, hold: Hold = "first", rounding: int = 0
+) -> tuple[Vector, npt.NDArray[np.int64]]:
+    """The stream at ``grid`` (int64 ns) inside its stretches: interpolated, or with its last sample held.
 
-    A stretch is a run of samples that are at most ``max_gap`` ns apart; a lone sample is one too.
+    A stretch is a run of samples that are at most ``max_gap`` ns apart; a lone sample is one too. A sample that is held
+    holds from ``rounding`` ns before its stamp on.
 
     Returns:
         The values, and for each the number of the stretch it lies in; -1, and a value of no meaning, where it lies in
@@ -37,7 +39,10 @@ def interpolate(stream: Stream, grid: Stamps, max_gap: int) -> tuple[Vector, npt
     """
     t = stream.stamps
     origin = t[0]
-    values = np.interp((grid - origin).astype(np.float64), (t - origin).astype(np.float64), stream.values)
+    if hold == "zero":
+        values = stream.values[np.maximum(np.searchsorted(t, grid + rounding, side="right") - 1, 0)]
+    else:
+        values = np.interp((grid - origin).astype(np.float64), (t - origin).astype(np.float64), stream.values)
     number = np.concatenate([[0], np.cumsum(np.diff(t) > max_gap)])
     after = np.minimum(np.searchsorted(t, grid, side="left"), len(t) - 1)
     before = np.maximum(np.searchsorted(t, grid, side="right") - 1, 0)
@@ -53,7 +58,7 @@ def uniform_grid(anchor: Stamps, period: float, max_gap: int) -> Stamps:
     cuts = np.flatnonzero(np.diff(anchor) > max_gap)
     first = (anchor[np.concatenate([[0], cuts + 1])] - anchor[0]) / period
     last = (anchor[np.concatenate([cuts, [len(anchor) - 1]])] - anchor[0]) / period
-    steps = [np.arange(np.ceil(a - _ROUNDING), np.floor(b + _ROUNDING) + 1) for a, b in zip(first, last, strict=True)]
+    steps = [np.arange(np.ceil(a - ROUNDING), np.floor(b + ROUNDING) + 1) for a, b in zip(first, last, strict=True)]
     grid: Stamps = anchor[0] + np.round(np.concatenate(steps) * period).astype(np.int64)
     return grid
 
@@ -71,7 +76,8 @@ def resample(
         rate: of the grid (Hz).
         max_gap: longest time between samples that is bridged (s).
         commands: source of ``u_t``.
-        info: metadata to carry along; its sampling time must be ``1 / rate``.
+        info: metadata to carry along; its sampling time must be ``1 / rate``. Signals that it names as ``held`` keep
+            their last sample until the next, the others are interpolated.
 
     Raises:
         RecordingError: the streams never overlap.
@@ -82,7 +88,8 @@ def resample(
     stretches: list[npt.NDArray[np.int64]] = []
     for name, stream in streams.items():
         smooth = Stream(stream.stamps, np.unwrap(stream.values)) if name == "theta" else stream
-        sampled[name], stretch = interpolate(smooth, grid, bridged)
+        hold: Hold = "zero" if name in info.held else "first"
+        sampled[name], stretch = sample(smooth, grid, bridged, hold, round(ROUNDING * period))
         stretches.append(stretch)
     numbers = np.stack(stretches)
     rows = np.flatnonzero((numbers >= 0).all(axis=0))

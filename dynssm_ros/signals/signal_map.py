@@ -22,6 +22,11 @@ REQUIRED_SIGNALS = (*STATE_SIGNALS, "throttle_feedback", "steering_feedback")
 COMMAND_SIGNALS = ("throttle_command", "steering_command")
 SIGNALS = (*REQUIRED_SIGNALS, *POSE_SIGNALS, *COMMAND_SIGNALS, "brake_feedback", "brake_command")
 
+Hold = Literal["zero", "first"]
+"""What a signal is between two samples: the last one, or on a line to the next."""
+ROUNDING = 1e-6
+"""Periods by which an instant of a grid may miss a sample."""
+
 Accessor = Callable[[Any], float | None]
 _STEP = r"[A-Za-z_]\w*(?:\[[^\[\]().]+\])?"
 _PATH = rf"{_STEP}(?:\.{_STEP})*"
@@ -39,6 +44,11 @@ class Source(StrictModel):
     field: str = Field(description="dotted path; position[steering] picks by name or index; yaw(path) of a quaternion")
     scale: float = 1.0
     offset: float = 0.0
+    hold: Hold | None = Field(
+        default=None,
+        description="between samples: zero, the last one; first, a line to the next, which a live node does not know. null: "
+        "zero for actuators and commands that come more slowly than the rows of a recording, else first",
+    )
 
     @property
     def recorded(self) -> str:

@@ -66,11 +66,31 @@ def test_the_signals_of_a_bag_come_out_as_they_went_in(make_bag: Any, drive: Any
         "commands": "topics",
         "source": ("bag",),
         "signal_map": "default",
+        "held": (),
         "notes": (),
     }
     t = seconds(recording)
     np.testing.assert_allclose(recording["x"], 10 * t, atol=1e-6)
     np.testing.assert_allclose(recording["theta"], 0.3, atol=1e-12)
+
+
+def test_actuators_that_are_slower_than_the_rows_are_held_unless_the_map_says_otherwise(
+    make_bag: Any, drive: Any
+) -> None:
+    """Rows between their samples would else look ahead of what a live node knows."""
+    bag = make_bag([record for k, record in enumerate(drive(200)) if record[0] == ODOMETRY or k % 5 == 0])
+    signals = DEFAULT.model_dump()["signals"]
+    actuators = [name for name in signals if name.startswith(("throttle", "steering"))]
+    recording = extract([bag], DEFAULT, 100.0)
+    assert recording.info.held == tuple(actuators)
+    changes = np.flatnonzero(np.diff(recording["delta_fb"]))
+    assert 0 < len(changes) <= len(recording) / 4
+    assert set(np.diff(changes)) == {int(np.diff(changes)[0])}
+    signals["steering_feedback"]["hold"] = "first"
+    line = extract([bag], SignalMap(name="own", signals=signals), 100.0)
+    assert line.info.held == tuple(name for name in actuators if name != "steering_feedback")
+    np.testing.assert_allclose(line["delta_fb"], 0.01 * seconds(line), atol=1e-9)
+    assert extract([bag], DEFAULT, 20.0).info.held == ()
 
 
 def test_without_command_topics_commands_are_zero_or_look_ahead(make_bag: Any, drive: Any) -> None:

@@ -87,6 +87,7 @@ class PlainHistory:
     """What :class:`History` must do, told with lists of ``(stamp, value)`` and nothing forgotten."""
 
     def __init__(self, T_s: float, H: int) -> None:
+        self.held = ("throttle_feedback",)
         self.offsets = [round(k * T_s * SECOND) for k in range(H - 1, -1, -1)]
         self.samples: dict[str, list[tuple[int, float]]] = {name: [] for name in SIGNALS}
         self.suspect: tuple[int, dict[str, float]] | None = None
@@ -145,6 +146,8 @@ class PlainHistory:
 
     def at(self, name: str, instant: int) -> float:
         samples = self.samples[name]
+        if name in self.held:
+            return [value for stamp, value in samples if stamp <= instant][-1]
         for (t, a), (u, b) in pairwise(samples):
             if t <= instant <= u:
                 return a + (b - a) * (instant - t) / (u - t)
@@ -166,7 +169,8 @@ moves = st.sampled_from([0.0, 0.005, 0.01, 0.01, 0.01, 0.02, 0.02, 0.1, 0.25, 0.
 def test_any_sequence_of_messages_is_answered_as_by_a_plain_list(
     sequence: list[tuple[float, dict[str, float]]],
 ) -> None:
-    history, plain = History(NO_COMMANDS, 0.02, 4, MAX_AGE, JUMP_BACK), PlainHistory(0.02, 4)
+    plain = PlainHistory(0.02, 4)
+    history = History(NO_COMMANDS, 0.02, 4, MAX_AGE, JUMP_BACK, plain.held)
     stamp = START
     for move, taken in sequence:
         stamp += round(move * SECOND)
@@ -191,14 +195,15 @@ def test_the_window_is_the_extractors_where_all_samples_are_known(data: st.DataO
         gaps = random.uniform(0.001, longest, int(4 / longest))
         stamps = START + np.cumsum(np.round(gaps * SECOND)).astype(np.int64)
         streams[name] = Stream(stamps, random.normal(size=len(stamps)))
-    info = RecordingInfo(sampling_time=T_s, commands="none")
+    held = ("steering_feedback",)
+    info = RecordingInfo(sampling_time=T_s, commands="none", held=held)
     try:
         recording = resample(streams, 1 / T_s, NO_COMMANDS.max_gap, "none", info)
     except RecordingError:  # so many gaps that the streams never overlap
         reject()
     ends = set(recording.window_ends(H, 0).tolist())
     for row in random.choice(len(recording), min(len(recording), 15), replace=False):
-        now, history = int(recording.time[row]), History(NO_COMMANDS, T_s, H, MAX_AGE)
+        now, history = int(recording.time[row]), History(NO_COMMANDS, T_s, H, MAX_AGE, held=held)
         for name, stream in streams.items():
             known = np.searchsorted(stream.stamps, now) + 1  # up to the first sample that is not older
             for stamp, value in zip(stream.stamps[:known].tolist(), stream.values[:known].tolist(), strict=True):
@@ -273,6 +278,23 @@ def test_the_window_may_end_before_the_newest_feedback() -> None:
     window = history.window(last - 77_000_000)
     assert not isinstance(window, Refusal)
     np.testing.assert_allclose(window[:, 3], 1.0 - 0.077 + 0.04 * np.arange(-4, 1), atol=1e-9)
+
+
+def test_slow_actuators_are_held_where_the_model_saw_them_held() -> None:
+    history = History(NO_COMMANDS, 0.04, 3, MAX_AGE, held=("steering_feedback",))
+    for k in range(41):
+        stamp = START + k * 10_000_000
+        if k % 10 == 0:
+            history.add(stamp, feedback(0.01 * k))
+        history.add(stamp, odometry(0.01 * k))
+    window = history.window(stamp - 10_000_000)
+    assert not isinstance(window, Refusal)
+    np.testing.assert_allclose(window[:, 3], [0.31, 0.35, 0.39], atol=1e-9)
+    np.testing.assert_allclose(window[:, 4], [-0.3, -0.3, -0.3], atol=1e-9)
+    history.resize(0.04, 3)
+    again = history.window(stamp - 10_000_000)
+    assert not isinstance(again, Refusal)
+    np.testing.assert_allclose(again[:, 4], [-0.31, -0.35, -0.39], atol=1e-9)
 
 
 def test_signals_of_one_topic_may_come_in_separate_messages() -> None:

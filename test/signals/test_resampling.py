@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.signals.recording import Recording, RecordingInfo
-from dynssm_ros.signals.resampling import Stream, interpolate, resample, uniform_grid
+from dynssm_ros.signals.resampling import Stream, resample, sample, uniform_grid
 from dynssm_ros.signals.signal_map import REQUIRED_SIGNALS, Commands
 
 START = 1_700_000_000_123_456_789
@@ -174,6 +174,15 @@ def test_headings_are_unwrapped_before_they_are_interpolated() -> None:
     np.testing.assert_allclose(np.exp(1j * recording["theta"]), np.exp(1j * (3.0 + 1.7 * seconds)), atol=1e-9)
 
 
+def test_a_held_signal_keeps_its_last_sample_also_where_a_row_misses_it_by_rounding() -> None:
+    grid = START + np.arange(7) * 20_000_000
+    slow = Stream(START + np.arange(4) * 50_000_000 + np.array([0, 5, 0, 0]), np.array([0.0, 1.0, 2.0, 3.0]))
+    values, stretch = sample(slow, grid, 250_000_000, "zero", 20)
+    assert values.tolist() == [0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
+    assert set(stretch.tolist()) == {0}
+    assert sample(slow, grid[:1] + 50_000_000, 250_000_000, "zero", 0)[0].tolist() == [0.0]
+
+
 def test_commands_become_increments_and_brakes_negative_throttle() -> None:
     t = np.arange(0, 2, 0.01)
     constants = {
@@ -210,7 +219,7 @@ def test_signals_that_never_overlap_are_told_with_their_spans() -> None:
 def test_a_lone_sample_covers_its_own_instant_only() -> None:
     lone = stream(np.array([0.5]), np.array([7.0]))
     grid = START + np.array([400_000_000, 500_000_000, 500_000_001])
-    values, stretch = interpolate(lone, grid, 250_000_000)
+    values, stretch = sample(lone, grid, 250_000_000)
     assert stretch.tolist() == [-1, 0, -1]
     assert values[1] == 7.0
 
