@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from dynssm_ros.errors import BagError
-from dynssm_ros.signals.signal_map import Accessor, SignalMap, compile_field
+from dynssm_ros.signals.signal_map import Accessor, SignalMap, Source, compile_field
 
 
 @dataclass(frozen=True)
 class _Reading:
     signal: str
-    field: str
+    source: Source
     read: Accessor
-    scale: float
-    offset: float
+
+    def value(self, raw: float) -> float:
+        """In SI units."""
+        if self.source.curve is not None and math.isfinite(raw):
+            at, values = zip(*self.source.curve, strict=True)
+            raw = float(np.interp(raw, at, values))
+        return self.source.scale * raw + self.source.offset
 
 
 class TopicDecoder:
@@ -34,7 +42,7 @@ class TopicDecoder:
         self.subscribed = next(sources, topic)
         """The name as the map has it: relative ones are in the namespace of a node."""
         self._readings = [
-            _Reading(name, source.field, compile_field(source.field), source.scale, source.offset)
+            _Reading(name, source, compile_field(source.field))
             for name, source in signal_map.active_signals().items()
             if source.recorded == topic
         ]
@@ -56,15 +64,16 @@ class TopicDecoder:
                 raw = reading.read(message)
             except AttributeError as error:
                 raise BagError(
-                    f"topic {self.topic}: {self.msgtype} has no field '{reading.field}' for signal {reading.signal} "
+                    f"topic {self.topic}: {self.msgtype} has no field '{reading.source.field}' for signal {reading.signal} "
                     f"(at '{error.name}'; there: {_public_fields(error.obj)})"
                 ) from error
             except (TypeError, ValueError, OverflowError) as error:
                 raise BagError(
-                    f"topic {self.topic}: field '{reading.field}' for signal {reading.signal} is not a number ({error})"
+                    f"topic {self.topic}: field '{reading.source.field}' for signal {reading.signal} is not a number "
+                    f"({error})"
                 ) from error
             if raw is not None:
-                values[reading.signal] = reading.scale * raw + reading.offset
+                values[reading.signal] = reading.value(raw)
         return values
 
 

@@ -89,6 +89,7 @@ def read_streams(
         bag.require(topic, decoder.msgtype)
     stamps = {name: array("q") for name in signal_map.active_signals()}
     values = {name: array("d") for name in signal_map.active_signals()}
+    delays = {name: round(source.delay * 1e9) for name, source in signal_map.active_signals().items()}
     total = sum(bag.counts[topic] for topic in by_topic)
     for done, (topic, log_time, raw) in enumerate(bag.messages(list(by_topic)), 1):
         message = bag.decode(topic, raw)
@@ -98,7 +99,7 @@ def read_streams(
         except BagError as error:
             raise BagError(f"{bag.path}: {error}") from error
         for name, value in present.items():
-            stamps[name].append(log_time if stamp is None else stamp)
+            stamps[name].append((log_time if stamp is None else stamp) - delays[name])
             values[name].append(value)
         if progress is not None:
             progress(done, total)

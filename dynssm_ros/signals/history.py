@@ -132,6 +132,7 @@ class History:
         self.names = tuple(signal_map.active_signals())
         self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
         self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
+        self._delays = {name: signal_map.signals[name].delay * 1e9 for name in self._buffers}
         self._max_gap = float(signal_map.max_gap_ns)
         self._max_age = max_age * 1e9
         self._jump = max(jump * 1e9, 2 * self._max_gap)
@@ -181,18 +182,19 @@ class History:
         """How far a message's stamp is beyond what can follow the last ones (ns): negative back, positive ahead, else 0."""
         assert self._epoch is not None
         time = float(stamp - self._epoch)
-        newest = max((self._buffers[name].newest for name in values), default=-np.inf)
+        newest = max((self._buffers[name].newest + self._delays[name] for name in values), default=-np.inf)
         if newest == -np.inf:
             return 0.0
-        latest = max(buffer.newest for buffer in self._buffers.values())  # a signal may be silent while others go on
+        # a signal may be silent while others go on
+        latest = max(buffer.newest + self._delays[name] for name, buffer in self._buffers.items())
         return min(time - (newest - self._jump), 0.0) or max(time - (latest + self._jump), 0.0)
 
     def _take(self, stamp: int, values: dict[str, float]) -> Refusal | None:
         """Appends the samples of one message, as far as they are newer than all others of their signals."""
         assert self._epoch is not None
-        time, refusal = float(stamp - self._epoch), None
+        refusal = None
         for name, value in values.items():
-            buffer = self._buffers[name]
+            buffer, time = self._buffers[name], float(stamp - self._epoch) - self._delays[name]
             if not isfinite(value):
                 refusal = refusal or Refusal.NOT_FINITE
                 continue

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,19 +32,30 @@ Accessor = Callable[[Any], float | None]
 _STEP = r"[A-Za-z_]\w*(?:\[[^\[\]().]+\])?"
 _PATH = rf"{_STEP}(?:\.{_STEP})*"
 _FIELD = re.compile(rf"^(?:yaw\((?P<yaw>{_PATH})\)|(?P<path>{_PATH}))\Z")
+_OUTSIDE_BRACKETS = r"(?![^\[]*\])"
+_PLUS, _TIMES = re.compile(rf"\s*\+\s*{_OUTSIDE_BRACKETS}"), re.compile(rf"\s*\*\s*{_OUTSIDE_BRACKETS}")
 
 
 class Source(StrictModel):
-    """Where one signal comes from; its value is ``scale * field + offset`` in SI units."""
+    """Where one signal comes from; its value is ``scale * curve(field) + offset`` in SI units."""
 
     topic: str = Field(
         pattern=r"^/?(?:\w+/)*\w+$",
         description="topic name; relative names, without a slash in front, are in the namespace of the node",
     )
     type: str = Field(pattern=r"^\w+/msg/\w+$", description="message type, package/msg/Name")
-    field: str = Field(description="dotted path; position[steering] picks by name or index; yaw(path) of a quaternion")
+    field: str = Field(
+        description="dotted path; position[steering] picks by name or index; yaw(path) of a quaternion. Sums of products of "
+        "these: torque[fl] + torque[fr], pressure * area"
+    )
+    curve: tuple[tuple[float, float], ...] | None = Field(
+        default=None,
+        min_length=2,
+        description="points (field, value) of a measured curve or a dead band: lines between them, the ends held",
+    )
     scale: float = 1.0
     offset: float = 0.0
+    delay: float = Field(default=0.0, ge=0, lt=1.0, description="by which stamps are late (s)")
     hold: Hold | None = Field(
         default=None,
         description="between samples: zero, the last one; first, a line to the next, which a live node does not know. null: "
@@ -58,8 +70,19 @@ class Source(StrictModel):
     @field_validator("field")
     @classmethod
     def _parses(cls, value: str) -> str:
-        if not _FIELD.match(value):
-            raise ValueError("expected a dotted path such as twist.twist.linear.x, position[steering] or yaw(pose)")
+        if not all(_FIELD.match(path) for term in _terms(value) for path in term):
+            raise ValueError(
+                "expected a dotted path such as twist.twist.linear.x, position[steering] or yaw(pose), or a sum (+) of "
+                "products (*) of them"
+            )
+        return value
+
+    @field_validator("curve")
+    @classmethod
+    def _rises(cls, value: tuple[tuple[float, float], ...] | None) -> tuple[tuple[float, float], ...] | None:
+        at = [] if value is None else [point[0] for point in value]
+        if any(b <= a for a, b in pairwise(at)):
+            raise ValueError("expected points in the order of rising field values")
         return value
 
 
@@ -80,6 +103,9 @@ class SignalMap(StrictModel):
         missing = [name for name in needed if name not in self.signals]
         if missing:
             raise ValueError(f"signals: missing {', '.join(missing)} (commands: {self.commands})")
+        for name in (*STATE_SIGNALS, *POSE_SIGNALS):
+            if name in self.signals and self.signals[name].delay:
+                raise ValueError(f"signals.{name}.delay: late odometry is the controller's `delay`; expected none")
         types: dict[str, str] = {}
         for source in self.signals.values():
             if types.setdefault(source.recorded, source.type) != source.type:
@@ -123,11 +149,29 @@ def load_signal_map(name_or_path: str | Path) -> SignalMap:
 
 
 def compile_field(field: str) -> Accessor:
-    """Turns a field path into a function of the message.
+    """Turns a field path, or a sum of products of them, into a function of the message.
 
     The function returns ``None`` where a joint name or index is not in this message (a partial JointState is legal)
     and raises ``AttributeError`` where the message type has no such field.
     """
+    terms = [[_compile_path(path) for path in term] for term in _terms(field)]
+    if len(terms) == len(terms[0]) == 1:
+        return terms[0][0]
+
+    def total(message: Any) -> float | None:
+        values = [[read(message) for read in term] for term in terms]
+        present = [[value for value in term if value is not None] for term in values]
+        return None if present != values else sum(math.prod(term) for term in present)
+
+    return total
+
+
+def _terms(field: str) -> list[list[str]]:
+    """The paths of a sum of products."""
+    return [_TIMES.split(term) for term in _PLUS.split(field)]
+
+
+def _compile_path(field: str) -> Accessor:
     match = _FIELD.match(field)
     if match is None:
         raise ValueError(f"not a field path: {field}")

@@ -43,6 +43,17 @@ def test_scale_and_offset_are_applied_in_this_order() -> None:
     assert decoder.decode(odometry(0, (0, 0, 0), (3.0, 0.0, 0.0)))["v_x"] == -5.0
 
 
+@pytest.mark.parametrize(
+    ("measured", "throttle"), [(-1.0, -0.8), (-0.5, -0.4), (0.05, 0.0), (0.6, 0.25), (2.0, 0.5), (np.inf, np.inf)]
+)
+def test_a_curve_comes_before_scale_and_offset_and_holds_its_ends(measured: float, throttle: float) -> None:
+    """A dead band up to 0.2; what is not finite stays so."""
+    curve = [[-1.0, -1.6], [0.0, 0.0], [0.2, 0.0], [1.0, 1.0]]
+    signal_map = with_field("twist.twist.linear.x", curve=curve, scale=0.5)
+    decoder = TopicDecoder("/vehicle/odometry", ODOMETRY, signal_map)
+    assert decoder.decode(odometry(0, (0, 0, 0), (measured, 0.0, 0.0)))["v_x"] == pytest.approx(throttle)
+
+
 def test_a_partial_joint_state_gives_what_it_has() -> None:
     decoder = decoders(DEFAULT)["/vehicle/actuator_feedback"]
     assert decoder.decode(joint_state(0, {"steering": 0.1})) == {"steering_feedback": 0.1}

@@ -15,7 +15,7 @@ from dynssm_ros.signals.history import History, Refusal, RingBuffer
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import RecordingInfo
 from dynssm_ros.signals.resampling import Stream, resample
-from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
 
 START = 1_700_000_000_123_456_789
 SECOND = 1_000_000_000
@@ -295,6 +295,21 @@ def test_slow_actuators_are_held_where_the_model_saw_them_held() -> None:
     again = history.window(stamp - 10_000_000)
     assert not isinstance(again, Refusal)
     np.testing.assert_allclose(again[:, 4], [-0.31, -0.35, -0.39], atol=1e-9)
+
+
+def test_a_signal_that_is_stamped_late_is_taken_back_to_when_it_was_true() -> None:
+    signals = {name: source.model_dump() for name, source in NO_COMMANDS.signals.items()}
+    signals["steering_feedback"]["delay"] = 0.02
+    history = History(SignalMap(name="own", commands="none", signals=signals), 0.04, 3, MAX_AGE)
+    for k in range(41):
+        stamp = START + k * 10_000_000
+        assert history.add(stamp, feedback(0.01 * k)) is None
+        assert history.add(stamp, odometry(0.01 * k)) is None
+    window = history.window(stamp - 20_000_000)
+    assert not isinstance(window, Refusal)
+    np.testing.assert_allclose(window[:, 3], 0.38 + 0.04 * np.arange(-2, 1), atol=1e-9)
+    np.testing.assert_allclose(window[:, 4], -window[:, 3] - 0.02, atol=1e-9)
+    assert history.ages(stamp)["steering_feedback"] == pytest.approx(0.02)
 
 
 def test_signals_of_one_topic_may_come_in_separate_messages() -> None:

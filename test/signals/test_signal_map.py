@@ -72,7 +72,13 @@ def test_the_av21_scales_turn_wheel_degrees_and_kilopascals_into_radians_and_fra
         ("signals.v_x.field", "position[", ["signals.v_x.field", "'position['"]),
         ("signals.v_x.field", "yaw(pose", ["signals.v_x.field", "'yaw(pose'"]),
         ("signals.v_x.field", "x\n", ["signals.v_x.field"]),
+        ("signals.v_x.field", "a + b *", ["signals.v_x.field", "sum", "'a + b *'"]),
         ("signals.v_x.scale", float("nan"), ["signals.v_x.scale", "nan"]),
+        ("signals.v_x.curve", [[0.0, 1.0]], ["signals.v_x.curve"]),
+        ("signals.v_x.curve", [[0.0, 1.0], [0.0, 2.0]], ["signals.v_x.curve", "rising field values"]),
+        ("signals.v_x.hold", "second", ["signals.v_x.hold", "'second'"]),
+        ("signals.v_x.delay", 0.1, ["signals.v_x.delay", "expected none"]),
+        ("signals.steering_feedback.delay", -0.1, ["signals.steering_feedback.delay", "-0.1"]),
         ("signals.v_x.gain", 2.0, ["signals.v_x.gain", "2.0"]),
         ("signals.v_x.field", ..., ["signals.v_x.field", "required"]),
         ("commands", "telepathy", ["commands", "'telepathy'", "lookahead"]),
@@ -141,6 +147,21 @@ def test_a_joint_that_is_named_but_has_no_value_is_absent() -> None:
 def test_joint_names_may_hold_what_urdf_allows(name: str) -> None:
     message = SimpleNamespace(name=["0", "1", "2", "3", "4", "5", "6", name], position=[*range(8)])
     assert compile_field(f"position[{name}]")(message) == 7.0
+
+
+@pytest.mark.parametrize(
+    ("field", "expected"),
+    [
+        ("torque[0] + torque[1]", 5.0),
+        ("torque[0]+torque[1] * gear + bias", 2.0 + 3.0 * 4.0 - 1.0),
+        ("torque[0] * gear", 8.0),
+        ("position[a + b] + bias", 9.0),
+        ("torque[0] + torque[7]", None),
+    ],
+)
+def test_fields_may_be_sums_of_products(field: str, expected: float | None) -> None:
+    message = SimpleNamespace(torque=[2.0, 3.0], gear=4.0, bias=-1.0, name=["a + b"], position=[10.0])
+    assert compile_field(field)(message) == expected
 
 
 def test_elements_of_nested_messages_are_reached_by_index() -> None:
