@@ -34,7 +34,10 @@ if TYPE_CHECKING:
 
 _HOMES = {
     **dict.fromkeys(
-        ("calibrate", "diagnose", "evaluate", "extract", "load_model", "race", "recorded", "replay", "simulate", "train"),
+        (
+            "calibrate", "diagnose", "evaluate", "extract", "inspect", "load_model", "race", "recorded", "replay", "simulate",
+            "train",
+        ),
         "api",
     ),
     "Recording": "signals.recording",
@@ -50,6 +53,7 @@ __all__ = [
     "diagnose",
     "evaluate",
     "extract",
+    "inspect",
     "load_model",
     "load_vehicle",
     "race",

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from dynssm_ros.learning.stages import Trained
     from dynssm_ros.runtime.artifact import Artifact
     from dynssm_ros.runtime.models import WindowModel
+    from dynssm_ros.signals.inspection import Inspection
     from dynssm_ros.simulation.laps import Run
     from dynssm_ros.simulation.plant import PlantKind
     from dynssm_ros.track.racing_line import LineKind
@@ -103,6 +104,26 @@ def simulate(
     return simulate(
         car, course, duration, laps, plant, seed, style, line_of(line, car, course), noise=noise, progress=on_progress
     )
+
+
+def inspect(
+    bag: PathLike, vehicle: Vehicle | PathLike | None = None, on_progress: Progress | None = None
+) -> Inspection:
+    """Says what is in a race log: topics, rates, gaps, clocks, and a first signal map.
+
+    Args:
+        bag: rosbag2 folder or ``.mcap``/``.db3`` file.
+        vehicle: with whose wheelbase the scale of the steering follows from the curvature that is driven.
+        on_progress: called with messages read.
+
+    Example:
+        >>> found = inspect("laps_bag", "orca")  # doctest: +SKIP
+        >>> print(found.signal_map())  # doctest: +SKIP
+    """
+    from dynssm_ros.signals.inspection import inspect
+
+    car = None if vehicle is None else _vehicle(vehicle).constants
+    return inspect(bag, None if car is None else car.l_f + car.l_r, on_progress)
 
 
 def extract(

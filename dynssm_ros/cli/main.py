@@ -17,6 +17,7 @@ from dynssm_ros.cli.console import errors
 from dynssm_ros.cli.diagnose import diagnose
 from dynssm_ros.cli.evaluate import evaluate
 from dynssm_ros.cli.extract import extract
+from dynssm_ros.cli.inspect import inspect
 from dynssm_ros.cli.race import race
 from dynssm_ros.cli.replay import replay
 from dynssm_ros.cli.simulate import simulate
@@ -35,7 +36,7 @@ app = typer.Typer(
 # click's base of all usage errors, wherever typer keeps its click
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
-for command in (simulate, extract, calibrate, train, evaluate, replay, diagnose, race):
+for command in (inspect, simulate, extract, calibrate, train, evaluate, replay, diagnose, race):
     app.command()(command)
 
 

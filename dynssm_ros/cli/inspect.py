@@ -1,0 +1,74 @@
+"""``dynssm inspect``: what is in a log, and a first signal map for it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dynssm_ros import api
+from dynssm_ros.cli.console import JsonOption, console, progress_bar
+from dynssm_ros.extras import require
+from dynssm_ros.files import replacing, write_json
+from dynssm_ros.reporting.inspection_tables import topic_table
+from dynssm_ros.signals.inspection import Inspection
+
+
+def inspect(
+    bag: Annotated[Path, typer.Argument(help="rosbag2 folder or .mcap/.db3 file.", metavar="BAG")],
+    vehicle: Annotated[
+        str | None,
+        typer.Option(help="Vehicle, with whose wheelbase the scale of the steering follows: shipped name or file."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for signals.yaml and report.html, which shows the signals.")
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Show what is in a log: topics, rates, gaps, clocks; suggest a signal map."""
+    with progress_bar("reading") as progress:
+        found = api.inspect(bag, vehicle, progress)
+    console.print(topic_table(found).brief.rich())
+    for note in found.notes:
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
+    console.print(found.signal_map(), markup=False, soft_wrap=True, end="")
+    if json is not None:
+        write_json(json, as_json(found))
+    if out is not None:
+        require("inspect --out", "report")
+        from dynssm_ros.reporting.inspection_report import inspection_report
+
+        with replacing(out / "signals.yaml") as aside:
+            aside.write_text(found.signal_map(), encoding="utf-8")
+        inspection_report(found).save(out / "report.html")
+        console.print(f"{out / 'signals.yaml'} written; {out / 'report.html'}: the signals over time", soft_wrap=True)
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def as_json(found: Inspection) -> dict[str, Any]:
+    """The inspection for programs."""
+    return {
+        "name": found.name,
+        "duration_s": found.duration,
+        "topics": {
+            topic.name: {
+                "type": topic.msgtype,
+                "count": topic.count,
+                "rate_hz": _known(topic.rate),
+                "longest_gap_s": topic.longest_gap,
+                "lateness_s": _known(topic.lateness),
+            }
+            for topic in found.topics.values()
+        },
+        "signals": {
+            name: {"topic": one.topic.name, "field": one.field, "scale": one.scale, "note": one.note}
+            for name, one in found.signals.items()
+        },
+        "missing": list(found.missing),
+        "notes": list(found.notes),
+    }

@@ -1,0 +1,35 @@
+"""``dynssm inspect``: the first command that a new user runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from dynssm_ros.signals.signal_map import load_signal_map
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+def test_a_log_is_shown_and_its_map_can_be_extracted_with(dynssm: Run, laps_bag: Path, tmp_path: Path) -> None:
+    out, out_json = tmp_path / "inspection", tmp_path / "found.json"
+    status, shown, err = dynssm("inspect", laps_bag, "--vehicle", "orca", "--out", out, "--json", out_json)
+    assert (status, err) == (0, "")
+    assert "/vehicle/odometry" in shown
+    assert (out / "signals.yaml").read_text() in shown
+    assert load_signal_map(out / "signals.yaml").commands == "topics"
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/svg+xml") == 2
+    found = json.loads(out_json.read_text())
+    assert found["topics"]["/vehicle/odometry"]["count"] > 100
+    assert found["missing"] == []
+    laps = tmp_path / "laps.parquet"
+    status, _, err = dynssm("extract", laps_bag, "--signals", out / "signals.yaml", "--rate", 50, "--out", laps)
+    assert (status, err) == (0, "")
+
+
+def test_what_is_no_bag_ends_in_one_line(dynssm: Run, tmp_path: Path) -> None:
+    status, _, err = dynssm("inspect", tmp_path / "nothing")
+    assert status == 1
+    assert err.count("\n") == 1
+    assert "no such bag" in err

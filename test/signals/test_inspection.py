@@ -1,0 +1,127 @@
+"""What an inspection says of a log: regularity, clocks, a signal map that can be used, and what it cannot know."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from dynssm_ros.errors import BagError
+from dynssm_ros.signals import messages
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.inspection import Inspection, inspect
+from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
+from dynssm_ros.vehicle import Vehicle
+
+START = 1_700_000_000_000_000_000
+ODOMETRY, FEEDBACK = messages.ODOMETRY_TOPIC, messages.FEEDBACK_TOPIC
+WHEELBASE = 0.3
+
+
+def suggested(found: Inspection) -> SignalMap:
+    """The signal map, read back."""
+    return SignalMap.model_validate(yaml.safe_load(found.signal_map()))
+
+
+def bends(
+    joints: str = "steering", scale: float = 1.0, late: float = 0.0, topic: str = FEEDBACK, rate: float = 50.0
+) -> list[Any]:
+    """20 s of bends without slip; the joints say ``scale`` times the road-wheel angle, ``late`` by another clock (s)."""
+    records = []
+    for t in np.arange(0.0, 20.0, 1 / rate):
+        stamp, delta, v_x = START + round(t * 1e9), 0.2 * np.sin(t), 3.0 + np.sin(0.3 * t)
+        omega = v_x * np.tan(delta) / WHEELBASE
+        moved = messages.odometry(stamp, (t, 0.1 * t, 0.0), (v_x, 0.01 * np.sin(t), omega))
+        values = messages.joint_state(
+            stamp - round(late * 1e9), {"throttle": 0.4 + 0.1 * np.sin(t), joints: scale * delta}
+        )
+        records.append((ODOMETRY, messages.ODOMETRY, stamp, moved))
+        records.append((topic, messages.JOINT_STATE, stamp, values))
+    return records
+
+
+def test_a_log_on_the_default_topics_gives_their_signal_map(laps_bag: Path, orca: Vehicle) -> None:
+    found = inspect(laps_bag, orca.constants.l_f + orca.constants.l_r)
+    assert (found.missing, found.notes) == ((), ())
+    default = load_signal_map("default")
+    expected = {name: (one.recorded, one.field, one.scale) for name, one in default.signals.items()}
+    mapped = suggested(found)
+    assert {name: (one.recorded, one.field, one.scale) for name, one in mapped.signals.items()} == expected
+    assert mapped.commands == "topics"
+    np.testing.assert_array_equal(extract([laps_bag], mapped, 50.0).matrix, extract([laps_bag], default, 50.0).matrix)
+
+
+@pytest.mark.parametrize("rate", [20.0, 50.0])
+def test_rates_gaps_and_what_is_in_the_topics_are_told(make_bag: Any, rate: float) -> None:
+    records = [one for one in bends(rate=rate) if not 5.0 < (one[2] - START) / 1e9 < 8.0]
+    topic = inspect(make_bag(records)).topics[FEEDBACK]
+    assert topic.rate == pytest.approx(rate, rel=1e-6)
+    assert topic.longest_gap == pytest.approx(3.0, abs=2 / rate)
+    assert topic.count == len(records) / 2
+    assert topic.lateness == pytest.approx(0.0, abs=1e-6)
+    assert {"position[steering]", "position[throttle]"} <= set(topic.values)
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(180 / np.pi, np.pi / 180), (-1.0, -1.0), (14.0, 1 / 14.0)])
+def test_degrees_swapped_signs_and_steering_wheels_are_seen_by_the_curvature(
+    make_bag: Any, scale: float, unit: float
+) -> None:
+    bag = make_bag(bends(scale=scale))
+    found = inspect(bag, WHEELBASE).signals["steering_feedback"]
+    assert found.scale == pytest.approx(unit, rel=0.05)
+    assert "curvature" in found.note
+    unknown = inspect(bag).signals["steering_feedback"]
+    assert (unknown.scale, "times the wheelbase" in unknown.note) == (1.0, True)
+
+
+def test_a_road_wheel_angle_in_rad_is_taken_as_it_is(make_bag: Any) -> None:
+    assert inspect(make_bag(bends()), WHEELBASE).signals["steering_feedback"].scale == 1.0
+
+
+def test_another_clock_is_told(make_bag: Any) -> None:
+    (note,) = inspect(make_bag(bends(late=3.0))).notes
+    assert f"{FEEDBACK} is stamped +3 s against {ODOMETRY}" in note
+    assert inspect(make_bag(bends(late=0.1), "early")).notes == ()
+
+
+def test_a_command_is_taken_where_nothing_is_measured(make_bag: Any) -> None:
+    found = inspect(make_bag(bends(topic="/drive_cmd")))
+    assert found.signals["throttle_feedback"].topic.name == "/drive_cmd"
+    assert "the command is taken" in found.signals["throttle_feedback"].note
+    assert found.missing == ()
+
+
+def test_what_is_not_there_stands_in_the_map_as_a_comment(make_bag: Any) -> None:
+    records = [one for one in bends(joints="wiper") if one[0] != ODOMETRY]
+    found = inspect(make_bag(records))
+    assert found.missing == ("v_x", "v_y", "omega", "steering_feedback")
+    assert all(f"# {name}: nothing found" in found.signal_map() for name in found.missing)
+    assert any("there is no nav_msgs/msg/Odometry" in note for note in found.notes)
+
+
+def test_poses_without_velocities_are_told(make_bag: Any) -> None:
+    records = [
+        (ODOMETRY, messages.ODOMETRY, one[2], messages.odometry(one[2], (k * 0.1, 0.0, 0.0), (0.0, 0.0, 0.0)))
+        for k, one in enumerate(bends())
+        if one[0] == ODOMETRY
+    ]
+    (note,) = inspect(make_bag(records)).notes
+    assert f"{ODOMETRY} has poses but no velocities" in note
+
+
+def test_an_empty_log_is_refused(make_bag: Any) -> None:
+    with pytest.raises(BagError, match="holds no messages"):
+        inspect(make_bag([]))
+
+
+def test_the_race_log_gives_its_signals(putnam: Path) -> None:
+    found = inspect(putnam, 2.9718)
+    fields = {name: one.field for name, one in found.signals.items()}
+    assert fields["steering_feedback"] == "steering_wheel_angle"
+    assert fields["throttle_feedback"] == "pedal_output"
+    assert fields["brake_feedback"] == "front_brake_pressure"
+    assert found.signals["steering_feedback"].scale == pytest.approx(0.0545 * np.pi / 180, rel=0.2)
+    assert suggested(found).commands == "none"
