@@ -38,7 +38,7 @@ from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.runtime.online import expert_weights
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.wiring import Wiring
-from dynssm_ros.signals.decoding import TopicDecoder, decoders, header_stamp_ns
+from dynssm_ros.signals.decoding import TopicDecoder, header_stamp_ns, live_decoders
 from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, twist_covariance
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import COEFFICIENTS
@@ -106,7 +106,7 @@ class PredictorNode(Node):
     def _listen(self, max_age: float) -> None:
         """Subscribes to what the signal map names, none of which may be silent for longer than ``max_age`` (s) or its gap."""
         signal_map = self._predictor.signal_map
-        by_topic = decoders(signal_map)
+        by_topic = live_decoders(signal_map)
         self._names = {topic: self.resolve_topic_name(decoder.subscribed) for topic, decoder in by_topic.items()}
         self._health = Health(tuple(self._names.values()), max(max_age, signal_map.max_gap), self._predictor.model.T_s)
         # actuators come first: when several messages wait, the executor serves subscriptions in this order
@@ -146,7 +146,8 @@ class PredictorNode(Node):
         odometry = self._prediction
         set_stamp(odometry.header, prediction.stamp)
         if isinstance(message, Odometry):
-            odometry.header.frame_id, odometry.child_frame_id = message.header.frame_id, message.child_frame_id
+            odometry.header.frame_id = message.header.frame_id
+            odometry.child_frame_id = getattr(message, "child_frame_id", "")
         twist = odometry.twist.twist
         twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in prediction.state)
         odometry.twist.covariance = twist_covariance(prediction.variance)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from dynssm_ros.errors import BagError
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.bags import Bag, copy_topics, open_bag, write_bag
-from dynssm_ros.signals.decoding import decoders, header_stamp_ns
+from dynssm_ros.signals.decoding import header_stamp_ns, live_decoders
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.messages import (
     JOINT_STATE,
@@ -43,7 +43,7 @@ def replay(bag: Bag, predictor: Predictor, progress: Callable[[int, int], None] 
     Raises:
         BagError: a topic is missing, of another type, or a message damaged.
     """
-    by_topic = decoders(predictor.signal_map)
+    by_topic = live_decoders(predictor.signal_map)
     for topic, decoder in by_topic.items():
         bag.require(topic, decoder.msgtype)
     total = sum(bag.counts[topic] for topic in by_topic)

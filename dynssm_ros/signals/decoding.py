@@ -10,6 +10,7 @@ import numpy as np
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.signals.signal_map import Accessor, SignalMap, Source, compile_field
+from dynssm_ros.signals.velocities import LiveVelocities
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,28 @@ class TopicDecoder:
             if raw is not None:
                 values[reading.signal] = reading.value(raw)
         return values
+
+
+class _PoseDecoder(TopicDecoder):
+    """Adds the velocities that follow from the poses so far."""
+
+    def __init__(self, topic: str, msgtype: str, signal_map: SignalMap, window: float) -> None:
+        super().__init__(topic, msgtype, signal_map)
+        self._velocities = LiveVelocities(window)
+
+    def decode(self, message: Any) -> dict[str, float]:
+        """As :class:`TopicDecoder`, with ``v_x``, ``v_y`` and ``omega`` as soon as there are poses enough."""
+        values, stamp = super().decode(message), header_stamp_ns(message)
+        return values if stamp is None else values | self._velocities.add(stamp, values)
+
+
+def live_decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
+    """As :func:`decoders`, with velocities from the poses so far where the map has none."""
+    found = decoders(signal_map)
+    if signal_map.velocities is not None:
+        topic = signal_map.odometry_topic
+        found[topic] = _PoseDecoder(topic, found[topic].msgtype, signal_map, signal_map.velocities.window)
+    return found
 
 
 def decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:

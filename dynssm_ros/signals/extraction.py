@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dynssm_ros.errors import BagError
+from dynssm_ros.errors import BagError, RecordingError
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.bags import Bag, open_bag
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import Stream, resample
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, SignalMap
+from dynssm_ros.signals.velocities import velocities_along
 
 _SLOW = 1.5  # periods of the grid between samples, from which on a signal is slower than it
 
@@ -43,6 +44,9 @@ def extract(
     for path in bags:
         with open_bag(path) as bag:
             streams, notes = read_streams(bag, signal_map, drop_bad, progress)
+        if signal_map.velocities is not None:
+            streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
+            notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")
         held = held_signals(signal_map, streams, 1e9 / rate)
         info = RecordingInfo(
             sampling_time=1 / rate,
@@ -54,6 +58,22 @@ def extract(
         )
         recordings.append(resample(streams, rate, signal_map.max_gap, signal_map.commands, info))
     return concatenate(recordings)
+
+
+def pose_velocities(streams: Mapping[str, Stream], window: float, where: str) -> dict[str, Stream]:
+    """Streams of ``v_x``, ``v_y`` and ``omega`` from those of the pose, without delay.
+
+    Raises:
+        RecordingError: fewer poses in a row than a window has.
+    """
+    x, y, theta = (streams[name] for name in POSE_SIGNALS)
+    stamps = np.intersect1d(np.intersect1d(x.stamps, y.stamps), theta.stamps)  # dropped ones may differ
+    columns = [one.values[np.searchsorted(one.stamps, stamps)] for one in (x, y, theta)]
+    poses = np.stack([*columns[:2], np.unwrap(columns[2])], axis=1)
+    rows, found = velocities_along((stamps - stamps[0]) / 1e9, poses, window)
+    if not len(rows):
+        raise RecordingError(f"{where}: {len(stamps)} poses; expected more in a row, for windows of {window:g} s")
+    return {name: Stream(stamps[rows], values) for name, values in zip(STATE_SIGNALS, found.T, strict=True)}
 
 
 def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: float) -> tuple[str, ...]:

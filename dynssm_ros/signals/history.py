@@ -129,10 +129,14 @@ class History:
         jump: float = 0.5,
         held: Collection[str] = (),
     ) -> None:
-        self.names = tuple(signal_map.active_signals())
+        velocities = STATE_SIGNALS if signal_map.velocities else ()
+        self.names = (*velocities, *signal_map.active_signals())
         self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
         self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
-        self._delays = {name: signal_map.signals[name].delay * 1e9 for name in self._buffers}
+        self._delays = dict.fromkeys(self._buffers, 0.0)
+        self._delays |= {
+            name: source.delay * 1e9 for name, source in signal_map.signals.items() if name in self._buffers
+        }
         self._max_gap = float(signal_map.max_gap_ns)
         self._max_age = max_age * 1e9
         self._jump = max(jump * 1e9, 2 * self._max_gap)

@@ -22,16 +22,14 @@ from dynssm_ros.errors import BagError
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.bags import Bag, open_bag
 from dynssm_ros.signals.decoding import header_stamp_ns
-from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, POSE_SIGNALS, REQUIRED_SIGNALS, SIGNALS
+from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, REQUIRED_SIGNALS, SIGNALS, STATE_SIGNALS, compile_field
 
 ODOMETRY = "nav_msgs/msg/Odometry"
-_ODOMETRY_FIELDS = {
-    "v_x": "twist.twist.linear.x",
-    "v_y": "twist.twist.linear.y",
-    "omega": "twist.twist.angular.z",
-    "x": "pose.pose.position.x",
-    "y": "pose.pose.position.y",
-    "theta": "yaw(pose.pose.orientation)",
+_TWIST = {"v_x": "twist.twist.linear.x", "v_y": "twist.twist.linear.y", "omega": "twist.twist.angular.z"}
+_POSES = {
+    ODOMETRY: "pose.pose",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
+    "geometry_msgs/msg/PoseStamped": "pose",
 }
 _SAMPLES = 4000  # messages of a topic that are taken apart, evenly spread
 _LARGEST = 65536  # bytes of a message; images and clouds hold no signal
@@ -51,6 +49,7 @@ _OTHER = re.compile(
 _RADIANS, _SHARE = 1.6, 1.5  # larger values are no road-wheel angle in rad, and no throttle between -1 and 1
 _AGREES = 0.5  # correlation with the curvature, from which on a scale is told
 _UNIT = (0.6, 1.7)  # wheelbase times curvature per unit, for a signal that is the road-wheel angle in rad already
+_WINDOW = 0.1  # s, of poses from which velocities follow
 _CLOCK = 1.0  # s by which the stamps of topics may be apart
 _DRIVING = 0.3  # of the largest speed, from which on curvature is compared
 
@@ -116,7 +115,13 @@ class Inspection:
     @property
     def missing(self) -> tuple[str, ...]:
         """Signals that every signal map needs and for which nothing was found."""
-        return tuple(name for name in REQUIRED_SIGNALS if name not in self.signals)
+        needed = REQUIRED_SIGNALS[len(STATE_SIGNALS) :] if self.poses_alone else REQUIRED_SIGNALS
+        return tuple(name for name in needed if name not in self.signals)
+
+    @property
+    def poses_alone(self) -> bool:
+        """Whether velocities have to follow from poses."""
+        return "v_x" not in self.signals and "x" in self.signals
 
     def signal_map(self) -> str:
         """The suggested signal map as YAML; what is missing or uncertain stands there as a comment."""
@@ -124,6 +129,7 @@ class Inspection:
         name = re.sub(r"\W+", "_", Path(self.name).stem) or "own"
         lines = [f"# Suggested by `dynssm inspect` from {self.name}. Check fields and scales before you use it.",
                  f"name: {name}", f"commands: {commands}", "max_gap: 0.25", "signals:"]  # fmt: skip
+        lines[-1:-1] = [f"velocities: {{window: {_WINDOW}}}"] if self.poses_alone else []
         lines += [f"  # {each}: nothing found; give its topic, type and field" for each in self.missing]
         for signal in SIGNALS:
             if signal not in self.signals:
@@ -203,12 +209,13 @@ def _topics(bag: Bag, progress: Progress | None) -> tuple[dict[str, TopicContent
 
 
 def _numbers(message: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, float]]:
-    """The numbers in a message by the paths of a signal map; those of an Odometry by what they mean."""
-    if depth == 0 and message.__msgtype__ == ODOMETRY:
-        pose, twist, q = message.pose.pose.position, message.twist.twist, message.pose.pose.orientation
-        yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
-        numbers = (twist.linear.x, twist.linear.y, twist.angular.z, pose.x, pose.y, yaw)
-        yield from zip(_ODOMETRY_FIELDS.values(), numbers, strict=True)
+    """The numbers in a message by the paths of a signal map; of poses and odometry those that signals are made of."""
+    if depth == 0 and message.__msgtype__ in _POSES:
+        paths = _pose_fields(message.__msgtype__) | (_TWIST if message.__msgtype__ == ODOMETRY else {})
+        for path in paths.values():
+            value = compile_field(path)(message)
+            if value is not None:
+                yield path, value
         return
     names = getattr(message, "name", ())
     for part in message.__dataclass_fields__:
@@ -231,25 +238,36 @@ def _numbers(message: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[s
 
 def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Suggestion]:
     """The odometry that moves most often, if there is one."""
-    found = [topic for topic in topics.values() if topic.msgtype == ODOMETRY and topic.values]
-    moving = [topic for topic in found if _spread(topic.values["twist.twist.linear.x"]) > 0]
+    odometries = [topic for topic in topics.values() if topic.msgtype == ODOMETRY and topic.values]
+    moving = [topic for topic in odometries if _spread(topic.values[_TWIST["v_x"]]) > 0]
     if not moving:
-        notes.append(
-            f"{found[0].name} has poses but no velocities; a signal map needs v_x, v_y and omega of the car"
-            if found
-            else f"there is no {ODOMETRY}; find a topic with v_x, v_y and omega of the car"
-        )
-        return {}
+        poses = [topic for topic in topics.values() if topic.msgtype in _POSES and _moves(topic)]
+        if not poses:
+            notes.append(
+                "nothing tells where the car is or how fast; find a topic with v_x, v_y and omega, or with poses"
+            )
+            return {}
+        best = max(poses, key=lambda topic: topic.count)
+        notes.append(f"no topic has velocities; they follow from the poses of {best.name}")
+        return {signal: Suggestion(best, path) for signal, path in _pose_fields(best.msgtype).items()}
     best = max(moving, key=lambda topic: topic.count)
     if len(moving) > 1:
         notes.append(f"several odometries move: {', '.join(topic.name for topic in moving)}; taken is {best.name}")
-    if _spread(best.values["twist.twist.linear.y"]) == 0:
+    if _spread(best.values[_TWIST["v_y"]]) == 0:
         notes.append(f"{best.name}: v_y is constant, so that nothing is known of how the car slides")
-    return {
-        signal: Suggestion(best, path)
-        for signal, path in _ODOMETRY_FIELDS.items()
-        if signal not in POSE_SIGNALS or _spread(best.values[path]) > 0
-    }
+    fields = _TWIST | _pose_fields(ODOMETRY) if _moves(best) else _TWIST
+    return {signal: Suggestion(best, path) for signal, path in fields.items()}
+
+
+def _pose_fields(msgtype: str) -> dict[str, str]:
+    """Where ``x``, ``y`` and ``theta`` are in a message that has a pose."""
+    pose = _POSES[msgtype]
+    return {"x": f"{pose}.position.x", "y": f"{pose}.position.y", "theta": f"yaw({pose}.orientation)"}
+
+
+def _moves(topic: TopicContent) -> bool:
+    fields = _pose_fields(topic.msgtype)
+    return any(_spread(topic.values[fields[name]]) > 0 for name in ("x", "y") if fields[name] in topic.values)
 
 
 def _actuators(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:

@@ -86,12 +86,21 @@ class Source(StrictModel):
         return value
 
 
+class Velocities(StrictModel):
+    """How velocities follow from poses; see :mod:`dynssm_ros.signals.velocities`."""
+
+    window: float = Field(default=0.1, gt=0, le=1.0, description="time over which a motion is fitted to the poses (s)")
+
+
 class SignalMap(StrictModel):
     """All signals of a car's stack."""
 
     name: str
     commands: Commands = "topics"
     max_gap: float = Field(default=0.25, gt=0, description="longest time between samples that is bridged (s)")
+    velocities: Velocities | None = Field(
+        default=None, description="for cars whose pose alone is measured; null: v_x, v_y and omega are signals"
+    )
     signals: dict[str, Source]
 
     @model_validator(mode="after")
@@ -100,6 +109,13 @@ class SignalMap(StrictModel):
         if unknown:
             raise ValueError(f"signals: unknown '{unknown[0]}'; expected {' '.join(SIGNALS)}")
         needed = REQUIRED_SIGNALS + (COMMAND_SIGNALS if self.commands == "topics" else ())
+        if self.velocities is not None:
+            double = [name for name in STATE_SIGNALS if name in self.signals]
+            if double:
+                raise ValueError(f"signals.{double[0]}: velocities come from poses; expected either")
+            if len({self.signals[name].topic for name in POSE_SIGNALS if name in self.signals}) > 1:
+                raise ValueError("velocities: x, y and theta come from several topics; expected one")
+            needed = (*POSE_SIGNALS, *needed[len(STATE_SIGNALS) :])
         missing = [name for name in needed if name not in self.signals]
         if missing:
             raise ValueError(f"signals: missing {', '.join(missing)} (commands: {self.commands})")
@@ -114,8 +130,8 @@ class SignalMap(StrictModel):
 
     @property
     def odometry_topic(self) -> str:
-        """The topic whose messages trigger predictions and anchor the time grid: the one that carries ``v_x``."""
-        return self.signals["v_x"].recorded
+        """The topic whose messages trigger predictions and anchor the time grid: that of ``v_x``, or of the pose."""
+        return self.signals["v_x" if self.velocities is None else "x"].recorded
 
     @property
     def max_gap_ns(self) -> int:

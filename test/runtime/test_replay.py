@@ -15,7 +15,7 @@ from dynssm_ros.runtime.replay import replay, replay_to_bag
 from dynssm_ros.signals.bags import open_bag
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.history import Refusal
-from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
 from dynssm_ros.vehicle import COEFFICIENTS
 
 H = 5
@@ -36,6 +36,25 @@ def test_replay_gives_what_evaluation_computes_from_the_recording(predictor: Pre
     windows = np.lib.stride_tricks.sliding_window_view(rows, H, axis=0).transpose(0, 2, 1)
     assert len(predicted) == len(windows) == len(rows) - H + 1
     np.testing.assert_allclose(predicted, predictor.model.predict(windows).state, rtol=1e-6, atol=1e-6)
+
+
+def test_from_poses_alone_it_predicts_what_it_does_from_velocities(small_model: Path, laps_bag: Path) -> None:
+    content = DEFAULT.model_dump()
+    signals = {name: source for name, source in content["signals"].items() if name not in ("v_x", "v_y", "omega")}
+    poses = SignalMap.model_validate(content | {"signals": signals, "velocities": {"window": 0.08}})
+    states = []
+    for signal_map in (DEFAULT, poses):
+        model = OnnxModel(open_artifact(small_model))
+        with open_bag(laps_bag) as bag:
+            outcomes = [answer.outcome for answer in replay(bag, Predictor(model, signal_map))]
+        states.append([outcome.state if isinstance(outcome, Prediction) else None for outcome in outcomes])
+    given, from_poses = states
+    later = sum(state is None for state in from_poses) - sum(state is None for state in given)
+    assert later == 3  # a motion is fitted to four poses at least
+    both = np.array([(a, b) for a, b in zip(given, from_poses, strict=True) if b is not None])
+    apart = np.sqrt(((both[:, 0] - both[:, 1]) ** 2).mean(axis=0))
+    # these laps move in Euler steps, by the heading at the start of a step, so that v_y is another by half a step
+    assert (apart[[0, 2]] < 0.1 * both[:, 0].std(axis=0)[[0, 2]]).all()
 
 
 def test_the_new_bag_holds_predictions_parameters_and_on_request_the_inputs(
