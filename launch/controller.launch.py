@@ -21,7 +21,9 @@ ARGUMENTS = {  # name: description, nodes that take it as a parameter
     "effects": ("Physics that only the simulated car has: NAME[:k=v,...], apart by blanks.", ("simulator",)),
     "model": ("Model folder; without one no predictor is started.", ("predictor",)),
     "use_sim_time": ("true: follow /clock, as when a bag is played with it.", ("controller", "simulator", "predictor")),
+    "autostart": ("false: a manager of life cycles configures and activates the nodes.", ("controller", "predictor")),
 }
+SWITCHES = ("use_sim_time", "autostart")
 NUMBERS = ("scale", "rate", "speed_scale")
 
 
@@ -56,8 +58,7 @@ def _parameters(executable: str, given: dict[str, str]) -> dict[str, str | float
         for name, (_, nodes) in ARGUMENTS.items()
         if executable in nodes and given[name]
     }
-    if "use_sim_time" in values:
-        values["use_sim_time"] = values["use_sim_time"] == "true"
+    values |= {name: values[name] == "true" for name in SWITCHES if name in values}
     return values | ({"driver": "external"} if executable == "simulator" else {})
 
 

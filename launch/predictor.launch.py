@@ -9,13 +9,14 @@ from launch_ros.substitutions import FindPackageShare
 
 def predictor(context: LaunchContext) -> list[Node]:
     """The node; an argument that was left empty does not override what the parameters file says."""
-    given = {
-        name: LaunchConfiguration(name).perform(context) for name in ("model", "signals", "use_sim_time", "respawn")
-    }
+    names = ("model", "signals", "use_sim_time", "autostart", "respawn")
+    given = {name: LaunchConfiguration(name).perform(context) for name in names}
     respawn = given.pop("respawn") == "true"
-    overrides = {name: value for name, value in given.items() if value}
-    if "use_sim_time" in overrides:
-        overrides["use_sim_time"] = overrides["use_sim_time"] == "true"
+    overrides = {
+        name: value == "true" if name in ("use_sim_time", "autostart") else value
+        for name, value in given.items()
+        if value
+    }
     return [
         Node(
             package="dynssm_ros",
@@ -42,6 +43,12 @@ def generate_launch_description() -> LaunchDescription:
                 default_value="",
                 choices=["", "true", "false"],
                 description="Follow /clock, as when a bag is played with it.",
+            ),
+            DeclareLaunchArgument(
+                "autostart",
+                default_value="",
+                choices=["", "true", "false"],
+                description="false: a manager of life cycles configures and activates the node.",
             ),
             DeclareLaunchArgument("params_file", default_value=parameters, description="ROS parameters file."),
             DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node."),

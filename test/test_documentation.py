@@ -224,9 +224,10 @@ def node_source(node: str) -> str:
 
 
 def declared_parameters(node: str) -> dict[str, object]:
-    """What a node declares: default values by name."""
-    tree = ast.parse(node_source(node))
-    return {
+    """What a node declares, a managed one with what all of these do: default values by name."""
+    source = node_source(node)
+    tree = ast.parse(source)
+    return ({} if node == "managed" or "ManagedNode" not in source else declared_parameters("managed")) | {
         call.args[1].value: call.args[2].value
         for call in ast.walk(tree)
         if isinstance(call, ast.Call) and ast.unparse(call.func) in ("describe", "choose")
@@ -256,9 +257,9 @@ def test_the_parameters_of_the_controller_are_those_of_its_page() -> None:
 def test_the_topics_are_those_of_the_default_signal_map_and_of_the_node() -> None:
     topics = {cells[0].strip("`"): cells[1].strip("`") for cells in _topic_rows()}
     default = {source.recorded: source.type for source in load_signal_map("default").signals.values()}
-    published = {messages.PREDICTION_TOPIC, messages.PARAMETERS_TOPIC, messages.HORIZON_TOPIC, "/diagnostics"}
+    published = {messages.PREDICTION_TOPIC, messages.PARAMETERS_TOPIC, messages.HORIZON_TOPIC, messages.MARKERS_TOPIC}
     assert {topic: kind for topic, kind in topics.items() if topic in default} == default
-    assert set(topics) == set(default) | published
+    assert set(topics) == set(default) | published | {"/diagnostics", "/tf"}
 
 
 def test_every_signal_and_shipped_file_is_named() -> None:

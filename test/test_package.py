@@ -245,10 +245,14 @@ def test_parameters_file_fits_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
         context.try_shutdown()
     assert read == content
     assert read == {
-        "model": "", "signals": "default", "max_age": 0.2, "online": True, "online_state": "", "horizon": 0.0,
-        "diagnostics_period": 1.0,
+        "model": "", "model_root": "", "signals": "default", "max_age": 0.2, "online": True, "online_state": "",
+        "horizon": 0.0, "markers": False, "tf": False, "diagnostics_period": 1.0, "autostart": True,
     }  # fmt: skip
-    assert [type(value) for value in read.values()] == [str, str, float, bool, str, float, float]
+    assert {name for name, value in read.items() if isinstance(value, float)} == {
+        "max_age",
+        "horizon",
+        "diagnostics_period",
+    }
 
 
 class Recorder:
@@ -317,11 +321,12 @@ def launched(launch_file: ModuleType, **given: str) -> Recorder:
 def test_launch_file_declares_described_arguments(launch_file: ModuleType) -> None:
     *declared, function = launch_file.generate_launch_description().positional[0]
     assert [argument.positional for argument in declared] == [
-        ("model",), ("signals",), ("use_sim_time",), ("params_file",), ("namespace",), ("respawn",), ("log_level",),
+        ("model",), ("signals",), ("use_sim_time",), ("autostart",), ("params_file",), ("namespace",), ("respawn",),
+        ("log_level",),
     ]  # fmt: skip
     assert all(argument.named["description"] for argument in declared)
     assert type(function).__name__ == "OpaqueFunction"
-    default = declared[3].named["default_value"].positional[0]
+    default = declared[4].named["default_value"].positional[0]
     assert default[0].positional == (PACKAGE,)
     assert ROOT.joinpath(*default[1:]).is_file()
 
@@ -346,9 +351,10 @@ def test_launch_arguments_override_the_parameters_file(launch_file: ModuleType) 
 
 
 def declared_parameters(node: str) -> dict[str, object]:
-    """What a node declares: default values by name."""
-    tree = ast.parse((ROOT / PACKAGE / "nodes" / f"{node}.py").read_text(encoding="utf-8"))
-    return {
+    """What a node declares, a managed one with what all of these do: default values by name."""
+    source = (ROOT / PACKAGE / "nodes" / f"{node}.py").read_text(encoding="utf-8")
+    tree = ast.parse(source)
+    return ({} if node == "managed" or "ManagedNode" not in source else declared_parameters("managed")) | {
         call.args[1].value: ast.literal_eval(call.args[2])
         for call in ast.walk(tree)
         if isinstance(call, ast.Call) and ast.unparse(call.func) in ("describe", "choose")
@@ -386,12 +392,14 @@ def test_controller_launch_file_passes_only_parameters_that_there_are(
 def test_controller_launch_file_has_namespace_parameters_file_time_and_respawn(
     load_launch: Callable[[str], ModuleType],
 ) -> None:
-    given = {"params_file": "mine.yaml", "use_sim_time": "true", "respawn": "true", "rate": "0.5"}
+    given = {"params_file": "mine.yaml", "use_sim_time": "true", "autostart": "false", "respawn": "true", "rate": "0.5"}
     for node in all_launched(load_launch("controller.launch.py"), model="out/model", **given):
         assert node.named["namespace"].positional == ("namespace",)
         assert node.named["respawn"] is True
         file, parameters = node.named["parameters"]
         assert file == "mine.yaml"
         assert parameters["use_sim_time"] is True
+        assert parameters.get("autostart", False) is False
+        assert ("autostart" in parameters) == (node.named["executable"] != "simulator")
         if node.named["executable"] != "predictor":
             assert parameters["rate"] == 0.5

@@ -1,7 +1,8 @@
 """The live controller: ``ros2 run dynssm_ros controller --ros-args -p vehicle:=orca -p track:=club``.
 
 Answers odometry with absolute throttle and steering; the predictor's coefficients and predictions go into the car that it
-plans with. All driving is in :mod:`dynssm_ros.control`; this node converts, calls and publishes.
+plans with. All driving is in :mod:`dynssm_ros.control`; this node converts, calls and publishes. It drives while it is
+active: with ``autostart:=false`` the car stands until somebody activates the node.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from typing import Any, get_args
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
@@ -22,6 +22,7 @@ from dynssm_ros.control.live import LiveController
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.nodes.managed import ManagedNode
 from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, diagnostics, output, relative, run
 from dynssm_ros.runtime.health import Health, Level
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
@@ -37,7 +38,7 @@ _STEPS = (2, 100)  # of a horizon
 _NEWEST = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
 
 
-class ControllerNode(Node):
+class ControllerNode(ManagedNode):
     """Drives one car in real time."""
 
     def __init__(self, **options: Any) -> None:
@@ -48,9 +49,14 @@ class ControllerNode(Node):
         self._watchdog: float = describe(
             self, "watchdog", 0.2, "Silence of the odometry at which the car is braked (s).", (0.01, 10.0), read_only=True
         )  # fmt: skip
-        period = describe(
+        self._period: float = describe(
             self, "diagnostics_period", 1.0, "Time between /diagnostics (s).", (0.1, 60.0), read_only=True
         )
+        self._describe_driver()
+        self.start()
+
+    def prepare(self) -> None:
+        """Makes the controller, with its first step behind it, and listens."""
         self._driver = self._make_driver()
         self._health = Health((ODOMETRY_TOPIC, PREDICTION_TOPIC, PARAMETERS_TOPIC), self._watchdog)
         self._decoder = decoders(load_signal_map("default"))[ODOMETRY_TOPIC]
@@ -64,47 +70,52 @@ class ControllerNode(Node):
         self.create_subscription(Odometry, relative(ODOMETRY_TOPIC), self._on_odometry, _NEWEST)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(self._driver.period / 1e9 / self._rate, self._watch, clock=steady)
-        self.create_timer(period, self._diagnose, clock=steady)
+        self.create_timer(self._period, self._diagnose, clock=steady)
 
-    def _make_driver(self) -> LiveController:
-        """What the parameters ask for; it has its first step behind it."""
-        vehicle = describe(self, "vehicle", "orca", "Vehicle: shipped name or file.", read_only=True)
-        track = describe(self, "track", "club", "Track: built-in name or CSV file.", read_only=True)
-        scale = describe(self, "scale", 1.0, "Size of the track.", (1e-4, 1e4), read_only=True)
-        line = describe(self, "line", "racing", "What to follow: centre, racing or a file with speeds.", read_only=True)
-        speed_scale = describe(
+    def _describe_driver(self) -> None:
+        """Declares what :meth:`_make_driver` goes by."""
+        self._vehicle: str = describe(self, "vehicle", "orca", "Vehicle: shipped name or file.", read_only=True)
+        self._track: str = describe(self, "track", "club", "Track: built-in name or CSV file.", read_only=True)
+        self._scale: float = describe(self, "scale", 1.0, "Size of the track.", (1e-4, 1e4), read_only=True)
+        self._line: str = describe(self, "line", "racing", "What to follow: centre, racing or a file.", read_only=True)
+        self._speed_scale: float = describe(
             self, "speed_scale", 0.9, "Share of the car's limits in the line's speed.", (0.1, 2.0), read_only=True
         )
-        objective: Objective = choose(
+        self._objective: Objective = choose(
             self, "objective", "tracking", get_args(Objective), "To follow the line's speed, or to go as far as can be."
         )
-        horizon = describe(self, "horizon", 0, "Steps of T_s planned ahead; 0: as the car needs.", read_only=True)
-        offset_free = describe(
+        self._steps: int = describe(
+            self, "horizon", 0, "Steps of T_s planned ahead; 0: as the car needs.", read_only=True
+        )
+        self._offset_free: bool = describe(
             self, "offset_free", False, "Whether what is mispredicted is followed at a fixed rate.", read_only=True
         )
-        evidence = describe(
+        self._evidence: bool = describe(
             self,
             "evidence",
             True,
             "Whether what the predictor says is planned with only where it was better than the calibrated car.",
             read_only=True,
         )
-        delay = describe(
+        self._delay: float = describe(
             self, "delay", 0.0, "From the stamp of the odometry until it arrives (s).", (0.0, 10.0), read_only=True
         )
-        max_age = describe(
+        self._max_age: float = describe(
             self, "max_age", 0.5, "Age to which the predictor's coefficients are held (s).", (0.01, 10.0), read_only=True
         )  # fmt: skip
-        if horizon and not _STEPS[0] <= horizon <= _STEPS[1]:
-            raise ConfigurationError(f"parameter horizon: {horizon}; expected {_STEPS[0]} to {_STEPS[1]}, or 0")
-        car = load_vehicle(vehicle)
-        road = load_track(track).scaled(scale)
-        reference = load_reference(line, car, road, speed_scale)
-        settings = Settings.of(car, objective, horizon or None, offset_free, evidence)
+
+    def _make_driver(self) -> LiveController:
+        """What the parameters ask for; it has its first step behind it."""
+        if self._steps and not _STEPS[0] <= self._steps <= _STEPS[1]:
+            raise ConfigurationError(f"parameter horizon: {self._steps}; expected {_STEPS[0]} to {_STEPS[1]}, or 0")
+        car = load_vehicle(self._vehicle)
+        road = load_track(self._track).scaled(self._scale)
+        reference = load_reference(self._line, car, road, self._speed_scale)
+        settings = Settings.of(car, self._objective, self._steps or None, self._offset_free, self._evidence)
         settings = replace(settings, deadline=car.sampling_time / self._rate)
-        driver = LiveController(car, reference, road, settings, max_age, self._watchdog, delay)
+        driver = LiveController(car, reference, road, settings, self._max_age, self._watchdog, self._delay)
         self.get_logger().info(
-            f"{car.name} on {road.name} ({road.length:.4g} m), {objective} of the {reference.name} line "
+            f"{car.name} on {road.name} ({road.length:.4g} m), {self._objective} of the {reference.name} line "
             f"({reference.lap_time:.4g} s a lap at its own speed), {settings.N} steps of {car.sampling_time:g} s"
         )
         return driver
@@ -131,6 +142,9 @@ class ControllerNode(Node):
             self.get_logger().warning(f"{topic}: ignored: {reason}", throttle_duration_sec=1.0)
 
     def _on_odometry(self, message: Odometry) -> None:
+        if not self.active:
+            self._health.arrived(ODOMETRY_TOPIC, self._now())
+            return
         stamp, values = _stamp(message), self._decoder.decode(message)
         pose, seen = Pose(*map(values.__getitem__, Pose._fields)), State(*map(values.__getitem__, State._fields))
         outcome = self._driver.step(stamp, pose, seen)
@@ -144,7 +158,7 @@ class ControllerNode(Node):
 
     def _watch(self) -> None:
         """Brakes while odometry is silent."""
-        if not self._silent():
+        if not (self.active and self._silent()):
             return
         if self._newest is None:
             stamp = int(self.get_clock().now().nanoseconds)
@@ -158,7 +172,7 @@ class ControllerNode(Node):
 
     def _diagnose(self) -> None:
         now, driver, health = self._now(), self._driver, self._health
-        level, words = driver.verdict()
+        level, words = driver.verdict() if self.active else (Level.OK, "inactive, drives nothing")
         if self._silent():
             age = health.age(ODOMETRY_TOPIC, now)
             silence = "nothing received" if math.isinf(age) else f"silent for {age:.1f} s"

@@ -1,7 +1,8 @@
 """The live predictor: ``ros2 run dynssm_ros predictor --ros-args -p model:=DIR``.
 
 Every odometry message gets a prediction of the next state once the window is full; topics and parameters are those of
-the README. All thinking is in :mod:`dynssm_ros.runtime`; this node converts, calls and publishes.
+the README. All thinking is in :mod:`dynssm_ros.runtime`; this node converts, calls and publishes. Until it is activated
+it already predicts and learns, but publishes only its diagnostics: a stand-by takes over with its window full.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError, UserError
+from dynssm_ros.nodes.display import Markers, frame_sender
+from dynssm_ros.nodes.managed import ManagedNode
 from dynssm_ros.nodes.support import (
     SENSOR_QOS,
     describe,
@@ -39,21 +41,25 @@ from dynssm_ros.runtime.online import expert_weights
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.wiring import Wiring
 from dynssm_ros.signals.decoding import TopicDecoder, header_stamp_ns, live_decoders
-from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, twist_covariance
+from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, planar_covariance
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import COEFFICIENTS
+from dynssm_ros.vehicle.kinematics import Pose
 
 _SAVE_PERIOD_S = 10.0
 
 
-class PredictorNode(Node):
+class PredictorNode(ManagedNode):
     """Subscribes to the topics of the signal map and publishes the predicted state and the adapted coefficients."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("dynssm", **options)
-        path = describe(self, "model", "", "Model folder; setting it anew swaps the model after it was checked.")
-        signals = describe(self, "signals", "default", "Signal map: shipped name or file.", read_only=True)
-        max_age = describe(
+        describe(self, "model", "", "Model folder; setting it anew swaps the model after it was checked.")
+        self._root = describe(
+            self, "model_root", "", "Folder below which model folders must be; empty: anywhere.", read_only=True
+        )
+        self._signals = describe(self, "signals", "default", "Signal map: shipped name or file.", read_only=True)
+        self._max_age = describe(
             self,
             "max_age",
             0.2,
@@ -64,7 +70,7 @@ class PredictorNode(Node):
         self._horizon = describe(
             self, "horizon", 0.0, "Length of the rollout on /dynssm/horizon (s); 0 switches it off.", (0.0, 10.0)
         )
-        online = describe(
+        self._online = describe(
             self, "online", True, "Whether the model's online layer learns and corrects, if it has one.", read_only=True
         )
         self._state = describe(
@@ -74,41 +80,69 @@ class PredictorNode(Node):
             "File of what the online layer has learned: read at the start if it is there, written while driving.",
             read_only=True,
         )
-        period = describe(
+        self._draws = describe(
+            self, "markers", False, "Whether the predicted car and its way are drawn for RViz.", read_only=True
+        )
+        self._sends_frame = describe(
+            self, "tf", False, "Whether the predicted pose is sent to TF (needs tf2_ros).", read_only=True
+        )
+        self._period = describe(
             self, "diagnostics_period", 1.0, "Time between /diagnostics (s).", (0.1, 60.0), read_only=True
         )
+        self._swap: OnnxModel | None = None
+        self._prediction = Odometry()
+        self._prediction.pose.covariance = planar_covariance(None)
+        self._adapted = JointState(name=list(COEFFICIENTS))
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+        self.start()
+
+    def prepare(self) -> None:
+        """Opens the model and listens."""
+        path = expanded(self.get_parameter("model").value)
         if not path:
             raise ConfigurationError("parameter model: not set; expected a model folder, e.g. -p model:=out/model")
-        self._predictor = Predictor(OnnxModel(open_artifact(path)), load_signal_map(signals), max_age, online)
+        self._predictor = Predictor(self._open(path), load_signal_map(self._signals), self._max_age, self._online)
         if self._state and pathlib.Path(self._state).exists():
             self._predictor.load_online(pathlib.Path(self._state))
-        self._swap: OnnxModel | None = None
-
-        self._prediction = Odometry()
-        self._adapted = JointState(name=list(COEFFICIENTS))
         self._publish_prediction = output(self, Odometry, PREDICTION_TOPIC)
         self._publish_parameters = output(self, JointState, PARAMETERS_TOPIC)
         self._publish_horizon = output(self, Path, HORIZON_TOPIC)
+        self._markers = Markers(self) if self._draws else None
+        self._send_frame = frame_sender(self) if self._sends_frame else None
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
 
         self._set_wiring()
-        self._listen(max_age)
-        self.add_on_set_parameters_callback(self._check_parameters)
-        self.add_post_set_parameters_callback(self._apply_parameters)
-        self.create_timer(period, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._listen()
+        self.create_timer(self._period, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if self._state:
-            self.create_timer(_SAVE_PERIOD_S, self.save_online, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self.create_timer(_SAVE_PERIOD_S, self.keep, clock=Clock(clock_type=ClockType.STEADY_TIME))
         model = self._predictor.model
         self.get_logger().info(
             f"{model.name} ({model.parameters} parameters): {model.H} rows of {model.T_s:g} s, commands {model.commands}"
         )
 
-    def _listen(self, max_age: float) -> None:
-        """Subscribes to what the signal map names, none of which may be silent for longer than ``max_age`` (s) or its gap."""
+    def _open(self, path: str) -> OnnxModel:
+        """The model in a folder.
+
+        Raises:
+            ConfigurationError: the folder is not below ``model_root``.
+            ArtifactError: there is no usable model in it.
+        """
+        if self._root and not pathlib.Path(path).resolve().is_relative_to(pathlib.Path(self._root).resolve()):
+            raise ConfigurationError(
+                f"{path}: is not below {self._root}; expected a folder in it (parameter model_root)"
+            )
+        return OnnxModel(open_artifact(path))
+
+    def _listen(self) -> None:
+        """Subscribes to what the signal map names, none of which may be silent for longer than ``max_age`` or its gap."""
         signal_map = self._predictor.signal_map
         by_topic = live_decoders(signal_map)
         self._names = {topic: self.resolve_topic_name(decoder.subscribed) for topic, decoder in by_topic.items()}
-        self._health = Health(tuple(self._names.values()), max(max_age, signal_map.max_gap), self._predictor.model.T_s)
+        self._health = Health(
+            tuple(self._names.values()), max(self._max_age, signal_map.max_gap), self._predictor.model.T_s
+        )
         # actuators come first: when several messages wait, the executor serves subscriptions in this order
         for topic, decoder in by_topic.items():
             receive = self._on_odometry if topic == signal_map.odometry_topic else self._on_actuator
@@ -132,7 +166,8 @@ class PredictorNode(Node):
         if not isinstance(outcome, Prediction):
             self._health.refused(outcome)
             return
-        self._publish(outcome, message)
+        if self.active:
+            self._publish(outcome, message)
         queued = self._health.queued(self._names[decoder.topic])
         self._health.predicted(time.monotonic() - now, outcome.residual_share, queued)
         self._predictor.finish()
@@ -150,7 +185,7 @@ class PredictorNode(Node):
             odometry.child_frame_id = getattr(message, "child_frame_id", "")
         twist = odometry.twist.twist
         twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in prediction.state)
-        odometry.twist.covariance = twist_covariance(prediction.variance)
+        odometry.twist.covariance = planar_covariance(prediction.variance)
         if prediction.pose is not None:
             set_pose(odometry.pose.pose, *prediction.pose)
         self._publish_prediction(odometry)
@@ -159,13 +194,20 @@ class PredictorNode(Node):
             self._adapted.position = prediction.theta.tolist()
             self._adapted.effort = [] if prediction.theta_std is None else prediction.theta_std.tolist()
             self._publish_parameters(self._adapted)
+        ahead: list[Pose] = []
         if self._horizon > 0:
-            self._publish_horizon(self._path(prediction))
+            ahead = self._predictor.horizon(prediction, max(1, round(self._horizon / self._predictor.model.T_s)))
+            self._publish_horizon(self._path(prediction, ahead))
+        if prediction.pose is not None and self._markers is not None:
+            car = self._predictor.model.artifact.card.vehicle
+            self._markers.draw(odometry.header, car, prediction.pose, ahead)
+        if prediction.pose is not None and self._send_frame is not None:
+            self._send_frame(odometry)
 
-    def _path(self, prediction: Prediction) -> Path:
+    def _path(self, prediction: Prediction, ahead: list[Pose]) -> Path:
         period = self._predictor.model.T_s
         path = Path(header=self._prediction.header)
-        for k, pose in enumerate(self._predictor.horizon(prediction, max(1, round(self._horizon / period)))):
+        for k, pose in enumerate(ahead):
             stamped = PoseStamped()
             stamped.header.frame_id = path.header.frame_id
             set_stamp(stamped.header, prediction.stamp + round(k * period * 1e9))
@@ -181,9 +223,9 @@ class PredictorNode(Node):
         """Opens a new model before it is accepted; a bad one changes nothing."""
         self._swap = None  # what was refused with others is not to be installed by a later set
         for parameter in parameters:
-            if parameter.name == "model":
+            if parameter.name == "model" and self.prepared:
                 try:
-                    model = OnnxModel(open_artifact(expanded(parameter.value)))
+                    model = self._open(expanded(parameter.value))
                     self._predictor.check_swap(model)
                 except UserError as error:
                     self.get_logger().error(str(error))
@@ -203,7 +245,7 @@ class PredictorNode(Node):
                 f"model swapped: {self._predictor.model.name} from {self._predictor.model.artifact.path}"
             )
 
-    def save_online(self) -> None:
+    def keep(self) -> None:
         """Writes what the online layer has learned, if a file is named for it."""
         if self._state:
             try:
@@ -211,16 +253,13 @@ class PredictorNode(Node):
             except UserError as error:
                 self.get_logger().error(str(error))
 
-    def destroy_node(self) -> None:
-        """Keeps what was learned before the node ends."""
-        self.save_online()
-        super().destroy_node()
-
     def _diagnose(self) -> None:
         now = time.monotonic()
         self._health.wiring = self._wiring.verdict()
         self._health.publishers = {topic: self.count_publishers(topic) for topic in self._health.topics}
         level, words = self._health.verdict(now)
+        if not self.active:
+            words = f"inactive, publishes nothing: {words}"
         values = {"model": self._predictor.model.name, "model folder": str(self._predictor.model.artifact.path)}
         vehicle = self._predictor.model.artifact.card.vehicle.name
         values["implausible"] = self._predictor.plausibility.last

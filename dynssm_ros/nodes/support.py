@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import re
 import signal
 import sys
 from collections.abc import Callable, Mapping
@@ -14,7 +15,9 @@ from typing import Any, TypeVar
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -145,13 +148,13 @@ def run(
         print(_help(sys.modules[make_node.__module__]))
         return
     interrupt = signal.signal(signal.SIGINT, _leave_it_to_rclpy)
-    rclpy.init(args=args)
     node: NodeType | None = None
     try:
+        _start_rclpy(args)
         load_plugins()
         node = make_node()
         work(node)
-    except UserError as error:
+    except (UserError, ParameterException) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
     except ExternalShutdownException:
@@ -164,6 +167,21 @@ def run(
             node.destroy_node()
         rclpy.try_shutdown()
         signal.signal(signal.SIGINT, interrupt)
+
+
+def _start_rclpy(args: list[str] | None) -> None:
+    """Starts rclpy; the places of its own code that it names are left out.
+
+    Raises:
+        ConfigurationError: ROS arguments that it cannot read: a log level, a parameters file, a remapping.
+    """
+    set_logger_level("rcl", LoggingSeverity.FATAL)  # it would say the same in a line of its own
+    try:
+        rclpy.init(args=args)
+        set_logger_level("rcl", LoggingSeverity.UNSET)
+    except RuntimeError as error:
+        words = re.sub(r", at \S+:\d+", "", str(error)).removeprefix("failed to initialize rcl: ")
+        raise ConfigurationError(f"ROS arguments: {words}") from error
 
 
 def _help(module: ModuleType) -> str:

@@ -19,7 +19,7 @@ from dynssm_ros.signals.messages import (
     PREDICTION_TOPIC,
     joint_state,
     odometry,
-    twist_covariance,
+    planar_covariance,
 )
 from dynssm_ros.vehicle import COEFFICIENTS
 
@@ -97,7 +97,7 @@ def replay_to_bag(
                 continue
             count += 1
             v_x, v_y, omega = outcome.state.tolist()
-            covariance = twist_covariance(outcome.variance)
+            covariance = planar_covariance(outcome.variance)
             message = odometry(outcome.stamp, outcome.pose or (0.0, 0.0, 0.0), (v_x, v_y, omega), covariance, *frames)
             sink.write(PREDICTION_TOPIC, log_time, message)
             if outcome.theta is not None:

@@ -19,6 +19,10 @@ COMMAND_TOPIC = "/vehicle/actuator_command"
 PREDICTION_TOPIC = "/dynssm/prediction"
 PARAMETERS_TOPIC = "/dynssm/parameters"
 HORIZON_TOPIC = "/dynssm/horizon"
+MARKERS_TOPIC = "/dynssm/markers"
+
+UNKNOWN = 1e6
+"""Variance of what nobody states: so large that who weighs by it gives it no weight (zero would mean certain)."""
 
 _TYPES = get_typestore(Stores.ROS2_JAZZY).types
 
@@ -37,7 +41,7 @@ def odometry(
         stamp: header stamp (ns).
         pose: ``x, y`` (m) and heading ``theta`` (rad) in ``frame_id``.
         state: ``v_x, v_y`` (m/s) and ``omega`` (rad/s) in ``child_frame_id``.
-        twist_covariance: row-major 6 x 6, shape ``(36,)``; zeros (unknown) if not given.
+        twist_covariance: row-major 6 x 6, shape ``(36,)``; nothing is known of it if it is not given.
         frame_id: frame of the pose.
         child_frame_id: frame of the twist.
     """
@@ -47,11 +51,11 @@ def odometry(
     quaternion = _TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2))
     body = _TYPES["geometry_msgs/msg/Pose"](point(float(x), float(y), 0.0), quaternion)
     twist = _TYPES["geometry_msgs/msg/Twist"](vector(float(v_x), float(v_y), 0.0), vector(0.0, 0.0, float(omega)))
-    covariance = np.zeros(36) if twist_covariance is None else twist_covariance
+    covariance = planar_covariance(None) if twist_covariance is None else twist_covariance
     return _TYPES[ODOMETRY](
         _header(stamp, frame_id),
         child_frame_id,
-        _TYPES["geometry_msgs/msg/PoseWithCovariance"](body, np.zeros(36)),
+        _TYPES["geometry_msgs/msg/PoseWithCovariance"](body, planar_covariance(None)),
         _TYPES["geometry_msgs/msg/TwistWithCovariance"](twist, covariance),
     )
 
@@ -69,12 +73,13 @@ def _header(stamp: int, frame_id: str) -> Any:
     return _TYPES["std_msgs/msg/Header"](_TYPES["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame_id)
 
 
-def twist_covariance(variances: Vector | None) -> Vector:
-    """Row-major 6 x 6 twist covariance ``(36,)`` from the variances of ``v_x, v_y, omega``, shape ``(3,)``.
+def planar_covariance(variances: Vector | None) -> Vector:
+    """Row-major 6 x 6 covariance ``(36,)`` of a pose or a twist from the variances of its planar part, shape ``(3,)``.
 
-    Zeros, which stand for unknown, without variances.
+    These are of x, y and yaw, or of ``v_x, v_y, omega``; their errors are followed apart, so no two are correlated. What
+    is not stated, as the vertical or all of it without variances, is :data:`UNKNOWN`.
     """
-    covariance = np.zeros(36)
+    covariance = np.diag(np.full(6, UNKNOWN)).ravel()
     if variances is not None:
         covariance[[0, 7, 35]] = variances
     return covariance

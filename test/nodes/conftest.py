@@ -25,6 +25,17 @@ from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_
 PERIOD = 20_000_000  # ns
 
 
+def call(collector: Collector, service: Any, name: str, **request: Any) -> Any:
+    """What a service answers."""
+    client = collector.create_client(service, name)
+    assert client.wait_for_service(20.0)
+    done = threading.Event()
+    future = client.call_async(service.Request(**request))
+    future.add_done_callback(lambda _: done.set())
+    assert done.wait(20.0)
+    return future.result()
+
+
 class Car:
     """Drives straight at 1 m/s on simulated stamps; what it sends can be spoilt message by message."""
 
@@ -105,14 +116,8 @@ class Car:
         return result.successful, result.reason
 
     def _call(self, service: Any, name: str, values: list[tuple[str, object]]) -> Any:
-        client = self.collector.create_client(service, f"/dynssm/{name}")
-        assert client.wait_for_service(10.0)
         parameters = [Parameter(key, value=value).to_parameter_msg() for key, value in values]
-        done = threading.Event()
-        future = client.call_async(service.Request(parameters=parameters))
-        future.add_done_callback(lambda _: done.set())
-        assert done.wait(10.0)
-        return future.result()
+        return call(self.collector, service, f"/dynssm/{name}", parameters=parameters)
 
     def _stamp(self, message: Odometry | JointState) -> None:
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.stamp, 1_000_000_000)

@@ -17,9 +17,10 @@ from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.replay import replay
 from dynssm_ros.signals.bags import open_bag
 from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.messages import UNKNOWN
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.signals.standard import recording_to_bag
-from dynssm_ros.vehicle import COEFFICIENTS
+from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
@@ -203,6 +204,58 @@ def test_the_horizon_is_published_on_request(start_car) -> None:
     assert paths[-1].poses[0].header.stamp == paths[-1].header.stamp
 
 
+def test_the_predicted_car_and_its_way_are_drawn(start_car) -> None:
+    from visualization_msgs.msg import MarkerArray
+
+    car = start_car(horizon=0.2, markers=True)
+    drawn: list[MarkerArray] = []
+    car.collector.create_subscription(MarkerArray, "/dynssm/markers", drawn.append, 10)
+
+    def comes() -> bool:
+        car.drive_until_answered()
+        return car.collector.wait_for(lambda: bool(drawn), 0.1)
+
+    assert any(comes() for _ in range(50))
+    body, way = drawn[-1].markers
+    assert (body.header.frame_id, body.id, way.id) == ("map", 0, 1)
+    assert body.pose.position.x == way.points[0].x, "the way begins at the predicted car"
+    vehicle = load_vehicle("orca").constants
+    assert body.points[0].x - body.points[2].x == pytest.approx(vehicle.l_f + vehicle.l_r), "from axle to axle"
+    assert len(way.points) == 10
+
+
+def test_the_pose_of_a_prediction_claims_no_certainty(start_car) -> None:
+    from nav_msgs.msg import Odometry
+
+    from dynssm_ros.nodes.support import SENSOR_QOS
+
+    car = start_car()
+    heard: list[Odometry] = []
+    car.collector.create_subscription(Odometry, "/dynssm/prediction", heard.append, SENSOR_QOS)
+
+    def comes() -> bool:
+        car.drive_until_answered()
+        return car.collector.wait_for(lambda: bool(heard), 0.1)
+
+    assert any(comes() for _ in range(50))
+    np.testing.assert_array_equal(np.reshape(heard[-1].pose.covariance, (6, 6)), UNKNOWN * np.eye(6))
+    stated = np.diag(np.reshape(heard[-1].twist.covariance, (6, 6)))
+    assert (stated[[0, 1, 5]] < 1.0).all()
+    np.testing.assert_array_equal(stated[2:5], UNKNOWN)
+
+
+def test_models_are_taken_from_below_their_root_only(start_car, small_model: Path, tmp_path: Path) -> None:
+    root = tmp_path / "models"
+    car = start_car(model=shutil.copytree(small_model, root / "a"), model_root=root)
+    car.drive_until_answered()
+    (root / "link").symlink_to(small_model)
+    for outside in (small_model, root / "link", root / ".." / "models_of_others"):
+        successful, reason = car.set_parameter("model", str(outside))
+        assert not successful
+        assert reason == f"{outside}: is not below {root}; expected a folder in it (parameter model_root)"
+    assert car.set_parameter("model", str(shutil.copytree(small_model, root / "b"))) == (True, "")
+
+
 def test_the_process_holds_no_torch(start_car) -> None:
     car = start_car()
     car.drive_until_answered()
@@ -221,6 +274,10 @@ def test_simulated_time_without_a_clock_does_not_hinder_predictions(start_car) -
     [
         ([], "parameter model: not set"),
         (["model:=/nowhere"], "/nowhere: no such model folder"),
+        (["model:={model}", "model_root:=/nowhere"], "is not below /nowhere; expected a folder in it"),
+        (["model:={model}", "max_age:=abc"], "Trying to set parameter 'max_age' to 'abc' of type 'STRING'"),
+        (["model:={model}", "max_age:=100.0"], "Parameter max_age out of range Min: 0.01, Max: 10.0, value: 100.0"),
+        (["model:={model}", "tf:=true"], "parameter tf: needs tf2_ros, which comes with a ROS installation"),
         (["model:={model}", "signals:=nothing"], "signals: 'nothing' is neither a file nor a shipped name"),
         (["model:={model}", "signals:=av21"], "signals: missing throttle_command, steering_command"),
     ],

@@ -52,6 +52,23 @@ def test_help_says_what_a_node_is_and_explains_its_parameters(node: str) -> None
     assert not ended.stderr
 
 
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--log-level", "loud"), "error: ROS arguments: Couldn't parse log level: '--log-level loud'"),
+        (("--params-file", "/nowhere"), "error: ROS arguments: Couldn't parse params file: '--params-file /nowhere'"),
+        (("-r", "nonsense"), "error: ROS arguments: Couldn't parse remap rule: '-r nonsense'"),
+    ],
+)
+def test_ros_arguments_that_cannot_be_read_are_one_line(arguments: tuple[str, ...], expected: str) -> None:
+    command = [sys.executable, "-m", "dynssm_ros.nodes.simulator", "--ros-args", *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith(expected)
+    assert len(ended.stderr.splitlines()) == 1
+    assert ".c:" not in ended.stderr, "where rcl found it is of no use to who typed it"
+
+
 def test_a_path_may_begin_at_home(refused_start) -> None:
     line = refused_start("predictor", "model:=~/no_such_model")
     assert line.startswith(f"error: {Path.home() / 'no_such_model'}: no such model folder")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.signals.decoding import header_stamp_ns
-from dynssm_ros.signals.messages import joint_state, odometry, twist_covariance
+from dynssm_ros.signals.messages import UNKNOWN, joint_state, odometry, planar_covariance
 from dynssm_ros.signals.signal_map import compile_field
 
 STAMP = 1_700_000_000_999_999_999
@@ -32,13 +32,13 @@ def test_the_orientation_is_a_unit_quaternion_about_z() -> None:
 
 def test_covariances_are_unknown_unless_given() -> None:
     message = odometry(0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    assert not message.pose.covariance.any()
-    assert not message.twist.covariance.any()
+    np.testing.assert_array_equal(message.pose.covariance.reshape(6, 6), UNKNOWN * np.eye(6))
+    np.testing.assert_array_equal(message.twist.covariance.reshape(6, 6), UNKNOWN * np.eye(6))
 
 
 def test_variances_of_the_state_lie_on_the_diagonal_of_the_twist() -> None:
-    covariance = twist_covariance(np.array([1.0, 2.0, 3.0])).reshape(6, 6)
-    np.testing.assert_array_equal(covariance, np.diag([1.0, 2.0, 0.0, 0.0, 0.0, 3.0]))
+    covariance = planar_covariance(np.array([1.0, 2.0, 3.0])).reshape(6, 6)
+    np.testing.assert_array_equal(covariance, np.diag([1.0, 2.0, UNKNOWN, UNKNOWN, UNKNOWN, 3.0]))
 
 
 def test_a_joint_state_names_its_positions() -> None:
