@@ -6,6 +6,7 @@ An output never replaces an input of the same command, nor a log, nor what is ne
 from __future__ import annotations
 
 import ctypes
+import errno
 import json
 import os
 import shutil
@@ -106,8 +107,16 @@ def replacing(path: str | Path, may_hold: Collection[str] = ()) -> Iterator[Path
         _require_nothing_else(target, scratch / target.name, may_hold)
         _settle(scratch / target.name, scratch)
         _put(scratch / target.name, target, scratch / "replaced")
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        raise UserError(f"{target}: cannot be written ({os.strerror(error.errno)})") from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+# what writers of libraries raise where the disk is full, a quota is used up, or a file may not be as large
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def _scratch(target: Path) -> str:

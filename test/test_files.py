@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -212,3 +213,41 @@ def test_the_scratch_of_a_run_that_lives_is_left_alone(tmp_path: Path) -> None:
         write_json(target, {})
         assert aside.read_text() == "slow"
     assert target.read_text() == "slow"
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
+def test_a_full_disk_is_named_and_leaves_what_was_there(
+    make: Callable[[Path, str], object], tmp_path: Path, number: int
+):
+    target = tmp_path / "out"
+    make(target, "old")
+
+    def write() -> None:
+        with replacing(target):
+            raise OSError(number, "no room")
+
+    with pytest.raises(UserError, match=rf"out: cannot be written \({os.strerror(number)}\)"):
+        write()
+    assert text_of(target) == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("out", ["bag", "laps.parquet"])
+def test_a_command_that_runs_out_of_room_ends_in_one_line(laps_bag: Path, tmp_path: Path, out: str) -> None:
+    """A limit on the size of files stands for a full disk: the same calls of the system fail."""
+    commands = {
+        "bag": ["simulate", "--vehicle", "orca", "--track", "club", "--duration", "20"],
+        "laps.parquet": ["extract", str(laps_bag), "--signals", "default", "--rate", "50"],
+    }
+    run = [sys.executable, "-m", "dynssm_ros.cli.main", *commands[out], "--out", str(tmp_path / out)]
+    ended = subprocess.run(
+        ["bash", "-c", 'ulimit -f 16; exec "$@"', "bash", *run],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1] == f"error: {tmp_path / out}: cannot be written (File too large)"
+    assert "Traceback" not in ended.stderr
+    assert not list(tmp_path.iterdir())

@@ -120,7 +120,7 @@ def _lines(known: Known, arguments: str, undriven: int) -> Iterator[str]:
     yield (
         f"Made by `{command}`. Every cell is a training and a drive that differs from it: another track, another line and "
         "more speed. One change of the car is hidden: 20 % less grip, a steering offset of 0.01 rad, 10 % more mass, or a "
-        "bank of 0.05 rad. Cars: 1:43, full size, 1:10, and the real logs. Plants: Euler steps as the models step, steps of "
+        "bank of 0.05 rad. Cars: 1:43, full size, 1:10, and the real logs. Plants: Euler steps of T_s, steps of "
         "1 ms, four wheels. Sensor noise: none, usual, three times. Rollouts take 0.6 s."
     )
     yield ""

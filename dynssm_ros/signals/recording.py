@@ -22,6 +22,7 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, Commands
 
 METADATA_KEY = b"dynssm"
+_OFF_GRID = 0.01  # of T_s that rows may be off their grid
 COLUMN_UNITS = {
     "v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "r_fb": "1", "delta_fb": "rad", "r_cmd": "1", "delta_cmd": "rad",
     "x": "m", "y": "m", "theta": "rad",
@@ -197,7 +198,30 @@ class Recording:
             bad = np.flatnonzero(~np.isfinite(values))
             if len(bad):
                 raise RecordingError(f"{path}: column {name}, row {bad[0]}: {values[bad[0]]}; expected a finite number")
+        _require_grid(path, time, segment, info.sampling_time)
         return cls(info, time, segment, columns)
+
+
+def _require_grid(path: Path, time: npt.NDArray[Any], segment: npt.NDArray[Any], T_s: float) -> None:
+    """Checks that within each segment the rows are ``T_s`` (s) apart, and that segments are numbered upwards.
+
+    Raises:
+        RecordingError: they are not; names the first row.
+    """
+    backwards = np.flatnonzero(np.diff(segment) < 0)
+    if len(backwards):
+        row = backwards[0] + 1
+        raise RecordingError(
+            f"{path}: column segment, row {row}: {segment[row]} after {segment[row - 1]}; expected no less"
+        )
+    steps = np.diff(time) / 1e9
+    off = np.flatnonzero((np.diff(segment) == 0) & (np.abs(steps - T_s) > _OFF_GRID * T_s))
+    if len(off):
+        row = off[0] + 1
+        raise RecordingError(
+            f"{path}: column time, row {row}: {steps[row - 1]:.6g} s after the row before; expected the sampling time "
+            f"{T_s:g} s within a segment"
+        )
 
 
 def _is_recording(path: str | Path) -> bool:

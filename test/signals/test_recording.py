@@ -90,6 +90,16 @@ def with_column(table: pa.Table, name: str, values: Any) -> pa.Table:
         (lambda t: with_column(t, "v_x", pa.array(["a", "b", "c"])), "column v_x: string; expected double"),
         (lambda t: with_column(t, "time", pa.array([0, None, 2])), "column time: 1 empty rows; expected int64"),
         (lambda t: t.slice(0, 0), "the recording is empty"),
+        (
+            lambda t: with_column(t, "time", pa.array([0, 40_000_000, 120_000_000])),
+            "column time, row 2: 0.08 s after the row before; expected the sampling time 0.04 s within a segment",
+        ),
+        (lambda t: with_column(t, "time", pa.array([0, 40_000_000, 40_000_000])), "column time, row 2: 0 s after"),
+        (lambda t: with_column(t, "time", pa.array([80_000_000, 40_000_000, 0])), "column time, row 1: -0.04 s after"),
+        (
+            lambda t: with_column(t, "segment", pa.array([0, 1, 0], pa.int32())),
+            "column segment, row 2: 0 after 1; expected no less",
+        ),
     ],
 )
 def test_a_damaged_recording_names_file_and_column(tmp_path: Path, change: Any, expected: str) -> None:
