@@ -26,7 +26,16 @@ from rosbags.typesys import Stores, get_typestore
 from dynssm_ros import __version__
 from dynssm_ros.errors import BagError
 from dynssm_ros.files import replacing, require_replaceable
-from dynssm_ros.signals.recover import is_short, is_unindexed, log_left, merge_log, recover, unpack, unpacked_message
+from dynssm_ros.signals.recover import (
+    bad_chunks,
+    is_short,
+    is_unindexed,
+    log_left,
+    merge_log,
+    recover,
+    unpack,
+    unpacked_message,
+)
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 _NO_INDEX = "it has no index"
@@ -153,6 +162,8 @@ def _open(paths: list[Path]) -> AnyReader:
             raise BagError(_NO_INDEX)
         if any(is_short(file) for file in files):
             raise BagError("a file is shorter than its header says")
+        if bad := sum(map(bad_chunks, files)):
+            raise BagError(f"{bad} of its chunks {'is' if bad == 1 else 'are'} not what the checksum says")
         reader = AnyReader(paths, default_typestore=_TYPESTORE)
         reader.open()
     except Exception as error:  # rosbags lets through what its decoders raise: struct, codec, YAML, index, type errors
@@ -214,7 +225,7 @@ def _usable_file(file: Path, scratch: Path, notes: list[str]) -> Path | None:
         return source
     damage = damage.replace(str(source), file.name)
     recovered = scratch / f"recovered{source.suffix}"
-    messages, complete = recover(source, recovered)
+    messages, complete, bad = recover(source, recovered)
     if messages == 0:
         notes.append(f"{file.name} holds nothing: not a bag, or cut off before its first message ({damage})")
         return None
@@ -223,6 +234,8 @@ def _usable_file(file: Path, scratch: Path, notes: list[str]) -> Path | None:
         return None
     if not complete:
         notes.append(f"{file.name} is cut off ({damage}): recovered {messages} messages up to the cut")
+    elif bad:
+        notes.append(f"{file.name} is damaged ({damage}): recovered {messages} messages of the other chunks")
     elif damage != _NO_INDEX:
         notes.append(f"{file.name} cannot be read as it is ({damage}): its {messages} ROS messages were copied")
     return recovered

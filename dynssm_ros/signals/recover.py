@@ -1,7 +1,8 @@
-"""What lies before the cut of a storage file that a killed recorder or an interrupted copy left behind.
+"""What can be read of a storage file that a killed recorder, an interrupted copy or a bad disk left behind.
 
-Such a file has no index, or one that points behind the cut, so its records are found one by one and copied to a new
-file that any reader opens. Nothing is guessed: a record that the cut goes through is left out.
+A file that was cut off has no index, or one that points behind the cut, so its records are found one by one and copied to
+a new file that any reader opens. Of an MCAP file with bad chunks the others are copied. Nothing is guessed: a record that
+the cut goes through is left out, and so is a chunk that is not what its checksum says.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import mmap
 import shutil
 import sqlite3
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
@@ -22,22 +24,31 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, DataEnd, Message, Schema
+from mcap.summary import Summary
 from mcap.writer import Writer as McapWriter
 
 SQLITE_LOGS = ("-wal", "-journal")
+_HEAD = 9  # bytes in front of an MCAP record: what it is, and its length
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _ROS_ENCODINGS = ("ros2msg", "ros2idl", "omgidl", "")
 _TABLE_LEAF = 0x0D
 _TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
 _T = TypeVar("_T")
-_McapRecord = Schema | Channel | Message | DataEnd
 
 
 class Recovered(NamedTuple):
-    """How many messages were copied, and whether the end was reached without meeting a cut."""
+    """How many messages were copied, whether the end was reached without meeting a cut, and chunks that were left out."""
 
     messages: int
     complete: bool
+    bad_chunks: int = 0
+
+
+class _BadChunk(NamedTuple):
+    """Stands for a chunk that is left out."""
+
+
+_McapRecord = Schema | Channel | Message | DataEnd | _BadChunk
 
 
 def recover(damaged: Path, recovered: Path) -> Recovered:
@@ -49,13 +60,20 @@ def recover(damaged: Path, recovered: Path) -> Recovered:
     return _recover_mcap(damaged, recovered) if damaged.suffix == ".mcap" else _recover_sqlite(damaged, recovered)
 
 
+def bad_chunks(file: Path) -> int:
+    """How many chunks of an indexed MCAP file are not what their checksums say."""
+    if file.suffix != ".mcap" or (summary := _summary(file)) is None:
+        return 0
+    with file.open("rb") as source:
+        return sum(isinstance(record, _BadChunk) for record in _indexed_chunks(source, summary, True))
+
+
 def is_unindexed(file: Path) -> bool:
     """Whether ``file`` is a whole MCAP file without the index that reading in the order of time needs."""
     if file.suffix != ".mcap":
         return False
     try:
-        with file.open("rb") as stream:
-            summary = make_reader(stream).get_summary()
+        summary = _read_summary(file)
     except Exception:  # damaged, which its reader will say better
         return False
     if summary is None:
@@ -120,16 +138,36 @@ def _pieces(source: IO[bytes], codec: str) -> Iterator[bytes]:
     return _until_cut(iter(lambda: stream.read(1 << 16), b""))
 
 
+def _read_summary(file: Path) -> Summary | None:
+    with file.open("rb") as stream:
+        return make_reader(stream).get_summary()
+
+
+def _summary(file: Path) -> Summary | None:
+    """The index of an MCAP file; ``None`` if it has none or a damaged one."""
+    with suppress(Exception):
+        return _read_summary(file)
+    return None
+
+
 def _recover_mcap(damaged: Path, recovered: Path) -> Recovered:
-    messages, complete = 0, False
+    messages, complete, bad = 0, False, 0
+    summary = _summary(damaged)
+    indexed = summary is not None and bool(summary.chunk_indexes)
     with damaged.open("rb") as source, recovered.open("wb") as sink:
         writer = McapWriter(sink)
         writer.start(profile="ros2")
         schemas: dict[int, int] = {0: 0}
         channels: dict[int, int] = {}
         source.seek(len(b"\x89MCAP0\r\n"))
-        for r in _until_cut(_mcap_records(source, damaged.stat().st_size)):
-            if isinstance(r, Schema) and r.id not in schemas and r.encoding in _ROS_ENCODINGS:
+        if summary is not None and indexed:
+            records = _indexed_chunks(source, summary)
+        else:
+            records = _until_cut(_mcap_records(source, damaged.stat().st_size))
+        for r in records:
+            if isinstance(r, _BadChunk):
+                bad += 1
+            elif isinstance(r, Schema) and r.id not in schemas and r.encoding in _ROS_ENCODINGS:
                 schemas[r.id] = writer.register_schema(r.name, r.encoding, r.data)
             elif isinstance(r, Channel) and r.id not in channels and r.schema_id in schemas:
                 channels[r.id] = writer.register_channel(r.topic, r.message_encoding, schemas[r.schema_id], r.metadata)
@@ -139,21 +177,45 @@ def _recover_mcap(damaged: Path, recovered: Path) -> Recovered:
             elif isinstance(r, DataEnd):
                 complete = True
         writer.finish()  # type: ignore[no-untyped-call]
-    return Recovered(messages, complete)
+    return Recovered(messages, complete or indexed, bad)
+
+
+def _indexed_chunks(source: IO[bytes], summary: Summary, check_only: bool = False) -> Iterator[_McapRecord]:
+    """Yields the records of an indexed file, chunk by chunk, so that a bad one does not hide those behind it.
+
+    Args:
+        source: of the file.
+        summary: its index, which has the schemas and channels too.
+        check_only: yield the bad chunks alone.
+    """
+    if not check_only:
+        yield from summary.schemas.values()
+        yield from summary.channels.values()
+    for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+        source.seek(index.chunk_start_offset)
+        content = _intact_content(source.read(index.chunk_length)[_HEAD:])
+        if content is None:
+            yield _BadChunk()
+        elif not check_only:
+            yield from _until_cut(_mcap_records(io.BytesIO(content), len(content)))
 
 
 def _mcap_records(source: IO[bytes], size: int) -> Iterator[_McapRecord]:
     """Yields the records of a stream of ``size`` bytes, also out of the chunk that the cut goes through."""
     last: _McapRecord | None = None
-    while len(head := source.read(9)) == 9 and head[0] != 0:
+    while len(head := source.read(_HEAD)) == _HEAD and head[0] != 0:
         if last is not None:
             yield last
             last = None
         opcode, length = struct.unpack("<BQ", head)
         body = source.read(min(length, size - source.tell()))
         if opcode == Opcode.CHUNK:
-            content = _chunk_content(body)
-            yield from _mcap_records(io.BytesIO(content), len(content))
+            cut = len(body) < length or body.endswith(bytes(8))  # zeros: by a power cut
+            content = _chunk_content(body) if cut else _intact_content(body)  # its beginning is as good as it was
+            if content is None:
+                yield _BadChunk()
+            else:
+                yield from _until_cut(_mcap_records(io.BytesIO(content), len(content)))
         if len(body) < length:
             return
         stream = ReadDataStream(io.BytesIO(body))
@@ -174,6 +236,16 @@ def _chunk_content(body: bytes) -> bytes:
     (length,) = struct.unpack_from("<I", body, 28)
     codec, data = body[32 : 32 + length].decode(), body[40 + length :]
     return b"".join(_pieces(io.BytesIO(data), codec)) if codec else data
+
+
+def _intact_content(body: bytes) -> bytes | None:
+    """The records of a chunk; ``None`` if they are not what its size and checksum say."""
+    with suppress(Exception):  # the decoders raise as they like
+        size, checksum = struct.unpack_from("<QI", body, 16)
+        content = _chunk_content(body)
+        if len(content) == size and checksum in (0, zlib.crc32(content)):
+            return content
+    return None
 
 
 def _recover_sqlite(damaged: Path, recovered: Path) -> Recovered:

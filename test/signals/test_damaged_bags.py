@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 
@@ -249,6 +250,33 @@ def test_an_mcap_without_index_that_is_damaged_inside_says_so(tmp_path: Path, ty
     path.write_bytes(content)
     found, notes = read_or_refused(path)
     assert len(found) == 150 or "recovered" in notes[-1] or "damaged" in notes[-1]
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("place", [0.0, 0.5, 0.9])
+def test_a_bad_chunk_costs_its_own_messages_alone(
+    tmp_path: Path, typestore: Any, drive: Any, compression: CompressionType, place: float
+) -> None:
+    path = write_mcap(tmp_path / "bag.mcap", typestore, drive(300), chunk_size=10_000, compression=compression)
+    whole, _ = read(path)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    chunks = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
+    chunk = chunks[int(place * len(chunks))]
+    content = bytearray(path.read_bytes())
+    content[chunk.chunk_start_offset + chunk.chunk_length - 20] ^= 0xFF
+    path.write_bytes(content)
+    found, notes = read(path)
+    lost = [m for m in whole if chunk.message_start_time <= m.log_time <= chunk.message_end_time]
+    assert [m for m in whole if m not in lost] == [
+        m for m in found if not chunk.message_start_time <= m.log_time <= chunk.message_end_time
+    ]
+    assert 0 < len(whole) - len(found) <= len(lost) < len(whole) / 2
+    assert notes == [
+        "bag.mcap is damaged (1 of its chunks is not what the checksum says): "
+        f"recovered {len(found)} messages of the other chunks"
+    ]
 
 
 def test_topics_that_are_not_of_ros_do_not_hide_those_that_are(tmp_path: Path, typestore: Any, drive: Any) -> None:

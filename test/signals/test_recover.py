@@ -44,7 +44,7 @@ def recovered(path: Path, share: float = 1.0) -> list[Row]:
     content = path.read_bytes()
     cut.write_bytes(content[: int(share * len(content))])
     saved.unlink(missing_ok=True)
-    count, complete = recover(cut, saved)
+    count, complete, _ = recover(cut, saved)
     assert not complete
     found = rows_of(saved) if count else []
     assert len(found) == count
