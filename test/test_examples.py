@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dynssm_ros.signals.messages import PARAMETERS_TOPIC, PREDICTION_TOPIC
+from dynssm_ros.vehicle import load_vehicle
 from examples import a_hidden_cause_found, a_log_to_a_prediction
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -67,3 +70,24 @@ def test_an_mpc_of_ones_own_follows_the_line_on_published_coefficients() -> None
     s, lateral = centre.project(places)
     assert np.abs(lateral).max() < 0.08
     assert np.unwrap(s, period=centre.length)[-1] - s[0] > 2.5
+
+
+CONSUMER = ROOT / "examples" / "cpp_consumer"
+
+
+def test_the_cpp_consumer_listens_to_the_topics_of_the_predictor() -> None:
+    source = (CONSUMER / "consumer.cpp").read_text(encoding="utf-8")
+    assert set(re.findall(r'"(dynssm/\w+)"', source)) == {PREDICTION_TOPIC[1:], PARAMETERS_TOPIC[1:]}
+    (name, own) = re.findall(r'coefficient\("(\w+)", ([\d.]+)\)', source)[0]
+    assert float(own) == load_vehicle("orca").coefficients[name].nominal
+
+
+@pytest.mark.skipif(
+    not any(
+        (Path(prefix) / "share" / "rclcpp").is_dir() for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(":")
+    ),
+    reason="no ROS 2 with rclcpp is sourced",
+)
+def test_the_cpp_consumer_compiles(tmp_path: Path) -> None:
+    subprocess.run(["cmake", "-S", str(CONSUMER), "-B", str(tmp_path)], check=True)
+    subprocess.run(["cmake", "--build", str(tmp_path)], check=True)
