@@ -88,7 +88,7 @@ def test_every_command_in_a_code_block_exists_with_its_options() -> None:
 
 
 def test_every_option_that_a_page_names_exists() -> None:
-    elsewhere = {"--help", "--ros-args", "--symlink-install", "--system-site-packages", "--backend"}
+    elsewhere = {"--help", "--ros-args", "--symlink-install", "--system-site-packages", "--backend", "--cpus"}
     known = set().union(*options().values()) | elsewhere
     for page, text in PAGES.items():
         if page not in MEASURED:
