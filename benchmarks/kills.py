@@ -144,22 +144,25 @@ def _dynssm(arguments: Sequence[str]) -> list[str]:
     return [sys.executable, "-m", "dynssm_ros.cli.main", *arguments]
 
 
+def _files(path: Path) -> list[Path]:
+    """The files of an output, be it a file or a folder; none if it is not there."""
+    return [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+
+
 def _content(path: Path) -> dict[str, str]:
     """Checksums of the files of an output by their names; empty if it is not there."""
-    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-    return {str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    return {str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest() for file in _files(path)}
 
 
 def _readable(path: Path) -> bool:
     """Whether none of its files is empty, and what is called JSON is that."""
-    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
     try:
-        for file in files:
+        for file in _files(path):
             if file.suffix == ".json":
                 json.loads(file.read_text(encoding="utf-8"))
     except ValueError:
         return False
-    return all(file.stat().st_size for file in files)
+    return all(file.stat().st_size for file in _files(path))
 
 
 def _compare_weights(whole: dict[str, str], now: dict[str, str], outcome: Outcome) -> None:

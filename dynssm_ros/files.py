@@ -23,6 +23,8 @@ from dynssm_ros.errors import UserError
 
 LOG_SUFFIXES = (".mcap", ".db3", ".bag", ".zstd")
 """Of files that recorders write, and we do not."""
+# what writers of libraries raise where the disk is full, a quota is used up, or a file may not be as large
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _HERE, _SWAP = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 _INPUTS: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
 _FORCED: ContextVar[bool] = ContextVar("forced", default=False)
@@ -113,10 +115,6 @@ def replacing(path: str | Path, may_hold: Collection[str] = ()) -> Iterator[Path
         raise UserError(f"{target}: cannot be written ({os.strerror(error.errno)})") from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-
-
-# what writers of libraries raise where the disk is full, a quota is used up, or a file may not be as large
-_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def _scratch(target: Path) -> str:

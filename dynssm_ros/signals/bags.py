@@ -10,7 +10,8 @@ from __future__ import annotations
 import os
 import sqlite3
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -57,6 +58,8 @@ class Bag:
 
     path: Path
     reader: AnyReader
+    mend: Callable[[str], AnyReader]
+    """A reader of what can be read of a bag in which that damage was met."""
     notes: list[str] = field(default_factory=list)
 
     @cached_property
@@ -98,9 +101,26 @@ class Bag:
     def messages(self, topics: Sequence[str]) -> Iterator[BagMessage]:
         """Yields the messages of ``topics`` in the order in which they were recorded.
 
+        Whether all can be read is seen on the way. Behind what cannot it goes on, if a reader can be made that does.
+
         Raises:
             BagError: the storage is damaged in the middle.
         """
+        given: Counter[str] = Counter()
+        try:
+            for message in self._stored(topics):
+                given[message.topic] += 1
+                yield message
+            return
+        except BagError as damage:
+            self.reader = self.mend(_one_line(damage.__cause__ or damage))
+        for message in self._stored(topics):
+            if given[message.topic] > 0:
+                given[message.topic] -= 1
+            else:
+                yield message
+
+    def _stored(self, topics: Sequence[str]) -> Iterator[BagMessage]:
         wanted = [c for c in self.reader.connections if c.topic in topics]
         if not wanted:
             return
@@ -137,13 +157,19 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         raise BagError(f"{path}: no such bag")
     with ExitStack() as stack:
         notes: list[str] = []
+
+        def mend(damage: str) -> AnyReader:
+            scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dynssm-")))
+            mended = _open_files(path, scratch, damage, notes)
+            stack.callback(mended.close)
+            return mended
+
         try:
             reader = _open([path])
+            stack.callback(reader.close)
         except BagError as damage:
-            scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dynssm-")))
-            reader = _open_files(path, scratch, str(damage), notes)
-        stack.callback(reader.close)
-        yield Bag(path, reader, notes)
+            reader = mend(str(damage))
+        yield Bag(path, reader, mend, notes)
 
 
 def _open(paths: list[Path]) -> AnyReader:
@@ -162,8 +188,6 @@ def _open(paths: list[Path]) -> AnyReader:
             raise BagError(_NO_INDEX)
         if any(is_short(file) for file in files):
             raise BagError("a file is shorter than its header says")
-        if bad := sum(map(bad_chunks, files)):
-            raise BagError(f"{bad} of its chunks {'is' if bad == 1 else 'are'} not what the checksum says")
         reader = AnyReader(paths, default_typestore=_TYPESTORE)
         reader.open()
     except Exception as error:  # rosbags lets through what its decoders raise: struct, codec, YAML, index, type errors
@@ -242,12 +266,13 @@ def _usable_file(file: Path, scratch: Path, notes: list[str]) -> Path | None:
 
 
 def _damage(file: Path) -> str | None:
-    """Why rosbags cannot read a storage file as it is; ``None`` if it can."""
+    """Why rosbags cannot read a storage file as it is, to its end; ``None`` if it can."""
     try:
         _open([file]).close()
     except BagError as error:
         return str(error)
-    return None
+    bad = bad_chunks(file)
+    return f"{bad} of its chunks {'is' if bad == 1 else 'are'} not what the checksum says" if bad else None
 
 
 _MARK = "dynssm_ros"

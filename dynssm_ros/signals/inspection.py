@@ -10,7 +10,7 @@ import math
 import re
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -189,8 +189,8 @@ def _topics(bag: Bag, progress: Progress | None) -> tuple[dict[str, TopicContent
         times[topic].append(log_time)
         if progress is not None:
             progress(done, total)
-    begin = min((one[0] for one in times.values()), default=0)
-    end = max((one[-1] for one in times.values()), default=0)
+    begin = min((one[0] for one in times.values() if one), default=0)  # a topic may be damaged altogether
+    end = max((one[-1] for one in times.values() if one), default=0)
     found = {}
     for topic in sorted(counts):
         apart = np.diff(np.frombuffer(times[topic], np.int64)) / 1e9
@@ -293,7 +293,7 @@ def _actuators(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:
         if f"{actuator}_feedback" not in found and f"{actuator}_command" in found and actuator != "brake":
             command = found[f"{actuator}_command"]
             note = "no feedback found: the command is taken for it"
-            found[f"{actuator}_feedback"] = Suggestion(command.topic, command.field, command.scale, note)
+            found[f"{actuator}_feedback"] = replace(command, note=note)
     return found
 
 
@@ -304,9 +304,9 @@ def _scaled(actuator: str, suggestion: Suggestion) -> Suggestion:
     if actuator == "steering" or largest <= _SHARE:
         return suggestion
     if actuator == "throttle" and largest <= 100.0 * _SHARE:
-        return Suggestion(suggestion.topic, suggestion.field, 0.01, "taken for percent")
+        return replace(suggestion, scale=0.01, note="taken for percent")
     note = f"up to {largest:.4g} in the log, which is taken for full {actuator}"
-    return Suggestion(suggestion.topic, suggestion.field, 1.0 / largest, note)
+    return replace(suggestion, scale=1.0 / largest, note=note)
 
 
 def _scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], wheelbase: float | None) -> Suggestion:
@@ -316,16 +316,14 @@ def _scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], whe
     if slope is None:
         large = float(np.nanmax(np.abs(values), initial=0.0)) > _RADIANS
         note = "too large for rad at the road wheel: find its scale" if large else suggestion.note
-        return Suggestion(suggestion.topic, suggestion.field, 1.0, note)
+        return replace(suggestion, scale=1.0, note=note)
     told = f"the curvature follows it with {slope:.4g} 1/m per unit"
     if wheelbase is None:
-        return Suggestion(
-            suggestion.topic, suggestion.field, 1.0, f"{told}: the scale is about that times the wheelbase"
-        )
+        return replace(suggestion, scale=1.0, note=f"{told}: the scale is about that times the wheelbase")
     scale = slope * wheelbase
     if _UNIT[0] < scale < _UNIT[1]:
-        return Suggestion(suggestion.topic, suggestion.field, 1.0, suggestion.note)
-    return Suggestion(suggestion.topic, suggestion.field, scale, f"{told}; measure the scale at the wheel")
+        return replace(suggestion, scale=1.0)
+    return replace(suggestion, scale=scale, note=f"{told}; measure the scale at the wheel")
 
 
 def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) -> float | None:

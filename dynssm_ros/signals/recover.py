@@ -62,10 +62,10 @@ def recover(damaged: Path, recovered: Path) -> Recovered:
 
 def bad_chunks(file: Path) -> int:
     """How many chunks of an indexed MCAP file are not what their checksums say."""
-    if file.suffix != ".mcap" or (summary := _summary(file)) is None:
+    if file.suffix != ".mcap" or (summary := _index(file)) is None:
         return 0
     with file.open("rb") as source:
-        return sum(isinstance(record, _BadChunk) for record in _indexed_chunks(source, summary, True))
+        return sum(content is None for content in _chunks(source, summary))
 
 
 def is_unindexed(file: Path) -> bool:
@@ -143,28 +143,25 @@ def _read_summary(file: Path) -> Summary | None:
         return make_reader(stream).get_summary()
 
 
-def _summary(file: Path) -> Summary | None:
-    """The index of an MCAP file; ``None`` if it has none or a damaged one."""
+def _index(file: Path) -> Summary | None:
+    """The summary of an MCAP file that says where its chunks are; ``None`` without one, or if it is damaged."""
     with suppress(Exception):
-        return _read_summary(file)
+        summary = _read_summary(file)
+        return summary if summary is not None and summary.chunk_indexes else None
     return None
 
 
 def _recover_mcap(damaged: Path, recovered: Path) -> Recovered:
     messages, complete, bad = 0, False, 0
-    summary = _summary(damaged)
-    indexed = summary is not None and bool(summary.chunk_indexes)
+    summary = _index(damaged)
     with damaged.open("rb") as source, recovered.open("wb") as sink:
         writer = McapWriter(sink)
         writer.start(profile="ros2")
         schemas: dict[int, int] = {0: 0}
         channels: dict[int, int] = {}
         source.seek(len(b"\x89MCAP0\r\n"))
-        if summary is not None and indexed:
-            records = _indexed_chunks(source, summary)
-        else:
-            records = _until_cut(_mcap_records(source, damaged.stat().st_size))
-        for r in records:
+        in_order = _until_cut(_mcap_records(source, damaged.stat().st_size))
+        for r in in_order if summary is None else _indexed_records(source, summary):
             if isinstance(r, _BadChunk):
                 bad += 1
             elif isinstance(r, Schema) and r.id not in schemas and r.encoding in _ROS_ENCODINGS:
@@ -177,27 +174,29 @@ def _recover_mcap(damaged: Path, recovered: Path) -> Recovered:
             elif isinstance(r, DataEnd):
                 complete = True
         writer.finish()  # type: ignore[no-untyped-call]
-    return Recovered(messages, complete or indexed, bad)
+    return Recovered(messages, complete or summary is not None, bad)
 
 
-def _indexed_chunks(source: IO[bytes], summary: Summary, check_only: bool = False) -> Iterator[_McapRecord]:
-    """Yields the records of an indexed file, chunk by chunk, so that a bad one does not hide those behind it.
-
-    Args:
-        source: of the file.
-        summary: its index, which has the schemas and channels too.
-        check_only: yield the bad chunks alone.
-    """
-    if not check_only:
-        yield from summary.schemas.values()
-        yield from summary.channels.values()
+def _chunks(source: IO[bytes], summary: Summary) -> Iterator[bytes | None]:
+    """Yields the content of each chunk of an indexed file, ``None`` for a bad one, which hides none of those behind it."""
     for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
         source.seek(index.chunk_start_offset)
-        content = _intact_content(source.read(index.chunk_length)[_HEAD:])
-        if content is None:
-            yield _BadChunk()
-        elif not check_only:
-            yield from _until_cut(_mcap_records(io.BytesIO(content), len(content)))
+        yield _intact_content(source.read(index.chunk_length)[_HEAD:])
+
+
+def _indexed_records(source: IO[bytes], summary: Summary) -> Iterator[_McapRecord]:
+    """Yields the records of an indexed file; schemas and channels are those of its index."""
+    yield from summary.schemas.values()
+    yield from summary.channels.values()
+    for content in _chunks(source, summary):
+        yield from _chunk_records(content)
+
+
+def _chunk_records(content: bytes | None) -> Iterator[_McapRecord]:
+    if content is None:
+        yield _BadChunk()
+    else:
+        yield from _until_cut(_mcap_records(io.BytesIO(content), len(content)))
 
 
 def _mcap_records(source: IO[bytes], size: int) -> Iterator[_McapRecord]:
@@ -212,10 +211,7 @@ def _mcap_records(source: IO[bytes], size: int) -> Iterator[_McapRecord]:
         if opcode == Opcode.CHUNK:
             cut = len(body) < length or body.endswith(bytes(8))  # zeros: by a power cut
             content = _chunk_content(body) if cut else _intact_content(body)  # its beginning is as good as it was
-            if content is None:
-                yield _BadChunk()
-            else:
-                yield from _until_cut(_mcap_records(io.BytesIO(content), len(content)))
+            yield from _chunk_records(content)
         if len(body) < length:
             return
         stream = ReadDataStream(io.BytesIO(body))
