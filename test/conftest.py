@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import io
 import os
 import sys
@@ -58,6 +59,22 @@ def acting() -> Callable[..., dict[str, float]]:
         }
 
     return parameters
+
+
+@pytest.fixture(scope="session")
+def declared_parameters() -> Callable[[str], dict[str, object]]:
+    """What a node declares in its source, a managed one with what all of these do: default values by name."""
+
+    def declared(node: str) -> dict[str, object]:
+        source = (REPOSITORY / "dynssm_ros" / "nodes" / f"{node}.py").read_text(encoding="utf-8")
+        return (declared("managed") if "(ManagedNode)" in source else {}) | {
+            call.args[1].value: ast.literal_eval(call.args[2])
+            for call in ast.walk(ast.parse(source))
+            if isinstance(call, ast.Call) and ast.unparse(call.func) in ("describe", "choose")
+            if isinstance(call.args[1], ast.Constant)
+        }
+
+    return declared
 
 
 @pytest.fixture(scope="session")

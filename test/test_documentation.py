@@ -7,7 +7,7 @@ import importlib
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import reduce
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,6 +27,7 @@ from dynssm_ros.signals.signal_map import SIGNALS, load_signal_map
 from dynssm_ros.vehicle import load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 
+Declared = Callable[[str], dict[str, object]]
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]}
 MEASURED = ("results.md", "results_race.md")  # written by `make paper`, in the words of the version that measured
@@ -105,7 +106,7 @@ def test_every_module_that_a_code_block_runs_exists() -> None:
             assert (ROOT / file).is_file(), f"{page}: {line}"
 
 
-def test_every_node_parameter_in_a_code_block_is_declared() -> None:
+def test_every_node_parameter_in_a_code_block_is_declared(declared_parameters: Declared) -> None:
     seen = set()
     for page, line in code_lines():
         found = re.match(r"(?:ros2 run dynssm_ros )?(predictor|player|controller|simulator) --ros-args (.*)", line)
@@ -223,24 +224,14 @@ def node_source(node: str) -> str:
     return (ROOT / "dynssm_ros" / "nodes" / f"{node}.py").read_text(encoding="utf-8")
 
 
-def declared_parameters(node: str) -> dict[str, object]:
-    """What a node declares, a managed one with what all of these do: default values by name."""
-    source = node_source(node)
-    tree = ast.parse(source)
-    return ({} if node == "managed" or "ManagedNode" not in source else declared_parameters("managed")) | {
-        call.args[1].value: call.args[2].value
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and ast.unparse(call.func) in ("describe", "choose")
-        if isinstance(call.args[1], ast.Constant) and isinstance(call.args[2], ast.Constant)
-    }
-
-
 def as_ros_writes(declared: dict[str, Any]) -> dict[str, str]:
     """Values of parameters as they stand in tables."""
     return {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in declared.items()}
 
 
-def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_file() -> None:
+def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_file(
+    declared_parameters: Declared,
+) -> None:
     declared = declared_parameters("predictor")
     described = {name: cells[0].strip("`") for name, cells in table("parameter", PAGES["predictor.md"]).items()}
     assert described == as_ros_writes(declared)
@@ -248,7 +239,7 @@ def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_fi
     assert shipped == declared
 
 
-def test_the_parameters_of_the_controller_are_those_of_its_page() -> None:
+def test_the_parameters_of_the_controller_are_those_of_its_page(declared_parameters: Declared) -> None:
     described = {name: cells[0].strip("`") for name, cells in table("parameter", PAGES["controller.md"]).items()}
     declared = declared_parameters("controller")
     assert described == as_ros_writes(declared)

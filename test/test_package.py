@@ -208,7 +208,9 @@ def test_shipped_models_are_valid(name: str) -> None:
 
 
 @pytest.mark.parametrize("node", ["predictor", "controller", "simulator", "player"])
-def test_each_node_has_a_parameters_file_with_its_defaults(node: str) -> None:
+def test_each_node_has_a_parameters_file_with_its_defaults(
+    declared_parameters: Callable[[str], dict[str, object]], node: str
+) -> None:
     content = yaml.safe_load((ROOT / "config" / f"{node}.yaml").read_text(encoding="utf-8"))["/**"]["ros__parameters"]
     declared = declared_parameters(node)
     assert content == declared
@@ -350,18 +352,6 @@ def test_launch_arguments_override_the_parameters_file(launch_file: ModuleType) 
     assert launched(launch_file, use_sim_time="false").named["parameters"][1] == {"use_sim_time": False}
 
 
-def declared_parameters(node: str) -> dict[str, object]:
-    """What a node declares, a managed one with what all of these do: default values by name."""
-    source = (ROOT / PACKAGE / "nodes" / f"{node}.py").read_text(encoding="utf-8")
-    tree = ast.parse(source)
-    return ({} if node == "managed" or "ManagedNode" not in source else declared_parameters("managed")) | {
-        call.args[1].value: ast.literal_eval(call.args[2])
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and ast.unparse(call.func) in ("describe", "choose")
-        if isinstance(call.args[1], ast.Constant)
-    }
-
-
 def test_controller_launch_file_starts_the_stack_that_is_asked_for(load_launch: Callable[[str], ModuleType]) -> None:
     file = load_launch("controller.launch.py")
     *declared, _ = file.generate_launch_description().positional[0]
@@ -380,7 +370,7 @@ def test_controller_launch_file_starts_the_stack_that_is_asked_for(load_launch: 
 
 
 def test_controller_launch_file_passes_only_parameters_that_there_are(
-    load_launch: Callable[[str], ModuleType],
+    load_launch: Callable[[str], ModuleType], declared_parameters: Callable[[str], dict[str, object]]
 ) -> None:
     for node in all_launched(load_launch("controller.launch.py"), model="out/model"):
         known = declared_parameters(node.named["executable"])

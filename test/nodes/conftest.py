@@ -131,17 +131,24 @@ def start_car(small_model: Path) -> Iterator[StartCar]:
     """Starts predictors with the small model (or another) and hands out cars that talk to them."""
     with ExitStack() as stack:
 
-        def start(model: Path = small_model, **parameters: object) -> Car:
+        def start(model: Path = small_model, wait: bool = True, **parameters: object) -> Car:
             os.environ.update(isolated_environment())
             process = stack.enter_context(
                 predictor_process(model, {"diagnostics_period": 0.1, **parameters}, os.environ.copy())
             )
             run = LiveRun(PERIOD)
             car = Car(stack.enter_context(collecting(run)), run, process)
-            car.wait_for_match()
+            if wait:
+                car.wait_for_match()
             return car
 
         yield start
+
+
+@pytest.fixture(scope="session")
+def call_service() -> Callable[..., Any]:
+    """Calls a service with the fields of a request by name; returns what it answers."""
+    return call
 
 
 RefusedStart = Callable[..., str]

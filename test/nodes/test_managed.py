@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
 
 from benchmarks.live_run import Collector, LiveRun, collecting, isolated_environment, node_process
-from test.nodes.conftest import PERIOD, Car, call
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(240)]
 
@@ -22,38 +19,39 @@ CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEA
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
 
 
+Change = Callable[[Collector, str, int], bool]
+
+
 @pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    with ExitStack() as stack:
-        os.environ.update(isolated_environment())
-        yield stack
+def change(call_service: Callable[..., Any]) -> Change:
+    """Asks a node for a transition; whether it was made."""
+    return lambda collector, node, transition: (
+        call_service(collector, ChangeState, f"/{node}/change_state", transition=Transition(id=transition)).success
+    )
 
 
-def change(collector: Collector, node: str, transition: int) -> bool:
-    """Asks for a transition; whether it was made."""
-    return call(collector, ChangeState, f"/{node}/change_state", transition=Transition(id=transition)).success
-
-
-def state(collector: Collector, node: str) -> str:
-    return call(collector, GetState, f"/{node}/get_state").current_state.label
+@pytest.fixture
+def state(call_service: Callable[..., Any]) -> Callable[[Collector, str], str]:
+    """The state of a node, in a word."""
+    return lambda collector, node: call_service(collector, GetState, f"/{node}/get_state").current_state.label
 
 
 def test_a_predictor_is_configured_stands_by_and_takes_over_with_its_window_full(
-    stack: ExitStack, small_model: Path, tmp_path: Path
+    start_car: Callable[..., Any],
+    change: Change,
+    state: Callable[[Collector, str], str],
+    small_model: Path,
+    tmp_path: Path,
 ) -> None:
-    given = {"autostart": False, "diagnostics_period": 0.1, "model": tmp_path / "none"}
-    process = stack.enter_context(node_process("predictor", given, os.environ.copy()))
-    run = LiveRun(PERIOD)
-    collector = stack.enter_context(collecting(run))
+    car = start_car(tmp_path / "none", wait=False, autostart=False)
+    collector, run = car.collector, car.run
     assert state(collector, "dynssm") == "unconfigured"
     assert not change(collector, "dynssm", CONFIGURE), "there is no such model"
     assert state(collector, "dynssm") == "unconfigured"
-    parameter = Parameter("model", value=str(small_model)).to_parameter_msg()
-    assert call(collector, SetParameters, "/dynssm/set_parameters", parameters=[parameter]).results[0].successful
+    assert car.set_parameter("model", str(small_model)) == (True, "")
     assert change(collector, "dynssm", CONFIGURE)
     assert state(collector, "dynssm") == "inactive"
 
-    car = Car(collector, run, process)
     car.wait_for_match()
     silent = [car.step() for _ in range(10)]
     assert car.diagnosed("inactive, publishes nothing: predicting"), run.diagnostics[-1:]
@@ -76,16 +74,24 @@ def test_a_predictor_is_configured_stands_by_and_takes_over_with_its_window_full
     car.drive_until_answered()
 
 
-def test_a_controller_drives_while_it_is_active(stack: ExitStack) -> None:
+@pytest.fixture
+def parked() -> Iterator[tuple[Collector, LiveRun]]:
+    """Hears a simulated car and a controller that waits to be configured."""
+    run, given = LiveRun(20_000_000), {"vehicle": "orca", "track": "club"}
+    waiting = given | {"autostart": False, "diagnostics_period": 0.1}
+    os.environ.update(isolated_environment())
+    with (
+        node_process("simulator", given | {"driver": "external"}, os.environ.copy()),
+        node_process("controller", waiting, os.environ.copy()),
+        collecting(run) as collector,
+    ):
+        yield collector, run
+
+
+def test_a_controller_drives_while_it_is_active(parked: tuple[Collector, LiveRun], change: Change) -> None:
     from sensor_msgs.msg import JointState
 
-    given = {"vehicle": "orca", "track": "club"}
-    stack.enter_context(node_process("simulator", given | {"driver": "external"}, os.environ.copy()))
-    stack.enter_context(
-        node_process("controller", given | {"autostart": False, "diagnostics_period": 0.1}, os.environ.copy())
-    )
-    run = LiveRun(PERIOD)
-    collector = stack.enter_context(collecting(run))
+    collector, run = parked
     commands: list[JointState] = []
 
     def keep(message: JointState) -> None:
