@@ -13,7 +13,7 @@ import math
 import sys
 import traceback
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,11 +29,13 @@ from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.decoding import header_stamp_ns, live_decoders
 from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.limits import vehicle_limits
 
 _START = 1_700_000_000_000_000_000  # ns
 _PERIOD = 10_000_000  # ns between odometry messages
 _SPOILT = 0.15  # share of messages
+_ODD = 0.01  # share of those that are lost, and of those that come twice
 _SPEED = 0.3  # of the car's top speed
 _REPORTED = 1000  # messages between reports of progress
 _NUMBERS = (math.nan, math.inf, -math.inf, 1e308, -1e308, 1e6, -1e6, 5e-324, 1e3, -1e3)
@@ -63,67 +65,40 @@ class Fuzzed:
     violations: dict[str, str] = field(default_factory=dict)
 
 
-class _Car:
-    """Sends messages, some of them spoilt."""
+class Traffic:
+    """The messages of a car that drives straight on, some of them spoilt.
 
-    def __init__(self, predictor: Predictor, seed: int) -> None:
+    Args:
+        vehicle: what it can do says what is beyond it, and how fast it drives.
+        seed: what the messages are.
+        period: between odometry messages (ns).
+        spoilt: share of messages that are damaged; a hundredth of all is lost and as many come twice, if any are.
+    """
+
+    def __init__(self, vehicle: Vehicle, seed: int, period: int = _PERIOD, spoilt: float = _SPOILT) -> None:
         self.random = np.random.default_rng(seed)
-        self.predictor = predictor
-        vehicle = predictor.model.artifact.card.vehicle
+        self.spoilt, self.period = spoilt, period
         self.ranges = ranges(vehicle)
         self.speed = _SPEED * vehicle_limits(vehicle).top_speed
-        self.decoders = live_decoders(predictor.signal_map)
         self.stamp = _START
-        self.done = Fuzzed()
 
-    def step(self) -> None:
-        """A period: actuators and odometry, each of which may be lost, come twice or be spoilt."""
-        self.stamp += _PERIOD
+    def step(self) -> Iterator[tuple[str, Any, bool]]:
+        """A period: actuators, then odometry, each with its topic and whether it is spoilt."""
+        self.stamp += self.period
+        odd = _ODD if self.spoilt else 0.0
         for topic in (messages.FEEDBACK_TOPIC, messages.COMMAND_TOPIC, messages.ODOMETRY_TOPIC):
-            for _ in range(int(self.random.choice((1, 0, 2), p=(0.98, 0.01, 0.01)))):
-                self._send(topic)
+            for _ in range(int(self.random.choice((1, 0, 2), p=(1 - 2 * odd, odd, odd)))):
+                spoil = bool(self.random.random() < self.spoilt)
+                make = self._odometry if topic == messages.ODOMETRY_TOPIC else self._actuators
+                yield topic, make(spoil), spoil
 
-    def _send(self, topic: str) -> None:
-        spoil = self.random.random() < _SPOILT
-        self.done.messages += 1
-        self.done.spoilt += spoil
-        message = self._odometry(spoil) if topic == messages.ODOMETRY_TOPIC else self._actuators(spoil)
-        try:
-            stamp = header_stamp_ns(message)
-            assert stamp is not None
-            values = self.decoders[topic].decode(message)
-            if topic == messages.ODOMETRY_TOPIC:
-                self._judge(stamp, values, self.predictor.predict(stamp, values))
-                self.predictor.finish()
-            else:
-                self.predictor.observe(stamp, values)
-        except Exception as error:  # that there is none is what is tried here
-            self._violated(f"{type(error).__name__} raised", traceback.format_exc())
-
-    def _judge(self, stamp: int, values: dict[str, float], outcome: Any) -> None:
-        if not isinstance(outcome, Prediction):
-            self.done.refusals[outcome.name.lower()] += 1
-            return
-        self.done.predictions += 1
-        parts = (
-            outcome.state,
-            outcome.pose,
-            outcome.theta,
-            outcome.theta_std,
-            outcome.variance,
-            outcome.residual_share,
-        )
-        if not all(np.all(np.isfinite(part)) for part in parts if part is not None):
-            self._violated("an output is not finite", repr(outcome))
+    def invalid(self, values: Mapping[str, float]) -> str:
+        """What of the decoded values of a message no car has, in words; empty if nothing."""
         for name, value in values.items():
             limit = self.ranges.get(name)
             if not math.isfinite(value) or (limit is not None and not limit.low <= value <= limit.high):
-                self._violated("predicted from an invalid sample", f"{name} = {value}")
-        if outcome.stamp <= stamp:
-            self._violated("the predicted instant is not ahead", f"{outcome.stamp} of {stamp}")
-
-    def _violated(self, kind: str, words: str) -> None:
-        self.done.violations.setdefault(kind, f"message {self.done.messages}: {words}")
+                return f"{name} = {value}"
+        return ""
 
     def _stamp(self, spoil: bool) -> int:
         moved = int(self.random.choice(_STAMPS)) if spoil and self.random.random() < 1 / 3 else 0
@@ -160,9 +135,62 @@ class _Car:
         return message
 
 
+class _Predicting:
+    """A predictor in this process, whose answers are judged."""
+
+    def __init__(self, predictor: Predictor, seed: int) -> None:
+        self.predictor = predictor
+        self.traffic = Traffic(predictor.model.artifact.card.vehicle, seed)
+        self.decoders = live_decoders(predictor.signal_map)
+        self.done = Fuzzed()
+
+    def step(self) -> None:
+        """The messages of a period."""
+        for topic, message, spoilt in self.traffic.step():
+            self.done.messages += 1
+            self.done.spoilt += spoilt
+            self._send(topic, message)
+
+    def _send(self, topic: str, message: Any) -> None:
+        try:
+            stamp = header_stamp_ns(message)
+            assert stamp is not None
+            values = self.decoders[topic].decode(message)
+            if topic == messages.ODOMETRY_TOPIC:
+                self._judge(stamp, values, self.predictor.predict(stamp, values))
+                self.predictor.finish()
+            else:
+                self.predictor.observe(stamp, values)
+        except Exception as error:  # that there is none is what is tried here
+            self._violated(f"{type(error).__name__} raised", traceback.format_exc())
+
+    def _judge(self, stamp: int, values: dict[str, float], outcome: Any) -> None:
+        if not isinstance(outcome, Prediction):
+            self.done.refusals[outcome.name.lower()] += 1
+            return
+        self.done.predictions += 1
+        parts = (
+            outcome.state,
+            outcome.pose,
+            outcome.theta,
+            outcome.theta_std,
+            outcome.variance,
+            outcome.residual_share,
+        )
+        if not all(np.all(np.isfinite(part)) for part in parts if part is not None):
+            self._violated("an output is not finite", repr(outcome))
+        if invalid := self.traffic.invalid(values):
+            self._violated("predicted from an invalid sample", invalid)
+        if outcome.stamp <= stamp:
+            self._violated("the predicted instant is not ahead", f"{outcome.stamp} of {stamp}")
+
+    def _violated(self, kind: str, words: str) -> None:
+        self.done.violations.setdefault(kind, f"message {self.done.messages}: {words}")
+
+
 def fuzz(model: Path, count: int, seed: int, progress: Progress | None = None) -> Fuzzed:
     """Sends at least ``count`` messages to a predictor of ``model``; what they are follows from ``seed``."""
-    car = _Car(Predictor(OnnxModel(open_artifact(model)), load_signal_map("default")), seed)
+    car = _Predicting(Predictor(OnnxModel(open_artifact(model)), load_signal_map("default")), seed)
     while car.done.messages < count:
         for _ in range(_REPORTED):
             car.step()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ from dynssm_ros.vehicle.effects import parse_effect
 
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
-_LINE_EVERY_S = 10.0
+_LINE_EVERY_S, _SHOWN_EVERY_S = 10.0, 0.1
 
 VehicleOption = Annotated[
     str, typer.Option("--vehicle", help="Vehicle: name of a shipped one (orca, av21, ...) or a file.")
@@ -105,8 +106,13 @@ def progress_bar(description: str) -> Iterator[Update]:
     )
     with Progress(*columns, console=errors, transient=True) as progress:
         task = progress.add_task(description, total=None, words="")
+        shown = -math.inf
 
         def update(done: int, total: int, words: str = "") -> None:
-            progress.update(task, completed=done, total=total, words=words)
+            nonlocal shown
+            now = time.monotonic()
+            if done >= total or now - shown >= _SHOWN_EVERY_S:  # drawing costs more than reading a message does
+                shown = now
+                progress.update(task, completed=done, total=total, words=words)
 
         yield update

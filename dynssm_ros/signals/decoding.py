@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,18 +13,20 @@ from dynssm_ros.signals.signal_map import Accessor, SignalMap, Source, compile_f
 from dynssm_ros.signals.velocities import LiveVelocities
 
 
-@dataclass(frozen=True)
-class _Reading:
+class _Reading(NamedTuple):
     signal: str
     source: Source
     read: Accessor
+    to_si: Callable[[float], float]
 
-    def value(self, raw: float) -> float:
-        """In SI units."""
-        if self.source.curve is not None and math.isfinite(raw):
-            at, values = zip(*self.source.curve, strict=True)
-            raw = float(np.interp(raw, at, values))
-        return self.source.scale * raw + self.source.offset
+
+def _to_si(source: Source) -> Callable[[float], float]:
+    """Turns what is in a message into SI units."""
+    scale, offset = source.scale, source.offset
+    if source.curve is None:
+        return lambda raw: scale * raw + offset
+    at, values = np.array(source.curve).T
+    return lambda raw: scale * float(np.interp(raw, at, values) if math.isfinite(raw) else raw) + offset
 
 
 class TopicDecoder:
@@ -43,7 +45,7 @@ class TopicDecoder:
         self.subscribed = next(sources, topic)
         """The name as the map has it: relative ones are in the namespace of a node."""
         self._readings = [
-            _Reading(name, source, compile_field(source.field))
+            _Reading(name, source, compile_field(source.field), _to_si(source))
             for name, source in signal_map.active_signals().items()
             if source.recorded == topic
         ]
@@ -60,21 +62,20 @@ class TopicDecoder:
             BagError: the message type has no such field, or the field is not a number.
         """
         values: dict[str, float] = {}
-        for reading in self._readings:
+        for signal, source, read, to_si in self._readings:
             try:
-                raw = reading.read(message)
+                raw = read(message)
             except AttributeError as error:
                 raise BagError(
-                    f"topic {self.topic}: {self.msgtype} has no field '{reading.source.field}' for signal {reading.signal} "
+                    f"topic {self.topic}: {self.msgtype} has no field '{source.field}' for signal {signal} "
                     f"(at '{error.name}'; there: {_public_fields(error.obj)})"
                 ) from error
             except (TypeError, ValueError, OverflowError) as error:
                 raise BagError(
-                    f"topic {self.topic}: field '{reading.source.field}' for signal {reading.signal} is not a number "
-                    f"({error})"
+                    f"topic {self.topic}: field '{source.field}' for signal {signal} is not a number ({error})"
                 ) from error
             if raw is not None:
-                values[reading.signal] = reading.value(raw)
+                values[signal] = to_si(raw)
         return values
 
 

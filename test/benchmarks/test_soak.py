@@ -1,0 +1,44 @@
+"""An hour's soak in short: the benchmark counts what it should, and sees what must not happen."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from benchmarks.fuzz import Traffic
+from benchmarks.soak import soak
+
+pytestmark = pytest.mark.live
+
+
+def test_each_message_is_answered_while_models_are_swapped(small_model: Path, tmp_path: Path) -> None:
+    other = shutil.copytree(small_model, tmp_path / "other")
+    done = soak([small_model, other], 3.0, 100.0, swap_every=0.8)
+    assert done.violations == {}
+    assert done.swaps == 3
+    assert done.odometry == done.predictions
+    assert done.odometry == pytest.approx(300, abs=10)
+    assert done.messages == 3 * done.odometry
+    assert 0 < done.latency_ms["p50"] <= done.latency_ms["p100"] == max(done.slowest_at_swap_ms, done.slowest_else_ms)
+    assert done.rss_mb[0] > 30
+    assert done.open_files[0] > 5
+
+
+def test_a_swap_that_is_refused_is_seen(small_model: Path, tmp_path: Path) -> None:
+    done = soak([small_model, tmp_path / "none"], 1.5, 100.0, swap_every=0.8)
+    assert "no such model folder" in done.violations["a swap was refused"]
+    assert done.swaps == 0
+
+
+def test_nothing_is_predicted_from_what_is_spoilt(small_model: Path) -> None:
+    done = soak([small_model], 3.0, 200.0, spoilt=0.15)
+    assert done.violations == {}
+    assert 0.1 < done.spoilt / done.messages < 0.2
+    assert done.predictions > 0.5 * done.odometry
+
+
+def test_a_prediction_from_an_invalid_sample_is_seen(small_model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Traffic, "invalid", lambda self, values: "planted")
+    assert "planted" in soak([small_model], 1.0, 100.0).violations["predicted from an invalid sample"]
