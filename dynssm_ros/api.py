@@ -2,18 +2,22 @@
 
 All functions take vehicles, models, signal maps and tracks by shipped name, by path, or as the object itself. Nothing is
 printed; ``on_progress`` is called with what is done and what there is to do. What is wrong with the input raises a
-:class:`~dynssm_ros.errors.UserError` whose message is one line.
+:class:`~dynssm_ros.errors.UserError` whose message is one line; data that look wrong a
+:class:`~dynssm_ros.errors.DataWarning`.
 """
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.errors import ConfigurationError, DataWarning
 from dynssm_ros.extras import require
 from dynssm_ros.progress import Progress
+from dynssm_ros.runtime.plausibility import implausible_rows
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
 from dynssm_ros.vehicle import Vehicle, load_vehicle
@@ -191,8 +195,9 @@ def calibrate(
     require("calibrate", "train")
     from dynssm_ros.identification.calibration import calibrate
 
-    data = _joined(recordings, commands, holdout)
-    return calibrate(data, _vehicle(vehicle), horizon, min_speed, integrator, starts, seed, on_progress)
+    car = _vehicle(vehicle)
+    data = _joined(_opened(recordings, car), commands, holdout)
+    return calibrate(data, car, horizon, min_speed, integrator, starts, seed, on_progress)
 
 
 class TrainingResult(NamedTuple):
@@ -243,9 +248,9 @@ def train(
     folder = Path(out) if Path(out).name else Path(out).absolute()  # "." has no name to put the checkpoint beside
     check_replaceable(folder)
     config = model_config(model, seed, epochs)
-    checkpoint = checkpoint_of(folder)
+    checkpoint, car = checkpoint_of(folder), _vehicle(vehicle)
     trained = train(
-        _joined(recordings, commands, holdout), config, _vehicle(vehicle), checkpoint, device, on_progress,
+        _joined(_opened(recordings, car), commands, holdout), config, car, checkpoint, device, on_progress,
         lambda data, car, integrator: calibrate(data, car, integrator=integrator).vehicle,
     )  # fmt: skip
     artifact = save_artifact(trained, folder, {"holdout": holdout, "device": device})
@@ -306,8 +311,9 @@ def evaluate(
     from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
     from dynssm_ros.track.lap_position import first_lap
 
-    log = _joined(recordings, None, 0.0)
     opened = models if isinstance(models, Mapping) else open_models(models, vehicle)
+    car = next((model.vehicle for model in opened.values() if model.vehicle is not None), None)
+    log = _joined(_opened(recordings, car), None, 0.0)
     line = first_lap(log) if track is None else _centre_line(track, log)
     log = log.with_commands(commands or shared_commands(opened))
     opened = with_offline(opened)
@@ -432,12 +438,10 @@ def diagnose(
     require("diagnose", "train")
     from dynssm_ros.identification.diagnose import diagnose
 
-    line = None if track is None else _track(track).centre
+    line, car = None if track is None else _track(track).centre, _vehicle(vehicle)
     report = on_progress or (lambda words: None)
-    data, changed = (
-        [_recording(log).with_commands(commands) for log in _several(logs)] for logs in (recordings, suspect)
-    )
-    return diagnose(data, _vehicle(vehicle), horizon, holdout, min_speed, integrator, line, report, exclude, changed)
+    data, changed = ([log.with_commands(commands) for log in _opened(logs, car)] for logs in (recordings, suspect))
+    return diagnose(data, car, horizon, holdout, min_speed, integrator, line, report, exclude, changed)
 
 
 def race(
@@ -550,13 +554,22 @@ def _vehicle(vehicle: Vehicle | PathLike) -> Vehicle:
     return vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
 
 
-def _recording(log: Log) -> Recording:
-    return log if isinstance(log, Recording) else Recording.load(log)
+def _opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
+    """Recordings; a :class:`DataWarning` names what of them the car cannot have done."""
+    opened = []
+    for log in _several(logs):
+        recording = log if isinstance(log, Recording) else Recording.load(log)
+        where = ", ".join(recording.info.source) if isinstance(log, Recording) else log
+        if car is not None and math.isclose(car.sampling_time, recording.T_s):  # else the command ends with that
+            for words in implausible_rows(recording, car):
+                warnings.warn(f"{where}: {words}", DataWarning, stacklevel=3)
+        opened.append(recording)
+    return opened
 
 
-def _joined(logs: Log | Sequence[Log], commands: Commands | None, holdout: float) -> Recording:
+def _joined(recordings: Sequence[Recording], commands: Commands | None, holdout: float) -> Recording:
     """Recordings one after the other, each without its last fraction ``holdout``."""
-    return concatenate([_recording(log).with_commands(commands).split_last(holdout)[0] for log in _several(logs)])
+    return concatenate([each.with_commands(commands).split_last(holdout)[0] for each in recordings])
 
 
 def _several(logs: Log | Sequence[Log]) -> list[Log]:

@@ -24,5 +24,9 @@ class RecordingError(UserError):
     """A recording is not what the command needs (columns, rate, length)."""
 
 
+class DataWarning(UserWarning):
+    """Data look wrong and are used nevertheless; the text is one complete line."""
+
+
 class ArtifactError(UserError):
     """A model folder is incomplete, of a newer version, damaged, or does not fit."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,7 +24,7 @@ from dynssm_ros.cli.race import race
 from dynssm_ros.cli.replay import replay
 from dynssm_ros.cli.simulate import simulate
 from dynssm_ros.cli.train import train
-from dynssm_ros.errors import UserError
+from dynssm_ros.errors import DataWarning, UserError
 from dynssm_ros.extras import load_plugins
 from dynssm_ros.files import protecting
 
@@ -67,7 +69,7 @@ def main() -> None:
     arguments = [word for word in sys.argv[1:] if word != "--force"]
     try:
         load_plugins()
-        with protecting(inputs(arguments), force=len(arguments) < len(sys.argv) - 1):
+        with _warning_in_lines(), protecting(inputs(arguments), force=len(arguments) < len(sys.argv) - 1):
             status = app(arguments, standalone_mode=False)
     except UserError as error:
         _fail(str(error))
@@ -93,6 +95,23 @@ def inputs(arguments: Sequence[str]) -> list[Path]:
             found.append(Path(value))
         option = ""
     return found
+
+
+@contextmanager
+def _warning_in_lines() -> Iterator[None]:
+    """Data that look wrong are a line each on stderr, every time; other warnings stay as they are."""
+    with warnings.catch_warnings():
+        others = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, DataWarning):
+                errors.print(f"[yellow]warning:[/yellow] {escape(str(message))}", soft_wrap=True, highlight=False)
+            else:
+                others(message, category, *where, **more)
+
+        warnings.simplefilter("always", DataWarning)
+        warnings.showwarning = show
+        yield
 
 
 def _fail(words: str) -> None:

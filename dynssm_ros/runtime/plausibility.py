@@ -6,11 +6,14 @@ A jump is believed when a second sample confirms it, as after a collision or whe
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
+
+import numpy as np
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.signals.history import Refusal
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.limits import vehicle_limits
 
@@ -18,6 +21,8 @@ _BEYOND = 1.5  # times a limit
 _SPIN = 3.0  # times the yaw rate of the tightest corner at the limit
 _HARD = 4.0  # times the car's accelerations: kerbs, hits
 _NOISE = 0.5  # jump that is no sign of anything, in units of the car's own speed and yaw rate
+_COLUMNS = {"throttle_feedback": "r_fb", "steering_feedback": "delta_fb"}
+_COMMANDED = {"throttle_command", "steering_command"}  # not measured: a controller may ask for anything
 _ACTUATOR_RANGE_S = 0.01  # an actuator that crosses its range faster than this, does not
 
 
@@ -60,6 +65,21 @@ def ranges(vehicle: Vehicle) -> dict[str, Range]:
         of_actuator = Range(middle - _BEYOND * half, middle + _BEYOND * half, 2 * half / _ACTUATOR_RANGE_S, 2 * half)
         found |= dict.fromkeys((f"{actuator}_feedback", f"{actuator}_command"), of_actuator)
     return found
+
+
+def implausible_rows(recording: Recording, vehicle: Vehicle) -> Iterator[str]:
+    """The rows of a recording that hold what the car cannot have done, in words: a line for each signal, with its first."""
+    of = ranges(vehicle)
+    for signal in of.keys() - _COMMANDED:
+        limit, name = of[signal], _COLUMNS.get(signal, signal)
+        values = recording[name]
+        beyond = np.flatnonzero(~((limit.low <= values) & (values <= limit.high)))
+        if len(beyond):
+            row = int(beyond[0])
+            yield (
+                f"row {row} at {(recording.time[row] - recording.time[0]) / 1e9:.2f} s: {name} = {values[row]:.4g}; expected "
+                f"{limit.low:.4g} to {limit.high:.4g} of vehicle {vehicle.name} ({len(beyond)} such rows)"
+            )
 
 
 class Plausibility:

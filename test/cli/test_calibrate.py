@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -115,3 +116,20 @@ def test_what_does_not_fit_is_one_line_and_leaves_nothing(
     (line,) = err.strip().splitlines()
     assert words in line
     assert [path.name for path in tmp_path.iterdir()] == ["laps.parquet"]
+
+
+@pytest.mark.parametrize("command", ["calibrate", "train", "evaluate", "diagnose"])
+def test_rows_that_the_car_cannot_have_driven_are_named_in_a_line(
+    dynssm: Run, laps: Path, tmp_path: Path, command
+) -> None:
+    recording = Recording.load(laps)
+    omega = np.where(np.arange(len(recording)) == 40, 500.0, recording["omega"])
+    replace(recording, columns=recording.columns | {"omega": omega}).save(laps)
+    models = {"train": ("--model", "ridge"), "evaluate": ("--model", "persistence", "--model", "single_track")}
+    status, _, words = dynssm(
+        command, laps, "--vehicle", "orca", *models.get(command, ()), "--out", tmp_path / "out.yaml"
+    )
+    assert status == 0, words
+    warned = [line for line in words.splitlines() if line.startswith("warning: ")]
+    assert len(warned) == 1
+    assert "row 40 at 0.80 s: omega = 500; expected" in warned[0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.api import recorded, simulate
-from dynssm_ros.runtime.plausibility import Plausibility, ranges
+from dynssm_ros.runtime.plausibility import Plausibility, implausible_rows, ranges
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.vehicle import load_vehicle
 
@@ -61,6 +61,20 @@ def test_what_is_not_finite_or_not_known_is_left_to_others(checks: Plausibility)
     assert checks.check(T_S, {"x": 1e9, "anything": 1e9}) is None
 
 
+def test_rows_of_a_recording_that_the_car_cannot_have_driven_are_named() -> None:
+    drive = recorded(simulate("orca", "club", duration=4.0))
+    assert list(implausible_rows(drive, ORCA)) == []
+    drive["v_x"][[70, 90]] = 12.0, np.nan
+    drive["delta_fb"][30] = -8.0  # degrees
+    drive["r_cmd"][10] = 50.0  # who commands may ask for anything
+    named = sorted(implausible_rows(drive, ORCA))
+    assert len(named) == 2
+    assert named[0].startswith("row 30 at 0.60 s: delta_fb = -8; expected -0.")
+    assert named[0].endswith("of vehicle orca (1 such rows)")
+    assert named[1].startswith("row 70 at 1.40 s: v_x = 12; expected ")
+    assert named[1].endswith("(2 such rows)")
+
+
 @pytest.mark.parametrize("plant", ["rk4", "double_track"])
 def test_a_car_at_its_limit_with_three_times_the_usual_noise_is_plausible(plant) -> None:
     drive = recorded(simulate("orca", "club", plant=plant, duration=20.0, noise=(0.03, 0.03, 0.09), seed=3))
@@ -68,6 +82,7 @@ def test_a_car_at_its_limit_with_three_times_the_usual_noise_is_plausible(plant)
     names = {"v_x": "v_x", "v_y": "v_y", "omega": "omega", "r_fb": "throttle_feedback", "delta_fb": "steering_feedback"}
     for k, stamp in enumerate(drive.time.tolist()):
         assert checks.check(stamp, {name: float(drive[column][k]) for column, name in names.items()}) is None
+    assert list(implausible_rows(drive, ORCA)) == []
 
 
 def test_limits_grow_with_the_car() -> None:
