@@ -222,9 +222,12 @@ def test_the_aggregator_takes_the_status_of_each_node_once() -> None:
     analyzers = [a for a in content["analyzers"]["ros__parameters"].values() if isinstance(a, dict)]
     said = {}
     for file in sorted((ROOT / "dynssm_ros" / "nodes").glob("*.py")):
-        found = re.search(r'diagnostics\(\s*self, "(\w+)"', file.read_text(encoding="utf-8"))
-        if found:
-            said[file.stem] = f"/car1/{file.stem}: {found[1]}"  # as nodes/support.py writes it
+        source = file.read_text(encoding="utf-8")
+        node, part = (
+            re.search(pattern, source) for pattern in (r'super\(\).__init__\("(\w+)"', r'diagnostics\(\s*self, "(\w+)"')
+        )
+        if node and part:
+            said[file.stem] = f"/car1/{node[1]}: {part[1]}"  # as nodes/support.py writes it
     assert set(said) == {"controller", "predictor", "simulator"}
     for status in said.values():
         assert len([a for a in analyzers if any(part in status for part in a["contains"])]) == 1, status
