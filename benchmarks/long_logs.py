@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.cli.console import console, errors, progress_bar
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
 from dynssm_ros.reporting.tables import Column, Table, Value
@@ -67,7 +67,8 @@ def measure(minutes: float, wanted: Sequence[str] = ()) -> dict[str, Cost]:
         costs, chosen = {}, commands(folder)
         for index, (title, arguments) in enumerate(chosen.items()):
             if not wanted or title.split()[0] in {*wanted, "extract"}:
-                costs[title] = _run(arguments)
+                costs[title] = cost = _run(arguments)
+                errors.print(f"{minutes:g} min: {title}: {cost.cpu:.1f} s, {cost.memory:.0f} MB", markup=False)
             progress(index + 1, len(chosen))
     return costs
 

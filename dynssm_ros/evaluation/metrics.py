@@ -13,8 +13,8 @@ import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.runtime.models import WindowModel, WindowPrediction, corrected, seen_by
-from dynssm_ros.runtime.online import Learned, Seen
-from dynssm_ros.runtime.path_judge import trusted_along
+from dynssm_ros.runtime.online import Along, Learned
+from dynssm_ros.runtime.path_judge import PathJudge, trusted_along
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
@@ -50,7 +50,7 @@ def predict_rows(
     rows: Indices,
     batch: int = BATCH,
     tick: Tick = silent,
-    learned: Learned | None = None,
+    drive: DriveThrough | None = None,
 ) -> WindowPrediction:
     """The model's predictions of the rows that follow ``rows``; windows exist only for one batch at a time.
 
@@ -60,16 +60,15 @@ def predict_rows(
         rows: last row of each window, shape ``(M,)``, ``M > 0``.
         batch: windows per call.
         tick: told of progress.
-        learned: what the model's online layer had learned at ``rows``; ``None``: it stays out.
+        drive: what the model's online layer knew along the recording; ``None``: it stays out.
     """
     parts = []
     for start in range(0, len(rows), batch):
         chunk = rows[start : start + batch]
         windows = gather(matrix, chunk, model.H - 1)
         predicted = model.predict(windows)
-        if model.online is not None and learned is not None:
-            known = learned.at(np.arange(start, start + len(chunk)))
-            predicted = corrected(predicted, windows, model.online, known)
+        if model.online is not None and drive is not None:
+            predicted = corrected(predicted, windows, model.online, drive.at(chunk))
         parts.append(predicted._replace(seen=None))
         tick(len(chunk))
     return WindowPrediction(
@@ -105,15 +104,18 @@ def drive_through(model: WindowModel, recording: Recording, batch: int = BATCH) 
     ends: Indices = recording.window_ends(model.H, 0, layer.minimum_speed)
     if len(ends) == 0:
         return None
-    starts = range(0, len(ends), batch)
-    parts = [seen_by(model, gather(matrix, ends[start : start + batch], model.H - 1)) for start in starts]
-    seen = Seen(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-    following = np.minimum(ends + 1, len(matrix) - 1)
-    learned = layer.drive(seen, matrix[ends], matrix[following, :3] - matrix[ends, :3], ends)
-    trusted = trusted_along(
-        layer, lambda row: matrix[row - model.H + 1 : row + 1], ends, learned, seen, partial(seen_by, model)
-    )
-    return DriveThrough(ends, learned._replace(trusted=trusted))
+    along, judge, last, parts = Along(layer), PathJudge(layer), None, []
+    for start in range(0, len(ends), batch):
+        chunk = ends[start : start + batch]
+        seen = seen_by(model, gather(matrix, chunk, model.H - 1))
+        following = np.minimum(chunk + 1, len(matrix) - 1)
+        learned = along.over(seen, matrix[chunk], matrix[following, :3] - matrix[chunk, :3], chunk)
+        trusted = trusted_along(
+            judge, lambda row: matrix[row - model.H + 1 : row + 1], chunk, learned, seen, partial(seen_by, model), last
+        )
+        parts.append(learned._replace(trusted=trusted))
+        last = int(chunk[-1])
+    return DriveThrough(ends, Learned(*(np.concatenate(each) for each in zip(*parts, strict=True))))
 
 
 def rmse(errors: Vector) -> Vector:

@@ -206,8 +206,7 @@ def _score(
     increments = matrix[rows + 1, :3] - matrix[rows, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
         drive = drive_through(model, recording, batch)
-        at_rows, at_starts = (None, None) if drive is None else (drive.at(rows), drive.at(starts))
-        predicted = predict_rows(model, matrix, rows, batch, tick, at_rows)
+        predicted = predict_rows(model, matrix, rows, batch, tick, drive)
         errors = predicted.state - matrix[rows + 1, :3]
         return Score(
             model=model,
@@ -220,7 +219,7 @@ def _score(
             coverage_90=None if predicted.variance is None else coverage(errors, predicted.variance),
             regime_rmse=regime_rmse(regimes, errors),
             coefficients=coefficient_statistics(predicted.theta, model.vehicle),
-            rollout=score_rollouts(model, matrix, starts, steps, recording.T_s, batch, tick, at_starts),
+            rollout=score_rollouts(model, matrix, starts, steps, recording.T_s, batch, tick, drive),
             latency_us=latency_us(model, gather(matrix, rows[:50], model.H - 1), calls),
         )
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.evaluation.metrics import BATCH, Tick, gather, silent
+from dynssm_ros.evaluation.metrics import BATCH, DriveThrough, Tick, gather, silent
 from dynssm_ros.runtime.models import WindowModel, corrected
 from dynssm_ros.runtime.online import Learned
 from dynssm_ros.vehicle.kinematics import path
@@ -113,7 +113,7 @@ def score_rollouts(
     T_s: float,
     batch: int = BATCH,
     tick: Tick = silent,
-    learned: Learned | None = None,
+    drive: DriveThrough | None = None,
 ) -> Rollout:
     """Rolls the model out from all ``starts`` and compares with what was measured.
 
@@ -125,13 +125,13 @@ def score_rollouts(
         T_s: sampling time (s).
         batch: rollouts that run side by side.
         tick: told of progress.
-        learned: what the model's online layer had learned at ``starts``.
+        drive: what the model's online layer knew along the recording.
     """
     squares, distances = np.zeros((steps, 3)), np.zeros(steps)
     for begin in range(0, len(starts), batch):
         chunk = starts[begin : begin + batch]
         stretches = gather(matrix, chunk, model.H - 1, steps)
-        known = None if learned is None else learned.at(np.arange(begin, begin + len(chunk)))
+        known = None if drive is None else drive.at(chunk)
         measured = stretches[:, model.H - 1 :, :3]
         predicted = np.concatenate([measured[:, :1], roll_out(model, stretches, steps, known)], axis=1)
         squares += np.sum((predicted - measured)[:, 1:] ** 2, axis=0)

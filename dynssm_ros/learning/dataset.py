@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -57,6 +58,11 @@ class TrainingWindows:
         ends = self.ends[index]
         rows = ends[:, None] + torch.arange(1 - self.H, 1, device=ends.device)
         return self.matrix[rows], self.matrix[ends + 1, :3] - self.matrix[ends, :3]
+
+    def batches(self, size: int = 4096) -> Iterator[tuple[Tensor, Tensor]]:
+        """All of them in order, as :meth:`batch` has them, so many at a time."""
+        for begin in range(0, len(self), size):
+            yield self.batch(slice(begin, begin + size))
 
     def to(self, device: torch.device) -> TrainingWindows:
         """The same windows on ``device``."""

@@ -220,17 +220,16 @@ def fit_layer(
         fitted = layer(prior, rows, {})
         return LeftOut(fitted, part, fitted.drive(*part))
 
-    trials = {rows: [without(part, prior, rows) for part, prior in left_out] for rows in _PRIOR_ROWS}
-    losses = {
-        rows: float(
-            0.5 * np.log(np.mean(np.concatenate([each.errors for each in trial]) ** 2, axis=0) + _SMALLEST).mean()
-        )
-        for rows, trial in trials.items()
-    }
-    least = min(losses.values())
-    chosen = next(rows for rows in _PRIOR_ROWS if losses[rows] <= least + np.log1p(_TOLERANCE))
+    trials: dict[float, tuple[float, list[LeftOut]]] = {}
+    for rows in _PRIOR_ROWS:
+        trial = [without(part, prior, rows) for part, prior in left_out]
+        errors = np.concatenate([each.errors for each in trial])
+        trials[rows] = float(0.5 * np.log(np.mean(errors**2, axis=0) + _SMALLEST).mean()), trial
+        least = min(loss for loss, _ in trials.values())
+        trials = {r: each for r, each in trials.items() if each[0] <= least + np.log1p(_TOLERANCE)}  # they are large
+    chosen, (loss, left) = next(iter(trials.items()))
     whole_layer = layer(_least_squares(whole, s_delta), chosen, config.spread)
-    return FittedLayer(whole_layer, float(np.exp(losses[chosen])), trials[chosen])
+    return FittedLayer(whole_layer, float(np.exp(loss)), left)
 
 
 class _Prior(NamedTuple):

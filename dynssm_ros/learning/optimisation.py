@@ -155,8 +155,11 @@ class Optimisation:
     @torch.no_grad()
     def _validate(self) -> dict[str, float]:
         self.model.eval()
-        window, target = self.validation.batch(slice(None))
-        return {term: value.item() for term, value in self._terms(window, target, self.steps).items()}
+        totals = dict.fromkeys(COMPONENTS, 0.0)
+        for window, target in self.validation.batches():
+            for term, value in self._terms(window, target, self.steps).items():
+                totals[term] += value.item() * len(target) / len(self.validation)
+        return totals
 
     def _terms(self, window: Tensor, target: Tensor, steps: int) -> dict[str, Tensor]:
         if self.steps == 1:

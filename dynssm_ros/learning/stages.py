@@ -165,8 +165,10 @@ def check_device(device: str) -> None:
 @torch.no_grad()
 def validation_rmse(model: TrainableModel, windows: TrainingWindows) -> tuple[float, float, float]:
     """One-step RMSE of each state over ``windows`` (m/s, m/s, rad/s)."""
-    batch, target = windows.batch(slice(None))
-    rmse = (model(batch).increment - target).square().mean(0).sqrt().tolist()
+    squares = torch.zeros(3)
+    for batch, target in windows.batches():
+        squares += (model(batch).increment - target).square().sum(0)
+    rmse = (squares / len(windows)).sqrt().tolist()
     return rmse[0], rmse[1], rmse[2]
 
 

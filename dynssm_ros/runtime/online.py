@@ -177,16 +177,27 @@ class OnlineLayer:
             increments: measured from them to the next (m/s, m/s, rad/s), ``(N, 3)``.
             ends: row numbers, ascending. The layer learns a step once the row after it is one of them.
         """
-        state = self.start()
-        count, n = len(ends), self.mean.shape[1]
-        learned = Learned(
-            *(np.empty((count, *shape)) for shape in ((CHANNELS, n), (CHANNELS,), (CHANNELS,), (17,), ()))
-        )
-        for k, row in enumerate(ends):
-            if k and ends[k - 1] == row - 1:
-                state.update(Seen(seen.features[k - 1], seen.physics[k - 1]), rows[k - 1], increments[k - 1])
+        return Along(self).over(seen, rows, increments, ends)
+
+
+class Along:
+    """An online layer that learns along a recording, block of rows after block."""
+
+    def __init__(self, layer: OnlineLayer) -> None:
+        self._state = layer.start()
+        self._shape = layer.mean.shape
+        self._last: tuple[int, Seen, Vector, Vector] | None = None
+
+    def over(self, seen: Seen, rows: Vector, increments: Vector, ends: Indices) -> Learned:
+        """The next block; as :meth:`OnlineLayer.drive`."""
+        state, shapes = self._state, (self._shape, self._shape[:1], self._shape[:1], (17,), ())
+        learned = Learned(*(np.empty((len(ends), *shape)) for shape in shapes))
+        for k, row in enumerate(ends.tolist()):
+            if self._last is not None and self._last[0] == row - 1:
+                state.update(*self._last[1:])
             else:
                 state.interrupt()
+            self._last = row, Seen(seen.features[k].copy(), seen.physics[k]), rows[k], increments[k]
             learned.weights[k] = state.mean
             learned.variance[k] = state.variance(seen.features[k])
             learned.limit[k] = state.limit

@@ -122,23 +122,30 @@ class _Pair:
 
 
 def trusted_along(
-    layer: OnlineLayer, windows: Callable[[int], Vector], ends: Indices, learned: Learned, seen: Seen, see: See
+    judge: PathJudge,
+    windows: Callable[[int], Vector],
+    ends: Indices,
+    learned: Learned,
+    seen: Seen,
+    see: See,
+    last: int | None = None,
 ) -> Vector:
     """Whether paths were to be predicted by the layer, at each of the rows ``ends`` that a recording was driven through.
 
     Args:
-        layer: the online layer.
+        judge: has judged up to there.
         windows: the window that ends at a row.
         ends: rows, ascending, ``(N,)``.
         learned: what was known there.
         seen: what the layer saw there.
         see: the model's graph.
+        last: row that was judged last; ``None`` if none was.
     """
-    judge, out = PathJudge(layer), np.ones(len(ends))
-    for k, row in enumerate(ends):
-        if k and ends[k - 1] != row - 1:
+    out = np.ones(len(ends))
+    for k, row in enumerate(ends.tolist()):
+        if last != row - 1:
             judge.interrupt()
-        at = np.array([k])
-        judge.step(windows(int(row)), Seen(seen.features[at], seen.physics[at]), learned.at(at), see)
+        at, last = np.array([k]), row
+        judge.step(windows(row), Seen(seen.features[at], seen.physics[at]), learned.at(at), see)
         out[k] = judge.trusted
     return out

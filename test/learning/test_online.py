@@ -126,10 +126,10 @@ def test_live_predictions_are_those_of_the_evaluation(noisy_laps, noisy_model):
     part = noisy_laps.select(rows)
     predictor = Predictor(noisy_model, SIGNALS)
     found = feed(predictor, part, rows)
-    ends, learned = drive_through(noisy_model, part)
-    shared = [k for k in ends if k in found]
+    drive = drive_through(noisy_model, part)
+    shared = [k for k in drive.ends if k in found]
     assert len(shared) > 300
-    batch = predict_rows(noisy_model, part.matrix, np.array(shared), learned=learned.at(np.searchsorted(ends, shared)))
+    batch = predict_rows(noisy_model, part.matrix, np.array(shared), drive=drive)
     np.testing.assert_allclose([found[k].state for k in shared], batch.state, atol=1e-5)
     np.testing.assert_allclose([found[k].variance for k in shared], batch.variance, rtol=1e-3)
 

@@ -7,7 +7,7 @@ import pytest
 
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.coefficients import SPREAD
-from dynssm_ros.runtime.online import OnlineLayer, OnlineLayerCard, Seen
+from dynssm_ros.runtime.online import Along, OnlineLayer, OnlineLayerCard, Seen
 from dynssm_ros.vehicle import load_vehicle
 
 N = 4
@@ -117,6 +117,12 @@ def test_what_was_known_at_a_row_does_not_depend_on_what_came_after():
     half = layer.drive(Seen(features[:25], increments[:25]), ROWS[:25], increments[:25], np.arange(25))
     np.testing.assert_array_equal(whole.weights[:25], half.weights)
     np.testing.assert_array_equal(whole.variance[:25], half.variance)
+    along = Along(layer)
+    parts = [
+        along.over(Seen(features[part], increments[part]), ROWS[:50][part], increments[part], np.arange(50)[part])
+        for part in (slice(0, 20), slice(20, 50))
+    ]
+    np.testing.assert_array_equal(whole.weights, np.concatenate([part.weights for part in parts]))
 
 
 def test_a_step_across_a_gap_is_not_learned():

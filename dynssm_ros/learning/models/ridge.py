@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import torch
@@ -47,13 +48,26 @@ class Ridge(TrainableModel):
     @torch.no_grad()
     def fit(self, training: TrainingWindows) -> bool:
         """Closed-form solution in double precision; the intercept is free of the penalty."""
-        windows, increments = training.batch(slice(None))
-        features = ((windows - self.mean) / self.std).flatten(1).double()
-        targets = (increments / self.increment_scale).double()
-        centre, level = features.mean(0), targets.mean(0)
-        x, y = features - centre, targets - level
-        gram = x.T @ x + self.penalty * torch.eye(x.shape[1], dtype=torch.float64)
-        weights = torch.linalg.solve(gram, x.T @ y)
+        columns = self.linear.in_features
+        centre, level = torch.zeros(columns, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+        for features, targets in self._scaled(training):
+            centre += features.sum(0) / len(training)
+            level += targets.sum(0) / len(training)
+        gram = self.penalty * torch.eye(columns, dtype=torch.float64)
+        moment = torch.zeros(columns, 3, dtype=torch.float64)
+        for features, targets in self._scaled(training):
+            x = features - centre
+            gram += x.T @ x
+            moment += x.T @ (targets - level)
+        weights = torch.linalg.solve(gram, moment)
         self.linear.weight.copy_(weights.T)
         self.linear.bias.copy_(level - centre @ weights)
         return True
+
+    def _scaled(self, training: TrainingWindows) -> Iterator[tuple[Tensor, Tensor]]:
+        """Features and targets, batch by batch."""
+        for windows, increments in training.batches():
+            yield (
+                ((windows - self.mean) / self.std).flatten(1).double(),
+                (increments / self.increment_scale).double(),
+            )
