@@ -66,19 +66,20 @@ class Car:
         assert self.diagnosed(""), "no diagnostics"
         return "nothing received" not in self.run.diagnostics[-1][1]
 
-    def odometry(self, v_x: float = 1.0) -> int:
+    def odometry(self, v_x: float = 1.0, v_y: float = 0.0, omega: float = 0.0) -> int:
         """Sends odometry at the present stamp; returns the stamp that a prediction for it has."""
         message = Odometry()
         self._stamp(message)
         message.header.frame_id, message.child_frame_id = "map", "base_link"
-        message.twist.twist.linear.x = v_x
+        twist = message.twist.twist
+        twist.linear.x, twist.linear.y, twist.angular.z = v_x, v_y, omega
         message.pose.pose.orientation.w = 1.0
         self._odometry.publish(message)
         return self.stamp + PERIOD
 
-    def actuators(self, commands: bool = True) -> None:
+    def actuators(self, commands: bool = True, throttle: float = 0.2, steering: float = 0.0) -> None:
         for publisher in (self._feedback, self._command) if commands else (self._feedback,):
-            message = JointState(name=["throttle", "steering"], position=[0.2, 0.0])
+            message = JointState(name=["throttle", "steering"], position=[throttle, steering])
             self._stamp(message)
             publisher.publish(message)
 
