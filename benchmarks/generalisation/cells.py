@@ -100,6 +100,14 @@ class Cell:
         return f"{self.training.name}-{self.change}"
 
     @property
+    def noise(self) -> tuple[float, float, float] | None:
+        """Deviations of what is measured of v_x, v_y, omega (m/s, m/s, rad/s); ``None`` of real logs: nobody knows them."""
+        if self.training.simulated is None:
+            return None
+        car, _, level = self.training.simulated
+        return sensor_noise(car, level)
+
+    @property
     def is_test(self) -> bool:
         """Whether it is for publishing only."""
         if self.training.simulated is None:
@@ -172,16 +180,21 @@ def _simulated(name: str, plant: PlantKind, level: str, part: str, change: str) 
     vehicle = simulated_car(name)
     track, scale = car.train if part == "train" else car.test
     road = load_track(track).scaled(scale)
-    noise = tuple(NOISE_LEVELS[level] * value for value in car.noise)
     for aggressiveness in (0.9, 0.8, 0.7, 0.6) if part == "train" else (0.95, 0.85, 0.75, 0.65, 0.55):
         with suppress(SimulationError):
             run = dynssm_ros.simulate(
                 vehicle, road, duration=car.seconds[part == "test"], plant=plant, seed=_SEEDS[part],
                 line="centre" if part == "train" else "racing", aggressiveness=aggressiveness,
-                noise=(noise[0], noise[1], noise[2]), effects=CHANGES[change],
+                noise=sensor_noise(name, level), effects=CHANGES[change],
             )  # fmt: skip
             return dynssm_ros.recorded(run)
     raise SimulationError(f"{name} with {change} on {track}: leaves the road however gently it is driven")
+
+
+def sensor_noise(name: str, level: str) -> tuple[float, float, float]:
+    """Deviations of the measured v_x, v_y, omega (m/s, m/s, rad/s) of a car at a level of noise."""
+    v_x, v_y, omega = (NOISE_LEVELS[level] * value for value in CARS[name].noise)
+    return v_x, v_y, omega
 
 
 def simulated_car(name: str) -> Vehicle:

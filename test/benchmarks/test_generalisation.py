@@ -110,6 +110,16 @@ def test_the_page_has_means_worst_cells_and_exact_cells():
     assert len(heat_map(known).axes[0].get_yticklabels()) == 3
 
 
+def test_the_page_says_how_near_the_noise_of_the_sensors_the_errors_are():
+    training = Training("orca-euler-three", "orca", ("orca", "euler", "three"))
+    known = {Cell(training, "a"): scores(**dict.fromkeys(BASELINES, 0.06), dynssm=0.03)}
+    assert next(iter(known)).noise == pytest.approx((0.03, 0.03, 0.09))
+    (part,) = (part for part in summary(known).values() if part["cells"])
+    np.testing.assert_allclose(part["models"]["dynssm"]["over_noise"], [1.0, 2.0, 1.0])
+    assert "1.00, 2.00, 1.00 (`dynssm`)" in page(known, "", 0)
+    assert Cell(Training("dart-free", "racer"), "circles").noise is None
+
+
 def test_a_cell_from_laps_to_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     short = {"orca": replace(CARS["orca"], seconds=(20.0, 6.0))}
     monkeypatch.setattr(of_cells, "CARS", short)
