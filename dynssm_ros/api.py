@@ -218,6 +218,7 @@ def train(
     epochs: int | None = None,
     device: str = "cpu",
     on_progress: Callable[[int, int, str], None] | None = None,
+    picture: Callable[[Trained, Path], None] | None = None,
 ) -> TrainingResult:
     """Trains a model and writes its folder: card, weights, ONNX graph, metrics. Continues after a kill.
 
@@ -232,6 +233,7 @@ def train(
         epochs: instead of the model file's, in each stage.
         device: ``cpu`` or ``cuda``.
         on_progress: called after each epoch with epochs done, epochs at most and a line about them.
+        picture: draws the training to the file in the folder that it is given.
 
     Example:
         >>> laps = recorded(simulate("orca", "club", duration=20.0))
@@ -253,7 +255,7 @@ def train(
         _joined(_opened(recordings, car), commands, holdout), config, car, checkpoint, device, on_progress,
         lambda data, car, integrator: calibrate(data, car, integrator=integrator).vehicle,
     )  # fmt: skip
-    artifact = save_artifact(trained, folder, {"holdout": holdout, "device": device})
+    artifact = save_artifact(trained, folder, {"holdout": holdout, "device": device}, picture)
     for path in checkpoints(config, checkpoint):
         path.unlink(missing_ok=True)
     return TrainingResult(trained, artifact)

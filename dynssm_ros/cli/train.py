@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from dynssm_ros import api
 from dynssm_ros.cli.console import CommandsOption, VehicleOption, console, errors, progress_bar
-from dynssm_ros.files import replacing
+
+if TYPE_CHECKING:
+    from dynssm_ros.learning.stages import Trained
 
 
 def train(
@@ -33,8 +35,9 @@ def train(
     with progress_bar("training") as progress:
         try:
             trained, artifact = api.train(
-                list(recordings), model, vehicle, out, holdout, commands, seed, epochs, device, progress
-            )
+                list(recordings), model, vehicle, out, holdout, commands, seed, epochs, device, progress,
+                _draw_losses if find_spec("matplotlib") is not None else None,
+            )  # fmt: skip
         except KeyboardInterrupt:
             folder = out.absolute()
             states = folder.parent.glob(f"{folder.name}.checkpoint*.pt")
@@ -42,11 +45,6 @@ def train(
             name = kept[-1].name if kept else "the beginning"
             errors.print(f"interrupted; the same command continues from {name}")
             raise typer.Exit(130) from None
-    if trained.history and find_spec("matplotlib") is not None:
-        from dynssm_ros.reporting.evaluation_figures import loss_components
-
-        with replacing(artifact.path / "losses.png") as aside:
-            loss_components(trained.history, trained.best_epoch).savefig(aside, dpi=150)
     if trained.resumed_from:
         console.print(f"continued from epoch {trained.resumed_from}")
     v_x, v_y, omega = trained.validation_rmse
@@ -63,3 +61,9 @@ def train(
             f"left-out parts of the laps, so it is {'used' if used else 'left out of the online layer'}",
             soft_wrap=True,
         )
+
+
+def _draw_losses(trained: Trained, file: Path) -> None:
+    from dynssm_ros.reporting.evaluation_figures import loss_components
+
+    loss_components(trained.history, trained.best_epoch).savefig(file, dpi=150)

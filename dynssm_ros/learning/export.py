@@ -42,6 +42,7 @@ from dynssm_ros.runtime.artifact import (
 )
 from dynssm_ros.runtime.online import save_layer
 
+LOSSES = "losses.png"
 TOLERANCE = 1e-5
 """Largest difference between ONNX and torch, in units of each state's scale."""
 _GRU_INITIAL_STATE = 5  # among the inputs of ONNX's GRU
@@ -77,13 +78,19 @@ class _Deployed(nn.Module):
         return tuple(self.named(window).values())
 
 
-def save_artifact(trained: Trained, out: Path, training: dict[str, object] | None = None) -> Artifact:
+def save_artifact(
+    trained: Trained,
+    out: Path,
+    training: dict[str, object] | None = None,
+    picture: Callable[[Trained, Path], None] | None = None,
+) -> Artifact:
     """Writes the model folder, atomically; an older one of the same name is replaced.
 
     Args:
         trained: outcome of :func:`dynssm_ros.learning.stages.train`.
         out: the folder.
         training: what to note about how it was trained.
+        picture: draws the training to the file that it is given; that is no part of the model.
 
     Raises:
         ArtifactError: ``out`` is something else, or the exported graph differs from the trained model.
@@ -91,7 +98,7 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
     check_replaceable(out)
     model, config = trained.model, trained.config
     sample = _sample_windows(trained)
-    with replacing(out, may_hold=(ONLINE, "losses.png")) as folder:
+    with replacing(out, may_hold=(ONLINE, LOSSES)) as folder:
         folder.mkdir()
         save_file({name: value.contiguous() for name, value in model.state_dict().items()}, folder / WEIGHTS)
         export_onnx(model, sample, folder / ONNX, trained.features)
@@ -124,6 +131,8 @@ def save_artifact(trained: Trained, out: Path, training: dict[str, object] | Non
             checksums={each.name: checksum(each) for each in sorted(folder.iterdir())},
         )
         write_card(card, folder)
+        if picture is not None and trained.history:
+            picture(trained, folder / LOSSES)
     return open_artifact(out)
 
 

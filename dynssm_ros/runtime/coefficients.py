@@ -24,7 +24,7 @@ from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.effects.carried import carries, increments_along
+from dynssm_ros.vehicle.effects.carried import carries, effect_states_along
 from dynssm_ros.vehicle.single_track import Integrator, increment
 
 SPREAD: dict[str, float] = {
@@ -244,25 +244,25 @@ class CoefficientEstimator:
 
     def _mean_increments(self, rows: Vector, cars: Vector) -> Vector:
         """Mean increments over ``rows`` ``(L, 7)`` of cars with coefficients ``(P, 17)``: ``(P, 3)``."""
-        theta = Coefficients(*cars.T[:, :, None])
+        theta, now = Coefficients(*cars.T[:, :, None]), rows.T[:, None]
         constants, T_s = self._vehicle.constants, self._vehicle.sampling_time
         with np.errstate(all="ignore"):
             if self._carries:
                 columns = [[np.full((1, 1), value) for value in row] for row in rows]
-                each = increments_along(
+                carried = effect_states_along(
                     np, [State(*row[:3]) for row in columns], [applied_inputs(row) for row in columns],
                     Applied(*columns[0][3:5]), theta, constants, T_s, self._effects, *self._stepping,
                 )  # fmt: skip
-                moved = [
-                    np.concatenate([np.broadcast_to(step[c], (len(cars), 1)) for step in each], axis=1)
-                    for c in range(3)
-                ]
+                effect_states = {
+                    name: np.concatenate([np.broadcast_to(each[name], (len(cars), 1)) for each in carried], axis=1)
+                    for name in carried[0]
+                }
             else:
-                now = rows.T[:, None]
-                found, _ = increment(
-                    np, State(*now[:3]), initial_effect_states(self._effects, now[3], now[4]), applied_inputs(now), theta,
-                    constants, T_s, self._effects, *self._stepping,
-                )  # fmt: skip
-                moved = [np.broadcast_to(part, (len(cars), len(rows))) for part in found]
+                effect_states = initial_effect_states(self._effects, now[3], now[4])
+            found, _ = increment(
+                np, State(*now[:3]), effect_states, applied_inputs(now), theta, constants, T_s, self._effects,
+                *self._stepping,
+            )  # fmt: skip
+            moved = [np.broadcast_to(part, (len(cars), len(rows))) for part in found]
         means: Vector = np.stack([part.mean(axis=1) for part in moved], axis=1)
         return means

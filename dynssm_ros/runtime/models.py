@@ -18,7 +18,7 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.effects.carried import CARRIED_S, carries, increments_along
+from dynssm_ros.vehicle.effects.carried import CARRIED_S, carries, effect_states_along
 from dynssm_ros.vehicle.single_track import Integrator, step_with_effect_states
 
 
@@ -173,16 +173,16 @@ class SingleTrack:
     def _following(self, windows: Vector, latest: int) -> Vector:
         """Next states ``(N, latest, 3)`` from the latest rows of windows ``(N, H, 7)``."""
         theta = Coefficients(*self._theta)
+        now = np.moveaxis(windows[:, -latest:], -1, 0)
         if self._carries:
             rows = [windows[:, k].T for k in range(windows.shape[1])]
-            moved = increments_along(
+            carried = effect_states_along(
                 np, [State(*row[:3]) for row in rows], [applied_inputs(row) for row in rows], Applied(*rows[0][3:5]), theta,
                 self.vehicle.constants, self.T_s, self._effects, *self._stepping,
             )[-latest:]  # fmt: skip
-            increments = np.stack([np.stack(each, axis=-1) for each in moved], axis=1)
-            return np.asarray(windows[:, -latest:, :3] + increments)
-        now = np.moveaxis(windows[:, -latest:], -1, 0)
-        effect_states = initial_effect_states(self._effects, now[3], now[4])
+            effect_states = {name: np.stack([each[name] for each in carried], axis=1) for name in carried[0]}
+        else:
+            effect_states = initial_effect_states(self._effects, now[3], now[4])
         state, _ = step_with_effect_states(
             np, State(*now[:3]), effect_states, applied_inputs(now), theta, self.vehicle.constants, self.T_s,
             self._effects, *self._stepping,

@@ -501,11 +501,7 @@ def increment(
         q = motion(xp, State(*y[:3]), applied, theta, constants, effects, carried, context, h)
         return (q.a_x, q.a_y, q.omega_dot, *(q.effect_state_rates[name] for name in names))
 
-    advance = _INTEGRATORS[integrator]
-    start: tuple[Array, ...] = (*true, *effect_states.values())
-    moved = advance(rates, start, h)
-    for _ in range(substeps - 1):
-        moved = _add(moved, advance(rates, _add(start, moved), h))
+    moved = integrate(rates, (*true, *effect_states.values()), T_s, integrator, substeps)
     change, changed = State(*moved[:3]), dict(zip(names, moved[3:], strict=True))
     if sensors:
         end = {name: value + changed[name] for name, value in effect_states.items()}
@@ -519,14 +515,26 @@ def _meeting(first: Array, second: Array) -> Array:
     return first * square / at_least(2 * square - first * second, square / 4 + 1e-30)
 
 
-_Rates = Callable[[Sequence[Array]], tuple[Array, ...]]
+Rates = Callable[[Sequence[Array]], tuple[Array, ...]]
+"""From quantities to their time derivatives."""
 
 
-def _euler(rates: _Rates, y: tuple[Array, ...], h: float) -> tuple[Array, ...]:
+def integrate(
+    rates: Rates, start: tuple[Array, ...], T_s: float, integrator: Integrator, substeps: int
+) -> tuple[Array, ...]:
+    """How much the quantities ``start`` change in ``T_s`` seconds."""
+    advance, h = _INTEGRATORS[integrator], T_s / substeps
+    moved = advance(rates, start, h)
+    for _ in range(substeps - 1):
+        moved = _add(moved, advance(rates, _add(start, moved), h))
+    return moved
+
+
+def _euler(rates: Rates, y: tuple[Array, ...], h: float) -> tuple[Array, ...]:
     return _times(h, rates(y))
 
 
-def _rk4(rates: _Rates, y: tuple[Array, ...], h: float) -> tuple[Array, ...]:
+def _rk4(rates: Rates, y: tuple[Array, ...], h: float) -> tuple[Array, ...]:
     k1 = rates(y)
     k2 = rates(_add(y, _times(h / 2, k1)))
     k3 = rates(_add(y, _times(h / 2, k2)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, cast
 
 import torch
@@ -12,7 +13,7 @@ from dynssm_ros.configuration import StrictModel
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.effects.carried import carries, increments_along
+from dynssm_ros.vehicle.effects.carried import carries, effect_states_along
 from dynssm_ros.vehicle.single_track import Integrator, increment
 
 INPUTS = len(WINDOW_COLUMNS)
@@ -83,10 +84,14 @@ class PhysicsLayer(nn.Module):
         """
         # columns of shape (B, 1), which the deployed graph need not squeeze and stack again
         rows = torch.split(latest, 1, dim=-1)
+        return self._from(rows, theta, initial_effect_states(self.effects, rows[3], rows[4]))
+
+    def _from(self, rows: Sequence[Tensor], theta: Tensor, effect_states: Mapping[str, Tensor]) -> Tensor:
+        """Increments from columns of rows, ``(..., 1)`` each, with the states that effects have there."""
         moved, _ = increment(
             _XP,
             State(*rows[:3]),
-            initial_effect_states(self.effects, rows[3], rows[4]),
+            effect_states,
             applied_inputs(rows),
             Coefficients(*torch.split(theta, 1, dim=-1)),
             self.vehicle.constants,
@@ -106,9 +111,10 @@ class PhysicsLayer(nn.Module):
         """
         if not self.carries:
             return cast(Tensor, self(window[:, window.shape[1] - latest :], theta))
+        wanted = torch.split(window[:, window.shape[1] - latest :], 1, dim=-1)
         rows = [torch.split(row, 1, dim=-1) for row in torch.unbind(window, dim=1)]
         each = theta if theta.dim() == 1 else theta[:, 0]
-        moved = increments_along(
+        carried = effect_states_along(
             _XP,
             [State(*row[:3]) for row in rows],
             [applied_inputs(row) for row in rows],
@@ -119,4 +125,5 @@ class PhysicsLayer(nn.Module):
             self.effects,
             *self.stepping,
         )[-latest:]
-        return torch.stack([torch.cat(list(increments), dim=-1) for increments in moved], dim=1)
+        effect_states = {name: torch.stack([at[name] for at in carried], dim=1) for name in carried[0]}
+        return self._from(wanted, theta, effect_states)

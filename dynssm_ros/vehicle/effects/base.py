@@ -7,7 +7,7 @@ arrays, tensors or symbols, so that a fit can vary many at once or differentiate
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar
@@ -16,7 +16,16 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.vehicle.single_track import Array, Coefficients, Constants, Motion, StageEffect, at_least
+from dynssm_ros.vehicle.single_track import (
+    Applied,
+    Array,
+    Coefficients,
+    Constants,
+    Motion,
+    StageEffect,
+    State,
+    at_least,
+)
 
 CONTEXT_UNITS: dict[str, str] = {
     "t": "s", "s": "m", "lap_length": "m", "x": "m", "y": "m", "theta": "rad", "roll": "rad",
@@ -213,12 +222,27 @@ def initial_effect_states(effects: Sequence[StageEffect], r: Array, delta: Array
     States on anything else depend on the car's motion: ``settled_effect_states`` finds all of them, and the step functions
     those that are missing.
     """
+    return inputs_alone(None, State(0.0, 0.0, 0.0), Applied(r, delta), effects, {}).effect_states
+
+
+def inputs_alone(
+    xp: Any,
+    state: State,
+    applied: Applied,
+    effects: Sequence[StageEffect],
+    effect_states: Mapping[str, Array],
+    h: float = 0.0,
+) -> Motion:
+    """The stage of the inputs alone, without a car: the states on the inputs and their rates; else as ``motion``."""
     zero = Coefficients(*(0.0,) * len(Coefficients._fields))
-    q = Motion(0.0, 0.0, 0.0, r, delta, theta=zero, m=0.0, l_f=0.0, l_r=0.0, h_cg=0.0, F_z0=0.0, load_transfer=False)
+    q = Motion(
+        *state, *applied, theta=zero, m=0.0, l_f=0.0, l_r=0.0, h_cg=0.0, F_z0=0.0, load_transfer=False,
+        effect_states=dict(effect_states), h=h,
+    )  # fmt: skip
     for effect in effects:
         if not effect.is_neutral:
-            effect.inputs(None, q)
-    return q.effect_states
+            effect.inputs(xp, q)
+    return q
 
 
 def require_context(effects: Iterable[StageEffect], available: Iterable[str], where: str) -> None:

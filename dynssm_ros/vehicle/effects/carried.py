@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from dynssm_ros.vehicle.effects.base import initial_effect_states
+from dynssm_ros.vehicle.effects.base import initial_effect_states, inputs_alone
 from dynssm_ros.vehicle.single_track import (
     Applied,
+    Array,
     Coefficients,
     Constants,
     Integrator,
     StageEffect,
     State,
     increment,
+    integrate,
     settled_effect_states,
 )
 
@@ -26,7 +28,7 @@ def carries(effects: Sequence[StageEffect]) -> bool:
     return any(effect.carries for effect in effects)
 
 
-def increments_along(
+def effect_states_along(
     xp: Any,
     states: Sequence[State],
     applied: Sequence[Applied],
@@ -37,10 +39,11 @@ def increments_along(
     effects: Sequence[StageEffect] = (),
     integrator: Integrator = "euler",
     substeps: int = 1,
-) -> list[State]:
-    """Increments from each of several measured rows, with effect states that are carried from row to row.
+) -> list[dict[str, Array]]:
+    """The effects' own states at each of several measured rows, carried from row to row.
 
-    At every row the state is the measured one; only what no sensor shows is carried.
+    At every row the state is the measured one; only what no sensor shows is carried. States on the inputs alone, as those
+    of lagging actuators, are carried without the car's equations.
 
     Args:
         xp: array namespace.
@@ -56,9 +59,19 @@ def increments_along(
     """
     known = initial_effect_states(effects, *feedback)
     carried = settled_effect_states(xp, states[0], applied[0], theta, constants, effects, known)
-    found = []
-    for state, inputs_now in zip(states, applied, strict=True):
-        moved, changed = increment(xp, state, carried, inputs_now, theta, constants, T_s, effects, integrator, substeps)
+    found, names = [carried], tuple(carried)
+    for state, acting in zip(states[:-1], applied[:-1], strict=True):
+        if carried.keys() == known.keys():
+
+            def rates(y: Sequence[Array], state: State = state, acting: Applied = acting) -> tuple[Array, ...]:
+                here = dict(zip(names, y, strict=True))
+                q = inputs_alone(xp, state, acting, effects, here, T_s / substeps)
+                return tuple(q.effect_state_rates[name] for name in names)
+
+            changes = integrate(rates, tuple(carried.values()), T_s, integrator, substeps)
+            changed = dict(zip(names, changes, strict=True))
+        else:
+            _, changed = increment(xp, state, carried, acting, theta, constants, T_s, effects, integrator, substeps)
         carried = {name: value + changed[name] for name, value in carried.items()}
-        found.append(moved)
+        found.append(carried)
     return found
