@@ -72,12 +72,12 @@ class Soaked:
     lost: int = 0
     latency_ms: dict[str, float] = field(default_factory=dict)
     late: int = 0
-    longest_gap_ms: float = math.nan
-    rss_mb: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    longest_gap_ms: float | None = None
+    rss_mb: tuple[float, float, float] = (0.0, 0.0, 0.0)
     open_files: tuple[int, int, int] = (0, 0, 0)
     swaps: int = 0
-    slowest_at_swap_ms: float = math.nan
-    slowest_else_ms: float = math.nan
+    slowest_at_swap_ms: float | None = None
+    slowest_else_ms: float | None = None
     violations: dict[str, str] = field(default_factory=dict)
 
 
@@ -287,10 +287,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             done = soak(models, 60 * given.minutes, given.rate, given.seed, given.spoilt, given.swap_every, progress)
     except UserError as error:
         sys.exit(f"error: {error}")
-    if given.json is not None:
-        write_json(given.json, asdict(done))
     for name, value in asdict(done).items():
         console.print(f"{name}: {value}", markup=False, highlight=False)
+    if given.json is not None:
+        write_json(given.json, asdict(done))
     sys.exit(1 if done.violations else 0)
 
 

@@ -109,7 +109,10 @@ def read_streams(
         bag.require(topic, decoder.msgtype)
     stamps = {name: array("q") for name in signal_map.active_signals()}
     values = {name: array("d") for name in signal_map.active_signals()}
-    delays = {name: round(source.delay * 1e9) for name, source in signal_map.active_signals().items()}
+    kept = {
+        name: (round(source.delay * 1e9), stamps[name].append, values[name].append)
+        for name, source in signal_map.active_signals().items()
+    }
     total = sum(bag.counts[topic] for topic in by_topic)
     for done, (topic, log_time, raw) in enumerate(bag.messages(list(by_topic)), 1):
         message = bag.decode(topic, raw)
@@ -118,9 +121,11 @@ def read_streams(
             present = by_topic[topic].decode(message)
         except BagError as error:
             raise BagError(f"{bag.path}: {error}") from error
+        at = log_time if stamp is None else stamp
         for name, value in present.items():
-            stamps[name].append((log_time if stamp is None else stamp) - delays[name])
-            values[name].append(value)
+            delay, append_stamp, append_value = kept[name]
+            append_stamp(at - delay)
+            append_value(value)
         if progress is not None:
             progress(done, total)
     notes = list(bag.notes)
@@ -171,5 +176,7 @@ def clean(stream: Stream, where: str, drop_bad: bool) -> tuple[Stream, str]:
                 f"expected finite values at increasing stamps (--drop-bad leaves such samples out)"
             )
         dropped.append(f"{bad.sum()} samples {kind}")
+    if not dropped:
+        return stream, ""
     keep = ~np.logical_or.reduce(list(kinds.values()))
     return Stream(stamps[keep], values[keep]), ", ".join(dropped)

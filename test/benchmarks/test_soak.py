@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import pytest
 
 from benchmarks.fuzz import Traffic
-from benchmarks.soak import soak
+from benchmarks.soak import main, soak
 
 pytestmark = pytest.mark.live
 
@@ -30,6 +31,16 @@ def test_a_swap_that_is_refused_is_seen(small_model: Path, tmp_path: Path) -> No
     done = soak([small_model, tmp_path / "none"], 1.5, 100.0, swap_every=0.8)
     assert "no such model folder" in done.violations["a swap was refused"]
     assert done.swaps == 0
+
+
+def test_the_command_writes_what_it_measured(small_model: Path, tmp_path: Path) -> None:
+    file = tmp_path / "soak.json"
+    with pytest.raises(SystemExit) as ended:
+        main(["--model", str(small_model), "--minutes", "0.02", "--json", str(file)])
+    assert ended.value.code == 0
+    content = json.loads(file.read_text(encoding="utf-8"))
+    assert content["predictions"] == content["odometry"] > 100
+    assert content["slowest_at_swap_ms"] is None
 
 
 def test_nothing_is_predicted_from_what_is_spoilt(small_model: Path) -> None:
