@@ -21,6 +21,11 @@ class MissingExtraError(UserError):
     """A library of an extra is not installed."""
 
 
+def missing_libraries(*extras: str) -> dict[str, str]:
+    """Libraries of ``extras`` that are not installed, each with its extra; nothing is imported."""
+    return {library: extra for extra in extras for library in EXTRAS[extra] if find_spec(library) is None}
+
+
 def require(what: str, *extras: str) -> None:
     """Checks that the libraries of ``extras`` are installed, without importing them.
 
@@ -31,7 +36,7 @@ def require(what: str, *extras: str) -> None:
     Raises:
         MissingExtraError: one is not; names the extra and how to install it.
     """
-    missing = {library: extra for extra in extras for library in EXTRAS[extra] if find_spec(library) is None}
+    missing = missing_libraries(*extras)
     if missing:
         names = ",".join(sorted(set(missing.values())))
         raise MissingExtraError(f"{what} needs {', '.join(missing)}: pip install 'dynssm_ros[{names}]'")

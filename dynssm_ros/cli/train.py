@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +9,7 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.cli.console import CommandsOption, VehicleOption, console, errors, progress_bar
+from dynssm_ros.extras import missing_libraries
 
 if TYPE_CHECKING:
     from dynssm_ros.learning.stages import Trained
@@ -36,7 +36,7 @@ def train(
         try:
             trained, artifact = api.train(
                 list(recordings), model, vehicle, out, holdout, commands, seed, epochs, device, progress,
-                _draw_losses if find_spec("matplotlib") is not None else None,
+                None if missing_libraries("report") else _draw_losses,
             )  # fmt: skip
         except KeyboardInterrupt:
             folder = out.absolute()
