@@ -6,6 +6,7 @@ how the inputs change, where the car is. All are in units that make one the usua
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from dynssm_ros.runtime.online import CHANNELS, MEAN_ERROR, Learned, OnlineLayer
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 
+_BLOCK = 4096  # rows that are worked on at once
 _PRIOR_ROWS = (10.0, 40.0, 160.0)
 _TOLERANCE = 0.01  # of the RMSE on left-out parts
 _RIDGE = 1e-4  # of a feature's mean square: draws weights that the laps leave open to the physics alone
@@ -141,12 +143,6 @@ class LayerDrive(NamedTuple):
     """Rows, ascending."""
 
 
-def joined(drives: list[LayerDrive]) -> LayerDrive:
-    """Drives one after the other."""
-    seen = Seen(*(np.concatenate(parts) for parts in zip(*(drive.seen for drive in drives), strict=True)))
-    return LayerDrive(seen, *(np.concatenate([drive[k] for drive in drives]) for k in (1, 2, 3)))
-
-
 class LeftOut(NamedTuple):
     """A part of the laps that a layer's prior was fitted without."""
 
@@ -198,14 +194,14 @@ def fit_layer(
         )
     s_delta: Vector = np.array(scale.increment_scale)
     left_out = [
-        (part, _least_squares(joined([*parts[:k], *parts[k + 1 :]]) if len(parts) > 1 else part, s_delta))
+        (part, _least_squares([*parts[:k], *parts[k + 1 :]] if len(parts) > 1 else [part], s_delta))
         for k, part in enumerate(parts)
     ]
 
     vehicle, stepping = features.physics.vehicle, features.physics.stepping
     nothing = BlockErrors(np.ones(CHANNELS), np.ones(CHANNELS))
-    whole = joined(parts)
-    usual = CoefficientEstimator(vehicle, s_delta, nothing, *stepping, config.spread).usual_errors(*whole[1:])
+    driven = (np.concatenate(each) for each in zip(*(part[1:] for part in parts), strict=True))
+    usual = CoefficientEstimator(vehicle, s_delta, nothing, *stepping, config.spread).usual_errors(*driven)
 
     def layer(prior: _Prior, rows: float, spread: dict[str, float]) -> OnlineLayer:
         card = OnlineLayerCard(features=features.names, memory=config.memory, prior_rows=rows, spread=spread)
@@ -228,7 +224,7 @@ def fit_layer(
         least = min(loss for loss, _ in trials.values())
         trials = {r: each for r, each in trials.items() if each[0] <= least + np.log1p(_TOLERANCE)}  # they are large
     chosen, (loss, left) = next(iter(trials.items()))
-    whole_layer = layer(_least_squares(whole, s_delta), chosen, config.spread)
+    whole_layer = layer(_least_squares(parts, s_delta), chosen, config.spread)
     return FittedLayer(whole_layer, float(np.exp(loss)), left)
 
 
@@ -239,19 +235,31 @@ class _Prior(NamedTuple):
     physics: Vector
 
 
-def _least_squares(drive: LayerDrive, s_delta: Vector) -> _Prior:
-    """Weights by least squares on a drive, drawn to the physics alone; the mean Gram matrix, mean square errors."""
-    F, y = drive.seen.features, drive.increments / s_delta
-    alone = np.zeros(F.shape[1:])
+def _least_squares(drives: list[LayerDrive], s_delta: Vector) -> _Prior:
+    """Weights by least squares on drives, drawn to the physics alone; the mean Gram matrix, mean square errors."""
+    n, rows = drives[0].seen.features.shape[2], sum(len(drive.ends) for drive in drives)
+    alone = np.zeros((CHANNELS, n))
     alone[:, 0] = 1.0
-    if len(F) == 0:
+    if rows == 0:
         one = np.ones(CHANNELS)
-        return _Prior(alone, np.tile(np.eye(F.shape[2]), (CHANNELS, 1, 1)), one, one)
-    gram = np.einsum("kci,kcj->cij", F, F, optimize=True) / len(F)
+        return _Prior(alone, np.tile(np.eye(n), (CHANNELS, 1, 1)), one, one)
+    gram, moment = np.zeros((CHANNELS, n, n)), np.zeros((CHANNELS, n))
+    noise, physics = np.zeros(CHANNELS), np.zeros(CHANNELS)
+    for F, y, _ in _blocks(drives, s_delta):
+        gram += np.einsum("kci,kcj->cij", F, F, optimize=True) / rows
+        moment += np.einsum("kci,kc->ci", F, y - np.einsum("kci,ci->kc", F, alone)) / rows
     ridge = _RIDGE * np.einsum("cii->ci", gram) + _SMALLEST
-    gram[:, range(F.shape[2]), range(F.shape[2])] += ridge
-    left: Vector = y - np.einsum("kci,ci->kc", F, alone)
-    mean: Vector = alone + np.linalg.solve(gram, (np.einsum("kci,kc->ci", F, left) / len(F))[..., None])[..., 0]
-    noise = np.mean((y - np.einsum("kci,ci->kc", F, mean)) ** 2, axis=0)
-    physics = np.mean((y - drive.seen.physics / s_delta) ** 2, axis=0)
+    gram[:, range(n), range(n)] += ridge
+    mean: Vector = alone + np.linalg.solve(gram, moment[..., None])[..., 0]
+    for F, y, predicted in _blocks(drives, s_delta):
+        noise += np.sum((y - np.einsum("kci,ci->kc", F, mean)) ** 2, axis=0) / rows
+        physics += np.sum((y - predicted) ** 2, axis=0) / rows
     return _Prior(mean, gram, np.maximum(noise, _LEAST_NOISE), np.maximum(physics, _LEAST_NOISE))
+
+
+def _blocks(drives: list[LayerDrive], s_delta: Vector) -> Iterator[tuple[Vector, Vector, Vector]]:
+    """Features ``(k, 3, n)``, increments and the physics' ones ``(k, 3)`` in units of s_delta, some rows at a time."""
+    for drive in drives:
+        for begin in range(0, len(drive.ends), _BLOCK):
+            part = slice(begin, begin + _BLOCK)
+            yield drive.seen.features[part], drive.increments[part] / s_delta, drive.seen.physics[part] / s_delta
