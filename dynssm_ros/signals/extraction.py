@@ -107,12 +107,7 @@ def read_streams(
     by_topic = decoders(signal_map)
     for topic, decoder in by_topic.items():
         bag.require(topic, decoder.msgtype)
-    stamps = {name: array("q") for name in signal_map.active_signals()}
-    values = {name: array("d") for name in signal_map.active_signals()}
-    kept = {
-        name: (round(source.delay * 1e9), stamps[name].append, values[name].append)
-        for name, source in signal_map.active_signals().items()
-    }
+    samples = _Samples()
     total = sum(bag.counts[topic] for topic in by_topic)
     for done, (topic, log_time, raw) in enumerate(bag.messages(list(by_topic)), 1):
         message = bag.decode(topic, raw)
@@ -121,17 +116,13 @@ def read_streams(
             present = by_topic[topic].decode(message)
         except BagError as error:
             raise BagError(f"{bag.path}: {error}") from error
-        at = log_time if stamp is None else stamp
-        for name, value in present.items():
-            delay, append_stamp, append_value = kept[name]
-            append_stamp(at - delay)
-            append_value(value)
+        samples.add(topic, log_time if stamp is None else stamp, present)
         if progress is not None:
             progress(done, total)
     notes = list(bag.notes)
     streams: dict[str, Stream] = {}
     for name, source in signal_map.active_signals().items():
-        stream = Stream(np.frombuffer(stamps[name], dtype=np.int64), np.frombuffer(values[name], dtype=np.float64))
+        stream = samples.stream(name, round(source.delay * 1e9))
         where = f"{bag.path}: topic {source.recorded}"
         stream, dropped = clean(stream, f"{where}: {name}", drop_bad)
         if dropped:
@@ -145,6 +136,36 @@ def read_streams(
             raise BagError(f"{where} {lack if counted else 'has no messages'}, needed for {name}")
         notes.append(f"{name}: topic {source.recorded} {lack}; left out")
     return streams, notes
+
+
+class _Samples:
+    """What messages carried, in the order of the messages; signals that always come together share their stamps."""
+
+    def __init__(self) -> None:
+        self._together: dict[tuple[str, ...], tuple[array[int], array[int], array[float]]] = {}
+        self._messages = 0
+
+    def add(self, topic: str, stamp: int, present: Mapping[str, float]) -> None:
+        """Adds a message of ``topic`` at ``stamp`` (ns) with the signals that it carried."""
+        key = (topic, *present)
+        if key not in self._together:
+            self._together[key] = array("q"), array("q"), array("d")
+        numbers, stamps, values = self._together[key]
+        self._messages += 1
+        numbers.append(self._messages)
+        stamps.append(stamp)
+        values.extend(present.values())
+
+    def stream(self, signal: str, delay: int) -> Stream:
+        """The samples of a signal as they came, with stamps ``delay`` ns earlier."""
+        numbers, stamps, values = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0)]
+        for (_, *signals), kept in self._together.items():
+            if signal in signals:
+                numbers.append(np.frombuffer(kept[0], np.int64))
+                stamps.append(np.frombuffer(kept[1], np.int64))
+                values.append(np.frombuffer(kept[2]).reshape(-1, len(signals))[:, signals.index(signal)])
+        order = np.argsort(np.concatenate(numbers), kind="stable")
+        return Stream(np.concatenate(stamps)[order] - delay, np.concatenate(values)[order])
 
 
 def clean(stream: Stream, where: str, drop_bad: bool) -> tuple[Stream, str]:

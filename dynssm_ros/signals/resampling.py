@@ -27,7 +27,7 @@ class Stream:
 
 def sample(
     stream: Stream, grid: Stamps, max_gap: int, hold: Hold = "first", rounding: int = 0
-) -> tuple[Vector, npt.NDArray[np.int64]]:
+) -> tuple[Vector, npt.NDArray[np.int32]]:
     """The stream at ``grid`` (int64 ns) inside its stretches: interpolated, or with its last sample held.
 
     A stretch is a run of samples that are at most ``max_gap`` ns apart; a lone sample is one too. A sample that is held
@@ -43,11 +43,11 @@ def sample(
         values = stream.values[np.maximum(np.searchsorted(t, grid + rounding, side="right") - 1, 0)]
     else:
         values = np.interp((grid - origin).astype(np.float64), (t - origin).astype(np.float64), stream.values)
-    number = np.concatenate([[0], np.cumsum(np.diff(t) > max_gap)])
+    number = np.concatenate([[0], np.cumsum(np.diff(t) > max_gap)]).astype(np.int32)
     after = np.minimum(np.searchsorted(t, grid, side="left"), len(t) - 1)
     before = np.maximum(np.searchsorted(t, grid, side="right") - 1, 0)
     inside = (grid >= t[0]) & (grid <= t[-1]) & (number[before] == number[after])
-    return values, np.where(inside, number[after], -1)
+    return values, np.where(inside, number[after], np.int32(-1))
 
 
 def uniform_grid(anchor: Stamps, period: float, max_gap: int) -> Stamps:
@@ -85,7 +85,7 @@ def resample(
     bridged, period = round(max_gap * 1e9), 1e9 / rate
     grid = uniform_grid(streams["v_x"].stamps, period, bridged)
     sampled: dict[str, Vector] = {}
-    stretches: list[npt.NDArray[np.int64]] = []
+    stretches: list[npt.NDArray[np.int32]] = []
     for name, stream in streams.items():
         smooth = Stream(stream.stamps, np.unwrap(stream.values)) if name == "theta" else stream
         hold: Hold = "zero" if name in info.held else "first"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import groupby, pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -191,7 +192,10 @@ def _compile_path(field: str) -> Accessor:
     match = _FIELD.match(field)
     if match is None:
         raise ValueError(f"not a field path: {field}")
-    steps = [_compile_step(part) for part in (match["yaw"] or match["path"]).split(".")]
+    steps: list[Callable[[Any], Any]] = []
+    for indexed, run in groupby((match["yaw"] or match["path"]).split("."), lambda name: "[" in name):
+        names = list(run)
+        steps += [_element(name) for name in names] if indexed else [attrgetter(".".join(names))]
 
     def value(message: Any) -> float | None:
         for step in steps:
@@ -211,10 +215,9 @@ def _compile_path(field: str) -> Accessor:
     return yaw if match["yaw"] else value
 
 
-def _compile_step(part: str) -> Callable[[Any], Any]:
+def _element(part: str) -> Callable[[Any], Any]:
+    """The element of an array by its index, or by the name beside it."""
     name, _, key = part.rstrip("]").partition("[")
-    if not key:
-        return lambda message: getattr(message, name)
     if key.isdecimal():
         index = int(key)
 
