@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from dynssm_ros.arrays import Vector
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.learning.dataset import all_windows
 from dynssm_ros.learning.models.base import OnlineConfig, TrainableModel, steps_of
 from dynssm_ros.learning.models.physics import PhysicsConfig
@@ -27,7 +27,6 @@ NETWORK_GAIN_WANTED = 0.03
 ``benchmarks/generalisation`` gains of 1 to 2 % on left-out laps did not carry over to another track."""
 _STRETCHES = 4  # of the laps, for a layer without a network
 _STARTS = 400  # rollouts in a part, at most
-_BATCH = 4096  # windows
 
 Part = tuple[TrainableModel, Recording]
 """A part of the laps, and a model that does not know it."""
@@ -46,6 +45,16 @@ class LayerBase(NamedTuple):
     def features(self, network: bool) -> OnlineFeatures:
         """What the layer sees, with a network's prediction or without."""
         return OnlineFeatures(self.config, self.vehicle, self.physics, self.normalisation, self.H, network)
+
+    @property
+    def path_steps(self) -> int:
+        """Steps of a controller's horizon."""
+        return steps_of(PATH_HORIZON_S, self.vehicle.sampling_time)
+
+    def starts(self, recording: Recording) -> Indices:
+        """Rows from which paths are predicted: some of those that a whole path follows, ascending."""
+        rows: Indices = recording.window_ends(self.H, self.path_steps, self.vehicle.minimum_speed)
+        return rows[:: max(1, len(rows) // _STARTS)]
 
     def fitted(self, features: OnlineFeatures, parts: list[Part]) -> FittedLayer:
         """The layer, its prior fitted to ``parts``."""
@@ -71,8 +80,7 @@ def earned_layer(
         Features, layer, and the gain; ``None`` if there is no network or no evidence.
     """
     alone = base.features(False)
-    stretches = [np.arange(len(laps)) * _STRETCHES // len(laps) == k for k in range(_STRETCHES)]
-    layer = base.fitted(alone, [(model, laps.select(stretch)) for stretch in stretches]).layer
+    layer = base.fitted(alone, [(model, laps.select(stretch)) for stretch in laps.stretches(_STRETCHES)]).layer
     if not model.LEARNS or not left_out:
         return alone, layer, None
     together = base.features(True)
@@ -93,17 +101,18 @@ def _errors(base: LayerBase, features: OnlineFeatures, fitted: FittedLayer, part
     return np.array([fitted.error, np.nanmean(np.concatenate(distances))])
 
 
-@torch.no_grad()
 def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording, base: LayerBase) -> LayerDrive:
-    """What the layer sees of all windows of a recording, with what ``model`` predicts from them."""
+    """What the layer sees of the windows of a recording, with what ``model`` predicts from them."""
     windows = all_windows(recording, base.H, base.vehicle.minimum_speed)
-    parts = []
-    for begin in range(0, max(len(windows), 1), _BATCH):
-        window, target = windows.batch(slice(begin, begin + _BATCH))
-        parts.append((*features(window, model.eval()(window)), target))
-    seen, physics, increments = (torch.cat(each).double().numpy() for each in zip(*parts, strict=True))
-    ends = windows.ends.numpy()
-    return LayerDrive(Seen(seen, physics), recording.matrix[ends], increments, ends)
+    ends, matrix = windows.ends.numpy(), recording.matrix
+
+    @torch.no_grad()
+    def see(block: slice) -> Seen:
+        window, _ = windows.batch(block)
+        return Seen(*(each.double().numpy() for each in features(window, model.eval()(window))))
+
+    starts = np.searchsorted(ends, base.starts(recording))
+    return LayerDrive(see, matrix[ends], matrix[ends + 1, :3] - matrix[ends, :3], ends, starts)
 
 
 @torch.no_grad()
@@ -111,13 +120,9 @@ def _path_error(
     base: LayerBase, features: OnlineFeatures, left_out: LeftOut, model: TrainableModel, recording: Recording
 ) -> Vector:
     """Mean distance (m) of predicted from measured paths, for each of some starts; NaN for what diverges."""
-    layer, drive, learned = left_out
-    steps = steps_of(PATH_HORIZON_S, layer.T_s)
-    starts = recording.window_ends(base.H, steps, base.vehicle.minimum_speed)
-    starts = starts[:: max(1, len(starts) // _STARTS)]
+    (layer, _, known), steps, starts = left_out, base.path_steps, base.starts(recording)
     if len(starts) == 0:
         return np.empty(0)
-    known = learned.at(np.searchsorted(drive.ends, starts))
     rows = recording.matrix[starts[:, None] + np.arange(1 - base.H, steps + 1)]
     rolled, mean_error = rows.copy(), None
     for k in range(steps):

@@ -6,7 +6,7 @@ how the inputs change, where the car is. All are in units that make one the usua
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from dynssm_ros.learning.models.base import OnlineConfig, steps_of
 from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
-from dynssm_ros.runtime.online import CHANNELS, MEAN_ERROR, Learned, OnlineLayer, OnlineLayerCard, Seen
+from dynssm_ros.runtime.online import CHANNELS, MEAN_ERROR, Along, Learned, OnlineLayer, OnlineLayerCard, Seen
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 
@@ -134,29 +134,32 @@ class OnlineFeatures(nn.Module):
 class LayerDrive(NamedTuple):
     """What the prior is fitted to: what the layer sees of a recording's windows, and what happened next."""
 
-    seen: Seen
+    see: Callable[[slice], Seen]
+    """Of some of the windows; computed anew each time, so that memory does not grow with the laps."""
     rows: Vector
-    """``(N, 7)``."""
+    """The last one of each window, ``(N, 7)``."""
     increments: Vector
-    """Measured, ``(N, 3)`` (m/s, m/s, rad/s)."""
+    """Measured from it to the next, ``(N, 3)`` (m/s, m/s, rad/s)."""
     ends: Indices
-    """Rows, ascending."""
+    """Its number, ``(N,)``, ascending."""
+    starts: Indices
+    """The windows from which paths are predicted, ascending."""
+
+    def blocks(self) -> Iterator[tuple[slice, Seen]]:
+        """All windows in order, some at a time; an empty block if there are none."""
+        for begin in range(0, max(len(self.ends), 1), _BLOCK):
+            block = slice(begin, begin + _BLOCK)
+            yield block, self.see(block)
 
 
 class LeftOut(NamedTuple):
-    """A part of the laps that a layer's prior was fitted without."""
+    """A layer along a part of the laps that its prior was fitted without."""
 
     layer: OnlineLayer
-    drive: LayerDrive
-    learned: Learned
-    """What the layer knew along it."""
-
-    @property
-    def errors(self) -> Vector:
-        """One-step errors, ``(N, 3)``, in units of s_delta."""
-        predicted = self.layer.increments(self.drive.seen.features, self.learned.weights)
-        errors: Vector = (predicted - self.drive.increments) / self.layer.scale
-        return errors
+    squares: Vector
+    """Sum of its squared one-step errors, ``(3,)``, in units of s_delta squared."""
+    known: Learned
+    """What it knew at the drive's starts."""
 
 
 class FittedLayer(NamedTuple):
@@ -193,14 +196,12 @@ def fit_layer(
             "online: no window at the vehicle's minimum speed or more; expected some to fit the prior to"
         )
     s_delta: Vector = np.array(scale.increment_scale)
-    left_out = [
-        (part, _least_squares([*parts[:k], *parts[k + 1 :]] if len(parts) > 1 else [part], s_delta))
-        for k, part in enumerate(parts)
-    ]
+    moments = [_moments(part, s_delta) for part in parts]
+    others = [[*moments[:k], *moments[k + 1 :]] if len(parts) > 1 else moments for k in range(len(parts))]
 
     vehicle, stepping = features.physics.vehicle, features.physics.stepping
     nothing = BlockErrors(np.ones(CHANNELS), np.ones(CHANNELS))
-    driven = (np.concatenate(each) for each in zip(*(part[1:] for part in parts), strict=True))
+    driven = (np.concatenate(each) for each in zip(*(part[1:4] for part in parts), strict=True))
     usual = CoefficientEstimator(vehicle, s_delta, nothing, *stepping, config.spread).usual_errors(*driven)
 
     def layer(prior: _Prior, rows: float, spread: dict[str, float]) -> OnlineLayer:
@@ -212,20 +213,37 @@ def fit_layer(
             vehicle, *stepping,
         )  # fmt: skip
 
-    def without(part: LayerDrive, prior: _Prior, rows: float) -> LeftOut:
-        fitted = layer(prior, rows, {})
-        return LeftOut(fitted, part, fitted.drive(*part))
+    trials = [
+        _along(part, [layer(_least_squares(rest), rows, {}) for rows in _PRIOR_ROWS])
+        for part, rest in zip(parts, others, strict=True)
+    ]
+    count = sum(len(part.ends) for part in parts)
+    mean_square = (
+        np.array([np.sum([each.squares for each in trial], axis=0) for trial in zip(*trials, strict=True)]) / count
+    )
+    losses = 0.5 * np.log(mean_square + _SMALLEST).mean(axis=1)
+    chosen = int(np.argmax(losses <= losses.min() + np.log1p(_TOLERANCE)))
+    whole = layer(_least_squares(moments), _PRIOR_ROWS[chosen], config.spread)
+    return FittedLayer(whole, float(np.exp(losses[chosen])), [trial[chosen] for trial in trials])
 
-    trials: dict[float, tuple[float, list[LeftOut]]] = {}
-    for rows in _PRIOR_ROWS:
-        trial = [without(part, prior, rows) for part, prior in left_out]
-        errors = np.concatenate([each.errors for each in trial])
-        trials[rows] = float(0.5 * np.log(np.mean(errors**2, axis=0) + _SMALLEST).mean()), trial
-        least = min(loss for loss, _ in trials.values())
-        trials = {r: each for r, each in trials.items() if each[0] <= least + np.log1p(_TOLERANCE)}  # they are large
-    chosen, (loss, left) = next(iter(trials.items()))
-    whole_layer = layer(_least_squares(parts, s_delta), chosen, config.spread)
-    return FittedLayer(whole_layer, float(np.exp(loss)), left)
+
+def _along(drive: LayerDrive, layers: list[OnlineLayer]) -> list[LeftOut]:
+    """Drives layers along a part of the laps, each for itself."""
+    learning = [Along(layer) for layer in layers]
+    squares = np.zeros((len(layers), CHANNELS))
+    known: list[list[Learned]] = [[] for _ in layers]
+    for block, seen in drive.blocks():
+        increments, ends = drive.increments[block], drive.ends[block]
+        starts = drive.starts[(drive.starts >= block.start) & (drive.starts < block.stop)] - block.start
+        for k, layer in enumerate(layers):
+            learned = learning[k].over(seen, drive.rows[block], increments, ends)
+            errors = (layer.increments(seen.features, learned.weights) - increments) / layer.scale
+            squares[k] += np.sum(errors**2, axis=0)
+            known[k].append(learned.at(starts))
+    return [
+        LeftOut(layer, squares[k], Learned(*(np.concatenate(each) for each in zip(*known[k], strict=True))))
+        for k, layer in enumerate(layers)
+    ]
 
 
 class _Prior(NamedTuple):
@@ -235,31 +253,43 @@ class _Prior(NamedTuple):
     physics: Vector
 
 
-def _least_squares(drives: list[LayerDrive], s_delta: Vector) -> _Prior:
-    """Weights by least squares on drives, drawn to the physics alone; the mean Gram matrix, mean square errors."""
-    n, rows = drives[0].seen.features.shape[2], sum(len(drive.ends) for drive in drives)
+class _Moments(NamedTuple):
+    """What least squares needs of a drive; sums over its rows, which add up over drives."""
+
+    rows: int
+    gram: Vector
+    """Of the features, ``(3, n, n)``."""
+    moment: Vector
+    """Of features with the physics' errors, ``(3, n)``."""
+    square: Vector
+    """Of the physics' errors, ``(3,)``, in units of s_delta squared."""
+
+
+def _moments(drive: LayerDrive, s_delta: Vector) -> _Moments:
+    parts = []
+    for block, (F, physics) in drive.blocks():
+        error = (drive.increments[block] - physics) / s_delta
+        gram = np.einsum("kci,kcj->cij", F, F, optimize=True)
+        parts.append(_Moments(len(error), gram, np.einsum("kci,kc->ci", F, error), np.sum(error**2, axis=0)))
+    return _added(parts)
+
+
+def _added(parts: list[_Moments]) -> _Moments:
+    rows, *sums = (sum(each) for each in zip(*parts, strict=True))
+    return _Moments(rows, *sums)
+
+
+def _least_squares(parts: list[_Moments]) -> _Prior:
+    """Weights by least squares, drawn to the physics alone; the mean Gram matrix, mean square errors."""
+    rows, total, moment, square = _added(parts)
+    n = total.shape[1]
     alone = np.zeros((CHANNELS, n))
     alone[:, 0] = 1.0
     if rows == 0:
         one = np.ones(CHANNELS)
         return _Prior(alone, np.tile(np.eye(n), (CHANNELS, 1, 1)), one, one)
-    gram, moment = np.zeros((CHANNELS, n, n)), np.zeros((CHANNELS, n))
-    noise, physics = np.zeros(CHANNELS), np.zeros(CHANNELS)
-    for F, y, _ in _blocks(drives, s_delta):
-        gram += np.einsum("kci,kcj->cij", F, F, optimize=True) / rows
-        moment += np.einsum("kci,kc->ci", F, y - np.einsum("kci,ci->kc", F, alone)) / rows
-    ridge = _RIDGE * np.einsum("cii->ci", gram) + _SMALLEST
-    gram[:, range(n), range(n)] += ridge
-    mean: Vector = alone + np.linalg.solve(gram, moment[..., None])[..., 0]
-    for F, y, predicted in _blocks(drives, s_delta):
-        noise += np.sum((y - np.einsum("kci,ci->kc", F, mean)) ** 2, axis=0) / rows
-        physics += np.sum((y - predicted) ** 2, axis=0) / rows
-    return _Prior(mean, gram, np.maximum(noise, _LEAST_NOISE), np.maximum(physics, _LEAST_NOISE))
-
-
-def _blocks(drives: list[LayerDrive], s_delta: Vector) -> Iterator[tuple[Vector, Vector, Vector]]:
-    """Features ``(k, 3, n)``, increments and the physics' ones ``(k, 3)`` in units of s_delta, some rows at a time."""
-    for drive in drives:
-        for begin in range(0, len(drive.ends), _BLOCK):
-            part = slice(begin, begin + _BLOCK)
-            yield drive.seen.features[part], drive.increments[part] / s_delta, drive.seen.physics[part] / s_delta
+    ridge = _RIDGE * np.einsum("cii->ci", total) / rows + _SMALLEST
+    gram = total / rows + ridge[:, None, :] * np.eye(n)
+    change = np.linalg.solve(gram, moment[..., None] / rows)[..., 0]
+    noise = square + np.einsum("ci,ci->c", change, np.einsum("cij,cj->ci", total, change) - 2.0 * moment)
+    return _Prior(alone + change, gram, *(np.maximum(each / rows, _LEAST_NOISE) for each in (noise, square)))

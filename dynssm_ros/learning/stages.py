@@ -91,13 +91,12 @@ def train(
     """
     files = checkpoints(config, checkpoint)[-1 - config.parts :]
     shorter = config.with_training(epochs=max(1, config.training.effort[0] // _SHORTER))
-    parts = [np.arange(len(recording)) * config.parts // len(recording) == k for k in range(config.parts)]
+    parts = recording.stretches(config.parts) if config.parts else []
     left_out = [recording.select(part) for part in parts]
-    rests = [recording.select(~part) for part in parts]
-    if not all(_can_be_trained_on(rest, config, vehicle) for rest in rests):
-        rests = []
+    if not all(_can_be_trained_on(_rest(recording, part), config, vehicle) for part in parts):
+        parts = []
 
-    stages = (_epochs(config), *(_epochs(shorter) for _ in rests))
+    stages = (_epochs(config), *(_epochs(shorter) for _ in parts))
 
     physics = config.with_physics
     calibrates = physics.nominal == "calibrated" or config.online is not None
@@ -119,9 +118,10 @@ def train(
         return trained
     if not trained.model.LEARNS:
         return _with_layer(trained, [(trained.model, part) for part in left_out])
+    integrator = trained.vehicle.integrator
     others = [
-        run(rest, shorter, k, f"{config.name} without part {k} of {len(parts)}", trained.vehicle.integrator).model
-        for k, rest in enumerate(rests, 1)
+        run(_rest(recording, part), shorter, k, f"{config.name} without part {k} of {len(parts)}", integrator).model
+        for k, part in enumerate(parts, 1)
     ]
     return _with_layer(trained, list(zip(others, left_out, strict=False)))
 
@@ -178,6 +178,11 @@ def _split(
     """Training and validation windows of ``extra_rows`` more rows than the model's."""
     rows, least = config.rows(vehicle.sampling_time) + extra_rows, config.training.effort[1]
     return split_windows(recording, rows, config.training, vehicle.minimum_speed, least)
+
+
+def _rest(recording: Recording, part: slice) -> Recording:
+    """A recording without a part."""
+    return recording.select(np.delete(np.arange(len(recording)), part))
 
 
 def _can_be_trained_on(recording: Recording, config: ModelConfig, vehicle: Vehicle) -> bool:

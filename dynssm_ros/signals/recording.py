@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -100,17 +101,22 @@ class Recording:
         return selected
 
     def select(self, rows: slice | npt.NDArray[np.bool_] | Indices) -> Recording:
-        """The given rows; a segment that the selection cuts apart becomes several."""
+        """The given rows, as a view where they are a slice; a segment that the selection cuts apart becomes several."""
         index = np.arange(len(self))[rows]
         cut = np.flatnonzero((np.diff(index) != 1) | (np.diff(self.segment[index]) != 0)) + 1
         segment = np.zeros(len(index), dtype=np.int32)
         segment[cut] = 1
         return replace(
             self,
-            time=self.time[index],
+            time=self.time[rows],
             segment=np.cumsum(segment, dtype=np.int32),
-            columns={name: values[index] for name, values in self.columns.items()},
+            columns={name: values[rows] for name, values in self.columns.items()},
         )
+
+    def stretches(self, count: int) -> list[slice]:
+        """Rows of ``count`` stretches of equal length, one after the other."""
+        edges = [-(-k * len(self) // count) for k in range(count + 1)]
+        return [slice(*edge) for edge in pairwise(edges)]
 
     def split_last(self, fraction: float) -> tuple[Recording, Recording]:
         """Splits off the last ``fraction`` of the rows as one block (blocked split): ``(first, last)``."""
@@ -250,6 +256,8 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
     if not recordings:
         raise RecordingError("no recording given")
     first = recordings[0]
+    if len(recordings) == 1:
+        return first
     for other in recordings[1:]:
         for name in ("sampling_time", "commands"):
             have, want = getattr(other.info, name), getattr(first.info, name)

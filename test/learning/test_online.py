@@ -1,5 +1,6 @@
 """The online layer from training to prediction: exact cars stay exact, live equals evaluation, changed cars are learned."""
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.models import OnnxModel, SingleTrack, without_online
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.history import Refusal
+from dynssm_ros.signals.recording import concatenate
 from dynssm_ros.signals.signal_map import load_signal_map
 
 SIGNALS = load_signal_map("default").with_commands("none")
@@ -44,6 +46,20 @@ def test_on_exact_laps_of_the_known_car_it_is_the_true_model(laps, orca, make_co
     score = evaluate(laps, {"rls": model, "true": SingleTrack(orca)}, calls=1).scores["rls"]
     assert np.all(score.rmse < 1e-5)
     assert score.rollout.ade < 1e-5
+
+
+def test_memory_of_a_training_grows_with_the_rows_of_the_laps_alone(laps, orca, make_config, tmp_path: Path):
+    def peak(recording) -> int:
+        tracemalloc.start()
+        train(recording, make_config(kind="rls", history=0.3), orca, tmp_path / "c.pt")
+        _, highest = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        return highest
+
+    less, more = (concatenate([laps] * -(-rows // len(laps))) for rows in (5000, 10000))  # more than a block
+    peak(laps)
+    a_row = (peak(more) - peak(less)) / (len(more) - len(less))
+    assert a_row < 8 * 100, "bytes; what the layer sees of a window alone has 3 x 30 numbers"
 
 
 def test_with_sensor_noise_it_beats_the_physics_that_it_starts_from(noisy_laps, noisy_model):

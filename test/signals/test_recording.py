@@ -213,6 +213,14 @@ def test_a_selection_by_slice_mask_and_index_is_the_same() -> None:
         assert kept.segment.tolist() == [0, 1]
 
 
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_stretches_are_all_rows_one_after_the_other(count: int) -> None:
+    r = recording([0] * 10)
+    parts = [r.select(stretch)["v_x"].tolist() for stretch in r.stretches(count)]
+    assert [value for part in parts for value in part] == r["v_x"].tolist()
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
 def test_lookahead_commands_are_the_next_feedback_inside_a_segment() -> None:
     r = recording([0, 0, 0, 1, 1]).with_commands("lookahead")
     assert r.info.commands == "lookahead"
