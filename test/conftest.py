@@ -133,7 +133,7 @@ history: 0.08
 ssm: {channels: 4, states: 2}
 gru: {hidden: 4}
 fusion: {hidden: 8, latent: 8}
-physics: {nominal: mid_range}
+physics: {nominal: vehicle}
 adaptation: {hidden: 8}
 residual: {hidden: [8], inputs: normalised}
 loss: {scale: increment}

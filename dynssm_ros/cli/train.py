@@ -9,6 +9,7 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.cli.console import CommandsOption, VehicleOption, console, errors, progress_bar
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import missing_libraries
 
 if TYPE_CHECKING:
@@ -45,6 +46,8 @@ def train(
             name = kept[-1].name if kept else "the beginning"
             errors.print(f"interrupted; the same command continues from {name}")
             raise typer.Exit(130) from None
+    if trained.restarts:
+        console.print(f"began anew {trained.restarts} times: it was no better than predicting the mean change")
     if trained.resumed_from:
         console.print(f"continued from epoch {trained.resumed_from}")
     v_x, v_y, omega = trained.validation_rmse
@@ -54,6 +57,8 @@ def train(
         f"v_y {v_y:.4g} m/s, omega {omega:.3g} rad/s (commands: {artifact.card.commands})",
         soft_wrap=True,
     )
+    if trained.failure:
+        raise ConfigurationError(trained.failure)
     if trained.network_gain is not None:
         used = "network" in (trained.features.names if trained.features else ())
         console.print(

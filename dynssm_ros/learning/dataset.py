@@ -53,6 +53,11 @@ class TrainingWindows:
     def __len__(self) -> int:
         return len(self.ends)
 
+    @property
+    def increments(self) -> Tensor:
+        """Measured increments ``s_{t+1} - s_t`` of all windows, ``(N, 3)``."""
+        return self.matrix[self.ends + 1, :3] - self.matrix[self.ends, :3]
+
     def batch(self, index: Tensor | slice) -> tuple[Tensor, Tensor]:
         """TrainingWindows ``(B, H, 7)`` and their measured increments ``s_{t+1} - s_t`` ``(B, 3)``."""
         ends = self.ends[index]

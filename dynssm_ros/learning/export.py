@@ -140,7 +140,9 @@ def _metrics(trained: Trained) -> dict[str, Any]:
     return {
         "validation_rmse": dict(zip(("v_x", "v_y", "omega"), trained.validation_rmse, strict=True)),
         "windows": dict(zip(("training", "validation"), trained.windows, strict=True)),
+        "unexplained": trained.unexplained,
         "best_epoch": trained.best_epoch,
+        "restarts": trained.restarts,
         "network_gain": trained.network_gain,
         "history": trained.history,
     }

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import math
 import zipfile
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from dynssm_ros.files import replacing
 from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import COMPONENTS, LossConfig, Scales, rollout_objective, scales
-from dynssm_ros.learning.models.base import ModelConfig, TrainableModel, TrainingConfig
+from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
@@ -27,6 +28,10 @@ from dynssm_ros.vehicle import Vehicle
 History = dict[str, list[float]]
 
 _LEARNING_RATE_FLOOR = 0.02  # the cosine schedule ends at this fraction of the learning rate
+_PLATEAU = 0.1  # of the epochs, after which a training is to be better than predicting the mean change
+_FALLING = 0.95  # of the loss in the first half of these epochs; a loss that falls below in the second is no plateau
+_PLATEAU_EPOCHS = 5  # but no fewer than these
+_RESTART_RATE = 0.25  # of the learning rate, with each restart
 
 
 @dataclass
@@ -38,12 +43,14 @@ class OptimisationResult:
         history: mean loss per epoch: ``train/TERM`` and ``validation/TERM`` for each of ``COMPONENTS``.
         best_epoch: the one with the lowest validation loss; 0: the untrained model.
         resumed_from: epochs that were done before.
+        restarts: times that it began anew, out of a plateau.
     """
 
     model: TrainableModel
     history: History
     best_epoch: int = 0
     resumed_from: int = 0
+    restarts: int = 0
 
 
 @dataclass
@@ -55,10 +62,23 @@ class _TrainingState:
     best_loss: float = float("inf")
     best: dict[str, Tensor] = field(default_factory=dict)
     history: History = field(default_factory=dict)
+    restarts: int = 0
 
 
 class Optimisation:
-    """Adam over shuffled batches."""
+    """Adam over shuffled batches.
+
+    Args:
+        config: the model file.
+        vehicle: the car.
+        model: to be trained.
+        scale: units of the losses.
+        training: windows to train on.
+        validation: windows that say which epoch is best.
+        checkpoint: file that is kept up to date.
+        device: to compute on.
+        anew: gives the model with other weights, for a restart; ``None``: it is not restarted.
+    """
 
     def __init__(
         self,
@@ -70,27 +90,25 @@ class Optimisation:
         validation: TrainingWindows,
         checkpoint: Path,
         device: torch.device,
+        anew: Callable[[int], TrainableModel] | None = None,
     ) -> None:
         self.config = config
+        self.anew = anew
         self.loss: LossConfig = config.loss
         self.settings = config.training
         self.steps = rollout_steps(config, vehicle)
         self.model = model.to(device)
         s_y, s_delta = scales(config.loss, scale)
         self.scales: Scales = (s_y.to(device), s_delta.to(device))
+        self.H = config.rows(vehicle.sampling_time)
         self.training, self.validation = training.to(device), validation.to(device)
         self.trained = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
-        self.optimiser = torch.optim.AdamW(
-            self.trained, lr=config.training.learning_rate, weight_decay=config.training.weight_decay
-        )
-        self.schedule = _schedule(config.training, self.optimiser)
+        self.optimiser, self.schedule = self._optimiser(1.0)
         self.shuffle = torch.Generator().manual_seed(config.training.seed)
         self.augmentation = Augmentation(config.training.augmentation, self.shuffle)
         self.checkpoint = checkpoint
         self.identity = _identity(config, vehicle, training)
-        self.state = _TrainingState(
-            history={f"{part}/{term}": [] for part in ("train", "validation") for term in COMPONENTS}
-        )
+        self.state = _TrainingState(history=_empty_history())
 
     def run(self, progress: NamedProgress | None) -> OptimisationResult:
         """Trains until the validation loss stops falling; returns the best model.
@@ -120,13 +138,48 @@ class Optimisation:
                     settings.epochs,
                     f"validation {validated['prediction']:.4g}, best {state.best_loss:.4g}",
                 )
+            if self._on_plateau():
+                state = self._restart()
         if state.epoch == 0:
             raise ConfigurationError(
                 f"model {self.config.name}: diverged in the first epoch; expected a smaller learning_rate than "
                 f"{settings.learning_rate:g}"
             )
         self.model.load_state_dict(state.best)
-        return OptimisationResult(self.model, state.history, state.best_epoch, resumed_from)
+        return OptimisationResult(self.model, state.history, state.best_epoch, resumed_from, state.restarts)
+
+    def _on_plateau(self) -> bool:
+        """Whether the loss has stopped falling without the model being any good, and the training can begin anew."""
+        epochs = max(math.ceil(_PLATEAU * self.settings.epochs), _PLATEAU_EPOCHS)
+        losses = self.state.history["validation/prediction"]
+        if (
+            self.state.epoch != epochs
+            or min(losses[epochs // 2 :]) < _FALLING * min(losses[: epochs // 2])
+            or self.anew is None
+            or self.state.restarts >= self.settings.restarts
+        ):
+            return False
+        self.model.eval()
+        return unexplained(self.model, self.training, replace(self.validation, H=self.H)) >= 1.0
+
+    def _restart(self) -> _TrainingState:
+        """Begins anew, from other weights and with a smaller learning rate."""
+        assert self.anew is not None
+        restarts = self.state.restarts + 1
+        self.model.load_state_dict(self.anew(restarts).state_dict())
+        self.optimiser, self.schedule = self._optimiser(_RESTART_RATE**restarts)
+        self.state = _TrainingState(history=_empty_history(), restarts=restarts)
+        self._keep_if_better(self._validate()["prediction"])
+        return self.state
+
+    def _optimiser(self, share: float) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
+        """The optimiser with ``share`` of the learning rate, and its schedule."""
+        rate = share * self.settings.learning_rate
+        optimiser = torch.optim.AdamW(self.trained, lr=rate, weight_decay=self.settings.weight_decay)
+        if self.settings.schedule == "constant":
+            return optimiser, torch.optim.lr_scheduler.ConstantLR(optimiser, factor=1.0)
+        floor = rate * _LEARNING_RATE_FLOOR
+        return optimiser, torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, self.settings.epochs, floor)
 
     def _keep_if_better(self, loss: float) -> None:
         if loss < self.state.best_loss:
@@ -211,11 +264,23 @@ def rollout_steps(config: Any, vehicle: Vehicle) -> int:
     return 1 if loss is None or loss.rollout == 0 else max(1, round(loss.rollout / vehicle.sampling_time))
 
 
-def _schedule(settings: TrainingConfig, optimiser: torch.optim.Optimizer) -> torch.optim.lr_scheduler.LRScheduler:
-    if settings.schedule == "constant":
-        return torch.optim.lr_scheduler.ConstantLR(optimiser, factor=1.0)
-    floor = settings.learning_rate * _LEARNING_RATE_FLOOR
-    return torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs, floor)
+@torch.no_grad()
+def squared_errors(model: TrainableModel, windows: TrainingWindows) -> Tensor:
+    """Mean squared one-step error of each state over ``windows``, ``(3,)`` in squared m/s, m/s, rad/s."""
+    squares = torch.zeros(3, dtype=torch.float64)
+    for batch, target in windows.batches():
+        squares += (model(batch).increment - target).double().square().sum(0).cpu()
+    return squares / len(windows)
+
+
+def unexplained(model: TrainableModel, training: TrainingWindows, validation: TrainingWindows) -> float:
+    """Mean squared error on ``validation`` over that of predicting the mean change in ``training``, mean of the states."""
+    of_mean = (validation.increments - training.increments.mean(0)).double().square().mean(0).cpu()
+    return float((squared_errors(model, validation) / of_mean).mean())
+
+
+def _empty_history() -> History:
+    return {f"{part}/{term}": [] for part in ("train", "validation") for term in COMPONENTS}
 
 
 def _identity(config: ModelConfig, vehicle: Vehicle, training: TrainingWindows) -> str:

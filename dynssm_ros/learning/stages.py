@@ -15,7 +15,14 @@ from dynssm_ros.learning.earned_layer import LayerBase, earned_layer
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.learning.models.registry import build_model
 from dynssm_ros.learning.online import OnlineFeatures
-from dynssm_ros.learning.optimisation import History, Optimisation, OptimisationResult, rollout_steps
+from dynssm_ros.learning.optimisation import (
+    History,
+    Optimisation,
+    OptimisationResult,
+    rollout_steps,
+    squared_errors,
+    unexplained,
+)
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.online import OnlineLayer
@@ -26,6 +33,7 @@ from dynssm_ros.vehicle.single_track import Integrator
 Calibrate = Callable[[Recording, Vehicle, Integrator | None], Vehicle]
 """Fits the nominal values of a vehicle to a recording, for an integrator or, ``None``, the one that is closest to it."""
 
+_SEEDS_APART = 1000  # of a restart from the training before
 _SHORTER = 4  # how many times fewer epochs the models have that only tell how large errors are on unknown laps
 
 
@@ -43,10 +51,14 @@ class Trained:
     """Mean loss per epoch: ``train/TERM`` and ``validation/TERM`` for each of ``COMPONENTS``."""
     best_epoch: int
     validation_rmse: tuple[float, float, float]
+    unexplained: float
+    """Mean squared error on validation windows over that of predicting the mean change, mean of the states."""
     windows: tuple[int, int]
     """Number of training and validation windows."""
     resumed_from: int = 0
     """Epochs that were already done, of all stages together."""
+    restarts: int = 0
+    """Times that it began anew, out of a plateau."""
     start: Trained | None = None
     """The model that fine-tuning started from."""
     features: OnlineFeatures | None = None
@@ -54,6 +66,17 @@ class Trained:
     online: OnlineLayer | None = None
     network_gain: float | None = None
     """Share of the online layer's error on left-out parts that the network takes away; ``None`` without either."""
+
+    @property
+    def failure(self) -> str:
+        """Why the training has failed, in words; empty if it has not. What an online layer stands on is judged by that."""
+        if self.config.online is not None or self.unexplained < 1.0:
+            return ""
+        return (
+            f"model {self.config.name}: the training failed: on validation windows its mean squared error is "
+            f"{self.unexplained:.3g} of that of predicting the mean change; expected less than 1 (a smaller learning_rate, "
+            f"another seed or more data may help)"
+        )
 
     @property
     def H(self) -> int:
@@ -162,16 +185,6 @@ def check_device(device: str) -> None:
         raise ConfigurationError(f"--device {device}: not available here; expected {' or '.join(available)}")
 
 
-@torch.no_grad()
-def validation_rmse(model: TrainableModel, windows: TrainingWindows) -> tuple[float, float, float]:
-    """One-step RMSE of each state over ``windows`` (m/s, m/s, rad/s)."""
-    squares = torch.zeros(3)
-    for batch, target in windows.batches():
-        squares += (model(batch).increment - target).square().sum(0)
-    rmse = (squares / len(windows)).sqrt().tolist()
-    return rmse[0], rmse[1], rmse[2]
-
-
 def _split(
     recording: Recording, config: ModelConfig, vehicle: Vehicle, extra_rows: int = 0
 ) -> tuple[TrainingWindows, TrainingWindows]:
@@ -216,12 +229,16 @@ def _train(
     """One stage; ``start`` is the outcome of the stage before."""
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
     torch.set_num_threads(1)  # batches are small: more threads wait for each other longer than they compute
-    torch.manual_seed(config.training.seed)
     vehicle = config.with_physics.modelled(vehicle)
     H = config.rows(vehicle.sampling_time)
     plain, _ = _split(recording, config, vehicle)
     scale = normalisation(recording, plain) if start is None else start.normalisation
-    model = build_model(config, vehicle, scale)
+
+    def anew(restart: int) -> TrainableModel:
+        torch.manual_seed(config.training.seed + _SEEDS_APART * restart)
+        return build_model(config, vehicle, scale)
+
+    model = anew(0)
     ahead = rollout_steps(config, vehicle) - 1
     if ahead and model.EXTRA_ROWS:
         raise ConfigurationError(
@@ -234,12 +251,15 @@ def _train(
         run = OptimisationResult(model, {})
     else:
         optimisation = Optimisation(
-            config, vehicle, model, scale, training, validation, checkpoint, torch.device(device)
-        )
+            config, vehicle, model, scale, training, validation, checkpoint, torch.device(device),
+            anew if start is None else None,
+        )  # fmt: skip
         run = optimisation.run(progress)
     model = run.model.cpu().eval()
     held = replace(validation, H=H)
+    v_x, v_y, omega = squared_errors(model, held).sqrt().tolist()
     return Trained(
-        config, vehicle, recording, model, scale, run.history, run.best_epoch, validation_rmse(model, held),
-        (len(training), len(validation)), run.resumed_from + (start.resumed_from if start else 0), start,
+        config, vehicle, recording, model, scale, run.history, run.best_epoch, (v_x, v_y, omega),
+        unexplained(model, training, held),
+        (len(training), len(validation)), run.resumed_from + (start.resumed_from if start else 0), run.restarts, start,
     )  # fmt: skip

@@ -125,7 +125,7 @@ def test_rows_that_the_car_cannot_have_driven_are_named_in_a_line(
     recording = Recording.load(laps)
     omega = np.where(np.arange(len(recording)) == 40, 500.0, recording["omega"])
     replace(recording, columns=recording.columns | {"omega": omega}).save(laps)
-    models = {"train": ("--model", "ridge"), "evaluate": ("--model", "persistence", "--model", "single_track")}
+    models = {"train": ("--model", "rls"), "evaluate": ("--model", "persistence", "--model", "single_track")}
     status, _, words = dynssm(
         command, laps, "--vehicle", "orca", *models.get(command, ()), "--out", tmp_path / "out.yaml"
     )

@@ -56,6 +56,16 @@ def test_an_interrupted_training_says_how_to_go_on_and_does(
     assert len(json.loads((tmp_path / "model" / "metrics.json").read_text())["history"]["train/prediction"]) == 4
 
 
+def test_a_training_that_came_to_nothing_says_so_and_leaves_what_shows_why(
+    dynssm: Run, arguments: list[str], tmp_path: Path, tiny_model: Path
+) -> None:
+    tiny_model.write_text(tiny_model.read_text().replace("nominal: vehicle", "nominal: mid_range"))
+    status, _, err = dynssm(*arguments, "--epochs", "1")
+    assert status == 1
+    assert "error: model tiny: the training failed" in err
+    assert (tmp_path / "model" / "losses.png").is_file()
+
+
 def test_fine_tuning_takes_one_command_and_goes_on_in_the_stage_where_it_was(
     dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -76,8 +86,9 @@ def test_fine_tuning_takes_one_command_and_goes_on_in_the_stage_where_it_was(
         status, _, err = dynssm(*arguments, "--epochs", 2, "--seed", 7)
         assert status == 130
         assert err.split("\n")[-2] == f"interrupted; the same command continues from {kept}"
-    status, out, _ = dynssm(*arguments, "--epochs", 2, "--seed", 7)
-    assert status == 0
+    status, out, err = dynssm(*arguments, "--epochs", 2, "--seed", 7)
+    assert status == 1
+    assert "the training failed" in err, "so few epochs come to nothing"
     assert "continued from epoch 3" in out
     assert not list(tmp_path.glob("*.pt"))
     card = open_artifact(tmp_path / "model").card
@@ -127,4 +138,4 @@ def test_without_a_terminal_there_is_no_progress_bar(arguments: list[str]) -> No
     command = [sys.executable, "-m", "dynssm_ros.cli.main", *arguments, "--epochs", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "parameters, best epoch 1, seed 0; one-step RMSE on" in done.stdout
+    assert "parameters, best epoch 0, seed 0; one-step RMSE on" in done.stdout

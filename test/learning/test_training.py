@@ -126,6 +126,53 @@ def test_gradients_are_clipped_if_the_model_file_says_so(
     assert moved[None] != moved[1.0]
 
 
+# --- come to nothing ----------------------------------------------------------------------------
+
+
+def plateaus(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """So many plateaus whatever the data, then all is well."""
+    shares = iter([1.0] * count)
+    monkeypatch.setattr(training_module, "_FALLING", 0.0)
+    monkeypatch.setattr(training_module, "unexplained", lambda *_: next(shares, 0.5))
+
+
+def test_a_training_on_a_plateau_begins_anew_with_a_smaller_learning_rate(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plateaus(monkeypatch, 2)
+    config = make_config(training={"epochs": 6, "schedule": "constant", "learning_rate": 0.008})
+    told: list[int] = []
+    trained = train(short, config, orca, checkpoint, progress=lambda done, *_: told.append(done))
+    assert trained.restarts == 2
+    assert told == [*range(1, 6), *range(1, 6), *range(1, 7)]
+    assert torch.load(checkpoint, weights_only=True)["optimiser"]["param_groups"][0]["lr"] == pytest.approx(0.0005)
+    assert len(trained.history["train/prediction"]) == 6
+
+
+def test_a_training_that_is_interrupted_after_a_restart_ends_bit_for_bit_like_another(
+    short: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plateaus(monkeypatch, 2)
+    config = make_config(training={"epochs": 8, "restarts": 1})
+    whole = train(short, config, orca, tmp_path / "whole.pt")
+    with pytest.raises(KeyboardInterrupt):
+        train(short, config, orca, tmp_path / "cut.pt", progress=interrupt_at(7))
+    resumed = train(short, config, orca, tmp_path / "cut.pt")
+    assert same(whole, resumed)
+    assert (resumed.restarts, resumed.resumed_from) == (1, 7)
+
+
+def test_a_training_that_ends_worse_than_the_mean_change_has_failed(
+    short: Recording, make_ddm: MakeConfig, orca: Vehicle, tmp_path: Path
+) -> None:
+    lost = train(short, make_ddm(training={"epochs": 1, "learning_rate": 1e-9}), orca, tmp_path / "a.pt")
+    assert lost.unexplained > 1.0
+    assert "the training failed" in lost.failure
+    fitted = train(short, make_ddm(kind="ridge"), orca, tmp_path / "b.pt")
+    assert fitted.unexplained < 1.0
+    assert fitted.failure == ""
+
+
 # --- interrupted --------------------------------------------------------------------------------
 
 

@@ -39,6 +39,12 @@ class TrainingConfig(SplitConfig):
     weight_decay: float = Field(default=0.0, ge=0)
     gradient_clip: float | None = Field(default=1.0, gt=0, description="largest norm of a gradient; null: any")
     patience: int = Field(ge=1, description="epochs without a better validation loss before it stops")
+    restarts: int = Field(
+        default=3,
+        ge=0,
+        description="times that a training begins anew, with other weights and a quarter of the learning rate, if after a "
+        "tenth of its epochs (at least 5) it is no better than predicting the mean change",
+    )
     augmentation: AugmentationConfig = Field(default_factory=AugmentationConfig)
 
     @property
