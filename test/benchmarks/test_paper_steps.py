@@ -43,7 +43,7 @@ SMALL = {
     "models": {
         "ridge_orca": {"base": "ridge", "change": {"history": 0.3}, "seeds": 1},
         "dynssm_orca": {"base": "dynssm_paper_orca", "change": {"physics": {"nominal": "calibrated"}}},
-        "ddm_orca": {"vehicle": "orca"}, "fthd_orca": {"vehicle": "orca"},
+        "ddm_orca": {"vehicle": "orca"}, "fthd_orca_ddm": {"vehicle": "orca"}, "fthd_orca": {"vehicle": "orca"},
     },
     "studies": {
         "track": {
@@ -182,11 +182,11 @@ def test_a_test_part_is_scored_and_nothing_else(small_run):
 
 def test_fine_tuning_goes_on_from_the_model_that_the_split_has_anyway(plan, tmp_path):
     """A planted mark in the first model's checkpoint comes out of the second's."""
-    study = plan.studies["track"].model_copy(update={"models": ("ddm_orca", "fthd_orca"), "seeds": 1})
+    study = plan.studies["track"].model_copy(update={"models": ("fthd_orca_ddm", "fthd_orca"), "seeds": 1})
     short = plan.drives["club"].model_copy(update={"duration": 3.0})
     small = plan.model_copy(update={"studies": {"track": study}, "drives": plan.drives | {"club": short}})
     steps = by_key(steps_of(small, None, {}))
-    ddm, fthd = (steps[f"models/club.topics/{name}.0"] for name in ("ddm_orca", "fthd_orca"))
+    ddm, fthd = (steps[f"models/club.topics/{name}.0"] for name in ("fthd_orca_ddm", "fthd_orca"))
     assert fthd.start == ddm.key
     steps["recordings/club.parquet"].make(tmp_path, frozenset())
     ddm.make(tmp_path, frozenset(ddm.needs))

@@ -69,9 +69,9 @@ def test_a_training_that_came_to_nothing_says_so_and_leaves_what_shows_why(
 def test_fine_tuning_takes_one_command_and_goes_on_in_the_stage_where_it_was(
     dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "tiny_ddm.yaml").write_text("{base: ddm_orca, name: tiny_ddm, dense: {layers: 2, width: 8}}")
+    (tmp_path / "tiny_ddm.yaml").write_text("{base: fthd_orca_ddm, name: tiny_ddm, dense: {layers: 2, width: 8}}")
     (tmp_path / "tiny.yaml").write_text(
-        "{base: fthd_orca, name: tiny, dense: {layers: 2, width: 8}, fine_tuning: {starts_from: tiny_ddm, frozen: 1}}"
+        "{base: fthd_orca, name: tiny, dense: {layers: 2, width: 8}, fine_tuning: {starts_from: tiny_ddm}}"
     )
     train_epoch, epochs = training.Optimisation._epoch, [0]
 

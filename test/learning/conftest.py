@@ -85,7 +85,7 @@ def make_fthd() -> MakeConfig:
 
     def make(start: dict[str, Any] | None = None, **changes: Any) -> ModelConfig:
         ddm = _changed(SMALL_DDM, **start or {}).model_dump()
-        settings = {"starts_from": ddm, "frozen": 2, "physics": 0.1} | changes
+        settings = {"starts_from": ddm, "frozen": 0.7, "physics": 0.00004} | changes
         training = ddm["training"] | {"epochs": 2, "learning_rate": 0.002}
         content = ddm | {"name": "small_fthd", "kind": "fthd", "training": training, "fine_tuning": settings}
         return parse_model_config(content, "test")

@@ -92,7 +92,7 @@ def test_what_does_not_fit_is_refused_with_field_and_value(
         ("ddm_av21", {"innovation": {"history": 0.06}}, "innovation: Extra inputs are not permitted"),
         (
             "ddm_av21",
-            {"fine_tuning": {"starts_from": "ddm_av21", "frozen": 1, "physics": 0.1}},
+            {"fine_tuning": {"starts_from": "ddm_av21", "frozen": 0.5, "physics": 0.1}},
             "fine_tuning: Extra inputs are not permitted",
         ),
         ("ddm_av21", {"training": {"validation": "none"}}, "training.validation: Input should be 'blocks' or 'random'"),
@@ -104,9 +104,13 @@ def test_what_does_not_fit_is_refused_with_field_and_value(
         ),
         ("fthd_av21", {"fine_tuning": {"starts_from": "ddm_mars"}}, "'ddm_mars' is neither a file nor a shipped name"),
         ("fthd_av21", {"fine_tuning": {"starts_from": "fthd_av21"}}, "fine_tuning.starts_from"),
-        ("fthd_av21", {"fine_tuning": {"frozen": 4}}, "frozen: 4 leaves nothing to train of GRU, 2 dense layers"),
-        ("fthd_av21", {"dense": {"width": 9}}, "dense: differs from that of ddm_av21, which fine_tuning starts from"),
-        ("fthd_av21", {"training": {"seed": 3}}, "seed: differs from that of ddm_av21"),
+        ("fthd_av21", {"fine_tuning": {"frozen": 1.0}}, "fine_tuning.frozen: Input should be less than 1 (got 1.0)"),
+        (
+            "fthd_av21",
+            {"dense": {"width": 9}},
+            "dense: differs from that of fthd_av21_ddm, which fine_tuning starts from",
+        ),
+        ("fthd_av21", {"training": {"seed": 3}}, "seed: differs from that of fthd_av21_ddm"),
     ],
 )
 def test_what_does_not_fit_a_rival_is_refused(
@@ -118,7 +122,7 @@ def test_what_does_not_fit_a_rival_is_refused(
 
 
 def test_the_model_that_fine_tuning_starts_from_is_read_with_it(tmp_path: Path) -> None:
-    write(tmp_path, "ddm_own", {"base": "ddm_av21", "name": "ddm_own", "training": {"epochs": 7}})
+    write(tmp_path, "ddm_own", {"base": "fthd_av21_ddm", "name": "ddm_own", "training": {"epochs": 7}})
     settings = {"fine_tuning": {"starts_from": "ddm_own"}, "training": {"epochs": 3}}
     config = load_model_config(write(tmp_path, "own", {"base": "fthd_av21", **settings}))
     assert config.fine_tuning is not None

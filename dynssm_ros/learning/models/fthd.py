@@ -1,21 +1,20 @@
 """Fine-Tuning Hybrid Dynamics (FTHD): a trained DDM is trained on with a physics loss that needs no measured next state.
 
 After Fang and Yu, "Fine-Tuning Hybrid Physics-Informed Neural Networks for Vehicle Dynamics Model Estimation", 2024. The
-network is the DDM's, its first layers are frozen, and the objective becomes ``w_1 L_1 + w_2 L_2``:
+network is the DDM's, the first three quarters of its layers are frozen, and it is trained on for as many epochs with the
+same learning rate. The objective becomes ``w_1 L_1 + w_2 L_2``, published with w_1 = 0.999975 and w_2 = 0.000025:
 
 - ``L_1``, supervised: the mean squared error of the next state, as for the DDM.
 - ``L_2``, unsupervised: the derivative of the predicted states, by finite differences, against the accelerations
   ``f`` that the single-track model gives for the predicted coefficients. With ``s^_{t+1}`` predicted from the window
   that ends at ``t`` with coefficients ``theta^_t``, and ``s^_t`` from the window one row earlier,
 
-      L_2 = mean | (s^_{t+1} - s^_t) - T_s f(s^_t, u_t; theta^_t) |^2
+      L_2 = mean | (s^_{t+1} - s^_t) / T_s - f(s^_t, u_t; theta^_t) |^2
 
 The papers leave open, or it is not known to us, and so it was chosen here: the difference is taken between the predictions
-of two windows that follow each other, because within a single Euler step it would be zero whatever the coefficients; it
-is multiplied by ``T_s``, so that both losses have the units of a state, ``w_1`` is 1 and ``w_2`` has no unit; ``f`` is the
-model file's integrator over one step; validation windows are those of the DDM, and what is kept is the epoch with the
-lowest ``L_1`` on them, the DDM itself included. ``w_2``, the learning rate and the number of frozen layers are in the model
-file.
+of two windows that follow each other, because within a single Euler step it would be zero whatever the coefficients; ``f``
+is the model file's integrator over one step; validation windows are those of the DDM, and what is kept is the epoch with the
+lowest ``L_1`` on them, the DDM itself included. ``w_1`` is 1 here and ``w_2`` in the model file.
 
 Because the window holds the measured ``s_t``, the loss is nearly the error of the step before: to first order
 ``s^_{t+1} - s^_t - T_s f(s^_t) = s_t - s^_t``. So it weighs what the supervised loss weighs, and does not add much to it.
@@ -49,8 +48,8 @@ class FineTuningConfig(StrictModel):
     """Second stage of FTHD: a trained DDM is trained on."""
 
     starts_from: DdmConfig = Field(description="the DDM; in a file the name of its model file")
-    frozen: int = Field(
-        ge=0, description="layers that stay as the DDM has them, from the input on; the GRU is the first"
+    frozen: float = Field(
+        default=0.75, ge=0, lt=1, description="share of the layers that stay as the DDM has them; the GRU is the first"
     )
     physics: float = Field(ge=0, description="weight of the unsupervised physics loss; the supervised loss has 1")
 
@@ -70,11 +69,6 @@ class FthdConfig(DdmConfig):
             for name in names:
                 if getattr(ours, name) != getattr(its, name):
                     raise ValueError(f"{name}: differs from that of {start.name}, which fine_tuning starts from")
-        if self.fine_tuning.frozen > self.dense.layers + 1:
-            raise ValueError(
-                f"fine_tuning.frozen: {self.fine_tuning.frozen} leaves nothing to train of GRU, {self.dense.layers} dense "
-                "layers and the output layer"
-            )
         return self
 
     @property
@@ -102,7 +96,7 @@ class FTHD(DDM):
     def take_over(self, start: TrainableModel) -> None:
         """Takes the weights of the trained DDM and freezes its first layers."""
         self.load_state_dict(start.state_dict())
-        for layer in self.layers[: self.fine_tuning.frozen]:
+        for layer in self.layers[: int(self.fine_tuning.frozen * len(self.layers))]:
             layer.requires_grad_(False)
 
     def terms(self, window: Tensor, target: Tensor, loss: LossConfig, scales: Scales) -> dict[str, Tensor]:
@@ -125,5 +119,5 @@ def physics_loss(model: DDM, windows: Tensor, output: Output, unit: Tensor) -> T
     state = windows[:, -2, :3] + model(windows[:, :-1]).increment
     following = windows[:, -1, :3] + output.increment
     advance = model.physics(torch.cat([state, windows[:, -1, 3:]], dim=-1), output.theta)
-    error: Tensor = (following - state - advance) / unit
+    error: Tensor = (following - state - advance) / model.physics.vehicle.sampling_time / unit
     return error.square().mean()

@@ -34,9 +34,7 @@ def small(make_ddm: MakeConfig, orca: Vehicle) -> DDM:
     ("name", "vehicle", "published"),
     [
         ("ddm_av21", "av21_paper", 85_193),
-        ("fthd_av21", "av21_paper", 85_193),
         ("ddm_orca", "orca", 2_878_035),
-        ("fthd_orca", "orca", 2_878_035),
     ],
 )
 def test_the_shipped_models_have_the_published_number_of_parameters(name: str, vehicle: str, published: int) -> None:

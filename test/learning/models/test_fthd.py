@@ -53,7 +53,7 @@ def loss_of(model: DDM, windows: np.ndarray, unit: tuple[float, float, float] = 
 
 def test_the_car_that_drove_agrees_with_its_physics(make_ddm: MakeConfig, short: Recording, orca: Vehicle) -> None:
     windows = np.stack([short.matrix[k : k + 5] for k in range(50, 90)])
-    assert loss_of(with_coefficients(make_ddm(), orca, orca.nominal), windows) < 1e-9
+    assert loss_of(with_coefficients(make_ddm(), orca, orca.nominal), windows) < 1e-5
 
 
 def test_the_loss_is_what_two_steps_of_another_car_disagree(
@@ -65,8 +65,8 @@ def test_the_loss_is_what_two_steps_of_another_car_disagree(
     state, following = (other.predict(windows[:, : k + 1]).state for k in (3, 4))
     imagined = np.concatenate([state, windows[:, -1, 3:]], axis=1)
     advance = other.predict(imagined[:, None]).state - state
-    expected = (((following - state - advance) / unit) ** 2).mean()
-    assert expected > 1e-4
+    expected = (((following - state - advance) / 0.02 / unit) ** 2).mean()
+    assert expected > 0.1
     assert loss_of(with_coefficients(make_ddm(), orca, theta), windows, unit) == pytest.approx(expected, rel=1e-3)
 
 
@@ -116,7 +116,7 @@ def test_the_physics_loss_is_part_of_the_history_by_its_weight(
 def test_it_lowers_both_losses_of_a_car_that_its_ddm_does_not_know_well(
     short: Recording, make_fthd: MakeConfig, orca: Vehicle, tmp_path: Path
 ) -> None:
-    config = make_fthd(frozen=1, physics=1.0).with_training(epochs=8, learning_rate=0.01)
+    config = make_fthd(frozen=0.4, physics=0.0004).with_training(epochs=8, learning_rate=0.01)
     trained = train(short, config, orca, tmp_path / "c.pt")
     assert trained.start is not None
     assert min(trained.history["validation/prediction"]) < min(trained.start.history["validation/prediction"])
@@ -158,7 +158,7 @@ def test_progress_covers_both_stages(short: Recording, make_fthd: MakeConfig, or
 
 
 @pytest.mark.parametrize(
-    "changes", [{"start": {"training": {"learning_rate": 0.001}}}, {"physics": 0.2}, {"frozen": 1}]
+    "changes", [{"start": {"training": {"learning_rate": 0.001}}}, {"physics": 0.2}, {"frozen": 0.4}]
 )
 def test_the_checkpoint_of_another_fine_tuning_is_ignored(
     short: Recording, make_fthd: MakeConfig, orca: Vehicle, tmp_path: Path, changes: dict[str, Any]
