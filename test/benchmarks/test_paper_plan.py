@@ -186,6 +186,25 @@ def test_the_bounds_in_the_reference_are_those_of_the_shipped_vehicles():
             assert row.bounds == vehicle.coefficients[coefficient].bounds, coefficient
 
 
+@pytest.mark.parametrize(
+    ("name", "vehicle", "data"), [("dynssm_paper_av21", "av21_paper", "real"), ("dynssm_paper_orca", "orca", "sim")]
+)
+def test_the_papers_model_has_the_papers_size(name, vehicle, data):
+    """Its ablation without GRU has the operations of the full model, so the paper does not count those of a GRU."""
+    from dynssm_ros.learning.export import count_flops
+    from dynssm_ros.learning.models.registry import build_model, load_model_config
+    from dynssm_ros.runtime.artifact import Normalisation
+    from dynssm_ros.vehicle import load_vehicle
+
+    none = Normalisation(input_mean=(0,) * 7, input_std=(1,) * 7, state_scale=(1,) * 3, increment_scale=(1,) * 3)
+    config, car = load_model_config(name), load_vehicle(vehicle)
+    model, H = build_model(config, car, none), config.rows(car.sampling_time)
+    of_gru = 2 * H * sum(weight.numel() for key, weight in model.named_parameters() if "gru.weight" in key)
+    paper = load_reference().open_loop[data]["DynSSM"]
+    assert sum(weight.numel() for weight in model.parameters()) == pytest.approx(paper.parameters, rel=0.05)
+    assert count_flops(model, H) - of_gru == pytest.approx(paper.flops, rel=0.05)
+
+
 def test_an_unreadable_plan_is_named():
     with pytest.raises(ConfigurationError, match=r"nowhere.yaml: cannot be read"):
         load_plan(Path("nowhere.yaml"))
