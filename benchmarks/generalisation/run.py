@@ -33,7 +33,9 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "rls_memory_100_s": {"base": "rls", "online": {"memory": 100.0}},
     "rls_hardly_learning": {"base": "rls", "online": {"memory": 1.0}},
 }  # fmt: skip
-RIVALS: dict[str, dict[str, Any]] = {"ddm": {"base": "ddm_{size}"}, "fthd": {"base": "fthd_{size}"}}
+RIVALS: dict[str, dict[str, Any]] = {
+    "gp": {"base": "gp"}, "ddm": {"base": "ddm_{size}"}, "fthd": {"base": "fthd_{size}"},
+}  # fmt: skip
 """Models of others, with what their authors chose for a car of about that size: ``orca`` or ``av21``."""
 SETS = {"shipped": MODELS, "ablations": ABLATIONS, "rivals": RIVALS}
 BASELINES = ("persistence", "single_track", "single_track_ewma", "ridge", "rls")

@@ -98,8 +98,9 @@ def _changed(base: dict[str, Any], **changes: Any) -> ModelConfig:
     for key, value in changes.items():
         both = isinstance(value, dict) and isinstance(content.get(key), dict)
         content[key] = content[key] | value if both else value
-    if content.get("kind") in ("ridge", "rls"):  # they have none of the blocks, and no epochs
-        content = {name: content[name] for name in ("name", "kind", "history", "penalty") if name in content}
+    if content.get("kind") in ("ridge", "rls", "gp"):  # they have no layers, and no epochs
+        own = ("name", "kind", "history", "penalty", *(["physics"] if content["kind"] == "gp" else []))
+        content = {name: content[name] for name in own if name in content}
         content["training"] = {"validation_block": 1.0}
     return parse_model_config(content, "test")
 

@@ -70,7 +70,7 @@ def test_a_base_that_does_not_exist_is_named(tmp_path: Path) -> None:
         ({"residual": {"hidden": []}}, "residual.hidden"),
         ({"training": {"validation_every": 1}}, "training.validation_every"),
         ({"loss": {"scale": "state"}}, "loss.scale: Input should be 'target', 'increment' or 'none' (got 'state')"),
-        ({"kind": "transformer"}, "kind: 'transformer'; expected one of ddm, dynssm, fthd, ridge, rls"),
+        ({"kind": "transformer"}, "kind: 'transformer'; expected one of ddm, dynssm, fthd, gp, ridge, rls"),
         ({"dense": {"layers": 2, "width": 4}}, "dense: Extra inputs are not permitted"),
     ],
 )

@@ -11,6 +11,7 @@ from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.learning.models.ddm import DDM
 from dynssm_ros.learning.models.dynssm.network import DynSSM
 from dynssm_ros.learning.models.fthd import FTHD
+from dynssm_ros.learning.models.gp import GaussianProcess
 from dynssm_ros.learning.models.ridge import Ridge
 from dynssm_ros.learning.models.rls import Rls
 from dynssm_ros.runtime.artifact import Normalisation
@@ -34,7 +35,7 @@ def register_model(model: type[TrainableModel]) -> type[TrainableModel]:
     return model
 
 
-for _model in (DynSSM, Rls, Ridge, DDM, FTHD):
+for _model in (DynSSM, Rls, Ridge, GaussianProcess, DDM, FTHD):
     register_model(_model)
 
 

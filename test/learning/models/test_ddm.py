@@ -43,7 +43,8 @@ def test_the_shipped_models_have_the_published_number_of_parameters(name: str, v
 
 
 def test_every_kind_can_be_built(make_config: MakeConfig, make_ddm: MakeConfig, make_fthd: MakeConfig) -> None:
-    configs = [make_config(), make_config(kind="ridge"), make_config(kind="rls"), make_ddm(), make_fthd()]
+    linear = [make_config(kind=kind) for kind in ("ridge", "rls", "gp")]
+    configs = [make_config(), *linear, make_ddm(), make_fthd()]
     assert {config.kind for config in configs} == set(MODELS)
     for config in configs:
         output = build_model(config, load_vehicle("orca"), UNIT)(torch.ones(2, config.rows(0.02), 7))
