@@ -46,7 +46,8 @@ Log = Recording | PathLike
 
 
 def load_model(name_or_dir: PathLike, vehicle: Vehicle | PathLike | None = None) -> WindowModel:
-    """Opens a trained model's folder, or a baseline: ``persistence``, ``single_track``, ``single_track_ewma``.
+    """Opens a trained model's folder, or one of the baselines ``persistence``, ``single_track``, ``single_track_ewma`` and
+    ``single_track_ekf``.
 
     Example:
         >>> model = load_model("single_track", "orca")

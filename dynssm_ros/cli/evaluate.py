@@ -38,7 +38,8 @@ def evaluate(
     model: Annotated[
         list[str],
         typer.Option(
-            help="Model folder, persistence, single_track or single_track_ewma (need --vehicle); repeat to compare.",
+            help="Model folder, persistence, single_track, single_track_ewma or single_track_ekf (which need "
+            "--vehicle); repeat to compare.",
             metavar="NAME_OR_DIR",
         ),
     ],

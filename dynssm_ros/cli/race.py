@@ -29,8 +29,8 @@ def race(
     model: Annotated[
         list[str],
         typer.Option(
-            help="Model folder, true (the plant's own model), single_track, single_track_ewma, persistence, or a vehicle "
-            "file whose coefficients the controller takes for the car's; repeat to compare.",
+            help="Model folder, true (the plant's own model), single_track, single_track_ewma, single_track_ekf, "
+            "persistence, or a vehicle file whose coefficients the controller takes for the car's; repeat to compare.",
             metavar="NAME_OR_DIR",
         ),
     ],

@@ -217,7 +217,7 @@ class SingleTrackEwma(SingleTrack):
         return WindowPrediction(corrected, np.tile(self._theta, (count, 1)), physics)
 
 
-UNTRAINED = (Persistence.name, SingleTrack.name, SingleTrackEwma.name)
+UNTRAINED = (Persistence.name, SingleTrack.name, SingleTrackEwma.name, "single_track_ekf")
 """Names of the models that need no training."""
 
 
@@ -325,7 +325,7 @@ def load_model(name_or_dir: str | Path, vehicle: Vehicle | None = None) -> Windo
     """Opens a model folder, or one of the models that need no training.
 
     Args:
-        name_or_dir: a model folder, ``persistence``, ``single_track`` or ``single_track_ewma``.
+        name_or_dir: a model folder, or one of :data:`UNTRAINED`.
         vehicle: needed for the single-track models.
 
     Raises:
@@ -336,7 +336,10 @@ def load_model(name_or_dir: str | Path, vehicle: Vehicle | None = None) -> Windo
         return OnnxModel(open_artifact(name_or_dir))
     if name_or_dir == "persistence":
         return Persistence()
-    for physical in (SingleTrack, SingleTrackEwma):
+    from dynssm_ros.runtime.kalman import SingleTrackEkf
+
+    physics: tuple[type[SingleTrack] | type[SingleTrackEkf], ...] = (SingleTrack, SingleTrackEwma, SingleTrackEkf)
+    for physical in physics:
         if name_or_dir == physical.name:
             if vehicle is None:
                 raise ConfigurationError(f"model {name_or_dir}: needs --vehicle")

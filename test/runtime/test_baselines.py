@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.runtime.kalman import SingleTrackEkf
 from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma, count_operations, load_model
 from dynssm_ros.signals.inputs import applied_inputs
-from dynssm_ros.vehicle import Coefficients, State, load_vehicle, step
+from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle, load_vehicle, step
 
 CAR = load_vehicle("orca")
 
 
-def drive(bias: np.ndarray, rows: int = 80) -> np.ndarray:
+def drive(bias: np.ndarray, rows: int = 80, car: Vehicle = CAR) -> np.ndarray:
     """Window rows of the ORCA car under smooth inputs, with ``bias`` added to each step: ``(rows, 7)``."""
     t = np.arange(rows) * CAR.sampling_time
     drive = np.zeros((rows, 7))
@@ -23,7 +24,7 @@ def drive(bias: np.ndarray, rows: int = 80) -> np.ndarray:
     drive[0, :3] = 1.5, 0.0, 0.0
     for k in range(rows - 1):
         applied = applied_inputs(drive[k])
-        state = step(np, State(*drive[k, :3]), applied, Coefficients(*CAR.nominal), CAR.constants, CAR.sampling_time)
+        state = step(np, State(*drive[k, :3]), applied, Coefficients(*car.nominal), CAR.constants, CAR.sampling_time)
         drive[k + 1, :3] = np.array(state) + bias
     return drive
 
@@ -95,7 +96,47 @@ def test_operations_of_the_single_track_are_those_of_its_stages() -> None:
     assert Persistence().flops == 0
 
 
-@pytest.mark.parametrize("name", ["single_track", "single_track_ewma"])
+def noisy(rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    measured = rows.copy()
+    measured[:, :3] += noise * np.random.default_rng(0).standard_normal((len(rows), 3))
+    return measured
+
+
+def test_the_filter_takes_a_share_of_the_measurement_noise_off() -> None:
+    true, model = drive(np.zeros(3), 400), SingleTrackEkf(CAR)
+    _, following = windows(true, model.H)
+    given, _ = windows(noisy(true, np.array([0.01, 0.01, 0.1])), model.H)
+    filtered, plain = (
+        np.sqrt(np.mean((m.predict(given).state - following) ** 2, axis=0)) for m in (model, SingleTrack(CAR))
+    )
+    assert np.all(filtered < 0.7 * plain)
+
+
+def test_the_filter_leaves_the_known_car_as_it_is() -> None:
+    model = SingleTrackEkf(CAR)
+    given, following = windows(drive(np.zeros(3), 200), model.H)
+    prediction = model.predict(given)
+    np.testing.assert_allclose(prediction.state, following, atol=1e-4)
+    assert prediction.theta is not None
+    np.testing.assert_allclose(prediction.theta, np.tile(CAR.nominal, (len(given), 1)), rtol=0.02)
+
+
+def test_the_filter_follows_a_car_that_has_changed() -> None:
+    theta = dict(zip(COEFFICIENTS, CAR.nominal, strict=True))
+    changed = CAR.with_nominal(np.array([v * (0.85 if n == "D_f" else 1.0) for n, v in theta.items()]))
+    rows, model = noisy(drive(np.zeros(3), 600, changed), np.array([0.002, 0.002, 0.01])), SingleTrackEkf(CAR)
+    given, following = windows(rows, model.H)
+    prediction = model.predict(given)
+    left, plain = (
+        np.mean((state - following) ** 2, axis=0) for state in (prediction.state, SingleTrack(CAR).predict(given).state)
+    )
+    assert left[2] < 0.5 * plain[2]
+    assert prediction.theta is not None
+    moved = np.median(prediction.theta[:, COEFFICIENTS.index("D_f")]) / theta["D_f"] - 1
+    assert -0.2 < moved < -0.05
+
+
+@pytest.mark.parametrize("name", ["single_track", "single_track_ewma", "single_track_ekf"])
 def test_single_track_models_need_a_vehicle(name: str) -> None:
     assert load_model(name, CAR).name == name
     with pytest.raises(ConfigurationError, match=f"model {name}: needs --vehicle"):
@@ -103,5 +144,7 @@ def test_single_track_models_need_a_vehicle(name: str) -> None:
 
 
 def test_an_unknown_model_is_named_with_the_known_ones() -> None:
-    with pytest.raises(ConfigurationError, match=r"'nothing'.*persistence, single_track, single_track_ewma"):
+    with pytest.raises(
+        ConfigurationError, match=r"'nothing'.*persistence, single_track, single_track_ewma, single_track_ekf"
+    ):
         load_model("nothing")
