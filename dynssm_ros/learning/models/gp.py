@@ -60,10 +60,6 @@ class GaussianProcess(TrainableModel):
     std: Tensor
     increment_scale: Tensor
     nominal: Tensor
-    points: Tensor
-    lengths: Tensor
-    weights: Tensor
-    memory: Tensor
 
     def __init__(self, config: GpConfig, vehicle: Vehicle, normalisation: Normalisation) -> None:
         super().__init__(config, vehicle, normalisation)
@@ -72,21 +68,24 @@ class GaussianProcess(TrainableModel):
         self.physics = PhysicsLayer(vehicle, config.physics)
         scale_buffers(self, normalisation)
         self.register_buffer("nominal", config.physics.theta_0(vehicle))
-        M = config.inducing
-        self.points, self.lengths = nn.Parameter(torch.zeros(M, INPUTS)), nn.Parameter(torch.ones(CHANNELS, INPUTS))
-        self.weights, self.memory = (
-            nn.Parameter(torch.zeros(M, CHANNELS)),
-            nn.Parameter(torch.zeros(self.H - 1, CHANNELS)),
-        )
+        self.points = nn.Parameter(torch.zeros(config.inducing, INPUTS))
+        self.lengths = nn.Parameter(torch.ones(CHANNELS, INPUTS))
+        self.weights = nn.Parameter(torch.zeros(config.inducing, CHANNELS))
+        self.memory = nn.Parameter(torch.zeros(self.H - 1, CHANNELS))
 
     def forward(self, window: Tensor) -> Output:
         """Raw windows ``(B, H, 7)`` to predictions."""
         over = self.physics.over(window, self.nominal, self.H)
         expected = self._over_states(self._inputs(window))
-        increments = (window[:, 1:, :CHANNELS] - window[:, :-1, :CHANNELS] - over[:, :-1]) / self.increment_scale
-        slow = ((increments - expected[:, :-1]) * self.memory).sum(1)
+        slow = (self._left(window, over, expected) * self.memory).sum(1)
         moved = over[:, -1] + self.increment_scale * (expected[:, -1] + slow)
         return Output(moved, over[:, -1], self.nominal.expand(window.shape[0], -1), None, None, over)
+
+    def _left(self, window: Tensor, over: Tensor, expected: Tensor) -> Tensor:
+        """Errors within windows that the process over states does not explain, ``(B, H - 1, 3)`` in units of s_delta."""
+        increments = window[:, 1:, :CHANNELS] - window[:, :-1, :CHANNELS]
+        left: Tensor = (increments - over[:, :-1]) / self.increment_scale - expected[:, :-1]
+        return left
 
     def _inputs(self, window: Tensor) -> Tensor:
         """State and applied inputs of rows, standardised, ``(..., 5)``."""
@@ -106,33 +105,30 @@ class GaussianProcess(TrainableModel):
         draw = torch.Generator().manual_seed(self.config.training.seed)
         chosen = torch.randperm(len(training), generator=draw)[: self.config.sample]
         window, increment = training.batch(chosen)
-        x, error = self._inputs(window[:, -1]).double(), self._errors(window, increment).double()
-        self.points.copy_(_spread_out(x, len(self.points)))
-        Z = self.points.double()
-        noises = []
+        self._fit_over_states(training, self._inputs(window[:, -1]).double(), self._errors(window, increment).double())
+        over = self.physics.over(window, self.nominal, self.H)
+        left = self._left(window, over, self._over_states(self._inputs(window)))
         for c in range(CHANNELS):
-            lengths, amplitude, noise = _over_states_fitted(x, error[:, c])
-            self.lengths[c] = lengths
-            noises.append(noise / amplitude)
-        M, lengths = len(Z), self.lengths.double()
-        gram, moment = torch.zeros(CHANNELS, M, M).double(), torch.zeros(CHANNELS, M).double()
+            self.memory[:, c] = _filter_fitted(left[..., c].double())
+        return True
+
+    def _fit_over_states(self, training: TrainingWindows, sample: Tensor, errors: Tensor) -> None:
+        """Inducing points and scales from a sample ``(S, 5)`` with its errors ``(S, 3)``, weights from all windows."""
+        self.points.copy_(_spread_out(sample, len(self.points)))
+        found = [_over_states_fitted(sample, errors[:, c]) for c in range(CHANNELS)]
+        self.lengths.copy_(torch.stack([lengths for lengths, _, _ in found]))
+        Z, lengths = self.points.double(), self.lengths.double()
+        gram, moment = torch.zeros(CHANNELS, len(Z), len(Z)).double(), torch.zeros(CHANNELS, len(Z)).double()
         for window, increment in training.batches():
             x, error = self._inputs(window[:, -1]).double(), self._errors(window, increment).double()
             for c in range(CHANNELS):
                 k = _kernel(x, Z, lengths[c])
                 gram[c] += k.T @ k
                 moment[c] += k.T @ error[:, c]
-        for c in range(CHANNELS):
+        for c, (_, variance, noise) in enumerate(found):
             T = _whitening(_kernel(Z, Z, lengths[c]))
-            ridge = noises[c] * torch.eye(T.shape[1]).double()
+            ridge = noise / variance * torch.eye(T.shape[1]).double()
             self.weights[:, c] = T @ torch.linalg.solve(ridge + T.T @ gram[c] @ T, T.T @ moment[c])
-        window, _ = training.batch(chosen)
-        over = self.physics.over(window, self.nominal, self.H)
-        left = (window[:, 1:, :CHANNELS] - window[:, :-1, :CHANNELS] - over[:, :-1]) / self.increment_scale
-        left = left - self._over_states(self._inputs(window))[:, :-1]
-        for c in range(CHANNELS):
-            self.memory[:, c] = _filter_fitted(left[..., c].double())
-        return True
 
     def _errors(self, window: Tensor, increment: Tensor) -> Tensor:
         """Of the physics from the last rows of windows, ``(B, 3)`` in units of s_delta."""
