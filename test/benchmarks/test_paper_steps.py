@@ -160,7 +160,14 @@ def test_the_small_run_measures_all_that_it_can(small_run):
     assert absent.tests == given.planned == ()
     assert absent.reasons == ["extract away: nowhere is not in the data folder (--data or DYNSSM_DATA)"]
     assert results.missing == {"extract away": "nowhere is not in the data folder (--data or DYNSSM_DATA)"}
-    assert set(results.costs) == {"persistence", "single_track", "single_track_ewma", "single_track_ekf", "ridge_orca", "dynssm_orca"}
+    assert set(results.costs) == {
+        "persistence",
+        "single_track",
+        "single_track_ewma",
+        "single_track_ekf",
+        "ridge_orca",
+        "dynssm_orca",
+    }
     assert (
         results.costs["ridge_orca"]["parameters"]
         == open_artifact(root / "models/club.topics/ridge_orca.0").card.parameters
