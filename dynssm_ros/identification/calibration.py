@@ -36,7 +36,7 @@ HORIZONS_S = (0.5, 0.25, 0.1)
 """Lengths of the simulations: the first for which a recording has stretches enough."""
 _INTEGRATORS: tuple[Integrator, ...] = ("rk4", "euler")  # the first, unless another is clearly closer to the data
 _EXPLAINED = 2.0  # how many times less errors count that hang together, up to which a model explains the data
-_SEARCHED = 4000  # rows with which a starting point is judged
+_SEARCHED, _POLISHED_ON = 1000, 4000  # rows with which starting points are judged, and the best is made better
 _SEARCH_PRIOR, _POLISHED = 0.1, 3  # weight of what is known before, at first; rounds that find it
 _INSIDE = 1e-6  # of the range, that a starting point keeps from its bounds
 _WEIGHT_SHOWN = 0.25  # least weight of a coefficient in a direction that the data do not determine
@@ -182,12 +182,16 @@ def _nearest_start(
     Far from the truth the noise model would take a wrong car for a disturbed one. Here errors are in units of the
     increments. What is known before is weighed with the errors that are left, found by a few rounds.
     """
-    some = one_step.select(np.arange(0, len(one_step), max(1, len(one_step) // _SEARCHED)))
-    rows = some.data.rows
-    scale = np.maximum((rows[:3, some.starts + 1] - rows[:3, some.starts]).std(axis=1), 1e-12)
+    few, many = (
+        one_step.select(np.arange(0, len(one_step), max(1, len(one_step) // n))) for n in (_SEARCHED, _POLISHED_ON)
+    )
+    rows = many.data.rows
+    scale = np.maximum((rows[:3, many.starts + 1] - rows[:3, many.starts]).std(axis=1), 1e-12)
     lower, width = given.vehicle.lower, given.vehicle.upper - given.vehicle.lower
 
-    def fitted(start: Vector, prior: float, tolerance: float, evaluations: int) -> optimize.OptimizeResult:
+    def fitted(
+        some: SimulationWindows, start: Vector, prior: float, tolerance: float, evaluations: int
+    ) -> optimize.OptimizeResult:
         def residuals(p: Vector) -> Vector:
             car = given.at(lower + p * width)
             return np.concatenate([(some.errors(car)[:, 0] / scale).ravel(), prior * car.moved])
@@ -200,12 +204,13 @@ def _nearest_start(
 
     found = []
     for theta in points:
-        found.append(fitted((theta - lower) / width, _SEARCH_PRIOR, 1e-5, 60))
+        found.append(fitted(few, (theta - lower) / width, _SEARCH_PRIOR, 1e-5, 60))
         tick()
     best = min(found, key=lambda fit: float(fit.cost))
+    left = float(np.median(np.abs(best.fun[: 3 * len(few)])))
     for _ in range(_POLISHED):
-        left = float(np.median(np.abs(best.fun[: 3 * len(some)])))
-        best = fitted(best.x, left, 1e-12, 300)
+        best = fitted(many, best.x, left, 1e-12, 300)
+        left = float(np.median(np.abs(best.fun[: 3 * len(many)])))
     return given.at(lower + best.x * width)
 
 

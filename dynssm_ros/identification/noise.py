@@ -141,8 +141,11 @@ def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Ve
     for _ in range(_ROUNDS):
         shares = np.exp(log_v)[:, None, None, None] * (inverse @ bases)  # sum to one
         fitted = inverse @ moment
-        slope = np.einsum("m,kmii->k", count, shares) - np.einsum("kmij,mji->k", shares, fitted)
-        curvature = np.einsum("m,kmij,lmji->kl", count, shares, shares)
+        of_each = shares.reshape(_VARIANCES, -1)  # a matrix product is many times faster than einsum over all indices
+        slope = np.einsum("m,kmii->k", count, shares) - of_each @ np.swapaxes(fitted, 1, 2).ravel()
+        curvature = (shares * count[:, None, None]).reshape(_VARIANCES, -1) @ np.swapaxes(shares, 2, 3).reshape(
+            _VARIANCES, -1
+        ).T
         free = ~((log_v <= low) & (slope > 0) | (log_v >= high) & (slope < 0))
         step = np.zeros(_VARIANCES)
         step[free] = -np.linalg.solve(curvature[np.ix_(free, free)] + _FLAT * np.eye(free.sum()), slope[free])

@@ -138,9 +138,7 @@ class Bag:
         """
         msgtype = self.types[topic]
         try:
-            if msgtype in self.reader.typestore.types:
-                return self.reader.deserialize(raw, msgtype)
-            return _TYPESTORE.deserialize_cdr(raw, msgtype)
+            return self.typestore(msgtype).deserialize_cdr(raw, msgtype)
         except Exception as error:  # rosbags raises struct, index, key and unicode errors here
             raise BagError(f"{self.path}: topic {topic}: a message is not a {msgtype} ({_one_line(error)})") from error
 

@@ -110,10 +110,11 @@ def decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
 
 def header_stamp_ns(message: Any) -> int | None:
     """The header stamp in integer nanoseconds, or ``None`` where the message has no header."""
-    stamp: Any = getattr(getattr(message, "header", None), "stamp", None)
-    if not hasattr(stamp, "sec"):
+    try:
+        stamp = message.header.stamp
+        return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    except AttributeError:
         return None
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def _public_fields(message: Any) -> str:

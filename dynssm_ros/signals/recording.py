@@ -23,6 +23,7 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, Commands
 
 METADATA_KEY = b"dynssm"
+_ROWS_AT_ONCE = 65536  # that are written
 _OFF_GRID = 0.01  # of T_s that rows may be off their grid
 COLUMN_UNITS = {
     "v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "r_fb": "1", "delta_fb": "rad", "r_cmd": "1", "delta_cmd": "rad",
@@ -170,7 +171,9 @@ class Recording:
         schema = pa.schema(fields, metadata={METADATA_KEY: self.info.model_dump_json().encode()})
         require_replaceable(path, _is_recording(path), "a recording")
         with replacing(path) as aside:
-            pq.write_table(pa.table(list(arrays.values()), schema=schema), aside, compression="zstd")
+            table = pa.table(list(arrays.values()), schema=schema)
+            # measured numbers hardly repeat: a dictionary of them costs memory and is larger
+            pq.write_table(table, aside, row_group_size=_ROWS_AT_ONCE, compression="zstd", use_dictionary=["segment"])
 
     @classmethod
     def load(cls, path: str | Path) -> Recording:
