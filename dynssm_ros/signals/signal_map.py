@@ -229,9 +229,7 @@ def _element(part: str) -> Callable[[Any], Any]:
 
     def by_name(message: Any) -> Any:
         values, names = getattr(message, name), message.name
-        for position, candidate in enumerate(names):
-            if candidate == key and position < len(values):
-                return values[position]
-        return None
+        position = names.index(key) if key in names else len(values)
+        return values[position] if position < len(values) else None
 
     return by_name
