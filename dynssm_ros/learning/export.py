@@ -177,6 +177,7 @@ def export_onnx(model: TrainableModel, sample: Tensor, file: Path, features: Onl
             dynamo=False,
         )
     _start_recurrences_from_rest(file)
+    _simplify(file)
 
 
 def _start_recurrences_from_rest(file: Path) -> None:
@@ -185,6 +186,19 @@ def _start_recurrences_from_rest(file: Path) -> None:
     for node in graph.graph.node:
         if node.op_type == "GRU" and len(node.input) > _GRU_INITIAL_STATE:
             del node.input[_GRU_INITIAL_STATE:]
+    onnx.save(graph, file)
+
+
+def _simplify(file: Path) -> None:
+    """Folds constants and drops what does nothing, once and for all: a node that swaps models has no time for it."""
+    options = ort.SessionOptions()
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC  # leaves standard operators alone
+    options.optimized_model_filepath = str(file)
+    ort.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
+    graph = onnx.load(file)
+    used = [each for each in graph.opset_import if each.domain in {node.domain for node in graph.graph.node}]
+    del graph.opset_import[:]
+    graph.opset_import.extend(used)
     onnx.save(graph, file)
 
 

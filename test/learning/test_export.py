@@ -98,6 +98,16 @@ def test_the_deployed_graph_is_the_trained_model(
                 assert np.abs((found[name] - expected.numpy()) / unit).max() < TOLERANCE, name
 
 
+def test_the_graph_is_simplified_once_and_for_all(artifact: Artifact, tmp_path: Path) -> None:
+    options = ort.SessionOptions()
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    options.optimized_model_filepath = str(tmp_path / "again.onnx")
+    ort.InferenceSession(artifact.onnx, options)
+    deployed, again = onnx.load(artifact.onnx), onnx.load(tmp_path / "again.onnx")
+    assert [each.domain for each in deployed.opset_import] == [""], "standard operators alone"
+    assert len(deployed.graph.node) == len(again.graph.node)
+
+
 def test_the_recurrence_is_deployed(artifact: Artifact) -> None:
     graph = onnx.load(artifact.onnx).graph
     kinds = [node.op_type for node in graph.node]
