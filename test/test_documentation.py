@@ -21,6 +21,7 @@ import dynssm_ros
 from dynssm_ros.cli.main import app
 from dynssm_ros.extras import EXTRAS
 from dynssm_ros.learning.models.registry import load_model_config
+from dynssm_ros.runtime.models import UNTRAINED
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.signal_map import SIGNALS, load_signal_map
@@ -172,6 +173,26 @@ def test_every_equation_of_the_paper_is_where_the_page_says() -> None:
         deepest = max((m for m in modules if _is_module(m)), key=len)
         rest = ("dynssm_ros." + name).removeprefix(deepest).strip(".")
         reduce(getattr, filter(None, rest.split(".")), importlib.import_module(deepest))
+
+
+def test_every_block_of_the_papers_results_is_somewhere() -> None:
+    reference = yaml.safe_load((ROOT / "benchmarks" / "paper" / "reference.yaml").read_text(encoding="utf-8"))
+    items = re.findall(r"^\| `(\w+)`:", PAGES["paper.md"], flags=re.M)
+    assert set(items) == set(reference)
+    shares = [*reference["claims"]["rmse"].values(), reference["claims"]["lap_time"]]
+    for share in shares:
+        assert f"{100 * share:.1f}" in PAGES["paper.md"]
+
+
+def test_the_rivals_settings_are_those_of_their_model_files() -> None:
+    rows = table("setting", PAGES["rivals.md"])
+    assert {"ddm_av21", "ddm_orca", "fthd_av21", "fthd_orca"} <= {name.split(".")[0] for name in rows}
+    for name, (published, ours, why) in rows.items():
+        model, *path = name.split(".")
+        assert float(ours) == reduce(getattr, path, load_model_config(model)), name
+        assert published == ours or why, f"{name}: differs from what is published without a reason"
+    named = set(table("model", PAGES["rivals.md"]))
+    assert named == {*UNTRAINED, "ridge", "rls", "gp"}
 
 
 def _is_module(name: str) -> bool:
