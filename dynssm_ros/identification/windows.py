@@ -31,6 +31,7 @@ _COMPARED = 13  # rows of each simulation, at most: more hang together
 _MAX_WINDOWS = 300  # windows in a fit, evenly spread: more would cost time and tell little
 _MEASURED = 3000  # windows in held-out rows
 _LEAST = 24  # windows with which a fit can begin
+_AT_ONCE = 16384  # simulations that are stepped together
 _WILD = 1e3  # a prediction farther off than this many spreads of its channel counts as that far
 
 
@@ -84,7 +85,7 @@ class SimulationWindows:
     def __len__(self) -> int:
         return len(self.starts)
 
-    def select(self, chosen: Indices | Mask) -> SimulationWindows:
+    def select(self, chosen: Indices | Mask | slice) -> SimulationWindows:
         """Some of the simulations."""
         return replace(self, starts=self.starts[chosen])
 
@@ -135,6 +136,16 @@ class SimulationWindows:
             cars: what is simulated; they differ in values alone.
             context: values that replace signals of the recording, the same in all rows.
         """
+        out = np.empty((len(cars), len(self), self.steps // self.every, 3))
+        for first in range(0, len(self), _AT_ONCE):
+            block = slice(first, first + _AT_ONCE)
+            self.select(block)._simulate(cars, context, out[:, block])
+        limit = _WILD * self.spread
+        out -= self.target
+        return np.asarray(np.clip(np.nan_to_num(out, copy=False, nan=1e9, posinf=1e9, neginf=-1e9), -limit, limit))
+
+    def _simulate(self, cars: Sequence[CarEstimate], context: dict[str, float] | None, out: Vector) -> None:
+        """Writes the predicted states of ``P`` cars to ``out``, shape ``(P, W, K, 3)``."""
         fleet = CarBatch.of(cars, self.number)
         carries = any(effect.carries for effect in fleet.effects)
         shift = -self.warm if carries or self.filtered else 0
@@ -145,7 +156,6 @@ class SimulationWindows:
         effect_states = settled_effect_states(
             np, state, Applied(*first[3:5]), fleet.theta, fleet.constants, fleet.effects, context=here
         )
-        out = np.empty((len(cars), len(self), self.steps // self.every, 3))
         with np.errstate(all="ignore"):
             for k in range(shift, self.steps):
                 rows = self.data.rows[:, self.starts + k]
@@ -155,9 +165,6 @@ class SimulationWindows:
                 if k >= 0 and (k + 1) % self.every == 0:
                     for channel, value in enumerate(state):
                         out[:, :, k // self.every, channel] = value
-        limit = _WILD * self.spread
-        out -= self.target
-        return np.asarray(np.clip(np.nan_to_num(out, copy=False, nan=1e9, posinf=1e9, neginf=-1e9), -limit, limit))
 
     def transitions(self, car: CarEstimate) -> Vector:
         """Derivatives of each compared row by the one before, along the measured rows, shape ``(W, K, 3, 3)``."""

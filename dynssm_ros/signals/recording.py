@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -185,24 +186,26 @@ class Recording:
         path = Path(path)
         if not os.path.isfile(path):
             raise RecordingError(f"{path}: no such recording; `dynssm extract` makes one from a bag")
-        try:
-            table = pq.read_table(path, partitioning=None)  # a folder named a=b is no column
-        except (pa.ArrowException, OSError) as error:
-            raise RecordingError(f"{path}: not a readable Parquet file ({' '.join(str(error).split())})") from error
-        raw = (table.schema.metadata or {}).get(METADATA_KEY)
+        with _readable(path), pq.ParquetFile(path) as file:
+            return cls._read(path, file)
+
+    @classmethod
+    def _read(cls, path: Path, file: pq.ParquetFile) -> Recording:
+        raw = (file.schema_arrow.metadata or {}).get(METADATA_KEY)
         if raw is None:
             raise RecordingError(f"{path}: Parquet, but not a dynssm recording (no '{METADATA_KEY.decode()}' metadata)")
         try:
             info = RecordingInfo.model_validate_json(raw)
         except ValidationError as error:
             raise RecordingError(f"{path}: metadata not understood: {describe(error)}") from error
-        missing = [name for name in ("time", "segment", *WINDOW_COLUMNS) if name not in table.column_names]
+        missing = [name for name in ("time", "segment", *WINDOW_COLUMNS) if name not in file.schema_arrow.names]
         if missing:
             raise RecordingError(f"{path}: column {missing[0]} is missing")
-        if table.num_rows == 0:
+        if file.metadata.num_rows == 0:
             raise RecordingError(f"{path}: the recording is empty")
-        time, segment = (_column(table, name, kind, path) for name, kind in (("time", "int64"), ("segment", "int32")))
-        columns = {name: _column(table, name, "double", path) for name in COLUMN_UNITS if name in table.column_names}
+        time, segment = (_column(file, name, kind, path) for name, kind in (("time", "int64"), ("segment", "int32")))
+        known = [name for name in COLUMN_UNITS if name in file.schema_arrow.names]
+        columns = {name: _column(file, name, "double", path) for name in known}
         for name, values in columns.items():
             bad = np.flatnonzero(~np.isfinite(values))
             if len(bad):
@@ -241,8 +244,18 @@ def _is_recording(path: str | Path) -> bool:
         return False
 
 
-def _column(table: pa.Table, name: str, kind: str, path: Path) -> npt.NDArray[Any]:
-    column = table[name]
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Says of which file it is that Parquet cannot be read."""
+    try:
+        yield
+    except (pa.ArrowException, OSError) as error:
+        raise RecordingError(f"{path}: not a readable Parquet file ({' '.join(str(error).split())})") from error
+
+
+def _column(file: pq.ParquetFile, name: str, kind: str, path: Path) -> npt.NDArray[Any]:
+    """A column, read alone: a long recording is not held twice."""
+    column = file.read(columns=[name], use_threads=False)[name]
     if str(column.type) != kind or column.null_count:
         have = f"{column.null_count} empty rows" if column.null_count else str(column.type)
         raise RecordingError(f"{path}: column {name}: {have}; expected {kind} in every row")

@@ -51,6 +51,15 @@ def test_a_lag_is_led_along_the_rows_before_the_start() -> None:
     np.testing.assert_array_equal(some.errors(in_fit), some.errors(CarEstimate.of(lagging)))
 
 
+def test_simulations_in_blocks_are_those_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    some, car = windows(AV21), CarEstimate.of(AV21)
+    cars = [car.with_effect("steering_lag", {"time_constant": value}) for value in (0.05, 0.1)]
+    at_once = some.errors_of(cars)
+    monkeypatch.setattr("dynssm_ros.identification.windows._AT_ONCE", 7)
+    np.testing.assert_array_equal(some.errors_of(cars), at_once)
+    assert len(some) % 7
+
+
 def test_steps_are_differentiated_by_their_start() -> None:
     some = windows(AV21, duration=10.0)
     at, car = some.starts[3], CarEstimate.of(AV21)
