@@ -11,6 +11,7 @@ from dynssm_ros.track.lines import ClosedLine
 
 _POINTS = 200  # of the path over the diagonal of the driven area
 _NEAR = 0.03  # of that diagonal: passing a place at most this far away is coming back to it
+_AT_ONCE = 16384  # rows that are projected together
 _STARTS = 200  # places at which a lap is tried to begin
 _ALIGNED = 0.5  # cosine between the directions in which a place is passed
 
@@ -31,7 +32,9 @@ def first_lap(recording: Recording) -> ClosedLine | None:
 
 def track_position(line: ClosedLine, recording: Recording) -> Vector:
     """Arc length along ``line`` of each row (m), in ``[0, length)``, shape ``(N,)``."""
-    return line.project(np.stack([recording["x"], recording["y"]], axis=1))[0]
+    positions = np.stack([recording["x"], recording["y"]], axis=1)
+    blocks = np.split(positions, range(_AT_ONCE, len(positions), _AT_ONCE))
+    return np.concatenate([line.project(block)[0] for block in blocks])
 
 
 def lap_context(recording: Recording, line: ClosedLine | None) -> dict[str, Vector]:

@@ -79,6 +79,14 @@ def test_the_position_on_the_lap_starts_anew_with_every_lap():
     assert np.median(np.diff(position)) == pytest.approx(2 * CIRCUMFERENCE / 800, rel=0.2)
 
 
+def test_positions_in_blocks_are_those_at_once(monkeypatch):
+    recording = drive(ellipse(2.5))
+    line = first_lap(recording)
+    at_once = track_position(line, recording)
+    monkeypatch.setattr("dynssm_ros.track.lap_position._AT_ONCE", 7)
+    np.testing.assert_allclose(track_position(line, recording), at_once, atol=1e-6)
+
+
 def test_errors_are_averaged_over_stretches_of_the_lap():
     position = np.array([0.0, 9.0, 10.0, 35.0, 39.999])
     errors = np.array([[3.0, 0.0], [4.0, 0.0], [2.0, 1.0], [1.0, -1.0], [1.0, np.nan]])
