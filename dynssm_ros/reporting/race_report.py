@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from scipy.spatial import cKDTree
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.control.race import Course, Race
 from dynssm_ros.evaluation.coefficients import coefficient_label
 from dynssm_ros.reporting.evaluation_figures import MEASURED, SYMBOLS, UNITS, WIDTH, model_colours, styled
@@ -20,6 +23,7 @@ from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, motion
 from dynssm_ros.vehicle.single_track import Motion, lateral_force
 
+_ENLARGED = 6.0  # where the paths part is enlarged if it is smaller than the track by this factor
 _STAMPS = 0.5  # s between the time stamps on the map
 _MOVED = (
     1e-3  # share of its bounds that a coefficient must move, and of a state's range that must be added, to be shown
@@ -100,8 +104,8 @@ def race_report(races: Sequence[Race]) -> Report:
     sections = [
         Section(
             "Trajectories",
-            f"The path of each model between the borders, with a mark every {_STAMPS:g} s; the line that the controller "
-            "follows is dashed.",
+            f"The path of each model between the borders, with a mark every {_stamp_period(races):g} s; the line that the "
+            "controller follows is dashed.",
             trajectories(races),
         ),
         Section(
@@ -212,14 +216,46 @@ def _start(course: Course) -> str:
 
 @styled
 def trajectories(races: Sequence[Race]) -> Figure:
-    """Paths on the track with marks at equal times.
+    """Paths on the track with marks at equal times; on a large track also, enlarged, where they part most.
 
     Args:
         races: on one course.
     """
+    place, side = _parting(races)
+    across, up = np.ptp(races[0].course.track.centre.points, axis=0)
+    enlarged = side * _ENLARGED < np.hypot(across, up)
+    height = (0.6 if enlarged else 0.9) * min(up / across, 1.0)
+    figure = Figure(figsize=(WIDTH, WIDTH * max(height, 0.35) + 0.9), layout="constrained")
+    if not enlarged:
+        plan = figure.subplots()
+    else:
+        plan, near = figure.subplots(1, 2, width_ratios=(2, 1))
+        _draw_paths(near, races)
+        near.set(xlim=place[0] + np.array([-side, side]) / 2, ylim=place[1] + np.array([-side, side]) / 2)
+        near.set_title("where the paths part most", fontsize=9)
+        plan.indicate_inset_zoom(near, edgecolor="black")
+    _draw_paths(plan, races)
+    every = max(1, round(_stamp_period(races) / races[0].course.vehicle.sampling_time))
+    for k in range(0, len(races[0].time), 2 * every):
+        x, y = (float(value) for value in races[0].pose[k, :2])
+        plan.annotate(
+            f"{round(float(races[0].time[k]), 2):g} s", (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7
+        )
+    figure.legend(*plan.get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+def _parting(races: Sequence[Race]) -> tuple[Vector, float]:
+    """Where another path is farthest from the first one, or that from the line if it is alone, and three widths there (m)."""
+    first, *others = (race.pose[:, :2] for race in sorted(races, key=lambda race: not race.completed))
+    points = np.concatenate(others or [races[0].course.reference.line.points])
+    apart = cKDTree(first).query(points)[0]
+    place, track = points[np.argmax(apart)], races[0].course.track
+    return place, 3.0 * float(sum(track.widths(track.centre.project(place)[0])))
+
+
+def _draw_paths(axes: Axes, races: Sequence[Race]) -> None:
     course, colours = races[0].course, model_colours([race.name for race in races])
-    figure = Figure(figsize=(WIDTH, 0.75 * WIDTH), layout="constrained")
-    axes = figure.subplots()
     for border in (course.track.left_border, course.track.right_border):
         axes.plot(*np.concatenate([border, border[:1]]).T, color=MEASURED, lw=1.0)
     line = course.reference.line.points
@@ -232,12 +268,7 @@ def trajectories(races: Sequence[Race]) -> Figure:
         axes.plot(*race.pose[:, :2].T, color=colours[race.name], lw=width, label=race.name)
         marks = race.pose[::every]
         axes.plot(*marks[:, :2].T, "o", color=colours[race.name], mec="white", mew=0.5, ms=4, zorder=3)
-    for k in range(0, len(races[0].time), 2 * every):
-        x, y = (float(value) for value in races[0].pose[k, :2])
-        axes.annotate(f"{races[0].time[k]:.3g} s", (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7)
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure
 
 
 def widths(count: int) -> list[float]:

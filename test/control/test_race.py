@@ -19,6 +19,7 @@ from dynssm_ros.reporting.race_report import (
     race_report,
     race_table,
     summary,
+    trajectories,
 )
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.simulation.sensing import Sensing
@@ -115,6 +116,21 @@ def test_the_report_shows_every_model(lap, course, orca, tmp_path):
     assert "Not completed: other spins" in summary([lap, other])
     assert "true, twin are the fastest" in summary([lap, replace(lap, name="twin")])
     assert len(race_table([lap, other]).cells) == 2
+
+
+def test_a_large_track_has_an_enlarged_part_where_the_paths_part_most(lap, course):
+    assert len(trajectories([lap]).axes) == 1
+    track = load_track("road_course")
+    x, y = track.centre.points.T
+    pose = np.column_stack([x, y, np.zeros_like(x)])
+    beside = pose + 2.0 * np.exp(-((np.arange(len(x)) - 100.0) ** 2) / 50.0)[:, None] * [0.0, 1.0, 0.0]
+    large = replace(course, track=track, reference=load_reference("centre", course.vehicle, track))
+    driven = [replace(lap, course=large, name=name, pose=path) for name, path in (("true", pose), ("other", beside))]
+    whole, near = trajectories(driven).axes
+    centre = np.mean([near.get_xlim(), near.get_ylim()], axis=1)
+    np.testing.assert_allclose(centre, beside[100, :2], atol=0.5)
+    assert np.ptp(near.get_xlim()) * 6 < np.ptp(whole.get_xlim())
+    assert list(near.get_xticks()) != list(whole.get_xticks())
 
 
 def test_a_car_that_leaves_the_road_is_stopped_and_said_so(course, orca):
