@@ -18,6 +18,8 @@ import typer
 import yaml
 
 import dynssm_ros
+from benchmarks.paper.plan import load_plan
+from benchmarks.paper.stale import marked
 from dynssm_ros.cli.main import app
 from dynssm_ros.extras import EXTRAS
 from dynssm_ros.learning.models.registry import load_model_config
@@ -182,6 +184,12 @@ def test_every_block_of_the_papers_results_is_somewhere() -> None:
     shares = [*reference["claims"]["rmse"].values(), reference["claims"]["lap_time"]]
     for share in shares:
         assert f"{100 * share:.1f}" in PAGES["paper.md"]
+
+
+@pytest.mark.parametrize("page", ["results.md", "results_race.md"])
+def test_results_of_other_settings_are_marked_stale(page: str) -> None:
+    """``python -m benchmarks.paper.stale docs/results.md docs/results_race.md`` mends it."""
+    assert PAGES[page] == marked(PAGES[page], load_plan())
 
 
 def test_the_rivals_settings_are_those_of_their_model_files() -> None:

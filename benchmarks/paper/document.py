@@ -9,13 +9,19 @@ from matplotlib.figure import Figure
 
 from benchmarks.paper import figures, tables
 from benchmarks.paper.results import Comparison, Results
+from benchmarks.paper.stale import signed
+from benchmarks.paper.summary import summary
 from dynssm_ros.arrays import Vector
 from dynssm_ros.files import replacing
 from dynssm_ros.reporting.evaluation_report import COMMANDS_IN_WORDS
 from dynssm_ros.reporting.tables import Table
 
 MADE_BY = "Made by `make paper`; no number here is typed by hand. The paper's own numbers are those of its tables."
-_CARS = {"real": "Full-size car", "sim": "Small car"}
+_CARS = {"real": "Full-size car", "sim": "Small car", "other": "1:10 car"}
+_DATA = {
+    "development": "Development data: models and their settings were chosen with such data in sight.",
+    "test": "Test data: nothing was chosen by it.",
+}
 _DPI = 130
 
 
@@ -26,11 +32,12 @@ def write(results: Results, path: Path) -> None:
         with replacing(path.with_name(f"{path.stem}_{name}.png")) as aside:
             figure.savefig(aside, dpi=_DPI, metadata={"Software": None})
     with replacing(path) as aside:
-        aside.write_text(markdown(results, {name: f"{path.stem}_{name}.png" for name in drawn}), encoding="utf-8")
+        text = markdown(results, {name: f"{path.stem}_{name}.png" for name in drawn})
+        aside.write_text(signed(text, results.plan), encoding="utf-8")
 
 
 def draw(results: Results) -> Iterator[tuple[str, Figure]]:
-    """The figures by name, of the full-size car: the small one's errors differ by so much that they need none."""
+    """The figures by name; against persistence of the full-size car alone: the small one's errors differ by too much."""
     comparisons = _comparable(results, "real")
     relative: dict[str, dict[str, Vector]] = {}
     for c in comparisons:
@@ -39,10 +46,18 @@ def draw(results: Results) -> Iterator[tuple[str, Figure]]:
             relative[model] = found | relative.get(model, {})  # where studies share a test, the first one's
     if relative:
         yield "persistence", figures.against_persistence(relative)
-    for c in comparisons:
-        if c.ablations and c.car.full in c.models:
-            ablations = {c.variants[lacking]: c.rmse(model) for lacking, model in c.ablations.items()}
-            yield f"ablations_{c.name}", figures.against_the_full_model(c.rmse(c.car.full), ablations)
+    for c in results.comparisons:
+        for base in c.bases:
+            variants = c.variants(base)
+            ablations = {variants[lacking]: c.rmse(model) for lacking, model in c.ablations(base).items()}
+            yield f"ablations_{c.name}_{base}", figures.against_the_full_model(c.rmse(base), ablations)
+    tried = {
+        results.plan.sweeps[name].model: {rate: tables.validation_loss(found) for rate, found in rates.items()}
+        for name, rates in results.rates.items()
+        if rates
+    }
+    if tried:
+        yield "rates", figures.learning_rates(tried)
 
 
 def markdown(results: Results, pictures: dict[str, str]) -> str:
@@ -57,6 +72,8 @@ def markdown(results: Results, pictures: dict[str, str]) -> str:
 
 def _parts(results: Results, pictures: dict[str, str]) -> Iterator[str]:
     yield "# Results"
+    yield from summary(results)
+    yield "## How it was measured"
     yield from _introduction(results)
     planned = {comparison.car.reference for comparison in results.comparisons}
     for data, title in _CARS.items():
@@ -65,13 +82,14 @@ def _parts(results: Results, pictures: dict[str, str]) -> Iterator[str]:
         comparisons = _comparable(results, data)
         yield f"## {title}"
         yield from _missing(results, data)
-        if comparisons:
+        if comparisons and data in results.reference.open_loop:
             yield from _against_published(results, data, comparisons)
         if data == "real" and "persistence" in pictures:
             yield f"![One-step errors relative to persistence]({pictures['persistence']})"
         for comparison in comparisons:
             yield from _study(comparison, results, pictures)
         yield from _coefficients(results, data)
+    yield from _rates(results, pictures)
     yield from _uncertainty(results)
     yield from _cost(results)
 
@@ -128,20 +146,20 @@ def _against_published(results: Results, data: str, comparisons: Sequence[Compar
     yield tables.published_table(comparisons, reference).markdown()
     yield "How far errors lie below those of DDM on the same test, in percent:"
     yield tables.reduction_table(comparisons, results.reference, data).markdown()
-    yield "The lowest RMSE in the paper's table, as a multiple of that of the full model here:"
-    yield tables.factor_table(comparisons, reference).markdown()
 
 
 def _study(comparison: Comparison, results: Results, pictures: dict[str, str]) -> Iterator[str]:
     yield f"### {comparison.study.title[0].upper()}{comparison.study.title[1:]}, commands `{comparison.study.commands}`"
     yield comparison.study.text
+    yield _DATA[comparison.study.data]
     yield tables.error_table(comparison).markdown()
     yield tables.relative_table(comparison).markdown()
-    if comparison.ablations and comparison.car.full in comparison.models:
-        yield f"Ablations of `{comparison.car.full}`, one-step RMSE:"
-        yield tables.ablation_table(comparison, results).markdown()
-        if f"ablations_{comparison.name}" in pictures:
-            yield f"![Ablations against the full model]({pictures[f'ablations_{comparison.name}']})"
+    for base in comparison.bases:
+        yield f"Ablations of `{base}`, one-step RMSE:"
+        yield tables.ablation_table(comparison, results, base).markdown()
+        picture = pictures.get(f"ablations_{comparison.name}_{base}")
+        if picture:
+            yield f"![Ablations of {base} against itself]({picture})"
     if comparison.study.remark:
         yield comparison.study.remark
 
@@ -155,6 +173,15 @@ def _coefficients(results: Results, data: str) -> Iterator[str]:
             yield "### Coefficients"
             yield "What the models do with the physical coefficients inside their bounds."
             yield table.markdown()
+
+
+def _rates(results: Results, pictures: dict[str, str]) -> Iterator[str]:
+    if any(results.rates.values()):
+        yield "## Learning rates of the rivals"
+        yield "What each was trained with, and rates beside it. Published settings and ours are in [rivals](rivals.md)."
+        yield tables.rate_table(results).markdown()
+        if "rates" in pictures:
+            yield f"![Validation loss over the epochs]({pictures['rates']})"
 
 
 def _uncertainty(results: Results) -> Iterator[str]:

@@ -70,6 +70,24 @@ def against_the_full_model(full: Sequence[SeedSpread], ablations: Mapping[str, S
     return figure
 
 
+def learning_rates(tried: Mapping[str, Mapping[float, Sequence[float]]]) -> Figure:
+    """The lowest validation loss so far over the epochs, a panel for each model.
+
+    Args:
+        tried: by model, then by learning rate: the loss of each epoch.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 0.28 * WIDTH), layout="constrained")
+        for axis, (model, rates) in zip(figure.subplots(1, len(tried), squeeze=False)[0], tried.items(), strict=True):
+            for k, (rate, losses) in enumerate(rates.items()):
+                best = np.minimum.accumulate(np.array(losses, dtype=float)) if len(losses) else np.array([])
+                axis.plot(np.arange(1, len(best) + 1), best, color=PALETTE[k % len(PALETTE)], label=f"{rate:g}")
+            axis.set(title=model, xlabel="epoch", yscale="log")
+            axis.legend(fontsize=7)
+        figure.supylabel("validation loss", fontsize=9)
+    return figure
+
+
 def _panels(rows: Sequence[str]) -> tuple[Figure, list[mpl.axes.Axes]]:
     """A panel for each state, sharing named rows, the first at the top."""
     figure = Figure(figsize=(WIDTH, 1.1 + 0.32 * len(rows)), layout="constrained")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel
@@ -25,6 +26,22 @@ Quantity = Literal["time", "speed", "yaw_rate", "lateral_acceleration"]
 MID_RANGE = "mid_range"
 FIXED = (TRUE, MID_RANGE, *UNTRAINED)
 """Models of a race that need no training: the plant's own, the middle of the bounds, and those on the calibrated car."""
+
+
+def _of_the_repository(vehicle: str) -> str:
+    """A vehicle by its name as it is, one by its file with the path to this repository before."""
+    return str(Path(__file__).parents[2] / vehicle) if "/" in vehicle else vehicle
+
+
+def _no_results(text: str) -> str:
+    """Refuses numbers: what was measured is filled in where the document is written, and never typed."""
+    found = re.search(r"\d", re.sub(r"\d{4}-\d\d-\d\d", "", text))
+    if found:
+        raise ValueError(f"'{text[max(0, found.start() - 20) :]:.40}': a number; expected words and the date alone")
+    return text
+
+
+VehicleName = Annotated[str, AfterValidator(_of_the_repository)]
 
 
 class Log(StrictModel):
@@ -92,16 +109,20 @@ class Split(StrictModel):
 class Car(StrictModel):
     """A car, and the models whose names have a meaning in the tables."""
 
-    vehicle: str = Field(description="vehicle file that is calibrated on each training part")
+    vehicle: VehicleName = Field(
+        description="vehicle that is calibrated on each training part: name, or file relative to the repository"
+    )
     start: Literal["vehicle", "mid_range"] = Field(
         default="vehicle", description="where calibration starts: the file's nominal values, or mid-range"
     )
     min_speed: float = Field(ge=0, description="rows that are slower are not calibrated on (m/s)")
-    reference: Literal["real", "sim"] = Field(description="which of the paper's data sets is comparable")
-    full: str = Field(
-        description="the full model; models named after it, with an underscore and more, are its ablations"
+    reference: Literal["real", "sim", "other"] = Field(
+        description="which of the paper's data sets is comparable, if any"
     )
-    paper: str | None = Field(default=None, description="the full model as the paper has it")
+    full: str = Field(
+        description="the model that ships; models named after it, with an underscore and more, are its ablations"
+    )
+    paper: str | None = Field(default=None, description="the paper's model; its ablations are named likewise")
     ddm: str
     fthd: str
     coefficients: str = Field(description="study that the coefficient table is about")
@@ -115,7 +136,9 @@ class Model(StrictModel):
     )
     change: dict[str, Any] = Field(default_factory=dict, description="fields instead of the base's, block by block")
     variant: str = Field(default="", description="of an ablation: what it is, as the table shows it; empty: its name")
-    vehicle: str | None = Field(default=None, description="vehicle file as it is; null: the calibrated car")
+    vehicle: VehicleName | None = Field(
+        default=None, description="vehicle as it is, name or file; null: the calibrated car"
+    )
     seeds: int | None = Field(default=None, ge=1, description="at most so many, also where a study wants more")
 
 
@@ -124,11 +147,25 @@ class Study(StrictModel):
 
     title: str
     text: str = Field(description="what is asked, in a sentence or two")
-    remark: str = Field(default="", description="what its authors make of the outcome, with the date")
+    remark: Annotated[str, AfterValidator(_no_results)] = Field(
+        default="", description="what its authors make of the outcome in words, with the date"
+    )
+    data: Literal["development", "test"] = Field(
+        default="development", description="whether decisions on models were taken with these data in sight"
+    )
     splits: tuple[str, ...] = Field(min_length=1)
     commands: Commands
     models: tuple[str, ...] = Field(min_length=1)
     seeds: int = Field(ge=1)
+
+
+class Sweep(StrictModel):
+    """A model that is trained with several learning rates, without restarts; which is best, validation windows say."""
+
+    split: str = Field(description="on whose training part")
+    commands: Commands
+    model: str
+    rates: tuple[float, ...] = Field(min_length=2, description="learning rates, in order")
 
 
 class Race(StrictModel):
@@ -174,6 +211,7 @@ class Plan(StrictModel):
     splits: dict[str, Split]
     models: dict[str, Model]
     studies: dict[str, Study]
+    sweeps: dict[str, Sweep] = Field(default_factory=dict)
     races: dict[str, Race] = Field(default_factory=dict)
     stride: int = Field(ge=1, description="rollouts start at every stride-th row")
     calls: int = Field(ge=1, description="predictions of each model that are timed")
@@ -198,17 +236,23 @@ class Plan(StrictModel):
             tests = self.tests(study)
             if len(set(tests)) < len(tests):
                 raise ValueError(f"studies.{name}.splits: tests of the same name: {', '.join(tests)}")
+        for name, sweep in self.sweeps.items():
+            _check(f"sweeps.{name}.split", [sweep.split], self.splits)
+            _check(f"sweeps.{name}.model", [sweep.model], self._trained(sweep.split, sweep.commands))
         for name, race in self.races.items():
             _check(f"races.{name}.split", [race.split], self.splits)
-            trained = [
-                model
-                for study in self.studies.values()
-                if race.split in study.splits and study.commands == race.commands
-                for model in study.models
-                if model in self.models
-            ]
-            _check(f"races.{name}.models", race.models, [*FIXED, *trained])
+            _check(f"races.{name}.models", race.models, [*FIXED, *self._trained(race.split, race.commands)])
         return self
+
+    def _trained(self, split: str, commands: Commands) -> list[str]:
+        """Models that any study trains there."""
+        return [
+            model
+            for study in self.studies.values()
+            if split in study.splits and study.commands == commands
+            for model in study.models
+            if model in self.models
+        ]
 
     def configured(self, name: str) -> ModelConfig:
         """Configuration of a model of the plan.
@@ -270,7 +314,8 @@ class Plan(StrictModel):
             for name, study in self.studies.items()
         }
         races = dict(list(self.races.items())[:1])
-        short = {"stride": quick.stride, "epochs": quick.epochs, "races": races}
+        sweeps = dict(list(self.sweeps.items())[:1])
+        short = {"stride": quick.stride, "epochs": quick.epochs, "races": races, "sweeps": sweeps}
         return self.model_copy(update={**short, "drives": drives, "studies": studies})
 
 

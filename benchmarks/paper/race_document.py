@@ -14,6 +14,7 @@ from benchmarks.paper.race_figures import lap_over_speed_scale
 from benchmarks.paper.reference import ClosedLoop
 from benchmarks.paper.results import Entry, Results
 from benchmarks.paper.schedule import race_key
+from benchmarks.paper.stale import signed
 from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.files import replacing
 from dynssm_ros.reporting.tables import Column, Table, Value
@@ -51,7 +52,7 @@ def write_races(results: Results, root: Path, path: Path) -> None:
         with replacing(path.with_name(pictures[names[-1]]["speed_scale"])) as aside:
             _over_pace(results, names).savefig(aside, format="png", dpi=_DPI, metadata={"Software": None})
     with replacing(path) as aside:
-        aside.write_text(races_markdown(results, pictures), encoding="utf-8")
+        aside.write_text(signed(races_markdown(results, pictures), results.plan), encoding="utf-8")
 
 
 def _sweeps(results: Results) -> list[list[str]]:

@@ -13,11 +13,12 @@ import numpy as np
 from benchmarks.paper.plan import Car, Plan, Study
 from benchmarks.paper.racing import NUMBERS
 from benchmarks.paper.reference import Reference
-from benchmarks.paper.schedule import COSTS, race_key, score_key
+from benchmarks.paper.schedule import COSTS, race_key, rate_key, score_key
 from benchmarks.paper.steps import Step
 from benchmarks.tasks import output, split_available
 from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.spread import SeedSpread, spreads
+from dynssm_ros.runtime.artifact import METRICS
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _NOT_MADE = "not made; `make paper` says why"
@@ -48,6 +49,7 @@ class Results:
         reference: the paper's numbers.
         scores: content of the steps that evaluate, by their keys, as far as they are done.
         races: what was driven in closed loop, by the plan's names, as ``dynssm race`` writes it, as far as it is done.
+        rates: by the plan's names of sweeps, then by learning rate: what the trainings say of themselves, as far as done.
         costs: of the models, by name: parameters, flops, latency_us, integrator.
         missing: why steps are not done, by their titles; steps that only lack others are left out.
         reasons: why scores are not there, by their keys.
@@ -58,6 +60,7 @@ class Results:
     reference: Reference
     scores: Mapping[str, Entry]
     races: Mapping[str, Entry]
+    rates: Mapping[str, Mapping[float, Entry]]
     costs: Mapping[str, Entry]
     missing: Mapping[str, str]
     reasons: Mapping[str, str]
@@ -106,20 +109,28 @@ class Comparison:
         return tuple(model for model, runs in self._runs.items() if runs)
 
     @property
-    def ablations(self) -> dict[str, str]:
-        """Models that are the full one less something, by what they lack."""
-        prefix = f"{self.car.full}_"
-        return {m.removeprefix(prefix): m for m in self.models if m.startswith(prefix) and m != self.car.paper}
+    def bases(self) -> tuple[str, ...]:
+        """The models with results that have ablations: the paper's, the one that ships."""
+        named = [each for each in (self.car.paper, self.car.full) if each in self.models]
+        return tuple(base for base in named if self.ablations(base))
 
-    @property
-    def variants(self) -> dict[str, str]:
+    def ablations(self, base: str) -> dict[str, str]:
+        """Models that are ``base`` less something, by what they lack."""
+        others = [each for each in (self.car.paper, self.car.full) if each and each.startswith(f"{base}_")]
+        own = [m for m in self.models if m.startswith(f"{base}_") and not any(m.startswith(each) for each in others)]
+        return {model.removeprefix(f"{base}_"): model for model in own}
+
+    def variants(self, base: str) -> dict[str, str]:
         """The ablations in words, by what they lack."""
-        return {lacking: self._plan.models[model].variant or lacking for lacking, model in self.ablations.items()}
+        return {lacking: self._plan.models[m].variant or lacking for lacking, m in self.ablations(base).items()}
 
     @property
     def compared(self) -> tuple[str, ...]:
         """The models that are no ablations."""
-        return tuple(model for model in self.models if model not in self.ablations.values())
+        left_out = [
+            model for base in (self.car.paper, self.car.full) if base for model in self.ablations(base).values()
+        ]
+        return tuple(model for model in self.models if model not in left_out)
 
     def seeds(self, model: str) -> int:
         """Number of trainings that the results of ``model`` are of."""
@@ -191,6 +202,14 @@ def read_results(plan: Plan, reference: Reference, root: Path, steps: Sequence[S
         reference=reference,
         scores=scores,
         races={name: _read(root / race_key(name) / NUMBERS) for name in plan.races if race_key(name) in done},
+        rates={
+            name: {
+                rate: _read(root / rate_key(sweep, rate) / METRICS)
+                for rate in sweep.rates
+                if rate_key(sweep, rate) in done
+            }
+            for name, sweep in plan.sweeps.items()
+        },
         costs=_read(root / COSTS)["models"] if COSTS in done else {},
         missing={titles[key]: reasons[key] for key, cause in causes.items() if cause == key}
         | {titles[key]: reason for key, reason in failed.items()},

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.paper.plan import FIXED, Plan, Race, Split
+from benchmarks.paper.plan import FIXED, Plan, Race, Split, Sweep
 from benchmarks.paper.racing import DriveLaps
 from benchmarks.paper.steps import (
     Calibrate,
@@ -42,6 +42,8 @@ def steps_of(plan: Plan, data: Path | None, given: Mapping[str, Path]) -> list[S
     for step in steps:
         if isinstance(step, Train):
             trained[step.model] = (*trained.get(step.model, ()), step.key)
+    for sweep in plan.sweeps.values():
+        steps += _Site(plan, sweep.split, sweep.commands).rates(sweep)
     steps += [_race_step(name, race, data) for name, race in plan.races.items()]
     timing = TimeModels(  # last, while nothing else computes
         key=COSTS, title="time the models", uses=tuple(step.key for step in steps), trained=trained, calls=plan.calls,
@@ -62,6 +64,11 @@ def score_key(split: str, commands: Commands) -> str:
 def model_key(split: str, commands: Commands, model: str, seed: int) -> str:
     """Where a training lies."""
     return f"models/{split}.{commands}/{model}.{seed}"
+
+
+def rate_key(sweep: Sweep, rate: float) -> str:
+    """Where the training of a sweep with a learning rate lies."""
+    return f"rates/{sweep.split}.{sweep.commands}/{sweep.model}.{rate:g}"
 
 
 def vehicle_key(split: str, commands: Commands) -> str:
@@ -172,3 +179,11 @@ class _Site:
             vehicle=own_vehicle or self.vehicle,
             start=start,
         )
+
+    def rates(self, sweep: Sweep) -> Iterator[Train]:
+        """The trainings of a sweep, with seed 0."""
+        plain = self._training(sweep.model, 0, {})
+        for rate in sweep.rates:
+            config = plain.config.with_training(learning_rate=rate, restarts=0)
+            title = f"train {sweep.model} at the rate {rate:g}, on {self.shown}"
+            yield replace(plain, key=rate_key(sweep, rate), title=title, config=config)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.paper.reference import Channels, OpenLoop, Reference
+from benchmarks.paper.reference import Ablation, OpenLoop, Reference
 from benchmarks.paper.results import Comparison, Entry, Results
 from dynssm_ros.evaluation.coefficients import coefficient_unit
 from dynssm_ros.evaluation.spread import SeedSpread
@@ -75,18 +75,6 @@ def reduction_table(comparisons: Sequence[Comparison], reference: Reference, dat
     return Table(columns, rows)
 
 
-def factor_table(comparisons: Sequence[Comparison], reference: Mapping[str, OpenLoop]) -> Table:
-    """The lowest RMSE of the paper's table over that of the full model."""
-    best = np.min([row.rmse.values for row in reference.values()], axis=0)
-    columns = (Column("test"), *(Column(TITLES[channel], "times lower") for channel in STATE_SIGNALS))
-    rows: list[list[Value]] = [
-        [c.label, *(_ratio(b, s.mean) for b, s in zip(best, c.rmse(c.car.full), strict=True))]
-        for c in comparisons
-        if c.car.full in c.models
-    ]
-    return Table(columns, rows)
-
-
 def error_table(comparison: Comparison) -> Table:
     """One-step RMSE and displacement of all models of a study but the ablations, all tests taken together."""
     columns = (
@@ -117,57 +105,91 @@ def relative_table(comparison: Comparison) -> Table:
     return Table(columns, rows, "One-step RMSE over that of persistence; above 1 is worse than no model at all.")
 
 
-def ablation_table(comparison: Comparison, results: Results) -> Table:
-    """The full model and its ablations, with the paper's RMSE where it has that variant."""
-    paper = results.reference.ablation.get(comparison.car.reference, {})
-    columns: list[Column] = [Column("variant")]
-    for channel in STATE_SIGNALS:
-        columns.append(Column(TITLES[channel], UNITS[channel], "", "min"))
-        if paper:
-            columns.append(Column(f"{TITLES[channel]}, the paper's", UNITS[channel]))
-    columns.append(Column("parameters"))
+def ablation_table(comparison: Comparison, results: Results, base: str) -> Table:
+    """A model and its ablations: errors and what they cost; the paper's numbers beside those of its own model."""
+    paper = results.reference.ablation.get(comparison.car.reference, {}) if base == comparison.car.paper else {}
+    shown = [Column(TITLES[channel], UNITS[channel], "", "min") for channel in STATE_SIGNALS]
+    shown += [Column("parameters"), Column("FLOPs"), Column("latency p50", "µs")]
+    columns = [Column("variant")]
+    for column in shown:
+        columns += [column, *([Column(f"{column.title}, the paper's", column.unit)] if paper else [])]
     variants = {_PHYSICS_ONLY: _PHYSICS_ONLY} if _PHYSICS_ONLY in comparison.models else {}
-    variants |= comparison.ablations | {"full": comparison.car.full}
-    names = {_PHYSICS_ONLY: "physics only, calibrated", "full": "full model"} | comparison.variants
+    variants |= comparison.ablations(base) | {"full": base}
+    names = {_PHYSICS_ONLY: "physics only, calibrated", "full": "full model"} | comparison.variants(base)
     rows: list[list[Value]] = []
     for lacking, model in variants.items():
-        row: list[Value] = [names[lacking]]
-        theirs: Channels | None = paper[lacking].rmse if lacking in paper else None
-        for k, spread in enumerate(comparison.rmse(model)):
-            row += [spread, *([theirs.values[k] if theirs else None] if paper else [])]
-        row.append(results.costs[model]["parameters"] if model in results.costs else None)
-        rows.append(row)
-    return Table(tuple(columns), rows, f"{better_ablations(comparison)} {_seeds(comparison)}")
+        theirs = paper.get(lacking)
+        cost = results.costs.get(model)
+        own: list[Value] = list(comparison.rmse(model))
+        own += [cost["parameters"], cost["flops"], cost["latency_us"]["p50"]] if cost else [None] * 3
+        published = _published_costs(theirs)
+        pairs = [[mine, other] if paper else [mine] for mine, other in zip(own, published, strict=True)]
+        rows.append([names[lacking], *(value for pair in pairs for value in pair)])
+    return Table(tuple(columns), rows, f"{better_ablations(comparison, base)} {_seeds(comparison)}")
 
 
-def better_ablations(comparison: Comparison) -> str:
-    """Says which ablations beat the full model by more than the spread of both over the seeds.
+def _published_costs(row: Ablation | None) -> list[Value]:
+    if row is None:
+        return [None] * 6
+    return [*row.rmse.values, row.parameters, row.flops, 1e6 * row.latency]
+
+
+def better_ablations(comparison: Comparison, base: str) -> str:
+    """Says which ablations beat the model itself by more than the spread of both over the seeds.
 
     A variant that was trained once is taken to vary as the full model does.
     """
-    full = comparison.rmse(comparison.car.full)
-    if comparison.seeds(comparison.car.full) < 2:
+    full = comparison.rmse(base)
+    if comparison.seeds(base) < 2:
         return "The full model was trained once, so the spread over seeds is not known."
     found = []
-    for lacking, model in comparison.ablations.items():
+    for lacking, model in comparison.ablations(base).items():
         once = comparison.seeds(model) < 2
         for channel, own, whole in zip(STATE_SIGNALS, comparison.rmse(model), full, strict=True):
             if whole.mean - own.mean > math.hypot(whole.std if once else own.std, whole.std):
                 percent = _percentage(1 - own.mean / whole.mean)
-                found.append(f"{comparison.variants[lacking]} in {TITLES[channel]} by {text(percent)} %")
+                found.append(f"{comparison.variants(base)[lacking]} in {TITLES[channel]} by {text(percent)} %")
     if not found:
         return "No ablation is better than the full model beyond the spread over seeds."
     return f"Better than the full model beyond the spread over seeds: {', '.join(found)}."
 
 
+def rate_table(results: Results) -> Table:
+    """The learning rates that were tried: what the validation windows of the training part say."""
+    columns = (
+        Column("model"), Column("trained on"), Column("learning rate"), Column("validation loss"),
+        Column("over that of the mean change"), Column("best epoch"), Column("chosen"),
+    )  # fmt: skip
+    rows: list[list[Value]] = []
+    for name, tried in results.rates.items():
+        sweep = results.plan.sweeps[name]
+        chosen = getattr(results.plan.configured(sweep.model).training, "learning_rate", None)
+        for rate, found in tried.items():
+            loss = min(validation_loss(found), default=None)
+            rows.append(
+                [f"`{sweep.model}`", sweep.split, f"{rate:g}", loss, found["unexplained"], found["best_epoch"],
+                 "yes" if rate == chosen else ""]
+            )  # fmt: skip
+    return Table(
+        columns, rows, "Seed 0, without restarts. The loss is the mean squared error in m/s, m/s and rad/s; over that of "
+        "predicting the mean change, 1 is a training that has learned nothing."
+    )  # fmt: skip
+
+
+def validation_loss(metrics: Entry) -> list[float]:
+    """Over the epochs of a training."""
+    found: list[float] = metrics["history"].get("validation/prediction", [])
+    return found
+
+
 def coefficient_table(comparison: Comparison, results: Results) -> Table | None:
     """The adapted coefficients against their bounds; ``None`` if no model adapts any."""
-    paper = results.reference.coefficients[comparison.car.reference]
+    paper = results.reference.coefficients.get(comparison.car.reference, {})
     models = [model for model in (comparison.car.paper, comparison.car.full) if model in comparison.models]
     statistics = {model: found for model in models if (found := _coefficients(comparison.entries(model)))}
     if not statistics:
         return None
-    columns = [Column("coefficient"), Column("bounds, the paper's"), Column("the paper's")]
+    columns = [Column("coefficient"), *([Column("bounds, the paper's"), Column("the paper's")] if paper else [])]
     for model in statistics:
         columns += [Column("bounds", "", f"`{model}`"), Column("adapted"), Column("at a bound", "%")]
     rows: list[list[Value]] = []
@@ -175,7 +197,8 @@ def coefficient_table(comparison: Comparison, results: Results) -> Table | None:
         unit = coefficient_unit(name)
         theirs = paper.get(name)
         row: list[Value] = [f"{name} ({unit})" if unit else name]
-        row += [_range(theirs.bounds), _plus_minus(theirs.mean, theirs.std)] if theirs else ["–", "–"]
+        if paper:
+            row += [_range(theirs.bounds), _plus_minus(theirs.mean, theirs.std)] if theirs else ["–", "–"]
         for found in statistics.values():
             bounds, mean, std, at_bound = found[name]
             row += [_range(bounds), _plus_minus(mean, std), _percentage(at_bound)]
@@ -204,7 +227,12 @@ def cost_table(results: Results) -> Table:
         Column("model"), Column("parameters"), Column("FLOPs"), Column("latency p50", "µs"), Column("p99", "µs"),
         Column("physics step"),
     )  # fmt: skip
-    ablations = {model for comparison in results.comparisons for model in comparison.ablations.values()}
+    ablations = {
+        model
+        for comparison in results.comparisons
+        for base in comparison.bases
+        for model in comparison.ablations(base).values()
+    }
     rows: list[list[Value]] = []
     for data, models in results.reference.open_loop.items():
         for name, row in models.items():

@@ -11,6 +11,8 @@ from benchmarks.paper import document, tables
 from benchmarks.paper.plan import load_plan
 from benchmarks.paper.reference import load_reference
 from benchmarks.paper.results import Made, Results
+from benchmarks.paper.stale import NOTE, marked
+from benchmarks.paper.summary import summary
 from dynssm_ros.vehicle import COEFFICIENTS
 
 STATE_SIGNALS = ("v_x", "v_y", "omega")
@@ -102,7 +104,8 @@ def make(scores):
 
     def results(**changes):
         parts = {
-            "plan": plan, "reference": load_reference(), "scores": scores, "races": {}, "costs": dict.fromkeys(MODELS, cost),
+            "plan": plan, "reference": load_reference(), "scores": scores, "races": {}, "rates": {},
+            "costs": dict.fromkeys(MODELS, cost),
             "missing": {}, "reasons": {}, "made": Made({"Made": "today"}),
         }  # fmt: skip
         return Results(**parts | changes)
@@ -142,10 +145,23 @@ def test_a_model_appears_only_with_results_on_every_test(make, scores):
     assert comparison.seeds("dynssm_av21_no_mirror") == 3
 
 
-def test_ablations_are_told_from_the_paper_s_configuration(make):
-    (comparison,) = make().comparisons
-    assert comparison.ablations == {"no_mirror": "dynssm_av21_no_mirror", "no_online": "dynssm_av21_no_online"}
+def test_ablations_are_told_from_the_paper_s_configuration(make, scores):
+    for content in scores.values():
+        for test in content["tests"].values():
+            test["models"]["dynssm_av21_paper_no_ssm"] = [entry(0.45, s) for s in (0, 1, 2)]
+    results = make()
+    study = results.plan.studies["unseen"]
+    study = study.model_copy(update={"models": (*MODELS, "dynssm_av21_paper_no_ssm")})
+    (comparison,) = make(plan=results.plan.model_copy(update={"studies": {"unseen": study}})).comparisons
+    assert comparison.ablations("dynssm_av21") == {
+        "no_mirror": "dynssm_av21_no_mirror", "no_online": "dynssm_av21_no_online"
+    }  # fmt: skip
+    assert comparison.ablations("dynssm_av21_paper") == {"no_ssm": "dynssm_av21_paper_no_ssm"}
+    assert comparison.bases == ("dynssm_av21_paper", "dynssm_av21")
     assert comparison.compared == ("persistence", "single_track", "ddm_av21", "dynssm_av21_paper", "dynssm_av21")
+    table = tables.ablation_table(comparison, results, "dynssm_av21_paper")
+    assert cells(table, "w/o SSM encoder")[:2] == ["0.450 ± 0.000", "0.0286"]
+    assert cells(table, "w/o SSM encoder")[7:12:2] == ["79,500", "139,800", "2,000"]
 
 
 def test_relative_errors_are_those_over_persistence_test_by_test(make, scores):
@@ -166,21 +182,15 @@ def test_reductions_are_shares_of_the_errors_of_ddm(make):
     assert cells(table, "DynSSM, the paper's abstract: up to, over DDM or FTHD")[1:4] == ["27.2", "73.9", "88.8"]
 
 
-def test_factors_are_over_the_best_of_the_paper(make):
-    results = make()
-    table = tables.factor_table(results.comparisons, results.reference.open_loop["real"])
-    expected = np.array([0.0246, 0.0190, 0.00722]) / 0.303
-    np.testing.assert_allclose([float(v) for v in table.rows[0][1:]], expected)
-
-
 def test_the_paper_s_numbers_stand_beside_and_are_never_the_best(make):
     results = make()
-    table = tables.ablation_table(results.comparisons[0], results)
-    assert cells(table, "w/o online layer")[1:6:2] == ["–"] * 3
-    assert cells(table, "full model")[:6:2] == ["0.303 ± 0.003"] * 3
-    assert cells(table, "physics only, calibrated")[:2] == ["0.800", "0.0350"]
+    table = tables.ablation_table(results.comparisons[0], results, "dynssm_av21")
+    assert cells(table, "full model") == ["0.303 ± 0.003"] * 3 + ["10", "20", "5.00"]
+    assert cells(table, "physics only, calibrated")[0] == "0.800"
     best = {(row[0].text, k) for row in table.cells for k, cell in enumerate(row) if cell.best}
-    assert best == {("full model", 1), ("full model", 3), ("full model", 5)}
+    assert best == {("full model", 1), ("full model", 2), ("full model", 3)}
+    theirs = tables.ablation_table(results.comparisons[0], results, "dynssm_av21_paper")
+    assert cells(theirs, "physics only, calibrated")[:2] == ["0.800", "0.0350"]
     published = tables.published_table(results.comparisons, results.reference.open_loop["real"])
     assert cells(published, "FTHD, the paper's")[1:4] == ["0.0270", "0.938", "0.0338"]
     assert not any(cell.best for row in published.cells for cell in row)
@@ -200,7 +210,7 @@ def test_an_ablation_that_beats_the_full_model_is_named(make, scores, level, sen
         for test in content["tests"].values():
             test["models"]["dynssm_av21_no_online"] = [entry(level * (1 + 0.01 * s), s) for s in (0, 1, 2)]
     (comparison,) = make().comparisons
-    assert tables.better_ablations(comparison) == sentence
+    assert tables.better_ablations(comparison, "dynssm_av21") == sentence
 
 
 @pytest.mark.parametrize(("level", "named"), [(0.2995, False), (0.25, True)])
@@ -208,14 +218,14 @@ def test_a_variant_that_was_trained_once_is_taken_to_vary_as_the_full_model_does
     for content in scores.values():
         for test in content["tests"].values():
             test["models"]["dynssm_av21_no_online"] = [entry(level, 0)]
-    assert ("w/o online layer" in tables.better_ablations(make().comparisons[0])) == named
+    assert ("w/o online layer" in tables.better_ablations(make().comparisons[0], "dynssm_av21")) == named
 
 
 def test_one_training_of_the_full_model_says_nothing_about_the_spread(make, scores):
     for content in scores.values():
         for test in content["tests"].values():
             test["models"]["dynssm_av21"] = [entry(0.3, 0)]
-    assert "not known" in tables.better_ablations(make().comparisons[0])
+    assert "not known" in tables.better_ablations(make().comparisons[0], "dynssm_av21")
 
 
 def test_coefficients_are_pooled_with_the_spread_between_trainings(make, scores):
@@ -265,11 +275,12 @@ def test_the_document_has_every_section_and_shows_its_figures(make, tmp_path):
     document.write(make(), path)
     text = path.read_text()
     assert re.findall(r"^#+ (.+)$", text, flags=re.M) == [
-        "Results", "Full-size car", "Against the published models", "Unseen driving, commands `lookahead`",
+        "Results", "In short", "How it was measured", "Full-size car",
+        "Against the published models", "Unseen driving, commands `lookahead`",
         "Coefficients", "Stated uncertainty", "Cost",
     ]  # fmt: skip
     shown = set(re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text))
-    assert shown == {"results_persistence.png", "results_ablations_unseen.png"}
+    assert shown == {"results_persistence.png", "results_ablations_unseen_dynssm_av21.png"}
     assert {file.name for file in path.parent.iterdir()} == {"results.md", *shown}
     for line in text.splitlines():
         assert line == line.rstrip()
@@ -299,3 +310,49 @@ def test_a_study_of_given_recordings_asks_for_them(make):
 def test_quick_runs_say_so(make):
     assert "Not results" not in document.markdown(make(), {})
     assert "**Not results:** a quick run" in document.markdown(make(made=Made(quick=True)), {})
+
+
+def test_the_first_half_page_says_what_helps_and_where_a_rival_wins(make, scores):
+    for content in scores.values():
+        for test in content["tests"].values():
+            test["models"]["ddm_av21"] = [entry(0.6, 0, ade=0.05)]
+    text = "\n".join(summary(make()))
+    row = next(line for line in text.splitlines() if line.startswith("| unseen driving, lookahead"))
+    assert [cell.strip() for cell in row.split("|")[2:-1]] == [
+        "development", "`single_track`", "0.379", "`persistence`", "1.00",
+        "`dynssm_av21_paper`", "0.750", "`ddm_av21`", "2.00",
+    ]  # fmt: skip
+    assert (
+        "A rival wins by more than 2 % in: unseen driving, lookahead, path: `ddm_av21`, our errors are 100 % larger."
+        in text
+    )
+    assert (
+        "`dynssm_av21` on unseen driving, lookahead, errors without its parts: w/o mirrored laps +67 % one step" in text
+    )
+    assert list(summary(make(scores={}))) == []
+
+
+def test_learning_rates_that_were_tried_are_shown_with_the_chosen_one(make, tmp_path):
+    found = {"history": {"validation/prediction": [3.0, 1.0, 2.0]}, "best_epoch": 2, "unexplained": 0.25}
+    results = make(rates={"ddm_av21": {0.001: found, 0.004: found | {"unexplained": 1.0}}})
+    rows = tables.rate_table(results).cells
+    assert [[cell.text for cell in row] for row in rows] == [
+        ["`ddm_av21`", "slow", "0.001", "1.00", "0.250", "2", "yes"], ["`ddm_av21`", "slow", "0.004", "1.00", "1.00", "2", ""]
+    ]  # fmt: skip
+    document.write(results, tmp_path / "results.md")
+    assert "](results_rates.png)" in (tmp_path / "results.md").read_text()
+    assert (tmp_path / "results_rates.png").stat().st_size > 1000
+
+
+def test_a_page_is_marked_stale_as_soon_as_a_setting_changes(make, tmp_path):
+    results = make()
+    document.write(results, tmp_path / "results.md")
+    page = (tmp_path / "results.md").read_text()
+    assert marked(page, results.plan) == page
+    changed = dict(results.plan.models)
+    changed["dynssm_av21"] = changed["dynssm_av21"].model_copy(update={"change": {"history": 0.8}})
+    other = results.plan.model_copy(update={"models": changed})
+    stale = marked(page, other)
+    assert stale.startswith(f"# Results\n\n{NOTE}\n\n")
+    assert marked(stale, other) == stale
+    assert marked(stale, results.plan) == page

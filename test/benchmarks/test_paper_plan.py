@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from benchmarks.paper.parts import cut, quantity
-from benchmarks.paper.plan import Part, Range, load_plan
+from benchmarks.paper.plan import Part, Range, Study, load_plan
 from benchmarks.paper.reference import load_reference
 from dynssm_ros.configuration import config_root
 from dynssm_ros.errors import ConfigurationError
@@ -65,13 +65,14 @@ def test_every_shipped_model_is_in_the_plan_and_every_change_fits(plan):
     assert shipped <= used
     assert {name: plan.configured(name).name for name in plan.models} == {name: name for name in plan.models}
     assert plan.configured("dynssm_av21_no_online").online is None
-    assert plan.configured("dynssm_orca_no_gru").physics.nominal == "calibrated"
+    assert plan.configured("dynssm_orca_paper_no_gru").physics.nominal == "mid_range"
+    assert plan.configured("dynssm_orca_paper_calibrated").physics.nominal == "calibrated"
 
 
 def test_every_ablation_of_the_plan_has_words(plan):
     for car in plan.cars.values():
         for model in plan.models:
-            if model.startswith(f"{car.full}_") and model != car.paper:
+            if model.startswith((f"{car.full}_", f"{car.paper}_")) and model != car.paper:
                 assert plan.models[model].variant, model
 
 
@@ -123,9 +124,23 @@ def test_a_quick_plan_is_shorter_in_everything(plan):
     }
 
 
-def test_models_that_take_long_are_trained_less_often_than_a_study_wants(plan):
-    study = plan.studies["unseen"]
-    assert len(plan.seeds(study, "ddm_av21")) == 1 < len(plan.seeds(study, "dynssm_av21")) == study.seeds
+def test_all_models_have_the_same_seeds_but_those_in_closed_form(plan):
+    for study in plan.studies.values():
+        assert study.seeds >= 3
+        fewer = {plan.configured(m).kind for m in study.models if m in plan.models and len(plan.seeds(study, m)) < 3}
+        assert fewer <= {"ridge", "rls", "gp"}
+
+
+def test_a_remark_in_the_plan_has_no_numbers(plan):
+    study = plan.studies["orca"].model_dump()
+    with pytest.raises(ValueError, match="a number; expected words and the date alone"):
+        Study.model_validate(study | {"remark": "Ahead by 7 %."})
+    Study.model_validate(study | {"remark": "Ahead (2026-11-23)."})
+
+
+def test_learning_rates_that_are_tried_hold_the_shipped_one(plan):
+    for sweep in plan.sweeps.values():
+        assert plan.configured(sweep.model).training.learning_rate in sweep.rates
 
 
 @pytest.mark.parametrize(

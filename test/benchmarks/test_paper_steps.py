@@ -97,7 +97,7 @@ def test_each_step_of_the_shipped_plan_is_there_once_with_what_it_builds_on():
 
 def test_every_training_of_a_split_is_evaluated():
     steps = steps_of(load_plan(), None, {})
-    trained = {step.key for step in steps if isinstance(step, Train)}
+    trained = {step.key for step in steps if isinstance(step, Train) and not step.key.startswith("rates/")}
     assert trained == {key for step in steps if isinstance(step, Evaluate) for key in step.trained}
 
 
@@ -123,7 +123,20 @@ def test_a_model_is_trained_on_the_car_that_the_plan_says():
 def test_a_calibrated_car_is_not_calibrated_again_by_the_training():
     steps = by_key(steps_of(load_plan(), None, {}))
     assert steps["models/slow.lookahead/dynssm_av21.0"].recipe()["model"]["physics"]["nominal"] == "calibrated"
-    assert steps["models/slow.lookahead/dynssm_av21_mid_range.0"].recipe()["model"]["physics"]["nominal"] == "mid_range"
+    own = steps["models/lap_2.lookahead/dynssm_av21_paper.0"].recipe()
+    calibrated = steps["models/lap_2.lookahead/dynssm_av21_paper_calibrated.0"].recipe()
+    assert [each["model"]["physics"]["nominal"] for each in (own, calibrated)] == ["mid_range", "calibrated"]
+
+
+def test_a_sweep_trains_one_model_at_each_rate_without_restarts():
+    steps = by_key(steps_of(load_plan(), None, {}))
+    rates = {key: step for key, step in steps.items() if key.startswith("rates/slow.lookahead/ddm_av21.")}
+    settings = [step.recipe()["model"]["training"] for step in rates.values()]
+    assert [each["learning_rate"] for each in settings] == list(load_plan().sweeps["ddm_av21"].rates)
+    assert {each["restarts"] for each in settings} == {0}
+    plain = steps["models/slow.lookahead/ddm_av21.0"].recipe()
+    same = settings[1] | {"restarts": plain["model"]["training"]["restarts"]}
+    assert plain["model"]["training"] == same
 
 
 def test_what_is_trained_on_decides_the_identity_of_a_training(plan):
