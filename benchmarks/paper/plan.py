@@ -124,7 +124,7 @@ class Car(StrictModel):
     )
     paper: str | None = Field(default=None, description="the paper's model; its ablations are named likewise")
     ddm: str
-    fthd: str
+    fthd: str | None = None
     coefficients: str = Field(description="study that the coefficient table is about")
 
 
