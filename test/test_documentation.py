@@ -200,7 +200,7 @@ def test_the_rivals_settings_are_those_of_their_model_files() -> None:
         assert float(ours) == reduce(getattr, path, load_model_config(model)), name
         assert published == ours or why, f"{name}: differs from what is published without a reason"
     named = set(table("model", PAGES["rivals.md"]))
-    assert named == {*UNTRAINED, "ridge", "rls", "gp"}
+    assert named == {*UNTRAINED, "ridge", "rls", "gp", "on_track"}
 
 
 def _is_module(name: str) -> bool:

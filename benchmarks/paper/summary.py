@@ -10,7 +10,7 @@ from benchmarks.paper.results import Comparison, Results
 from dynssm_ros.reporting.tables import Column, Table, Value
 from dynssm_ros.runtime.models import UNTRAINED
 
-_IN_CLOSED_FORM = ("ridge", "rls", "gp")
+_WITHOUT_A_NETWORK = ("ridge", "rls", "gp", "on_track")
 _ALIKE = 0.02  # errors that differ by less are called equal
 _ERRORS = ("one step", "path")
 
@@ -41,7 +41,7 @@ def errors(comparison: Comparison, model: str) -> dict[str, float]:
 def _simple(comparison: Comparison, results: Results) -> list[str]:
     """Its models without a network."""
     models = results.plan.models
-    closed = [m for m in comparison.compared if m in models and results.plan.configured(m).kind in _IN_CLOSED_FORM]
+    closed = [m for m in comparison.compared if m in models and results.plan.configured(m).kind in _WITHOUT_A_NETWORK]
     return [*(m for m in comparison.compared if m in UNTRAINED), *closed]
 
 

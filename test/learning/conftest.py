@@ -98,8 +98,8 @@ def _changed(base: dict[str, Any], **changes: Any) -> ModelConfig:
     for key, value in changes.items():
         both = isinstance(value, dict) and isinstance(content.get(key), dict)
         content[key] = content[key] | value if both else value
-    if content.get("kind") in ("ridge", "rls", "gp"):  # they have no layers, and no epochs
-        own = ("name", "kind", "history", "penalty", *(["physics"] if content["kind"] == "gp" else []))
+    if content.get("kind") in ("ridge", "rls", "gp", "on_track"):  # they have no layers, and no epochs
+        own = ("name", "kind", "history", "penalty", *(["physics"] if content["kind"] in ("gp", "on_track") else []))
         content = {name: content[name] for name in own if name in content}
         content["training"] = {"validation_block": 1.0}
     return parse_model_config(content, "test")

@@ -70,7 +70,10 @@ def test_a_base_that_does_not_exist_is_named(tmp_path: Path) -> None:
         ({"residual": {"hidden": []}}, "residual.hidden"),
         ({"training": {"validation_every": 1}}, "training.validation_every"),
         ({"loss": {"scale": "state"}}, "loss.scale: Input should be 'target', 'increment' or 'none' (got 'state')"),
-        ({"kind": "transformer"}, "kind: 'transformer'; expected one of ddm, dynssm, fthd, gp, ridge, rls"),
+        (
+            {"kind": "transformer"},
+            "kind: 'transformer'; expected one of ddm, dynssm, ekf_fthd, fthd, gp, on_track, ridge, rls",
+        ),
         ({"dense": {"layers": 2, "width": 4}}, "dense: Extra inputs are not permitted"),
     ],
 )
@@ -100,7 +103,7 @@ def test_what_does_not_fit_is_refused_with_field_and_value(
         (
             "fthd_av21",
             {"fine_tuning": {"starts_from": "ridge"}},
-            "fine_tuning.starts_from.kind: Input should be 'ddm' or 'fthd' (got 'ridge')",
+            "fine_tuning.starts_from.kind: Input should be 'ddm', 'fthd' or 'ekf_fthd' (got 'ridge')",
         ),
         ("fthd_av21", {"fine_tuning": {"starts_from": "ddm_mars"}}, "'ddm_mars' is neither a file nor a shipped name"),
         ("fthd_av21", {"fine_tuning": {"starts_from": "fthd_av21"}}, "fine_tuning.starts_from"),

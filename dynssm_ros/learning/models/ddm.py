@@ -33,7 +33,7 @@ class DenseConfig(StrictModel):
 class DdmConfig(ModelConfig):
     """Model file of a DDM."""
 
-    kind: Literal["ddm", "fthd"] = "ddm"
+    kind: Literal["ddm", "fthd", "ekf_fthd"] = "ddm"
     gru: GruConfig
     dense: DenseConfig
     physics: PhysicsConfig
@@ -74,9 +74,18 @@ class DDM(TrainableModel):
         """What is trained, from the input to the output: the GRU, the hidden dense layers, the output layer."""
         return [self.gru, *self.dense]
 
+    def hidden(self, window: Tensor) -> Tensor:
+        """The last hidden layer ``(B, width)`` for raw windows ``(B, H, 7)``."""
+        remembered, _ = self.gru((window - self.mean) / self.std)
+        layer: Tensor = self.dense[:-1](remembered.flatten(1))
+        return layer
+
+    def coefficients(self, hidden: Tensor) -> Tensor:
+        """``theta`` ``(B, 17)`` from the last hidden layer."""
+        return self.lower + torch.sigmoid(self.dense[-1](hidden)) * self.admissible
+
     def forward(self, window: Tensor) -> Output:
         """Raw windows ``(B, H, 7)`` to predictions that are all physics."""
-        remembered, _ = self.gru((window - self.mean) / self.std)
-        theta = self.lower + torch.sigmoid(self.dense(remembered.flatten(1))) * self.admissible
+        theta = self.coefficients(self.hidden(window))
         increment = self.physics.over(window, theta[:, None], 1)[:, 0]
         return Output(increment, increment, theta, None, None)

@@ -19,8 +19,7 @@ lowest ``L_1`` on them, the DDM itself included. ``w_1`` is 1 here and ``w_2`` i
 Because the window holds the measured ``s_t``, the loss is nearly the error of the step before: to first order
 ``s^_{t+1} - s^_t - T_s f(s^_t) = s_t - s^_t``. So it weighs what the supervised loss weighs, and does not add much to it.
 
-The variant EKF-FTHD, which filters the states by an extended Kalman filter with learned noise covariances before the
-training, is not built.
+The variant that filters the states is :mod:`dynssm_ros.learning.models.ekf_fthd`.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class FineTuningConfig(StrictModel):
 class FthdConfig(DdmConfig):
     """Model file of an FTHD."""
 
-    kind: Literal["fthd"] = "fthd"
+    kind: Literal["fthd", "ekf_fthd"] = "fthd"
     fine_tuning: FineTuningConfig
 
     @model_validator(mode="after")
@@ -94,8 +93,8 @@ class FTHD(DDM):
         self.fine_tuning = config.fine_tuning
 
     def take_over(self, start: TrainableModel) -> None:
-        """Takes the weights of the trained DDM and freezes its first layers."""
-        self.load_state_dict(start.state_dict())
+        """Takes the weights of the trained DDM and freezes its first layers; what the DDM does not have is new."""
+        self.load_state_dict(self.state_dict() | start.state_dict())
         for layer in self.layers[: int(self.fine_tuning.frozen * len(self.layers))]:
             layer.requires_grad_(False)
 

@@ -10,8 +10,10 @@ from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.learning.models.ddm import DDM
 from dynssm_ros.learning.models.dynssm.network import DynSSM
+from dynssm_ros.learning.models.ekf_fthd import EkfFTHD
 from dynssm_ros.learning.models.fthd import FTHD
 from dynssm_ros.learning.models.gp import GaussianProcess
+from dynssm_ros.learning.models.on_track import OnTrack
 from dynssm_ros.learning.models.ridge import Ridge
 from dynssm_ros.learning.models.rls import Rls
 from dynssm_ros.runtime.artifact import Normalisation
@@ -35,7 +37,7 @@ def register_model(model: type[TrainableModel]) -> type[TrainableModel]:
     return model
 
 
-for _model in (DynSSM, Rls, Ridge, GaussianProcess, DDM, FTHD):
+for _model in (DynSSM, Rls, Ridge, GaussianProcess, OnTrack, DDM, FTHD, EkfFTHD):
     register_model(_model)
 
 

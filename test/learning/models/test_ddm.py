@@ -13,7 +13,7 @@ from dynssm_ros.learning.dataset import TrainingWindows, split_windows
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.ddm import DDM
-from dynssm_ros.learning.models.registry import MODELS, build_model, load_model_config
+from dynssm_ros.learning.models.registry import MODELS, build_model, load_model_config, parse_model_config
 from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.models import OnnxModel, SingleTrack
@@ -43,8 +43,10 @@ def test_the_shipped_models_have_the_published_number_of_parameters(name: str, v
 
 
 def test_every_kind_can_be_built(make_config: MakeConfig, make_ddm: MakeConfig, make_fthd: MakeConfig) -> None:
-    linear = [make_config(kind=kind) for kind in ("ridge", "rls", "gp")]
-    configs = [make_config(), *linear, make_ddm(), make_fthd()]
+    linear = [make_config(kind=kind) for kind in ("ridge", "rls", "gp", "on_track")]
+    fthd = make_fthd()
+    filtering = parse_model_config(fthd.model_dump(mode="json") | {"kind": "ekf_fthd", "filter": {"rows": 3}}, "test")
+    configs = [make_config(), *linear, make_ddm(), fthd, filtering]
     assert {config.kind for config in configs} == set(MODELS)
     for config in configs:
         output = build_model(config, load_vehicle("orca"), UNIT)(torch.ones(2, config.rows(0.02), 7))
