@@ -13,6 +13,7 @@ from benchmarks.paper.stale import signed
 from benchmarks.paper.summary import summary
 from dynssm_ros.arrays import Vector
 from dynssm_ros.files import replacing
+from dynssm_ros.reporting.evaluation_figures import loss_components
 from dynssm_ros.reporting.evaluation_report import COMMANDS_IN_WORDS
 from dynssm_ros.reporting.tables import Table
 
@@ -51,6 +52,8 @@ def draw(results: Results) -> Iterator[tuple[str, Figure]]:
             variants = c.variants(base)
             ablations = {variants[lacking]: c.rmse(model) for lacking, model in c.ablations(base).items()}
             yield f"ablations_{c.name}_{base}", figures.against_the_full_model(c.rmse(base), ablations)
+    for model, training in results.losses.items():
+        yield f"losses_{model}", loss_components(training["history"], training["best_epoch"])
     tried = {
         results.plan.sweeps[name].model: {rate: tables.validation_loss(found) for rate, found in rates.items()}
         for name, rates in results.rates.items()
@@ -89,6 +92,7 @@ def _parts(results: Results, pictures: dict[str, str]) -> Iterator[str]:
         for comparison in comparisons:
             yield from _study(comparison, results, pictures)
         yield from _coefficients(results, data)
+        yield from _losses(results, data, pictures)
     yield from _rates(results, pictures)
     yield from _uncertainty(results)
     yield from _cost(results)
@@ -173,6 +177,15 @@ def _coefficients(results: Results, data: str) -> Iterator[str]:
             yield "### Coefficients"
             yield "What the models do with the physical coefficients inside their bounds."
             yield table.markdown()
+
+
+def _losses(results: Results, data: str, pictures: dict[str, str]) -> Iterator[str]:
+    papers = dict.fromkeys(car.paper for car in results.plan.cars.values() if car.reference == data)
+    for picture in (pictures.get(f"losses_{model}") for model in papers):
+        if picture:
+            yield "### Terms of the loss"
+            yield "Of the paper's model over the epochs, seed 0; the paper shows the same figure."
+            yield f"![Terms of the loss over the epochs]({picture})"
 
 
 def _rates(results: Results, pictures: dict[str, str]) -> Iterator[str]:

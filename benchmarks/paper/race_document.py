@@ -121,7 +121,7 @@ def _parts(results: Results, pictures: Mapping[str, Mapping[str, str]]) -> Itera
         driven = results.races[name]
         yield _course(race, driven)
         yield race_table(race, driven, _published(results, race)).markdown()
-        yield _said(driven["models"])
+        yield " ".join(filter(None, [_said(driven["models"]), claimed(results, race, driven["models"])]))
         for figure, address in pictures.get(name, {}).items():
             yield f"![{_CAPTIONS[figure]}: {race.title}]({address})"
 
@@ -200,6 +200,20 @@ def _said(models: Mapping[str, Entry]) -> str:
         listed = ", ".join(f"{_name(model)} {100 * (lap / mark - 1):+.2f} %" for model, lap in others.items())
         said.append(f"Lap time against the plant's own model: {listed}.")
     return " ".join(said)
+
+
+def claimed(results: Results, race: Race, models: Mapping[str, Entry]) -> str:
+    """The paper's claim on lap times beside what its model does here, where its table is set beside."""
+    car = results.plan.cars[results.plan.splits[race.split].car]
+    laps = {model: row["lap_time_s"] for model, row in models.items() if row["lap_time_s"] is not None}
+    if not race.paper or car.paper not in laps:
+        return ""
+    own, rivals = laps[car.paper], [rival for rival in (car.ddm, car.fthd) if rival in laps]
+    gains = [f"{100 * (1 - own / laps[rival]):+.2f} % than `{rival}`" for rival in rivals]
+    return (
+        f"The paper's claim: up to {100 * results.reference.claims.lap_time:.1f} % faster than the published models. Here "
+        f"`{car.paper}` is faster by {', '.join(gains) or 'nothing that could be compared'}."
+    )
 
 
 def _lap(seconds: float | None) -> str:

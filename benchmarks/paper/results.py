@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.paper.plan import Car, Plan, Study
 from benchmarks.paper.racing import NUMBERS
 from benchmarks.paper.reference import Reference
-from benchmarks.paper.schedule import COSTS, race_key, rate_key, score_key
+from benchmarks.paper.schedule import COSTS, model_key, race_key, rate_key, score_key
 from benchmarks.paper.steps import Step
 from benchmarks.tasks import output, split_available
 from dynssm_ros.arrays import Vector
@@ -50,6 +50,7 @@ class Results:
         scores: content of the steps that evaluate, by their keys, as far as they are done.
         races: what was driven in closed loop, by the plan's names, as ``dynssm race`` writes it, as far as it is done.
         rates: by the plan's names of sweeps, then by learning rate: what the trainings say of themselves, as far as done.
+        losses: what a training of the paper's model says of itself, by the model's name, as far as done.
         costs: of the models, by name: parameters, flops, latency_us, integrator.
         missing: why steps are not done, by their titles; steps that only lack others are left out.
         reasons: why scores are not there, by their keys.
@@ -61,6 +62,7 @@ class Results:
     scores: Mapping[str, Entry]
     races: Mapping[str, Entry]
     rates: Mapping[str, Mapping[float, Entry]]
+    losses: Mapping[str, Entry]
     costs: Mapping[str, Entry]
     missing: Mapping[str, str]
     reasons: Mapping[str, str]
@@ -210,12 +212,25 @@ def read_results(plan: Plan, reference: Reference, root: Path, steps: Sequence[S
             }
             for name, sweep in plan.sweeps.items()
         },
+        losses=_losses(plan, root, done),
         costs=_read(root / COSTS)["models"] if COSTS in done else {},
         missing={titles[key]: reasons[key] for key, cause in causes.items() if cause == key}
         | {titles[key]: reason for key, reason in failed.items()},
         reasons={key: f"{titles[causes[key]]}: {reason}" for key, reason in reasons.items()} | failed,
         made=made,
     )
+
+
+def _losses(plan: Plan, root: Path, done: Container[str]) -> dict[str, Entry]:
+    """Of the first training of the paper's model of each car, with seed 0."""
+    found: dict[str, Entry] = {}
+    for study in plan.studies.values():
+        model = plan.car(study).paper
+        for split in study.splits:
+            if model and model in study.models and model not in found:
+                key = model_key(split, study.commands, model, 0)
+                found |= {model: _read(root / key / METRICS)} if key in done else {}
+    return found
 
 
 def by_name(values: Entry) -> Vector:

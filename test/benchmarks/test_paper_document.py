@@ -13,6 +13,7 @@ from benchmarks.paper.reference import load_reference
 from benchmarks.paper.results import Made, Results
 from benchmarks.paper.stale import NOTE, marked
 from benchmarks.paper.summary import summary
+from dynssm_ros.learning.losses import COMPONENTS
 from dynssm_ros.vehicle import COEFFICIENTS
 
 STATE_SIGNALS = ("v_x", "v_y", "omega")
@@ -104,7 +105,7 @@ def make(scores):
 
     def results(**changes):
         parts = {
-            "plan": plan, "reference": load_reference(), "scores": scores, "races": {}, "rates": {},
+            "plan": plan, "reference": load_reference(), "scores": scores, "races": {}, "rates": {}, "losses": {},
             "costs": dict.fromkeys(MODELS, cost),
             "missing": {}, "reasons": {}, "made": Made({"Made": "today"}),
         }  # fmt: skip
@@ -330,6 +331,14 @@ def test_the_first_half_page_says_what_helps_and_where_a_rival_wins(make, scores
         "`dynssm_av21` on unseen driving, lookahead, errors without its parts: w/o mirrored laps +67 % one step" in text
     )
     assert list(summary(make(scores={}))) == []
+
+
+def test_the_terms_of_the_loss_are_a_figure(make, tmp_path):
+    history = {f"{part}/{term}": [2.0, 1.0] for part in ("train", "validation") for term in COMPONENTS}
+    results = make(losses={"dynssm_av21_paper": {"history": history, "best_epoch": 2}})
+    document.write(results, tmp_path / "results.md")
+    assert "](results_losses_dynssm_av21_paper.png)" in (tmp_path / "results.md").read_text()
+    assert (tmp_path / "results_losses_dynssm_av21_paper.png").stat().st_size > 1000
 
 
 def test_learning_rates_that_were_tried_are_shown_with_the_chosen_one(make, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from benchmarks.paper.plan import load_plan
-from benchmarks.paper.race_document import write_races
+from benchmarks.paper.race_document import claimed, write_races
 from benchmarks.paper.race_figures import lap_over_speed_scale
 from benchmarks.paper.racing import NUMBERS
 from benchmarks.paper.reference import load_reference
@@ -112,6 +112,23 @@ def test_lap_times_over_the_pace(tmp_path):
     assert [list(line.get_ydata()) for line in lost] == [[top]]
     assert [text.get_text() for text in axes.texts] == ["theirs: 4.88 s"]
     figure.savefig(tmp_path / "speed_scale.png")
+
+
+def test_the_papers_claim_stands_beside_what_its_model_does(plan, root, tmp_path):
+    """Laps of 5 s by the paper's model and of 5.05 s by DDM: 0.99 %."""
+    whole = load_plan()
+    results = read_results(whole, load_reference(), root, [], Made({}, False))
+    race = whole.races["ethz_mobil"]
+    laps = {
+        "dynssm_orca_paper": {"lap_time_s": 5.0},
+        "ddm_orca": {"lap_time_s": 5.05},
+        "fthd_orca": {"lap_time_s": None},
+    }
+    assert claimed(results, race, laps) == (
+        "The paper's claim: up to 13.2 % faster than the published models. Here `dynssm_orca_paper` is faster by "
+        "+0.99 % than `ddm_orca`."
+    )
+    assert claimed(results, whole.races["grip_patch"], laps) == ""
 
 
 def test_a_race_that_could_not_be_driven_says_why(plan, root, tmp_path):
