@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
@@ -29,6 +30,8 @@ from dynssm_ros.extras import load_plugins
 from dynssm_ros.vehicle import Applied
 
 NodeType = TypeVar("NodeType", bound=Node)
+
+_AWAKE = 1.0  # s after which a spinning node looks whether it is to end
 
 # sensor data, but deep enough that a pause of the process (a model swap, a busy core) loses nothing
 SENSOR_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=100)
@@ -131,7 +134,13 @@ def set_pose(pose: Any, x: float, y: float, theta: float) -> None:
 
 
 def spin(node: Node) -> None:
-    """Serves a node's callbacks until rclpy is shut down."""
+    """Serves a node's callbacks until rclpy is shut down.
+
+    On SIGTERM, rclpy wakes the executor and shuts its context down in another thread. An executor that is quicker finds the
+    context as it was and waits again; a node that nothing else wakes would then wait for ever (1 of 50 idle nodes). So
+    something wakes it every second, on a clock that simulated time does not stop.
+    """
+    node.create_timer(_AWAKE, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     executor.spin()

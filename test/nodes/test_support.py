@@ -33,6 +33,26 @@ def test_a_player_that_waits_for_a_message_far_away_ends_at_once(laps_bag: Path,
     assert player.wait(5.0) == 0
 
 
+IDLE = """
+import threading
+from rclpy.node import Node
+from dynssm_ros.nodes.support import run
+
+class Idle(Node):
+    def __init__(self):
+        super().__init__("idle")
+        threading.Timer(0.5, self.context.handle.shutdown).start()  # and nothing wakes the executor
+
+run(Idle)
+"""
+
+
+def test_an_idle_node_notices_that_its_context_was_shut_down() -> None:
+    """As on SIGTERM, when rclpy wakes the executor a moment before it shuts the context down."""
+    ended = subprocess.run([sys.executable, "-c", IDLE], env=isolated_environment(), timeout=30, check=False)
+    assert ended.returncode == 0
+
+
 def test_a_node_that_crashed_is_named() -> None:
     def crash() -> None:
         with node_process("simulator") as process:
