@@ -17,7 +17,8 @@ from dynssm_ros.control.race_models import load_prediction_model
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.files import replacing, write_json
-from dynssm_ros.reporting import race_report as report
+from dynssm_ros.reporting import race_figures
+from dynssm_ros.reporting.race_report import race_json
 from dynssm_ros.track.racing_line import LineKind
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
@@ -67,9 +68,11 @@ class DriveLaps(Step):
         races = [drive(course, self._knowledge(name, driven, root)) for name in models]
         with replacing(root / self.key) as folder:
             folder.mkdir()
-            write_json(folder / NUMBERS, report.race_json(races))
+            write_json(folder / NUMBERS, race_json(races))
             for figure in race.figures:
-                getattr(report, figure)(races).savefig(folder / f"{figure}.png", dpi=_DPI, metadata={"Software": None})
+                getattr(race_figures, figure)(races).savefig(
+                    folder / f"{figure}.png", dpi=_DPI, metadata={"Software": None}
+                )
 
     def _line(self) -> str | Path:
         return self.race.line if self.race.line in get_args(LineKind) else in_data(self.data, self.race.line)

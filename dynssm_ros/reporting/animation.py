@@ -20,7 +20,7 @@ from dynssm_ros.control.race import Race
 from dynssm_ros.evaluation.coefficients import coefficient_label
 from dynssm_ros.files import replacing
 from dynssm_ros.reporting.evaluation_figures import MEASURED, STYLE, model_colours
-from dynssm_ros.reporting.race_report import driven_coefficients, widths
+from dynssm_ros.reporting.race_figures import driven_coefficients, widths
 from dynssm_ros.track.racing_line import CAR_WIDTH
 from dynssm_ros.vehicle import COEFFICIENTS
 

@@ -12,15 +12,8 @@ from dynssm_ros.control.race_models import load_prediction_model, true_model
 from dynssm_ros.control.reference import Reference, load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.reporting.race_report import (
-    coefficients,
-    driven_coefficients,
-    race_json,
-    race_report,
-    race_table,
-    summary,
-    trajectories,
-)
+from dynssm_ros.reporting.race_figures import coefficients, driven_coefficients, forces, trajectories
+from dynssm_ros.reporting.race_report import race_json, race_report, race_table, summary
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.simulation.sensing import Sensing
 from dynssm_ros.track.tracks import load_track
@@ -116,6 +109,16 @@ def test_the_report_shows_every_model(lap, course, orca, tmp_path):
     assert "Not completed: other spins" in summary([lap, other])
     assert "true, twin are the fastest" in summary([lap, replace(lap, name="twin")])
     assert len(race_table([lap, other]).cells) == 2
+
+
+def test_forces_are_those_of_each_models_own_coefficients(lap):
+    """Twice the peak is twice the force; the dashed line is the driven car's."""
+    peak = np.array([2.0 if name in ("D_f", "S_vf") else 1.0 for name in COEFFICIENTS])
+    panels = forces([lap, replace(lap, name="other", theta=lap.theta * peak)]).axes
+    own, other, driven = (line.get_ydata() for line in panels[0].lines[:3])
+    np.testing.assert_allclose(own, driven)
+    np.testing.assert_allclose(other, 2 * driven)
+    np.testing.assert_allclose(*(line.get_ydata() for line in panels[1].lines[:2]))
 
 
 def test_a_large_track_has_an_enlarged_part_where_the_paths_part_most(lap, course):
