@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ from scipy.stats import binomtest
 from benchmarks.hidden_causes.cases import Case, Hidden
 from dynssm_ros.identification.diagnosis import Cause
 from dynssm_ros.vehicle.effects import EFFECTS
+from dynssm_ros.vehicle.effects.base import LOCATION
 
 _NINETY = 1.645  # standard deviations of a 90 % interval
 
@@ -126,6 +127,22 @@ def _share(right: Sequence[bool]) -> dict[str, Any]:
         return {"of": 0, "count": 0, "share": None, "interval_95": None}
     interval = binomtest(count, of).proportion_ci(method="wilson")
     return {"of": of, "count": count, "share": count / of, "interval_95": [float(interval.low), float(interval.high)]}
+
+
+def share_of_range(effect: str, values: Mapping[str, float]) -> float:
+    """Where a size lies between just noticeable (0) and large (1), in its logarithm."""
+    about = {name: p for name, p in EFFECTS[effect].PARAMETERS.items() if not p.shape and name in values}
+    place = LOCATION if any(p.local for p in about.values()) else ()
+    off = [values[name] - p.neutral for name, p in about.items() if name not in place]
+    least, most = EFFECTS[effect].TYPICAL
+    return float(np.log(np.linalg.norm(off) / least) / np.log(most / least))
+
+
+def by_size(outcomes: Sequence[Outcome], parts: int = 3) -> list[dict[str, Any]]:
+    """Shares of cases of one effect that are named first, by size: from the range's least part to its greatest."""
+    one = [o for o in outcomes if len(o.values) == 1]
+    part = [min(int(parts * max(share_of_range(*next(iter(o.values.items()))), 0.0)), parts - 1) for o in one]
+    return [_share([o.strictly_first for o, p in zip(one, part, strict=True) if p == k]) for k in range(parts)]
 
 
 def matrix(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], npt.NDArray[np.intp]]:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from benchmarks.hidden_causes.cases import NOISE, TRACKS, Case, cases, off, size
-from benchmarks.hidden_causes.outcomes import Outcome, judge, matrix, rates
+from benchmarks.hidden_causes.outcomes import Outcome, by_size, judge, matrix, rates, share_of_range
 from benchmarks.hidden_causes.page import page
 from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
 from dynssm_ros.files import write_json
@@ -44,6 +44,22 @@ def test_every_effect_has_sizes_that_the_library_admits(name: str) -> None:
         values = size(name, np.random.default_rng(seed))
         car = load_vehicle("av21").with_effect(name, values)
         assert not car.active_effects[-1].is_neutral
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_a_size_is_known_again_by_its_place_in_the_range(name: str) -> None:
+    least, most = EFFECTS[name].TYPICAL
+    for share in (0.0, 0.4, 1.0):
+        values = EFFECTS[name].drawn(least * (most / least) ** share, np.random.default_rng(1))
+        assert share_of_range(name, values) == pytest.approx(share, abs=1e-6)
+
+
+def test_cases_are_counted_by_size() -> None:
+    least, most = EFFECTS["front_grip"].TYPICAL
+    hidden = [{"front_grip": {"factor": 1 - least * (most / least) ** share}} for share in (0.1, 0.2, 0.9)]
+    named = ("front_grip", "drag", "front_grip")
+    outcomes = [judge(Case(each, 0), [cause(name, {})]) for each, name in zip(hidden, named, strict=True)]
+    assert [(rate["of"], rate["count"]) for rate in by_size(outcomes)] == [(2, 1), (0, 0), (1, 1)]
 
 
 def test_the_cases_hold_every_effect_none_two_and_four_wheels() -> None:
