@@ -25,6 +25,8 @@ EXTRAS = {
     "race": ["casadi>=3.8", "scipy>=1.12"],
     # figures and pages
     "report": ["matplotlib>=3.9", "jinja2>=3.1", "scipy>=1.12"],
+    # seasons of logs on several processes
+    "scale": ["joblib>=1.4"],
     # ROS 2 Jazzy as wheels, for machines without it; a sourced ROS installation provides the same modules
     "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
 }

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     )
     from dynssm_ros.learning.models.registry import register_model
     from dynssm_ros.signals.recording import Recording
+    from dynssm_ros.signals.season import Season
     from dynssm_ros.simulation.plant import register_plant
     from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
     from dynssm_ros.vehicle.effects import register_effect
@@ -41,6 +42,7 @@ _HOMES = {
         "api",
     ),
     "Recording": "signals.recording",
+    "Season": "signals.season",
     **dict.fromkeys(("Vehicle", "load_vehicle", "save_vehicle"), "vehicle"),
     "register_effect": "vehicle.effects",
     "register_model": "learning.models.registry",
@@ -48,6 +50,7 @@ _HOMES = {
 }  # fmt: skip
 __all__ = [
     "Recording",
+    "Season",
     "Vehicle",
     "calibrate",
     "diagnose",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +19,7 @@ from dynssm_ros.extras import require
 from dynssm_ros.progress import Progress
 from dynssm_ros.runtime.plausibility import implausible_rows
 from dynssm_ros.signals.recording import Recording, concatenate
+from dynssm_ros.signals.season import Season, is_season
 from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
@@ -558,9 +559,9 @@ def _vehicle(vehicle: Vehicle | PathLike) -> Vehicle:
 
 
 def _opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
-    """Recordings; a :class:`DataWarning` names what of them the car cannot have done."""
+    """Recordings, all of a season's folder; a :class:`DataWarning` names what of them the car cannot have done."""
     opened = []
-    for log in _several(logs):
+    for log in _files(logs):
         recording = log if isinstance(log, Recording) else Recording.load(log)
         where = ", ".join(recording.info.source) if isinstance(log, Recording) else log
         if car is not None and math.isclose(car.sampling_time, recording.T_s):  # else the command ends with that
@@ -573,6 +574,16 @@ def _opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
 def _joined(recordings: Sequence[Recording], commands: Commands | None, holdout: float) -> Recording:
     """Recordings one after the other, each without its last fraction ``holdout``."""
     return concatenate([each.with_commands(commands).split_last(holdout)[0] for each in recordings])
+
+
+def _files(logs: Log | Sequence[Log]) -> Iterator[Log]:
+    """Recordings or their files, those of seasons one by one."""
+    for log in _several(logs):
+        if not isinstance(log, Recording) and is_season(log):
+            season = Season.load(log)
+            yield from (season.file(session) for session in season.chosen())
+        else:
+            yield log
 
 
 def _several(logs: Log | Sequence[Log]) -> list[Log]:

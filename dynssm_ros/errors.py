@@ -30,3 +30,7 @@ class DataWarning(UserWarning):
 
 class ArtifactError(UserError):
     """A model folder is incomplete, of a newer version, damaged, or does not fit."""
+
+
+class ProcessDiedError(UserError):
+    """Processes that work beside this one were killed, again and again."""

@@ -12,6 +12,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "train": ("torch", "onnx", "onnxscript", "scipy"),
     "race": ("casadi", "scipy"),
     "report": ("matplotlib", "jinja2", "scipy"),
+    "scale": ("joblib",),
     "ros": ("rclpy",),
 }
 """Libraries by extra. The core (`pip install dynssm_ros`) has what extracts, replays and predicts."""

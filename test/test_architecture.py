@@ -25,7 +25,15 @@ FLOORS = (  # lowest first; a room imports itself and the floors below, never an
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
-GROUND = {"arrays", "configuration", "errors", "extras", "files", "progress"}  # for all rooms, so they import none
+GROUND = {
+    "arrays",
+    "configuration",
+    "errors",
+    "extras",
+    "files",
+    "parallel",
+    "progress",
+}  # for all rooms, so they import none
 TOP = {"__init__", "api"}  # the Python API: over all rooms but those that call it
 
 ROS = {
@@ -34,7 +42,7 @@ ROS = {
 }  # fmt: skip
 OWNERS = {
     "torch": {"learning"}, "lightning": {"learning"}, "casadi": {"control"}, "matplotlib": {"reporting"},
-    "jinja2": {"reporting"}, "typer": {"cli"}, "rich": {"cli", "reporting"},
+    "jinja2": {"reporting"}, "joblib": {"parallel"}, "typer": {"cli"}, "rich": {"cli", "reporting"},
 }  # fmt: skip
 OWNERS |= {module: {"nodes"} for module in ROS}
 

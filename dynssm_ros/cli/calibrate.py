@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import CommandsOption, JsonOption, VehicleOption, console, progress_bar
+from dynssm_ros.cli.console import CommandsOption, JsonOption, VehicleOption, WhereOption, chosen, console, progress_bar
 from dynssm_ros.files import write_json
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, save_vehicle
 from dynssm_ros.vehicle.single_track import Integrator
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    recordings: Annotated[list[Path], typer.Argument(help="Recordings of one car.", metavar="R.parquet...")],
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings of one car, or a season.", metavar="R.parquet...")
+    ],
     vehicle: VehicleOption,
     out: Annotated[Path, typer.Option(help="Vehicle file to write.", dir_okay=False)],
     horizon: Annotated[
@@ -45,13 +47,23 @@ def calibrate(
     seed: Annotated[int, typer.Option(help="Of the random starting points.", min=0)] = 0,
     commands: CommandsOption = None,
     json: JsonOption = None,
+    where: WhereOption = None,
 ) -> None:
     """Fit the nominal parameters of a vehicle to measured laps, within their bounds."""
     with progress_bar("calibrating") as progress:
         result = api.calibrate(
-            list(recordings), vehicle, horizon, min_speed, holdout, integrator, starts, seed, commands, progress
+            chosen(recordings, where),
+            vehicle,
+            horizon,
+            min_speed,
+            holdout,
+            integrator,
+            starts,
+            seed,
+            commands,
+            progress,
         )
-    source = ", ".join(str(path) for path in recordings)
+    source = ", ".join(str(path) for path in recordings) + (f" where {where}" if where else "")
     save_vehicle(
         result.vehicle,
         out,

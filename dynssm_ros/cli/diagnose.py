@@ -14,6 +14,8 @@ from dynssm_ros.cli.console import (
     JsonOption,
     MinSpeedOption,
     VehicleOption,
+    WhereOption,
+    chosen,
     console,
     progress_bar,
     write_results,
@@ -30,7 +32,8 @@ def diagnose(
     recordings: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Recordings of one car. What only one of several has is named with it.", metavar="R.parquet..."
+            help="Recordings of one car, or a season. What only one of several has is named with it.",
+            metavar="R.parquet...",
         ),
     ] = None,
     reference: Annotated[
@@ -63,6 +66,7 @@ def diagnose(
     ] = None,
     commands: CommandsOption = None,
     json: JsonOption = None,
+    where: WhereOption = None,
 ) -> None:
     """Find out what the simulation gets wrong about measured laps, and why; write the vehicle file that has it."""
     require("diagnose", "train", "report")
@@ -70,6 +74,7 @@ def diagnose(
 
     if not (given := [*(recordings or ()), *(reference or ())]):
         raise ConfigurationError("no recording given; expected R.parquet or --reference R.parquet")
+    given = chosen(given, where)
     with progress_bar("diagnosing") as progress:
         steps = itertools.count(1)
         result = api.diagnose(

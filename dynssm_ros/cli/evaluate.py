@@ -12,6 +12,8 @@ from dynssm_ros.cli.console import (
     CommandsOption,
     JsonOption,
     MinSpeedOption,
+    WhereOption,
+    chosen,
     console,
     progress_bar,
     write_results,
@@ -33,7 +35,9 @@ TrackOption = Annotated[
 def evaluate(
     recordings: Annotated[
         list[Path],
-        typer.Argument(help="Recordings of one car to score on, in the order of driving.", metavar="R.parquet..."),
+        typer.Argument(
+            help="Recordings of one car to score on, in the order of driving, or a season.", metavar="R.parquet..."
+        ),
     ],
     model: Annotated[
         list[str],
@@ -56,6 +60,7 @@ def evaluate(
     stride: Annotated[int, typer.Option(help="Start a rollout at every n-th row.", min=1)] = 1,
     track: TrackOption = None,
     json: JsonOption = None,
+    where: WhereOption = None,
 ) -> None:
     """Score models on a recording: one-step errors, rollouts, displacement, latency; with an HTML report.
 
@@ -66,7 +71,7 @@ def evaluate(
     from dynssm_ros.reporting.evaluation_report import markdown, open_loop_report, summary_table, verdict
 
     models = api.open_models(list(model), vehicle)
-    logs = [Recording.load(recording) for recording in recordings]
+    logs = [Recording.load(recording) for recording in chosen(recordings, where)]
     wanted, recorded = shared_commands(models), {log.info.commands for log in logs}
     if commands is None and wanted is not None and recorded != {wanted}:
         others = "', '".join(sorted(recorded - {wanted}))
@@ -74,7 +79,7 @@ def evaluate(
     with progress_bar("evaluating") as progress:
         evaluation = api.evaluate(
             logs, models, vehicle, holdout, commands, min_speed, horizon, stride, track, progress,
-            ", ".join(recording.name for recording in recordings),
+            ", ".join(recording.name for recording in recordings) + (f" where {where}" if where else ""),
         )  # fmt: skip
     open_loop_report(evaluation).save(out / "report.html")
     with replacing(out / "results.md") as aside:

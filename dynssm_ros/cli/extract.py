@@ -9,6 +9,9 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.cli.console import CommandsOption, SignalsOption, console, progress_bar
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.signals.season import Log, extract_season, logs_of
+from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
 from dynssm_ros.signals.standard import recording_to_bag
 
 
@@ -19,7 +22,9 @@ def extract(
     ],
     signals: SignalsOption,
     rate: Annotated[float, typer.Option(help="Rate of the uniform time grid (Hz).", min=1.0, max=1000.0)],
-    out: Annotated[Path, typer.Option(help="Recording to write (Parquet).", dir_okay=False)],
+    out: Annotated[
+        Path, typer.Option(help="Recording to write (R.parquet); or folder of a season, one recording for each bag.")
+    ],
     bag: Annotated[
         Path | None,
         typer.Option(
@@ -31,8 +36,20 @@ def extract(
         bool,
         typer.Option("--drop-bad", help="Leave out samples that are not finite or out of order instead of stopping."),
     ] = False,
+    car: Annotated[str | None, typer.Option(help="Of a season: which car drove.")] = None,
+    track: Annotated[str | None, typer.Option(help="Of a season: where.")] = None,
+    jobs: Annotated[int, typer.Option(help="Of a season: processes.", min=1)] = 1,
 ) -> None:
-    """Turn race logs into a recording: named SI signals on a uniform time grid."""
+    """Turn race logs into a recording: named SI signals on a uniform time grid. Or into a season of recordings."""
+    if out.suffix != ".parquet":
+        if car is None or track is None or bag is not None:
+            raise ConfigurationError(
+                f"--out {out}: a season's folder needs --car and --track and takes no --bag; expected those, or R.parquet"
+            )
+        _into_season(bags, out, jobs, logs_of(bags, car, track, _signals(signals, commands), rate, drop_bad))
+        return
+    if (car, track, jobs) != (None, None, 1):
+        raise ConfigurationError(f"--out {out}: --car, --track and --jobs are of a season; expected a folder")
     with progress_bar("reading") as progress:
         recording = api.extract(list(bags), signals, rate, commands, drop_bad, progress)
     if bag is not None:
@@ -47,3 +64,24 @@ def extract(
         markup=False,
         soft_wrap=True,
     )
+
+
+def _signals(name: str, commands: Commands | None) -> SignalMap:
+    return load_signal_map(name).with_commands(commands)
+
+
+def _into_season(bags: list[Path], out: Path, jobs: int, logs: list[Log]) -> None:
+    with progress_bar("extracting") as progress:
+        season, new = extract_season(logs, out, jobs, progress)
+    failed = [season.sessions[log.place] for log in logs if season.sessions[log.place].failure]
+    for session in failed:
+        console.print(f"{session.bag}: not extracted: {session.failure}", markup=False, soft_wrap=True)
+    read = [session for session in new if not session.failure]
+    console.print(
+        f"{out}: {len(season.sessions)} sessions; of {len(bags)} bags {len(read)} extracted, "
+        f"{len(bags) - len(new)} as they were, {len(failed)} not readable",
+        markup=False,
+        soft_wrap=True,
+    )
+    if len(failed) == len(bags):
+        raise typer.Exit(1)

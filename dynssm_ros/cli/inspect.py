@@ -10,14 +10,21 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.cli.console import JsonOption, console, progress_bar
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
 from dynssm_ros.files import replacing, write_json
-from dynssm_ros.reporting.inspection_tables import topic_table
+from dynssm_ros.reporting.inspection_tables import season_table, topic_table
 from dynssm_ros.signals.inspection import Inspection
+from dynssm_ros.signals.season import Manifest, Season, is_season
 
 
 def inspect(
-    bag: Annotated[Path, typer.Argument(help="rosbag2 folder or .mcap/.db3 file.", metavar="BAG")],
+    bag: Annotated[
+        Path,
+        typer.Argument(
+            help="rosbag2 folder or .mcap/.db3 file; or a season, whose sessions are listed.", metavar="BAG"
+        ),
+    ],
     vehicle: Annotated[
         str | None,
         typer.Option(help="Vehicle, with whose wheelbase the scale of the steering follows: shipped name or file."),
@@ -28,6 +35,14 @@ def inspect(
     json: JsonOption = None,
 ) -> None:
     """Show what is in a log: topics, rates, gaps, clocks; suggest a signal map."""
+    if is_season(bag):
+        if vehicle is not None or out is not None:
+            raise ConfigurationError(f"{bag}: a season is listed alone; expected neither --vehicle nor --out")
+        season = Season.load(bag)
+        console.print(season_table(season).rich())
+        if json is not None:
+            write_json(json, Manifest(sessions=tuple(season.sessions.values())).model_dump(mode="json"))
+        return
     with progress_bar("reading") as progress:
         found = api.inspect(bag, vehicle, progress)
     console.print(topic_table(found).brief.rich())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import CommandsOption, VehicleOption, console, errors, progress_bar
+from dynssm_ros.cli.console import CommandsOption, VehicleOption, WhereOption, chosen, console, errors, progress_bar
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import missing_libraries
 
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 
 def train(
-    recordings: Annotated[list[Path], typer.Argument(help="Recordings of one car.", metavar="R.parquet...")],
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings of one car, or a season.", metavar="R.parquet...")
+    ],
     vehicle: VehicleOption,
     out: Annotated[Path, typer.Option(help="Model folder to write.", file_okay=False)],
     model: Annotated[
@@ -31,12 +33,13 @@ def train(
     seed: Annotated[int | None, typer.Option(help="Instead of the model file's.", min=0)] = None,
     epochs: Annotated[int | None, typer.Option(help="Instead of the model file's, in each stage.", min=1)] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    where: WhereOption = None,
 ) -> None:
     """Train a model on recordings and write its folder: card, weights, ONNX, metrics, loss picture."""
     with progress_bar("training") as progress:
         try:
             trained, artifact = api.train(
-                list(recordings), model, vehicle, out, holdout, commands, seed, epochs, device, progress,
+                chosen(recordings, where), model, vehicle, out, holdout, commands, seed, epochs, device, progress,
                 None if missing_libraries("report") else _draw_losses,
             )  # fmt: skip
         except KeyboardInterrupt:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dynssm_ros.reporting.tables import Column, Table, Value
 from dynssm_ros.signals.inspection import Inspection
+from dynssm_ros.signals.season import Season
 
 
 def topic_table(found: Inspection) -> Table:
@@ -38,3 +39,18 @@ def signal_table(found: Inspection) -> Table:
         known = one.values[one.values == one.values]
         rows.append([name, one.topic.name, one.field, one.scale, float(known.min()), float(known.max())])
     return Table(columns, rows)
+
+
+def season_table(season: Season) -> Table:
+    """All sessions, in the order of driving, those that could not be read last."""
+    columns = (
+        Column("car"), Column("track"), Column("session"), Column("start"), Column("rows"), Column("duration", "s"),
+        Column("segments"), Column("notes"),
+    )  # fmt: skip
+    sessions = sorted(season.sessions.values(), key=lambda each: (bool(each.failure), each.start, each.place))
+    rows: list[list[Value]] = [
+        [each.car, each.track, each.session, each.start, each.rows, each.seconds, each.segments,
+         f"not read: {each.failure}" if each.failure else "; ".join(each.notes)]
+        for each in sessions
+    ]  # fmt: skip
+    return Table(columns, rows, f"{len(sessions)} sessions, {sum(each.seconds for each in sessions) / 3600:.3g} h.")

@@ -98,7 +98,7 @@ class Health:
         return float(np.percentile(self._latencies, percent)) if self._latencies else 0.0
 
     def verdict(self, now: float) -> tuple[Level, str]:
-        """How it is now, in words: silent or missing inputs first, then why predictions are refused."""
+        """How it is now, in words: silent or missing inputs first, then why predictions are or were refused."""
         silent = {topic: self.age(topic, now) for topic in self.topics}
         words = [
             f"{topic}: " + ("nothing received" if isinf(age) else f"silent for {age:.1f} s")
@@ -107,22 +107,27 @@ class Health:
         ]
         words += self._clocks()
         if words:
-            return Level.ERROR, "; ".join(words)
+            return Level.ERROR, "; ".join([*words, *self._mostly_refused()])
         if self.wiring:
             return Level.ERROR, self.wiring
-        refused = [outcome for outcome in self._outcomes if outcome is not None]
-        recent = list(self._outcomes)[-_NOW:]
-        if recent and None not in recent:
-            newest = refused[-1]
+        recent = [outcome for outcome in list(self._outcomes)[-_NOW:] if outcome is not None]
+        if recent and len(recent) == min(_NOW, len(self._outcomes)):
+            newest = recent[-1]
             return (Level.WARN if newest is Refusal.FILLING else Level.ERROR), newest.value
         several = [f"{topic}: {count} publishers" for topic, count in self.publishers.items() if count > 1]
         if several:
             return Level.WARN, "; ".join(several)
+        refused = self._mostly_refused()
+        return (Level.WARN, refused[0]) if refused else (Level.OK, "predicting")
+
+    def _mostly_refused(self) -> list[str]:
+        """The share of messages that was refused lately, with the reason of most; nothing if it is small."""
+        refused = [outcome for outcome in self._outcomes if outcome is not None]
         share = len(refused) / max(len(self._outcomes), 1)
         most = Counter(refused).most_common(1)
-        if share > _MANY and most[0][0] is not Refusal.FILLING:
-            return Level.WARN, f"{share:.0%} of the last messages refused, mostly: {most[0][0].value}"
-        return Level.OK, "predicting"
+        if share <= _MANY or most[0][0] is Refusal.FILLING:
+            return []
+        return [f"{share:.0%} of the last messages refused, mostly: {most[0][0].value}"]
 
     def _clocks(self) -> list[str]:
         """Topics whose stamps are on another clock than those of most others."""

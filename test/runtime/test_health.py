@@ -48,6 +48,14 @@ def test_silence_is_an_error_and_has_no_rate(health: Health) -> None:
     assert health.rate(ODOMETRY, 1.99) == 0.0
 
 
+def test_what_was_refused_before_the_silence_is_told_with_it(health: Health) -> None:
+    for _ in range(20):
+        health.refused(Refusal.OUTLIER)
+    words = health.verdict(1.99)[1]
+    assert words.startswith("/feedback: silent for 1.0 s; /odometry: silent for 1.0 s; ")
+    assert words.endswith(f"% of the last messages refused, mostly: {Refusal.OUTLIER.value}")
+
+
 @pytest.mark.parametrize(("refusal", "level"), [(Refusal.FILLING, Level.WARN), (Refusal.STALE, Level.ERROR)])
 def test_refusals_are_told_until_a_prediction_goes_out_again(health: Health, refusal: Refusal, level: Level) -> None:
     for _ in range(5):

@@ -1,0 +1,221 @@
+"""Seasons: logs to a data set, again after a change, and what ``--where`` chooses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.dataset as ds
+import pytest
+
+from dynssm_ros.cli.main import app, main
+from dynssm_ros.errors import ConfigurationError, RecordingError, UserError
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.season import MANIFEST, Log, Season, extract_season, is_season, logs_of
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.simulation.laps import simulate, write_run
+from dynssm_ros.track.tracks import load_track
+from dynssm_ros.vehicle import load_vehicle
+
+MAP = load_signal_map("default")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four short bags of one car on one track, of which the last is cut."""
+    folder = tmp_path_factory.mktemp("bags")
+    for k in range(3):
+        run = simulate(load_vehicle("orca"), load_track("club"), duration=3.0 + k, seed=k)
+        write_run(run, folder / f"run_{k}")
+    shutil.copytree(folder / "run_0", folder / "broken")
+    for file in (folder / "broken").glob("*.mcap"):
+        file.write_bytes(file.read_bytes()[:100])
+    return folder
+
+
+@pytest.fixture
+def bags(made: Path, tmp_path: Path) -> list[Path]:
+    """The same, to be changed."""
+    shutil.copytree(made, tmp_path / "bags")
+    return [tmp_path / "bags" / name for name in ("run_0", "run_1", "broken", "run_2")]
+
+
+def logs(bags: list[Path], track: str = "club") -> list[Log]:
+    return logs_of(bags, "orca", track, MAP, 50.0, False)
+
+
+def stamps(season: Season) -> dict[str, int]:
+    """When each recording was written."""
+    return {each.session: season.file(each).stat().st_mtime_ns for each in season.chosen()}
+
+
+def test_each_bag_is_a_recording_and_a_broken_one_is_listed_with_its_reason(bags: list[Path], tmp_path: Path) -> None:
+    season, new = extract_season(logs(bags), tmp_path / "season")
+    assert {session.session for session in new} == {"run_0", "run_1", "run_2", "broken"}
+    assert [session.session for session in season.chosen()] == ["run_0", "run_1", "run_2"]
+    assert "broken" in season.sessions["orca", "club", "broken"].failure
+    for bag in (bags[0], bags[3]):
+        session = season.sessions["orca", "club", bag.name]
+        alone = extract([bag], MAP, 50.0)
+        there = Recording.load(season.file(session))
+        np.testing.assert_array_equal(there.matrix, alone.matrix)
+        assert (session.rows, session.segments, session.notes) == (len(alone), 1, alone.info.notes)
+        assert session.seconds == pytest.approx(alone.duration)
+    assert Season.load(tmp_path / "season").sessions == season.sessions
+
+
+def test_an_unchanged_season_is_not_read_again_and_a_changed_bag_alone_is(bags: list[Path], tmp_path: Path) -> None:
+    season, _ = extract_season(logs(bags), tmp_path / "season")
+    before = stamps(season)
+    again, new = extract_season(logs(bags), tmp_path / "season")
+    assert (new, stamps(again)) == ([], before)
+    for file in bags[0].iterdir():  # written anew with the same content
+        file.write_bytes(file.read_bytes())
+    assert extract_season(logs(bags), tmp_path / "season")[1] == []
+    shutil.rmtree(bags[1])
+    shutil.copytree(bags[3], bags[1])
+    changed, new = extract_season(logs(bags), tmp_path / "season")
+    assert [session.session for session in new] == ["run_1"]
+    assert changed.sessions["orca", "club", "run_1"].rows == changed.sessions["orca", "club", "run_2"].rows
+    assert {name for name, stamp in stamps(changed).items() if stamp != before[name]} == {"run_1"}
+
+
+def test_other_settings_and_a_lost_recording_are_reasons_to_extract_again(bags: list[Path], tmp_path: Path) -> None:
+    season, _ = extract_season(logs(bags[:2]), tmp_path / "season")
+    season.file(season.sessions["orca", "club", "run_0"]).unlink()
+    _, new = extract_season(logs(bags[:2]), tmp_path / "season")
+    assert [session.session for session in new] == ["run_0"]
+    finer = [replace(log, rate=100.0) for log in logs(bags[:2])]
+    _, new = extract_season(finer, tmp_path / "season")
+    assert {session.rate for session in new} == {100.0}
+
+
+def test_a_bag_that_breaks_takes_its_recording_along(bags: list[Path], tmp_path: Path) -> None:
+    """What is there must be of the log that the manifest names."""
+    season, _ = extract_season(logs(bags[:2]), tmp_path / "season")
+    (file,) = bags[0].glob("*.mcap")
+    file.write_bytes(file.read_bytes()[:100])
+    season, _ = extract_season(logs(bags[:2]), tmp_path / "season")
+    assert [session.session for session in season.chosen()] == ["run_1"]
+    assert not season.file(season.sessions["orca", "club", "run_0"]).exists()
+
+
+def test_what_is_done_stays_done_after_an_interrupt(bags: list[Path], tmp_path: Path) -> None:
+    def interrupt(done: int, total: int, words: str = "") -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        extract_season(logs(bags), tmp_path / "season", progress=interrupt)
+    assert len(Season.load(tmp_path / "season").sessions) == 2
+    season, new = extract_season(logs(bags), tmp_path / "season")
+    assert (len(new), len(season.sessions)) == (2, 4)
+
+
+def test_several_processes_give_the_same(bags: list[Path], tmp_path: Path) -> None:
+    one, _ = extract_season(logs(bags), tmp_path / "one")
+    two, _ = extract_season(logs(bags), tmp_path / "two", jobs=2)
+    assert one.sessions == two.sessions
+    for session in one.chosen():
+        assert one.file(session).read_bytes() == two.file(session).read_bytes()
+
+
+def test_others_read_it_as_a_partitioned_data_set(bags: list[Path], tmp_path: Path) -> None:
+    season, _ = extract_season(logs(bags), tmp_path / "season")
+    extract_season(logs(bags[:1], "oval"), tmp_path / "season")
+    table = ds.dataset(tmp_path / "season", format="parquet", partitioning="hive")
+    rows = table.count_rows(filter=(ds.field("track") == "club") & (ds.field("session") != "run_0"))
+    assert rows == sum(season.sessions["orca", "club", name].rows for name in ("run_1", "run_2"))
+
+
+@pytest.mark.parametrize(
+    ("where", "expected"),
+    [
+        ("session == 'run_1'", ["run_1"]),
+        ("track == 'club' and seconds > 3.5", ["run_1", "run_2"]),
+        ("session in ['run_0', 'run_2'] and not rows < 0", ["run_0", "run_2"]),
+        ("(session == 'run_0' or session == 'run_2') and 3.5 < seconds <= 10", ["run_2"]),
+        ("start >= '1970-01-01'", ["run_0", "run_1", "run_2"]),
+    ],
+)
+def test_sessions_are_chosen_by_a_condition(bags: list[Path], tmp_path: Path, where: str, expected: list[str]) -> None:
+    season, _ = extract_season(logs(bags), tmp_path / "season")
+    assert sorted(session.session for session in season.chosen(where)) == expected
+
+
+@pytest.mark.parametrize(
+    ("where", "reason"),
+    [
+        ("track = 'club'", "not understood"),
+        ("driver == 'me'", "'driver' is no field; expected one of car, track, session, rate"),
+        ("__import__('os').system('true')", "Call is not part of a condition"),
+        ("track", "no comparison"),
+        ("track > 3", "expected texts with texts, numbers with numbers"),
+    ],
+)
+def test_what_is_no_condition_is_refused(bags: list[Path], tmp_path: Path, where: str, reason: str) -> None:
+    season, _ = extract_season(logs(bags[:1]), tmp_path / "season")
+    with pytest.raises(ConfigurationError, match=reason.replace("(", r"\(")):
+        season.chosen(where)
+    with pytest.raises(RecordingError, match="none of 1 sessions"):
+        season.chosen("track == 'monza'")
+
+
+def test_what_is_no_season_is_not_replaced_and_names_are_unique(bags: list[Path], tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("years of work")
+    with pytest.raises(UserError, match="exists and is not a season"):
+        extract_season(logs(bags), other)
+    assert not is_season(other)
+    (tmp_path / "day").mkdir()
+    shutil.copytree(bags[0], tmp_path / "day" / "run_0")
+    same = logs_of([bags[0], tmp_path / "day" / "run_0"], "orca", "club", MAP, 50.0, False)
+    assert [log.session for log in same] == ["bags-run_0", "day-run_0"]
+    with pytest.raises(ConfigurationError, match="--track 'a/b': expected letters"):
+        logs_of(bags, "orca", "a/b", MAP, 50.0, False)
+
+
+def test_a_damaged_manifest_is_named(bags: list[Path], tmp_path: Path) -> None:
+    extract_season(logs(bags[:1]), tmp_path / "season")
+    (tmp_path / "season" / MANIFEST).write_text("{")
+    with pytest.raises(RecordingError, match=MANIFEST):
+        Season.load(tmp_path / "season")
+
+
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: object) -> tuple[int, str]:
+    """Exit status and all that a command says."""
+    monkeypatch.setattr("sys.argv", ["dynssm", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr()
+    return int(ended.value.code or 0), " ".join((said.out + said.err).split())
+
+
+def test_the_commands_take_a_season(
+    bags: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert app is not None
+    season = tmp_path / "season"
+    extracting = ("extract", *bags, "--signals", "default", "--rate", 50, "--out", season)
+    status, said = run(capsys, monkeypatch, *extracting)
+    assert (status, "--car and --track" in said) == (1, True)
+    status, said = run(capsys, monkeypatch, *extracting, "--car", "orca", "--track", "club")
+    assert status == 0
+    assert "broken: not extracted:" in said
+    assert "4 sessions; of 4 bags 3 extracted, 0 as they were, 1 not readable" in said
+    status, said = run(capsys, monkeypatch, "inspect", season, "--json", tmp_path / "listed.json")
+    assert status == 0
+    assert len(json.loads((tmp_path / "listed.json").read_text())["sessions"]) == 4
+    evaluating = ("evaluate", "--model", "single_track", "--vehicle", "orca", "--out", tmp_path / "report")
+    status, said = run(capsys, monkeypatch, *evaluating, season, "--where", "session != 'run_0'")
+    assert status == 0, said
+    text = (tmp_path / "report" / "results.md").read_text()
+    assert "run_1, run_2" in text
+    assert "run_0" not in text.replace("session != 'run_0'", "")
+    status, said = run(capsys, monkeypatch, *evaluating, bags[0], "--where", "session == 'run_0'")
+    assert (status, "chooses sessions of a season's folder" in said) == (1, True)
