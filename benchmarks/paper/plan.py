@@ -50,6 +50,7 @@ class Log(StrictModel):
     bag: str = Field(description="rosbag2 folder or file, relative to the data folder")
     signals: str = Field(description="signal map, by name")
     rate: float = Field(gt=0, description="of the recording (Hz)")
+    commands: Commands | None = Field(default=None, description="source of the command inputs; null: the signal map's")
 
 
 class Drive(StrictModel):

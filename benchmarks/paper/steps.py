@@ -92,11 +92,16 @@ class Extract(Step):
     def recipe(self) -> dict[str, Any]:
         """Signal map, rate and what the log holds."""
         signals = load_signal_map(self.log.signals).model_dump(mode="json")
-        return {"log": self.log.model_dump(mode="json"), "signals": signals, "content": digest(self._bag())}
+        return {
+            "log": self.log.model_dump(mode="json", exclude_none=True),
+            "signals": signals,
+            "content": digest(self._bag()),
+        }
 
     def make(self, root: Path, there: frozenset[str]) -> None:
         """Extracts it."""
-        extract([self._bag()], load_signal_map(self.log.signals), self.log.rate).save(root / self.key)
+        signals = load_signal_map(self.log.signals).with_commands(self.log.commands)
+        extract([self._bag()], signals, self.log.rate).save(root / self.key)
 
     def _bag(self) -> Path:
         return in_data(self.data, self.log.bag)
