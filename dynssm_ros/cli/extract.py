@@ -73,7 +73,7 @@ def _signals(name: str, commands: Commands | None) -> SignalMap:
 def _into_season(bags: list[Path], out: Path, jobs: int, logs: list[Log]) -> None:
     with progress_bar("extracting") as progress:
         season, new = extract_season(logs, out, jobs, progress)
-    failed = [season.sessions[log.place] for log in logs if season.sessions[log.place].failure]
+    failed = [session for session in season.of_bags(bags) if session.failure]
     for session in failed:
         console.print(f"{session.bag}: not extracted: {session.failure}", markup=False, soft_wrap=True)
     read = [session for session in new if not session.failure]

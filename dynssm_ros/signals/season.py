@@ -15,7 +15,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -124,6 +124,11 @@ class Season:
         sessions = tuple(self.sessions[place] for place in sorted(self.sessions))
         write_json(self.path / MANIFEST, Manifest(sessions=sessions).model_dump(mode="json"))
 
+    def of_bags(self, bags: Sequence[Path]) -> list[Session]:
+        """The sessions of some logs."""
+        places = {_address(bag) for bag in bags}
+        return [each for each in self.sessions.values() if each.bag in places]
+
     def file(self, of: Session | Log) -> Path:
         """The recording of a session."""
         return self.path / f"car={of.car}" / f"track={of.track}" / f"session={of.session}" / FILE
@@ -196,15 +201,12 @@ def extract_season(
         The season, and those of its sessions that were extracted now.
 
     Raises:
-        UserError: ``out`` is something else; another log has the place of one of these.
+        UserError: ``out`` is something else; the names of a log are those of others.
     """
     out = Path(out)
     require_replaceable(out, is_season(out) or (out.is_dir() and not any(out.iterdir())), "a season")
     season = Season.load(out) if is_season(out) else Season(out)
-    for log in logs:
-        before = season.sessions.get(log.place)
-        if before is not None and Path(before.bag).name != log.bag.name:
-            raise UserError(f"{out}: session '{log.session}' is of {before.bag}; expected another name for {log.bag}")
+    logs = [_placed(season, log) for log in logs]
     out.mkdir(parents=True, exist_ok=True)
     wanted = [log for log in logs if not _is_as_it_was(season, log)]
     done: list[Session] = []
@@ -219,16 +221,36 @@ def extract_season(
     return season, done
 
 
+def _placed(season: Season, log: Log) -> Log:
+    """The log with the name of its session: that which it has, else its own, else with its folder's in front.
+
+    Raises:
+        UserError: these are the names of other logs.
+    """
+    here = [each for each in season.sessions.values() if each.place[:2] == log.place[:2]]
+    known = next((each.session for each in here if each.bag == _address(log.bag)), None)
+    if known is not None:
+        return replace(log, session=known)
+    taken = {each.session: each.checksum for each in here}
+    for name in (log.session, f"{log.bag.resolve().parent.name}-{log.session}"):
+        if name not in taken or taken[name] == checksum(log.bag):  # the same log, elsewhere
+            return replace(log, session=name)
+    raise UserError(f"{log.bag}: {season.path} has a session '{log.session}' of another log; expected another name")
+
+
+def _address(bag: Path) -> str:
+    return str(bag.resolve())
+
+
 def _is_as_it_was(season: Season, log: Log) -> bool:
     """Whether a log need not be read: same settings, and files of the same size and time, or else of the same content."""
     before = season.sessions.get(log.place)
     if before is None or before.settings != log.settings or not (before.failure or season.file(before).is_file()):
         return False
     files = _files(log.bag)
-    if files != before.files:
-        if checksum(log.bag) != before.checksum:
-            return False
-        season.sessions[log.place] = before.model_copy(update={"files": files})
+    if files != before.files and checksum(log.bag) != before.checksum:
+        return False
+    season.sessions[log.place] = before.model_copy(update={"files": files, "bag": _address(log.bag)})
     return True
 
 
@@ -236,7 +258,7 @@ def _extracted(task: tuple[Log, Path]) -> Session:
     """Reads a log and writes its recording; a failure is part of the outcome."""
     log, target = task
     about = Session(
-        car=log.car, track=log.track, session=log.session, bag=str(log.bag), files=_files(log.bag),
+        car=log.car, track=log.track, session=log.session, bag=_address(log.bag), files=_files(log.bag),
         checksum=checksum(log.bag), settings=log.settings, signal_map=log.signal_map.name, rate=log.rate,
     )  # fmt: skip
     try:

@@ -180,6 +180,27 @@ def test_what_is_no_season_is_not_replaced_and_names_are_unique(bags: list[Path]
         logs_of(bags, "orca", "a/b", MAP, 50.0, False)
 
 
+def test_another_log_of_the_same_name_takes_nothing_away(bags: list[Path], tmp_path: Path) -> None:
+    """It is named after its folder too, also when it comes again; a log that moved is the same one."""
+    season, _ = extract_season(logs(bags[:1]), tmp_path / "season")
+    before = stamps(season)
+    other = tmp_path / "day_2" / "run_0"
+    shutil.copytree(bags[3], other)
+    for expected in (["day_2-run_0"], []):
+        season, new = extract_season(logs([other]), tmp_path / "season")
+        assert [session.session for session in new] == expected
+    assert stamps(season)["run_0"] == before["run_0"]
+    moved = tmp_path / "archive" / "run_0"
+    moved.parent.mkdir()
+    shutil.move(bags[0], moved)
+    season, new = extract_season(logs([moved]), tmp_path / "season")
+    assert (new, set(stamps(season))) == ([], {"run_0", "day_2-run_0"})
+    third = tmp_path / "other" / "day_2" / "run_0"
+    shutil.copytree(bags[1], third)
+    with pytest.raises(UserError, match="has a session 'run_0' of another log"):
+        extract_season(logs([third]), tmp_path / "season")
+
+
 def test_a_damaged_manifest_is_named(bags: list[Path], tmp_path: Path) -> None:
     extract_season(logs(bags[:1]), tmp_path / "season")
     (tmp_path / "season" / MANIFEST).write_text("{")
@@ -208,9 +229,15 @@ def test_the_commands_take_a_season(
     assert status == 0
     assert "broken: not extracted:" in said
     assert "4 sessions; of 4 bags 3 extracted, 0 as they were, 1 not readable" in said
+    (tmp_path / "day_2").mkdir()
+    shutil.copytree(bags[2], tmp_path / "day_2" / "run_0")
+    again = ("extract", tmp_path / "day_2" / "run_0", bags[0], *extracting[1 + len(bags) :])
+    status, said = run(capsys, monkeypatch, *again, "--car", "orca", "--track", "club")
+    assert status == 0, said
+    assert "of 2 bags 0 extracted, 1 as they were, 1 not readable" in said
     status, said = run(capsys, monkeypatch, "inspect", season, "--json", tmp_path / "listed.json")
     assert status == 0
-    assert len(json.loads((tmp_path / "listed.json").read_text())["sessions"]) == 4
+    assert len(json.loads((tmp_path / "listed.json").read_text())["sessions"]) == 5
     evaluating = ("evaluate", "--model", "single_track", "--vehicle", "orca", "--out", tmp_path / "report")
     status, said = run(capsys, monkeypatch, *evaluating, season, "--where", "session != 'run_0'")
     assert status == 0, said
