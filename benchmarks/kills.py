@@ -10,7 +10,6 @@ its output. Ends with status 1 otherwise.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import shutil
 import subprocess
@@ -25,6 +24,7 @@ import numpy as np
 
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.errors import UserError
+from dynssm_ros.files import checksum, files_in
 
 _WEIGHTS = "*.safetensors"
 
@@ -144,30 +144,25 @@ def _dynssm(arguments: Sequence[str]) -> list[str]:
     return [sys.executable, "-m", "dynssm_ros.cli.main", *arguments]
 
 
-def _files(path: Path) -> list[Path]:
-    """The files of an output, be it a file or a folder; none if it is not there."""
-    return [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-
-
 def _content(path: Path) -> dict[str, str]:
     """Checksums of the files of an output by their names; empty if it is not there."""
-    return {str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest() for file in _files(path)}
+    return {str(file.relative_to(path)): checksum(file) for file in files_in(path)}
 
 
 def _readable(path: Path) -> bool:
     """Whether none of its files is empty, and what is called JSON is that."""
     try:
-        for file in _files(path):
+        for file in files_in(path):
             if file.suffix == ".json":
                 json.loads(file.read_text(encoding="utf-8"))
     except ValueError:
         return False
-    return all(file.stat().st_size for file in _files(path))
+    return all(file.stat().st_size for file in files_in(path))
 
 
 def _compare_weights(whole: dict[str, str], now: dict[str, str], outcome: Outcome) -> None:
-    for name, checksum in whole.items():
-        if Path(name).match(_WEIGHTS) and now.get(name) != checksum:
+    for name, before in whole.items():
+        if Path(name).match(_WEIGHTS) and now.get(name) != before:
             outcome.faults.append(f"{name}: other weights than those of a training that was not killed")
 
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         diagnose,
         evaluate,
         extract,
+        extract_season,
         load_model,
         race,
         recorded,
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
 _HOMES = {
     **dict.fromkeys(
         (
-            "calibrate", "diagnose", "evaluate", "extract", "inspect", "load_model", "race", "recorded", "replay", "simulate",
-            "train",
+            "calibrate", "diagnose", "evaluate", "extract", "extract_season", "inspect", "load_model", "race", "recorded",
+            "replay", "simulate", "train",
         ),
         "api",
     ),
@@ -56,6 +57,7 @@ __all__ = [
     "diagnose",
     "evaluate",
     "extract",
+    "extract_season",
     "inspect",
     "load_model",
     "load_vehicle",

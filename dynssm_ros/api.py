@@ -19,7 +19,7 @@ from dynssm_ros.extras import require
 from dynssm_ros.progress import Progress
 from dynssm_ros.runtime.plausibility import implausible_rows
 from dynssm_ros.signals.recording import Recording, concatenate
-from dynssm_ros.signals.season import Season, is_season
+from dynssm_ros.signals.season import recording_files
 from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from dynssm_ros.runtime.artifact import Artifact
     from dynssm_ros.runtime.models import WindowModel
     from dynssm_ros.signals.inspection import Inspection
+    from dynssm_ros.signals.season import Season, Session
     from dynssm_ros.simulation.laps import Run
     from dynssm_ros.simulation.plant import PlantKind
     from dynssm_ros.track.racing_line import LineKind
@@ -158,8 +159,47 @@ def extract(
     from dynssm_ros.signals.extraction import extract
 
     several = [bags] if isinstance(bags, (str, Path)) else list(bags)
-    signal_map = signals if isinstance(signals, SignalMap) else load_signal_map(signals)
-    return extract(several, signal_map.with_commands(commands), rate, drop_bad, on_progress)
+    return extract(several, _signal_map(signals, commands), rate, drop_bad, on_progress)
+
+
+def extract_season(
+    bags: Sequence[PathLike],
+    out: PathLike,
+    car: str,
+    track: str,
+    signals: SignalMap | PathLike = "default",
+    rate: float = 50.0,
+    commands: Commands | None = None,
+    drop_bad: bool = False,
+    jobs: int = 1,
+    on_progress: Progress | None = None,
+) -> tuple[Season, list[Session]]:
+    """Turns race logs into a season, one recording for each; those that are as they were are not read again.
+
+    Args:
+        bags: rosbag2 folders or ``.mcap``/``.db3`` files. One that cannot be read is listed with its reason.
+        out: folder of the season; sessions of other logs stay.
+        car: which car drove.
+        track: where.
+        signals: signal map: which topic and field is which signal.
+        rate: of the grid (Hz).
+        commands: source of the command inputs; the signal map's if not given.
+        drop_bad: leave out samples that are not finite or out of order instead of listing the log as not readable.
+        jobs: processes.
+        on_progress: called with the logs that are done.
+
+    Returns:
+        The season, and those of its sessions that were extracted now.
+
+    Example:
+        >>> season, new = extract_season(["run_1", "run_2"], "season", "av21", "putnam")  # doctest: +SKIP
+        >>> [session.session for session in season.chosen("seconds > 60")]  # doctest: +SKIP
+        ['run_1', 'run_2']
+    """
+    from dynssm_ros.signals.season_extraction import extract_season, logs_of
+
+    logs = logs_of([Path(bag) for bag in bags], car, track, _signal_map(signals, commands), rate, drop_bad)
+    return extract_season(logs, out, jobs, on_progress)
 
 
 def calibrate(
@@ -558,6 +598,11 @@ def _vehicle(vehicle: Vehicle | PathLike) -> Vehicle:
     return vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
 
 
+def _signal_map(signals: SignalMap | PathLike, commands: Commands | None) -> SignalMap:
+    signal_map = signals if isinstance(signals, SignalMap) else load_signal_map(signals)
+    return signal_map.with_commands(commands)
+
+
 def _opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
     """Recordings, all of a season's folder; a :class:`DataWarning` names what of them the car cannot have done."""
     opened = []
@@ -579,11 +624,7 @@ def _joined(recordings: Sequence[Recording], commands: Commands | None, holdout:
 def _files(logs: Log | Sequence[Log]) -> Iterator[Log]:
     """Recordings or their files, those of seasons one by one."""
     for log in _several(logs):
-        if not isinstance(log, Recording) and is_season(log):
-            season = Season.load(log)
-            yield from (season.file(session) for session in season.chosen())
-        else:
-            yield log
+        yield from [log] if isinstance(log, Recording) else recording_files([log])
 
 
 def _several(logs: Log | Sequence[Log]) -> list[Log]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import hashlib
 import json
 import os
 import shutil
@@ -25,6 +26,7 @@ LOG_SUFFIXES = (".mcap", ".db3", ".bag", ".zstd")
 """Of files that recorders write, and we do not."""
 # what writers of libraries raise where the disk is full, a quota is used up, or a file may not be as large
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_CHUNK = 1 << 20  # bytes of a file that are summed at once
 _HERE, _SWAP = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 _INPUTS: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
 _FORCED: ContextVar[bool] = ContextVar("forced", default=False)
@@ -183,3 +185,25 @@ def write_json(path: str | Path, content: dict[str, Any]) -> None:
     """Writes ``content`` as indented JSON, atomically; NaN is refused because JSON has none."""
     with replacing(path) as aside:
         aside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def checksum(file: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    total = hashlib.sha256()
+    with open(file, "rb") as content:
+        while chunk := content.read(_CHUNK):
+            total.update(chunk)
+    return total.hexdigest()
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, or of the files in a folder and their names."""
+    total = hashlib.sha256()
+    for file in files_in(path):
+        total.update(f"{file.relative_to(path)} {checksum(file)}\n".encode())
+    return total.hexdigest()
+
+
+def files_in(path: Path) -> list[Path]:
+    """A file, or all files in a folder, however deep; none if nothing is there."""
+    return [file for file in (sorted(path.rglob("*")) if path.is_dir() else [path]) if file.is_file()]

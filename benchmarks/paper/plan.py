@@ -319,6 +319,13 @@ class Plan(StrictModel):
         short = {"stride": quick.stride, "epochs": quick.epochs, "races": races, "sweeps": sweeps}
         return self.model_copy(update={**short, "drives": drives, "studies": studies})
 
+    @property
+    def vehicles(self) -> set[str]:
+        """Names of all vehicles that are calibrated, driven or raced, or that a model starts from."""
+        of_models = {model.vehicle for model in self.models.values() if model.vehicle}
+        parts = (self.cars.values(), self.drives.values(), self.races.values())
+        return of_models | {each.vehicle for part in parts for each in part}
+
 
 def load_plan(path: Path | None = None) -> Plan:
     """Reads a plan, the shipped one if not given.
@@ -328,13 +335,10 @@ def load_plan(path: Path | None = None) -> Plan:
     """
     path = Path(__file__).parent / "plan.yaml" if path is None else path
     plan = configuration.validate(Plan, configuration.read_yaml(path), path)
-    vehicles = {car.vehicle for car in plan.cars.values()} | {drive.vehicle for drive in plan.drives.values()}
-    vehicles |= {model.vehicle for model in plan.models.values() if model.vehicle}
-    vehicles |= {race.vehicle for race in plan.races.values()}
     try:
         for name in plan.models:
             plan.configured(name)
-        for vehicle in sorted(vehicles):
+        for vehicle in sorted(plan.vehicles):
             configuration.find_config("vehicles", vehicle)
         for log in plan.logs.values():
             configuration.find_config("signals", log.signals)

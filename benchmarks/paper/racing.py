@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any, ClassVar, get_args
 
 from benchmarks.paper.plan import MID_RANGE, Race
-from benchmarks.paper.steps import Step, digest, in_data, named_track
+from benchmarks.paper.steps import Step, in_data, named_track
 from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.race import Course, Start
 from dynssm_ros.control.race import race as drive
 from dynssm_ros.control.race_models import load_prediction_model
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
-from dynssm_ros.files import replacing, write_json
+from dynssm_ros.files import digest, replacing, write_json
 from dynssm_ros.reporting import race_figures
 from dynssm_ros.reporting.race_report import race_json
 from dynssm_ros.track.racing_line import LineKind

@@ -24,9 +24,6 @@ NOTE = (
 
 def fingerprint(plan: Plan) -> str:
     """SHA-256 of all settings that the results follow from: the plan, its models and its vehicles."""
-    vehicles = {car.vehicle for car in plan.cars.values()} | {drive.vehicle for drive in plan.drives.values()}
-    vehicles |= {model.vehicle for model in plan.models.values() if model.vehicle}
-    vehicles |= {race.vehicle for race in plan.races.values()}
     studies = {name: study.model_dump(mode="json", exclude={"remark"}) for name, study in plan.studies.items()}
     content = {
         "plan": plan.model_dump(mode="json", exclude={"studies", "models", "cars"}),
@@ -36,7 +33,7 @@ def fingerprint(plan: Plan) -> str:
             name: model.model_dump(mode="json", exclude={"vehicle"}) | plan.configured(name).model_dump(mode="json")
             for name, model in plan.models.items()
         },
-        "vehicles": sorted(load_vehicle(name).model_dump_json() for name in vehicles),
+        "vehicles": sorted(load_vehicle(name).model_dump_json() for name in plan.vehicles),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

@@ -6,7 +6,6 @@ they read and write files only.
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 import tempfile
 from abc import ABC, abstractmethod
@@ -23,7 +22,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.metrics import by_channel, latency_us
 from dynssm_ros.evaluation.open_loop import Evaluation, evaluate
-from dynssm_ros.files import write_json
+from dynssm_ros.files import digest, write_json
 from dynssm_ros.identification.calibration import calibrate
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.runtime.models import UNTRAINED, WindowModel, load_model
@@ -339,15 +338,6 @@ def named_track(data: Path | None, name: str) -> str | Path:
         UnavailableError: there is none.
     """
     return name if name in LAYOUTS else in_data(data, name)
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file, or of the files in a folder and their names."""
-    total = hashlib.sha256()
-    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-        if file.is_file():
-            total.update(f"{file.relative_to(path)} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
-    return total.hexdigest()
 
 
 def recording_key(name: str) -> str:

@@ -122,13 +122,13 @@ def ablation_table(comparison: Comparison, results: Results, base: str) -> Table
         cost = results.costs.get(model)
         own: list[Value] = list(comparison.rmse(model))
         own += [cost["parameters"], cost["flops"], cost["latency_us"]["p50"]] if cost else [None] * 3
-        published = _published_costs(theirs)
+        published = _published_row(theirs)
         pairs = [[mine, other] if paper else [mine] for mine, other in zip(own, published, strict=True)]
         rows.append([names[lacking], *(value for pair in pairs for value in pair)])
     return Table(tuple(columns), rows, f"{better_ablations(comparison, base)} {_seeds(comparison)}")
 
 
-def _published_costs(row: Ablation | None) -> list[Value]:
+def _published_row(row: Ablation | None) -> list[Value]:
     if row is None:
         return [None] * 6
     return [*row.rmse.values, row.parameters, row.flops, 1e6 * row.latency]

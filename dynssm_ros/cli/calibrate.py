@@ -9,8 +9,9 @@ import typer
 from rich.table import Table
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import CommandsOption, JsonOption, VehicleOption, WhereOption, chosen, console, progress_bar
+from dynssm_ros.cli.console import CommandsOption, JsonOption, VehicleOption, WhereOption, console, progress_bar
 from dynssm_ros.files import write_json
+from dynssm_ros.signals.season import recording_files
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, save_vehicle
 from dynssm_ros.vehicle.single_track import Integrator
 
@@ -50,19 +51,9 @@ def calibrate(
     where: WhereOption = None,
 ) -> None:
     """Fit the nominal parameters of a vehicle to measured laps, within their bounds."""
+    logs = recording_files(recordings, where)
     with progress_bar("calibrating") as progress:
-        result = api.calibrate(
-            chosen(recordings, where),
-            vehicle,
-            horizon,
-            min_speed,
-            holdout,
-            integrator,
-            starts,
-            seed,
-            commands,
-            progress,
-        )
+        result = api.calibrate(logs, vehicle, horizon, min_speed, holdout, integrator, starts, seed, commands, progress)
     source = ", ".join(str(path) for path in recordings) + (f" where {where}" if where else "")
     save_vehicle(
         result.vehicle,

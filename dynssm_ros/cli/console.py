@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Protocol
@@ -13,9 +13,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.files import write_json
-from dynssm_ros.signals.season import Season, is_season
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle.effects import parse_effect
 
@@ -70,27 +68,6 @@ def write_results(content: dict[str, Any], out: Path, also: Path | None) -> None
     for path in (out / "results.json", also):
         if path is not None:
             write_json(path, content)
-
-
-def chosen(recordings: Sequence[Path], where: str | None) -> list[Path]:
-    """Recordings, and of folders of a season the recordings of the sessions that ``--where`` is about.
-
-    Raises:
-        ConfigurationError: the condition is none, or there is no season that it could be about.
-        RecordingError: no session meets it.
-    """
-    if where and not any(map(is_season, recordings)):
-        raise ConfigurationError(
-            f"--where {where!r}: chooses sessions of a season's folder; expected one, not a recording"
-        )
-    found: list[Path] = []
-    for path in recordings:
-        found += _sessions(Season.load(path), where) if is_season(path) else [path]
-    return found
-
-
-def _sessions(season: Season, where: str | None) -> list[Path]:
-    return [season.file(session) for session in season.chosen(where)]
 
 
 def as_effects(texts: list[str] | None) -> dict[str, dict[str, float]]:

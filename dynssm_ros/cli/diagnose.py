@@ -15,13 +15,13 @@ from dynssm_ros.cli.console import (
     MinSpeedOption,
     VehicleOption,
     WhereOption,
-    chosen,
     console,
     progress_bar,
     write_results,
 )
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
+from dynssm_ros.signals.season import recording_files
 from dynssm_ros.vehicle import save_vehicle
 from dynssm_ros.vehicle.single_track import Integrator
 
@@ -74,7 +74,7 @@ def diagnose(
 
     if not (given := [*(recordings or ()), *(reference or ())]):
         raise ConfigurationError("no recording given; expected R.parquet or --reference R.parquet")
-    given = chosen(given, where)
+    given = recording_files(given, where)
     with progress_bar("diagnosing") as progress:
         steps = itertools.count(1)
         result = api.diagnose(

@@ -13,7 +13,6 @@ from dynssm_ros.cli.console import (
     JsonOption,
     MinSpeedOption,
     WhereOption,
-    chosen,
     console,
     progress_bar,
     write_results,
@@ -21,6 +20,7 @@ from dynssm_ros.cli.console import (
 from dynssm_ros.extras import require
 from dynssm_ros.files import replacing
 from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.season import recording_files
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
 TrackOption = Annotated[
@@ -71,7 +71,7 @@ def evaluate(
     from dynssm_ros.reporting.evaluation_report import markdown, open_loop_report, summary_table, verdict
 
     models = api.open_models(list(model), vehicle)
-    logs = [Recording.load(recording) for recording in chosen(recordings, where)]
+    logs = [Recording.load(recording) for recording in recording_files(recordings, where)]
     wanted, recorded = shared_commands(models), {log.info.commands for log in logs}
     if commands is None and wanted is not None and recorded != {wanted}:
         others = "', '".join(sorted(recorded - {wanted}))

@@ -10,8 +10,7 @@ import typer
 from dynssm_ros import api
 from dynssm_ros.cli.console import CommandsOption, SignalsOption, console, progress_bar
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.signals.season import Log, extract_season, logs_of
-from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
+from dynssm_ros.signals.season import Season, Session
 from dynssm_ros.signals.standard import recording_to_bag
 
 
@@ -46,7 +45,9 @@ def extract(
             raise ConfigurationError(
                 f"--out {out}: a season's folder needs --car and --track and takes no --bag; expected those, or R.parquet"
             )
-        _into_season(bags, out, jobs, logs_of(bags, car, track, _signals(signals, commands), rate, drop_bad))
+        with progress_bar("extracting") as progress:
+            season, new = api.extract_season(bags, out, car, track, signals, rate, commands, drop_bad, jobs, progress)
+        _say_season(season, new, bags)
         return
     if (car, track, jobs) != (None, None, 1):
         raise ConfigurationError(f"--out {out}: --car, --track and --jobs are of a season; expected a folder")
@@ -66,19 +67,13 @@ def extract(
     )
 
 
-def _signals(name: str, commands: Commands | None) -> SignalMap:
-    return load_signal_map(name).with_commands(commands)
-
-
-def _into_season(bags: list[Path], out: Path, jobs: int, logs: list[Log]) -> None:
-    with progress_bar("extracting") as progress:
-        season, new = extract_season(logs, out, jobs, progress)
+def _say_season(season: Season, new: list[Session], bags: list[Path]) -> None:
     failed = [session for session in season.of_bags(bags) if session.failure]
     for session in failed:
         console.print(f"{session.bag}: not extracted: {session.failure}", markup=False, soft_wrap=True)
     read = [session for session in new if not session.failure]
     console.print(
-        f"{out}: {len(season.sessions)} sessions; of {len(bags)} bags {len(read)} extracted, "
+        f"{season.path}: {len(season.sessions)} sessions; of {len(bags)} bags {len(read)} extracted, "
         f"{len(bags) - len(new)} as they were, {len(failed)} not readable",
         markup=False,
         soft_wrap=True,

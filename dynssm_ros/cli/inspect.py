@@ -15,7 +15,7 @@ from dynssm_ros.extras import require
 from dynssm_ros.files import replacing, write_json
 from dynssm_ros.reporting.inspection_tables import season_table, topic_table
 from dynssm_ros.signals.inspection import Inspection
-from dynssm_ros.signals.season import Manifest, Season, is_season
+from dynssm_ros.signals.season import Season, is_season
 
 
 def inspect(
@@ -41,7 +41,7 @@ def inspect(
         season = Season.load(bag)
         console.print(season_table(season).rich())
         if json is not None:
-            write_json(json, Manifest(sessions=tuple(season.sessions.values())).model_dump(mode="json"))
+            write_json(json, season.to_json())
         return
     with progress_bar("reading") as progress:
         found = api.inspect(bag, vehicle, progress)

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import CommandsOption, VehicleOption, WhereOption, chosen, console, errors, progress_bar
+from dynssm_ros.cli.console import CommandsOption, VehicleOption, WhereOption, console, errors, progress_bar
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import missing_libraries
+from dynssm_ros.signals.season import recording_files
 
 if TYPE_CHECKING:
     from dynssm_ros.learning.stages import Trained
@@ -39,7 +40,7 @@ def train(
     with progress_bar("training") as progress:
         try:
             trained, artifact = api.train(
-                chosen(recordings, where), model, vehicle, out, holdout, commands, seed, epochs, device, progress,
+                recording_files(recordings, where), model, vehicle, out, holdout, commands, seed, epochs, device, progress,
                 None if missing_libraries("report") else _draw_losses,
             )  # fmt: skip
         except KeyboardInterrupt:

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from dynssm_ros.errors import ArtifactError
-from dynssm_ros.files import replacing
+from dynssm_ros.files import checksum, replacing
 from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import TrainableModel
@@ -36,7 +36,6 @@ from dynssm_ros.runtime.artifact import (
     WEIGHTS,
     Artifact,
     ModelCard,
-    checksum,
     open_artifact,
     write_card,
 )

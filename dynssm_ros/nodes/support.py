@@ -137,7 +137,7 @@ def spin(node: Node) -> None:
     """Serves a node's callbacks until rclpy is shut down.
 
     On SIGTERM, rclpy wakes the executor and shuts its context down in another thread. An executor that is quicker finds the
-    context as it was and waits again; a node that nothing else wakes would then wait for ever (1 of 50 idle nodes). So
+    context as it was and waits again; a node that nothing else wakes would then wait for ever (4 of 240 idle nodes). So
     something wakes it every second, on a clock that simulated time does not stop.
     """
     node.create_timer(_AWAKE, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -7,7 +7,6 @@ opened, not when the car drives.
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError, ConfigurationError
+from dynssm_ros.files import checksum
 from dynssm_ros.runtime.online import OnlineLayer, OnlineLayerCard, load_layer
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import Commands
@@ -167,11 +167,6 @@ def write_card(card: ModelCard, folder: Path) -> None:
     """Writes ``model.yaml`` into ``folder``, which is being put together."""
     text = yaml.safe_dump(card.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=110)
     (folder / CARD).write_text(text, encoding="utf-8")
-
-
-def checksum(file: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def _check_weights(file: Path) -> None:

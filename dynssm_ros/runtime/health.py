@@ -110,9 +110,9 @@ class Health:
             return Level.ERROR, "; ".join([*words, *self._mostly_refused()])
         if self.wiring:
             return Level.ERROR, self.wiring
-        recent = [outcome for outcome in list(self._outcomes)[-_NOW:] if outcome is not None]
-        if recent and len(recent) == min(_NOW, len(self._outcomes)):
-            newest = recent[-1]
+        recent = list(self._outcomes)[-_NOW:]
+        newest = recent[-1] if recent else None
+        if newest is not None and None not in recent:
             return (Level.WARN if newest is Refusal.FILLING else Level.ERROR), newest.value
         several = [f"{topic}: {count} publishers" for topic, count in self.publishers.items() if count > 1]
         if several:

@@ -248,9 +248,8 @@ class OnnxModel:
         options = ort.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.graph_optimization_level = (
-            ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-        )  # the export did; a swap is not held up
+        # the export has optimised the graph; doing it again would hold up a swap
+        options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
         options.enable_mem_reuse = False  # small tensors: planning their reuse costs more than their effect states
         options.log_severity_level = 3
         try:

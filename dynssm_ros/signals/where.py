@@ -13,6 +13,11 @@ from typing import Any
 
 from dynssm_ros.errors import ConfigurationError
 
+Value = Callable[[Mapping[str, Any]], Any]
+"""A part of a condition: from the fields of a session to what it says."""
+
+_JOINED: dict[type[ast.boolop], Callable[[Any], bool]] = {ast.And: all, ast.Or: any}
+_ALONE: dict[type[ast.unaryop], Callable[[Any], Any]] = {ast.Not: operator.not_, ast.USub: operator.neg}
 _COMPARED: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
@@ -24,11 +29,6 @@ _COMPARED: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
     ast.NotIn: lambda value, among: value not in among,
 }
 
-_ALLOWED = (
-    *(ast.BoolOp, ast.And, ast.Or, ast.UnaryOp, ast.Not, ast.USub, ast.Compare, *_COMPARED),
-    *(ast.Name, ast.Load, ast.Constant, ast.List, ast.Tuple),
-)
-
 
 def condition(text: str, fields: Sequence[str]) -> Callable[[Mapping[str, Any]], bool]:
     """The condition as a function of the fields of a session.
@@ -38,15 +38,17 @@ def condition(text: str, fields: Sequence[str]) -> Callable[[Mapping[str, Any]],
     """
     try:
         tree = ast.parse(text.strip(), mode="eval").body
-        _require_known(tree, text, fields)
     except (SyntaxError, ValueError) as error:
         raise ConfigurationError(
             f"--where {text!r}: not understood; expected, for example, track == 'putnam'"
         ) from error
+    value = _Reader(text, fields).visit(tree)
+    if not isinstance(tree, (ast.BoolOp, ast.Compare, ast.UnaryOp)):
+        raise ConfigurationError(f"--where {text!r}: no comparison; expected, for example, track == 'putnam'")
 
     def holds(session: Mapping[str, Any]) -> bool:
         try:
-            return bool(_value(tree, session))
+            return bool(value(session))
         except TypeError as error:
             raise ConfigurationError(
                 f"--where {text!r}: {error}; expected texts with texts, numbers with numbers"
@@ -55,31 +57,49 @@ def condition(text: str, fields: Sequence[str]) -> Callable[[Mapping[str, Any]],
     return holds
 
 
-def _require_known(tree: ast.AST, text: str, fields: Sequence[str]) -> None:
-    """Checks that there is nothing but what this module's text says."""
-    for node in ast.walk(tree):
-        if not isinstance(node, _ALLOWED):
-            raise ConfigurationError(f"--where {text!r}: {type(node).__name__} is not part of a condition")
-        if isinstance(node, ast.Name) and node.id not in fields:
-            raise ConfigurationError(f"--where {text!r}: '{node.id}' is no field; expected one of {', '.join(fields)}")
-    if not isinstance(tree, (ast.BoolOp, ast.Compare, ast.UnaryOp)):
-        raise ConfigurationError(f"--where {text!r}: no comparison; expected, for example, track == 'putnam'")
+class _Reader(ast.NodeVisitor):
+    """Each part of a condition as a function of a session; what has no method here is no part of one."""
 
+    def __init__(self, text: str, fields: Sequence[str]) -> None:
+        self.text, self.fields = text, fields
 
-def _value(node: ast.AST, session: Mapping[str, Any]) -> Any:
-    if isinstance(node, ast.BoolOp):
-        parts = (_value(each, session) for each in node.values)
-        return all(parts) if isinstance(node.op, ast.And) else any(parts)
-    if isinstance(node, ast.UnaryOp):
-        value = _value(node.operand, session)
-        return not value if isinstance(node.op, ast.Not) else -value
-    if isinstance(node, ast.Compare):
-        values = [_value(each, session) for each in (node.left, *node.comparators)]
-        pairs = zip(node.ops, values, values[1:], strict=False)
-        return all(_COMPARED[type(op)](one, other) for op, one, other in pairs)
-    if isinstance(node, (ast.List, ast.Tuple)):
-        return [_value(each, session) for each in node.elts]
-    if isinstance(node, ast.Name):
-        return session[node.id]
-    assert isinstance(node, ast.Constant)
-    return node.value
+    def generic_visit(self, node: ast.AST) -> Value:
+        raise ConfigurationError(f"--where {self.text!r}: {type(node).__name__} is not part of a condition")
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> Value:
+        join, parts = _JOINED[type(node.op)], [self.visit(each) for each in node.values]
+        return lambda session: join(part(session) for part in parts)
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> Value:
+        apply, operand = _ALONE.get(type(node.op)) or self.generic_visit(node.op), self.visit(node.operand)
+        return lambda session: apply(operand(session))
+
+    def visit_Compare(self, node: ast.Compare) -> Value:
+        compared = [_COMPARED.get(type(op)) or self.generic_visit(op) for op in node.ops]
+        parts = [self.visit(each) for each in (node.left, *node.comparators)]
+
+        def holds(session: Mapping[str, Any]) -> bool:
+            values = [part(session) for part in parts]
+            return all(compare(*pair) for compare, *pair in zip(compared, values, values[1:], strict=False))
+
+        return holds
+
+    def visit_List(self, node: ast.List) -> Value:
+        return self._several(node.elts)
+
+    def visit_Tuple(self, node: ast.Tuple) -> Value:
+        return self._several(node.elts)
+
+    def visit_Name(self, node: ast.Name) -> Value:
+        if node.id not in self.fields:
+            raise ConfigurationError(
+                f"--where {self.text!r}: '{node.id}' is no field; expected one of {', '.join(self.fields)}"
+            )
+        return operator.itemgetter(node.id)
+
+    def visit_Constant(self, node: ast.Constant) -> Value:
+        return lambda session: node.value
+
+    def _several(self, nodes: list[ast.expr]) -> Value:
+        parts = [self.visit(each) for each in nodes]
+        return lambda session: [part(session) for part in parts]

@@ -11,9 +11,10 @@ from benchmarks.paper.plan import Plan, load_plan
 from benchmarks.paper.reference import load_reference
 from benchmarks.paper.results import Made, read_results
 from benchmarks.paper.schedule import steps_of
-from benchmarks.paper.steps import Evaluate, Take, Train, UnavailableError, digest
+from benchmarks.paper.steps import Evaluate, Take, Train, UnavailableError
 from benchmarks.tasks import output, perform, split_available
 from dynssm_ros.configuration import validate
+from dynssm_ros.files import digest
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import load_vehicle

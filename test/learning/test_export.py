@@ -16,13 +16,14 @@ import torch
 import yaml
 
 from dynssm_ros.errors import ArtifactError, ConfigurationError
+from dynssm_ros.files import checksum
 from dynssm_ros.learning import export as export_module
 from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.export import TOLERANCE, check_export, check_replaceable, load_torch, save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import Trained, train
-from dynssm_ros.runtime.artifact import Artifact, checksum, open_artifact
+from dynssm_ros.runtime.artifact import Artifact, open_artifact
 from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle

@@ -14,7 +14,8 @@ import yaml
 from safetensors.numpy import load_file, save_file
 
 from dynssm_ros.errors import ArtifactError
-from dynssm_ros.runtime.artifact import CARD, FORMAT_VERSION, METRICS, ONNX, WEIGHTS, checksum, open_artifact, read_card
+from dynssm_ros.files import checksum
+from dynssm_ros.runtime.artifact import CARD, FORMAT_VERSION, METRICS, ONNX, WEIGHTS, open_artifact, read_card
 from dynssm_ros.runtime.artifact import write_card as write
 from dynssm_ros.runtime.models import OnnxModel
 

@@ -51,6 +51,7 @@ class EkfFTHD(FTHD):
     """An FTHD on filtered states."""
 
     KIND = "ekf_fthd"
+    NEW = ("noises.weight", "noises.bias", "increment_scale")
     CONFIG: ClassVar[type[ModelConfig]] = EkfFthdConfig
     increment_scale: Tensor
     nudges: Tensor

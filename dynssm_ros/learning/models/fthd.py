@@ -82,9 +82,14 @@ class FthdConfig(DdmConfig):
 
 
 class FTHD(DDM):
-    """The DDM's network in its second stage."""
+    """The DDM's network in its second stage.
+
+    Attributes:
+        NEW: names of parameters and buffers that the DDM does not have.
+    """
 
     KIND = "fthd"
+    NEW: ClassVar[tuple[str, ...]] = ()
     CONFIG: ClassVar[type[ModelConfig]] = FthdConfig
     EXTRA_ROWS = 1  # the predictions of neighbouring windows are compared
 
@@ -93,8 +98,9 @@ class FTHD(DDM):
         self.fine_tuning = config.fine_tuning
 
     def take_over(self, start: TrainableModel) -> None:
-        """Takes the weights of the trained DDM and freezes its first layers; what the DDM does not have is new."""
-        self.load_state_dict(self.state_dict() | start.state_dict())
+        """Takes the weights of the trained DDM and freezes its first layers; what is :attr:`NEW` stays."""
+        own = self.state_dict()
+        self.load_state_dict({name: own[name] for name in self.NEW} | start.state_dict())
         for layer in self.layers[: int(self.fine_tuning.frozen * len(self.layers))]:
             layer.requires_grad_(False)
 

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from dynssm_ros.learning.dataset import SplitConfig, TrainingWindows
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel, scale_buffers
+from dynssm_ros.learning.models.fitting import driven, minimise
 from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
@@ -88,10 +89,7 @@ class GaussianProcess(TrainableModel):
         return left
 
     def _inputs(self, window: Tensor) -> Tensor:
-        """State and applied inputs of rows, standardised, ``(..., 5)``."""
-        rows = (window - self.mean) / self.std
-        applied = (window[..., 3:5] + window[..., 5:7] - self.mean[3:5]) / self.std[3:5]
-        return torch.cat([rows[..., :CHANNELS], applied], dim=-1)
+        return driven(window, self.mean, self.std)
 
     def _over_states(self, x: Tensor) -> Tensor:
         """Posterior mean of the process over states and inputs ``(..., 5)``, ``(..., 3)`` in units of s_delta."""
@@ -201,13 +199,8 @@ def _negative_log_likelihood(K: Tensor, y: Tensor) -> Tensor:
     return value
 
 
-@torch.enable_grad()
 def _minimised(loss: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
     """The least that Adam finds."""
     p = start.clone().requires_grad_()
-    optimiser = torch.optim.Adam([p], lr=_RATE)
-    for _ in range(_STEPS):
-        optimiser.zero_grad()
-        loss(p).backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
+    minimise([p], lambda: loss(p), _STEPS, _RATE)
     return p.detach()

@@ -13,7 +13,6 @@ them, those are kept whose one-step errors are smallest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
 import torch
@@ -23,6 +22,7 @@ from torch import Tensor, nn
 from dynssm_ros.learning.dataset import SplitConfig, TrainingWindows
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel, scale_buffers
+from dynssm_ros.learning.models.fitting import driven, minimise
 from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
@@ -33,10 +33,8 @@ TYRES = ("B_f", "C_f", "D_f", "E_f", "S_hf", "B_r", "C_r", "D_r", "E_r", "S_hr")
 _LATERAL = slice(1, 3)  # v_y and omega among the states
 _RATE, _EPOCHS = 0.01, 300  # of Adam, for the network
 _FIT_RATE, _FIT_STEPS = 0.05, 300  # of Adam, for the tyres
-_SPEEDS, _ANGLES = (
-    5,
-    41,
-)  # circles: quantiles of the speeds that were driven, steering between its 1st and 99th percentile
+_SPEEDS = 5  # of the circles: quantiles of those that were driven
+_ANGLES = 41  # of the circles: steering between the 1st and 99th percentile of what was driven
 _SETTLED_S = 3.0  # s that a circle is driven
 _EDGE = 1e-4  # how close to a bound a tyre's value may start, as a share of its range
 
@@ -106,11 +104,8 @@ class OnTrack(TrainableModel):
         return float(error[:, _LATERAL].square().mean())
 
     def _inputs(self, rows: Tensor) -> Tensor:
-        """State and applied inputs of rows ``(N, 7)``, standardised, ``(N, 5)``."""
-        applied = (rows[:, 3:5] + rows[:, 5:7] - self.mean[3:5]) / self.std[3:5]
-        return torch.cat([(rows[:, :3] - self.mean[:3]) / self.std[:3], applied], dim=-1)
+        return driven(rows, self.mean, self.std)
 
-    @torch.enable_grad()
     def _network(self, rows: Tensor, wrong: Tensor, draw: torch.Generator) -> nn.Module:
         """What learns the errors ``(N, 2)`` of v_y and omega, in units of s_delta."""
         x, width = self._inputs(rows), self.config.hidden
@@ -118,7 +113,7 @@ class OnTrack(TrainableModel):
         with torch.no_grad():
             for parameter in network.parameters():
                 parameter.copy_(0.3 * torch.randn(parameter.shape, generator=draw))
-        _minimise(network.parameters(), lambda: (network(x) - wrong).square().mean(), _EPOCHS, _RATE)
+        minimise(network.parameters(), lambda: (network(x) - wrong).square().mean(), _EPOCHS, _RATE)
         return network
 
     @torch.no_grad()
@@ -140,7 +135,6 @@ class OnTrack(TrainableModel):
         steady = (moved.abs() < 0.05 * self.increment_scale[_LATERAL]).all(-1)
         return now[steady & (now[:, _LATERAL].abs() <= seen).all(-1)]
 
-    @torch.enable_grad()
     def _tyres(self, circles: Tensor) -> Tensor:
         """Coefficients ``(17,)`` with the tyres whose forces hold the car on the circles ``(M, 7)``."""
         which = torch.tensor([COEFFICIENTS.index(name) for name in TYRES])
@@ -162,14 +156,5 @@ class OnTrack(TrainableModel):
             units = self.increment_scale[_LATERAL] / self.vehicle.sampling_time
             return ((q.a_y / units[0]).square() + (q.omega_dot / units[1]).square()).mean()
 
-        _minimise([p], unbalanced, _FIT_STEPS, _FIT_RATE)
+        minimise([p], unbalanced, _FIT_STEPS, _FIT_RATE)
         return theta().detach().float()
-
-
-def _minimise(parameters: Iterable[Tensor], loss: Callable[[], Any], steps: int, rate: float) -> None:
-    """So many steps of Adam."""
-    optimiser = torch.optim.Adam(parameters, lr=rate)
-    for _ in range(steps):
-        optimiser.zero_grad()
-        loss().backward()
-        optimiser.step()
