@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dynssm_ros.errors import ConfigurationError, DataWarning
 from dynssm_ros.extras import require
+from dynssm_ros.parallel import HERE, Workers
 from dynssm_ros.progress import Progress
 from dynssm_ros.runtime.plausibility import implausible_rows
 from dynssm_ros.signals.recording import Recording, concatenate
@@ -171,7 +172,7 @@ def extract_season(
     rate: float = 50.0,
     commands: Commands | None = None,
     drop_bad: bool = False,
-    jobs: int = 1,
+    workers: Workers = HERE,
     on_progress: Progress | None = None,
 ) -> tuple[Season, list[Session]]:
     """Turns race logs into a season, one recording for each; those that are as they were are not read again.
@@ -185,7 +186,7 @@ def extract_season(
         rate: of the grid (Hz).
         commands: source of the command inputs; the signal map's if not given.
         drop_bad: leave out samples that are not finite or out of order instead of listing the log as not readable.
-        jobs: processes.
+        workers: where logs are read; those of a cluster find them, and the folder, by the same paths.
         on_progress: called with the logs that are done.
 
     Returns:
@@ -199,7 +200,7 @@ def extract_season(
     from dynssm_ros.signals.season_extraction import extract_season, logs_of
 
     logs = logs_of([Path(bag) for bag in bags], car, track, _signal_map(signals, commands), rate, drop_bad)
-    return extract_season(logs, out, jobs, on_progress)
+    return extract_season(logs, out, workers, on_progress)
 
 
 def calibrate(

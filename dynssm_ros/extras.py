@@ -13,6 +13,8 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "race": ("casadi", "scipy"),
     "report": ("matplotlib", "jinja2", "scipy"),
     "scale": ("joblib",),
+    "ray": ("joblib", "ray"),
+    "dask": ("joblib", "dask", "distributed"),
     "ros": ("rclpy",),
 }
 """Libraries by extra. The core (`pip install dynssm_ros`) has what extracts, replays and predicts."""

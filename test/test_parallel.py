@@ -1,4 +1,4 @@
-"""Work on several processes: all of it is done, also if one of them dies."""
+"""Work on several processes and on clusters: all of it is done, also if a process dies."""
 
 from __future__ import annotations
 
@@ -9,25 +9,39 @@ from pathlib import Path
 
 import pytest
 
-from dynssm_ros.errors import ProcessDiedError
-from dynssm_ros.parallel import each
+from dynssm_ros.errors import ConfigurationError, ProcessDiedError
+from dynssm_ros.parallel import HERE, Workers, each
+
+ALL = [HERE, Workers(2), Workers(2, "ray"), Workers(2, "dask")]
+SEVERAL = ALL[1:]
 
 
 @pytest.fixture
 def squared() -> Callable[[int], int]:
     # functions of this module would be looked for by its name, which the processes do not know
     def squared(number: int) -> int:
+        if number < 0:
+            raise ConfigurationError(f"{number}: expected a positive number")
         return number**2
 
     return squared
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_every_item_has_its_result(squared: Callable[[int], int], jobs: int) -> None:
-    assert dict(each(squared, range(6), jobs)) == {k: k**2 for k in range(6)}
+def name(workers: Workers) -> str:
+    return f"{workers.jobs}-{workers.backend}"
 
 
-def test_what_a_dead_process_took_along_is_done_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("workers", ALL, ids=name)
+def test_every_item_has_its_result_and_an_error_is_the_one_that_was_raised(
+    squared: Callable[[int], int], workers: Workers
+) -> None:
+    assert dict(each(squared, range(6), workers)) == {k: k**2 for k in range(6)}
+    with pytest.raises(ConfigurationError, match="-1: expected a positive number"):
+        list(each(squared, [1, -1, 2], workers))
+
+
+@pytest.mark.parametrize("workers", SEVERAL, ids=name)
+def test_what_a_dead_process_took_along_is_done_again(tmp_path: Path, workers: Workers) -> None:
     mark = tmp_path / "mark"
 
     def dies_once(number: int) -> int:
@@ -36,15 +50,24 @@ def test_what_a_dead_process_took_along_is_done_again(tmp_path: Path) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         return number**2
 
-    assert sorted(each(dies_once, range(8), 2)) == [(k, k**2) for k in range(8)]
+    assert sorted(each(dies_once, range(8), workers)) == [(k, k**2) for k in range(8)]
     assert mark.exists()
 
 
-def test_what_kills_every_process_is_said() -> None:
+@pytest.mark.parametrize("workers", SEVERAL, ids=name)
+def test_what_kills_every_process_is_said(workers: Workers) -> None:
     def dies(number: int) -> int:
         if number == 1:
             os.kill(os.getpid(), signal.SIGKILL)
         return number
 
-    with pytest.raises(ProcessDiedError, match="a process died in each of 3 tries"):
-        list(each(dies, range(4), 2))
+    with pytest.raises(ProcessDiedError, match="expected less memory"):
+        list(each(dies, range(4), workers))
+
+
+def test_what_is_no_place_to_work_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="address tcp://there:8786: of no cluster"):
+        Workers(address="tcp://there:8786")
+    for workers in ((0, "processes", "1"), (1, "ray", "2"), (1, "dask", "2")):
+        with pytest.raises(ConfigurationError, match=f"jobs {workers[0]}: expected {workers[2]} or more"):
+            Workers(workers[0], workers[1])

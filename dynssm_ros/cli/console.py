@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from dynssm_ros.files import write_json
+from dynssm_ros.parallel import Backend
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle.effects import parse_effect
 
@@ -58,6 +59,17 @@ WhereOption = Annotated[
         "--where",
         help="Sessions of a season's folder: car, track, session, start, rate, rows, seconds, segments, as in "
         "\"track == 'putnam' and seconds > 60\".",
+    ),
+]
+JobsOption = Annotated[
+    int | None, typer.Option(help="Pieces of work at a time; all that a cluster has if not given, else one.", min=1)
+]
+BackendOption = Annotated[Backend, typer.Option(help="Where they are done: processes here, or a Ray or Dask cluster.")]
+AddressOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Of the cluster: Ray's auto or ray://HOST:10001, Dask's tcp://HOST:8786.",
+        show_default="one is started here, for as long as the work takes",
     ),
 ]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the result as JSON.", dir_okay=False)]

@@ -8,8 +8,17 @@ from typing import Annotated
 import typer
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import CommandsOption, SignalsOption, console, progress_bar
+from dynssm_ros.cli.console import (
+    AddressOption,
+    BackendOption,
+    CommandsOption,
+    JobsOption,
+    SignalsOption,
+    console,
+    progress_bar,
+)
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.parallel import HERE, Workers
 from dynssm_ros.signals.season import Season, Session
 from dynssm_ros.signals.standard import recording_to_bag
 
@@ -37,20 +46,27 @@ def extract(
     ] = False,
     car: Annotated[str | None, typer.Option(help="Of a season: which car drove.")] = None,
     track: Annotated[str | None, typer.Option(help="Of a season: where.")] = None,
-    jobs: Annotated[int, typer.Option(help="Of a season: processes.", min=1)] = 1,
+    jobs: JobsOption = None,
+    backend: BackendOption = "processes",
+    address: AddressOption = None,
 ) -> None:
     """Turn race logs into a recording: named SI signals on a uniform time grid. Or into a season of recordings."""
+    workers = Workers(jobs, backend, address)
     if out.suffix != ".parquet":
         if car is None or track is None or bag is not None:
             raise ConfigurationError(
                 f"--out {out}: a season's folder needs --car and --track and takes no --bag; expected those, or R.parquet"
             )
         with progress_bar("extracting") as progress:
-            season, new = api.extract_season(bags, out, car, track, signals, rate, commands, drop_bad, jobs, progress)
+            season, new = api.extract_season(
+                bags, out, car, track, signals, rate, commands, drop_bad, workers, progress
+            )
         _say_season(season, new, bags)
         return
-    if (car, track, jobs) != (None, None, 1):
-        raise ConfigurationError(f"--out {out}: --car, --track and --jobs are of a season; expected a folder")
+    if (car, track, workers) != (None, None, HERE):
+        raise ConfigurationError(
+            f"--out {out}: --car, --track, --jobs, --backend and --address are of a season; expected a folder"
+        )
     with progress_bar("reading") as progress:
         recording = api.extract(list(bags), signals, rate, commands, drop_bad, progress)
     if bag is not None:

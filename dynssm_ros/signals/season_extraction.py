@@ -13,7 +13,7 @@ from pathlib import Path
 from dynssm_ros import __version__
 from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.files import digest, files_in, require_replaceable
-from dynssm_ros.parallel import each
+from dynssm_ros.parallel import HERE, Workers, each
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.season import Season, Session, address, is_season
@@ -69,7 +69,7 @@ def logs_of(
 
 
 def extract_season(
-    logs: Sequence[Log], out: str | Path, jobs: int = 1, progress: Progress | None = None
+    logs: Sequence[Log], out: str | Path, workers: Workers = HERE, progress: Progress | None = None
 ) -> tuple[Season, list[Session]]:
     """Extracts the logs that are new or changed into the season in a folder; others of it stay.
 
@@ -78,7 +78,7 @@ def extract_season(
     Args:
         logs: of the season.
         out: its folder.
-        jobs: processes.
+        workers: where logs are read; those of a cluster find them, and the folder, by the same paths.
         progress: told of each log that is done.
 
     Returns:
@@ -95,7 +95,7 @@ def extract_season(
     wanted = [log for log in logs if not _is_as_it_was(season, log)]
     done: list[Session] = []
     tasks = [(log, season.file(log.place)) for log in wanted]
-    for _, session in each(_extracted, tasks, jobs):
+    for _, session in each(_extracted, tasks, workers):
         season.sessions[session.place] = session
         season.save()
         done.append(session)

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pyarrow.dataset as ds
 import pytest
+from dask import config
+from distributed import LocalCluster
 
 from dynssm_ros.cli.main import main
 from dynssm_ros.errors import ConfigurationError, RecordingError, UserError
+from dynssm_ros.parallel import Backend, Workers
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.season import MANIFEST, Season, is_season
@@ -117,12 +128,64 @@ def test_what_is_done_stays_done_after_an_interrupt(bags: list[Path], tmp_path: 
     assert (len(new), len(season.sessions)) == (2, 4)
 
 
-def test_several_processes_give_the_same(bags: list[Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize("backend", get_args(Backend))
+def test_several_processes_give_the_same_though_one_is_killed(
+    bags: list[Path], tmp_path: Path, backend: Backend
+) -> None:
+    killed: list[int] = []
+
+    def kill(done: int, total: int, words: str = "") -> None:
+        if not killed:
+            killed.append(workers_of(backend)[0])
+            os.kill(killed[0], signal.SIGKILL)
+
     one, _ = extract_season(logs(bags), tmp_path / "one")
-    two, _ = extract_season(logs(bags), tmp_path / "two", jobs=2)
+    two, _ = extract_season(logs(bags), tmp_path / "two", Workers(2, backend), progress=kill)
+    assert killed
     assert one.sessions == two.sessions
     for session in one.chosen():
         assert one.file(session.place).read_bytes() == two.file(session.place).read_bytes()
+
+
+def workers_of(backend: Backend) -> list[int]:
+    """Processes that this one and those below it have begun for joblib."""
+    below, found = [str(os.getpid())], []
+    while below:
+        for task in Path("/proc", below.pop(), "task").glob("*/children"):
+            for process in task.read_text().split():
+                below.append(process)
+                command = Path("/proc", process, "cmdline").read_text()
+                if {"processes": "popen_loky", "ray": "ray::Pool", "dask": "spawn_main"}[backend] in command:
+                    found.append(int(process))
+    return found
+
+
+@pytest.fixture(params=["ray", "dask"])
+def cluster(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Workers]:
+    """A cluster of two workers that runs on its own."""
+    if request.param == "dask":
+        with (
+            config.set({"temporary-directory": str(tmp_path)}),
+            LocalCluster(n_workers=2, dashboard_address=None) as local,
+        ):
+            yield Workers(None, "dask", local.scheduler_address)
+        return
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    begin = ("start", "--head", f"--port={port}", "--num-cpus=2", "--include-dashboard=false", "--disable-usage-stats")
+    with tempfile.TemporaryDirectory(dir="/tmp") as scratch:  # short, as the paths of sockets must be
+        command = [Path(sys.executable).with_name("ray"), *begin, "--block", f"--temp-dir={scratch}"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as head:
+            assert head.stdout is not None
+            assert any("Ray runtime started" in line for line in head.stdout)
+            yield Workers(None, "ray", f"127.0.0.1:{port}")
+            head.terminate()
+
+
+def test_a_cluster_gives_the_same(bags: list[Path], tmp_path: Path, cluster: Workers) -> None:
+    one, _ = extract_season(logs(bags), tmp_path / "one")
+    two, _ = extract_season(logs(bags), tmp_path / "two", cluster)
+    assert one.sessions == two.sessions
 
 
 def test_others_read_it_as_a_partitioned_data_set(bags: list[Path], tmp_path: Path) -> None:
