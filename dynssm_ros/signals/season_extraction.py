@@ -93,6 +93,9 @@ def extract_season(
     logs = [_placed(season, log) for log in logs]
     out.mkdir(parents=True, exist_ok=True)
     wanted = [log for log in logs if not _is_as_it_was(season, log)]
+    wanted.sort(
+        key=lambda log: -sum(size for size, _ in _states(log.bag).values())
+    )  # so that all processes end together
     done: list[Session] = []
     tasks = [(log, season.file(log.place)) for log in wanted]
     for _, session in each(_extracted, tasks, workers):
