@@ -27,7 +27,9 @@ EXTRAS = {
     "report": ["matplotlib>=3.9", "jinja2>=3.1", "scipy>=1.12"],
     # seasons of logs on several processes
     "scale": ["joblib>=1.4"],
-    # the same on clusters
+    # settings of models that are searched for
+    "sweep": ["optuna>=4.0"],
+    # several processes on clusters
     "ray": ["joblib>=1.4", "ray>=2.40"],
     "dask": ["joblib>=1.4", "dask>=2024.12", "distributed>=2024.12"],
     # ROS 2 Jazzy as wheels, for machines without it; a sourced ROS installation provides the same modules

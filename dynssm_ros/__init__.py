@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         recorded,
         replay,
         simulate,
+        sweep,
         train,
     )
     from dynssm_ros.learning.models.registry import register_model
@@ -38,7 +39,7 @@ _HOMES = {
     **dict.fromkeys(
         (
             "calibrate", "diagnose", "evaluate", "extract", "extract_season", "inspect", "load_model", "race", "recorded",
-            "replay", "simulate", "train",
+            "replay", "simulate", "sweep", "train",
         ),
         "api",
     ),
@@ -69,6 +70,7 @@ __all__ = [
     "replay",
     "save_vehicle",
     "simulate",
+    "sweep",
     "train",
 ]
 

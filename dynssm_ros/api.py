@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from dynssm_ros.control.race import Race
     from dynssm_ros.control.settings import Objective
     from dynssm_ros.evaluation.open_loop import Evaluation
+    from dynssm_ros.evaluation.sweep import Errors, Space, Sweep
     from dynssm_ros.identification.calibration import Calibration
     from dynssm_ros.identification.diagnosis import Diagnosis
     from dynssm_ros.learning.models.base import ModelConfig
@@ -311,6 +313,113 @@ def model_config(model: ModelConfig | PathLike, seed: int | None = None, epochs:
     given = {key: value for key, value in (("seed", seed), ("epochs", epochs)) if value is not None}
     config = load_model_config(model) if isinstance(model, (str, Path)) else model
     return config.with_training(**given)
+
+
+def sweep(
+    recordings: Log | Sequence[Log],
+    model: PathLike,
+    vehicle: Vehicle | PathLike,
+    out: PathLike,
+    space: Space | PathLike = "dynssm",
+    trials: int = 24,
+    holdout: float = 0.25,
+    validation: Log | Sequence[Log] = (),
+    commands: Commands | None = None,
+    seed: int = 0,
+    epochs: int | None = None,
+    workers: Workers = HERE,
+    on_progress: Progress | None = None,
+) -> Sweep:
+    """Trains a model with other settings of its file, again and again, and scores it on laps that were left out.
+
+    The first trial is the file as it is. Each model is in ``OUT/trials``. Continues after a kill, or with more trials.
+
+    Args:
+        recordings: of one car, to train on.
+        model: model file: shipped name or path.
+        vehicle: the car.
+        out: folder of the sweep.
+        space: fields of the model file and what they may be: shipped name, path, or the object.
+        trials: in all.
+        holdout: last fraction of each recording that is left out, to score on.
+        validation: recordings to score on, instead of that fraction.
+        commands: source of the command inputs; the recording's own if not given.
+        seed: of the choices.
+        epochs: instead of the model file's, in each stage.
+        workers: where trials are done; those of a cluster find the recordings and ``out`` by the same paths.
+        on_progress: called with the trials that are done.
+
+    Raises:
+        ConfigurationError: a field that the model file does not have, or whose own value is not in the space.
+
+    Example:
+        >>> found = sweep("laps.parquet", "dynssm", "orca", "sweep")  # doctest: +SKIP
+        >>> found.best.settings["training.learning_rate"]  # doctest: +SKIP
+        0.0031
+    """
+    require("sweep", "sweep", "train", "race")
+    from dynssm_ros.evaluation.sweep import Space, Sweep
+    from dynssm_ros.learning.models.registry import load_model_config
+
+    space = space if isinstance(space, Space) else Space.load(space)
+    car, config = _vehicle(vehicle), load_model_config(model).model_dump(mode="json")
+    for logs in (recordings, validation):
+        _opened(logs, car)  # what is wrong with them is said once
+    about = {
+        "model": config, "vehicle": car.model_dump(mode="json"), "recordings": [str(log) for log in _files(recordings)],
+        "validation": [str(log) for log in _files(validation)], "holdout": holdout, "commands": commands, "epochs": epochs,
+    }  # fmt: skip
+    found = Sweep(Path(out), space, {name: _field(config, name) for name in space.choices}, seed, about)
+    objective = partial(
+        _scored, list(_files(recordings)), list(_files(validation)), model, car, Path(out), holdout, commands, epochs
+    )
+    found.run(objective, trials, workers, on_progress)
+    return found
+
+
+def _field(config: Mapping[str, Any], name: str) -> Any:
+    """A field of a model file by its dotted name."""
+    value: Any = config
+    for part in name.split("."):
+        if not isinstance(value, Mapping) or part not in value:
+            raise ConfigurationError(f"{name}: no field of the model file; expected one, as training.learning_rate")
+        value = value[part]
+    return value
+
+
+def swept(model: PathLike, settings: Mapping[str, Any]) -> ModelConfig:
+    """A model file with other values of fields, by their dotted names."""
+    from dynssm_ros.learning.models.registry import load_model_config
+
+    overrides: dict[str, Any] = {}
+    for name, value in settings.items():
+        *blocks, field = name.split(".")
+        inner = overrides
+        for block in blocks:
+            inner = inner.setdefault(block, {})
+        inner[field] = value
+    return load_model_config(model, overrides)
+
+
+def _scored(
+    recordings: list[Log], validation: list[Log], model: PathLike, car: Vehicle, out: Path, holdout: float,
+    commands: Commands | None, epochs: int | None, number: int, settings: Mapping[str, Any],
+) -> Errors:  # fmt: skip
+    """Trains with settings, and scores on laps that were left out."""
+    from dynssm_ros.evaluation.open_loop import evaluate
+    from dynssm_ros.evaluation.sweep import STRIDE, Errors
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        part = 0.0 if validation else holdout
+        config = model_config(swept(model, settings), None, epochs)
+        train(recordings, config, car, out / "trials" / f"{number:03d}", part, commands)
+        trained = load_model(out / "trials" / f"{number:03d}")
+        logs = [log.with_commands(trained.commands) for log in _opened(validation or recordings, car)]
+    log = concatenate(logs if validation else [log.split_last(holdout)[1] for log in logs])
+    score = evaluate(log, {trained.name: trained}, stride=STRIDE, calls=1).scores[trained.name]
+    v_x, v_y, omega = map(float, score.rmse)
+    return Errors(float(score.rollout.ade), (v_x, v_y, omega))
 
 
 def checkpoint_of(out: Path) -> Path:

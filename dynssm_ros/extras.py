@@ -13,6 +13,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "race": ("casadi", "scipy"),
     "report": ("matplotlib", "jinja2", "scipy"),
     "scale": ("joblib",),
+    "sweep": ("optuna",),
     "ray": ("joblib", "ray"),
     "dask": ("joblib", "dask", "distributed"),
     "ros": ("rclpy",),

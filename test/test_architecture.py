@@ -42,7 +42,8 @@ ROS = {
 }  # fmt: skip
 OWNERS = {
     "torch": {"learning"}, "lightning": {"learning"}, "casadi": {"control"}, "matplotlib": {"reporting"},
-    "jinja2": {"reporting"}, "joblib": {"parallel"}, "typer": {"cli"}, "rich": {"cli", "reporting"},
+    "jinja2": {"reporting"}, "joblib": {"parallel"}, "ray": {"parallel"}, "distributed": {"parallel"},
+    "optuna": {"evaluation"},     "typer": {"cli"}, "rich": {"cli", "reporting"},
 }  # fmt: skip
 OWNERS |= {module: {"nodes"} for module in ROS}
 

@@ -23,6 +23,7 @@ from dynssm_ros.cli.inspect import inspect
 from dynssm_ros.cli.race import race
 from dynssm_ros.cli.replay import replay
 from dynssm_ros.cli.simulate import simulate
+from dynssm_ros.cli.sweep import sweep
 from dynssm_ros.cli.train import train
 from dynssm_ros.errors import DataWarning, UserError
 from dynssm_ros.extras import load_plugins
@@ -38,7 +39,7 @@ app = typer.Typer(
 # click's base of all usage errors, wherever typer keeps its click
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
-for command in (inspect, simulate, extract, calibrate, train, evaluate, replay, diagnose, race):
+for command in (inspect, simulate, extract, calibrate, train, sweep, evaluate, replay, diagnose, race):
     app.command()(command)
 
 

@@ -1,0 +1,238 @@
+"""Sweeps: models trained with other settings and scored on laps that were left out, by Optuna.
+
+A space names fields of a model file and what they may be. Settings are chosen by a tree-structured Parzen estimator, always
+:data:`WAVE` at a time, so that several processes find what one finds. The state of a sweep is a file of Optuna's, and each
+choice depends on that and the seed alone: what was interrupted goes on as if it had not been.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import optuna
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import FrozenTrial, TrialState
+from pydantic import Field, model_validator
+from typing_extensions import Self
+
+from dynssm_ros import configuration
+from dynssm_ros.configuration import StrictModel
+from dynssm_ros.errors import ConfigurationError, UserError
+from dynssm_ros.parallel import HERE, Workers, each
+from dynssm_ros.progress import Progress
+
+WAVE = 4
+STRIDE = 5  # a rollout starts at every fifth row of the laps that were left out
+_STATE = "sweep.journal"
+_RMSE, _FAILURE = "one_step_rmse", "failure"
+
+
+class Choice(StrictModel):
+    """What a field may be: a range, or values."""
+
+    low: float | None = None
+    high: float | None = None
+    log: bool = Field(default=False, description="even on a logarithmic scale")
+    step: float | None = Field(default=None, gt=0)
+    values: tuple[bool | int | float | str, ...] = ()
+
+    @model_validator(mode="after")
+    def _is_one_of_both(self) -> Self:
+        if bool(self.values) == (self.low is not None and self.high is not None):
+            raise ValueError("expected either low and high, or values")
+        if self.low is not None and self.high is not None and not self.low < self.high:
+            raise ValueError(f"low {self.low:g}, high {self.high:g}: expected low < high")
+        return self
+
+    def contains(self, value: Any) -> bool:
+        """Whether the field may be that."""
+        if self.values:
+            return value in self.values
+        return (
+            isinstance(value, (int, float))
+            and self.low is not None
+            and self.high is not None
+            and self.low <= value <= self.high
+        )
+
+    def distribution(self, own: Any) -> BaseDistribution:
+        """For Optuna; whole numbers if the field's ``own`` value is one."""
+        if self.values:
+            return CategoricalDistribution(self.values)
+        assert self.low is not None
+        assert self.high is not None
+        if isinstance(own, int):
+            return IntDistribution(round(self.low), round(self.high), self.log, round(self.step or 1))
+        return FloatDistribution(self.low, self.high, self.log, self.step)
+
+
+class Space(StrictModel):
+    """Fields of a model file, by dotted name, and what they may be."""
+
+    choices: dict[str, Choice] = Field(min_length=1)
+
+    @classmethod
+    def load(cls, name_or_path: str | Path) -> Space:
+        """Reads it from a file of ``config/sweeps`` or a path.
+
+        Raises:
+            ConfigurationError: not found or malformed.
+        """
+        path = configuration.find_config("sweeps", name_or_path)
+        return configuration.validate(cls, {"choices": configuration.read_yaml(path)}, path)
+
+
+class Errors(NamedTuple):
+    """Of a trained model on the laps that were left out."""
+
+    ade: float
+    """Mean distance of rollouts from the measured path (m); what is minimised."""
+    rmse: tuple[float, float, float]
+    """Of one step: v_x, v_y (m/s), omega (rad/s)."""
+
+
+class Trial(NamedTuple):
+    """Settings, and what became of them."""
+
+    number: int
+    settings: dict[str, Any]
+    errors: Errors | None
+    failure: str
+
+
+Objective = Callable[[int, Mapping[str, Any]], Errors]
+
+
+class Sweep:
+    """The state of a sweep in a folder.
+
+    Args:
+        folder: where its state is, or will be.
+        space: what is varied.
+        own: values of the model file's own fields, which are tried first.
+        seed: of the choices.
+        about: what else must be the same when the sweep goes on.
+
+    Raises:
+        ConfigurationError: the file's own values are not in the space, or the folder holds a sweep of another one.
+    """
+
+    def __init__(
+        self, folder: Path, space: Space, own: Mapping[str, Any], seed: int = 0, about: Mapping[str, Any] | None = None
+    ) -> None:
+        self.seed = seed
+        self.distributions = {name: choice.distribution(own[name]) for name, choice in space.choices.items()}
+        for name, choice in space.choices.items():
+            if not choice.contains(own[name]):
+                raise ConfigurationError(
+                    f"{name}: {own[name]} of the model file is not in the space; expected it there"
+                )
+        optuna.logging.set_verbosity(logging.WARNING)
+        folder.mkdir(parents=True, exist_ok=True)
+        storage = JournalStorage(JournalFileBackend(str(folder / _STATE)))
+        self.study = optuna.create_study(storage=storage, study_name="sweep", load_if_exists=True)
+        now = {"space": space.model_dump(mode="json"), "own": dict(own), "seed": seed, **(about or {})}
+        before = self.study.user_attrs.get("about", now)
+        other = next((name for name in now if now[name] != before.get(name)), None)
+        if other is not None:
+            raise ConfigurationError(f"{folder}: its trials have another {other}; expected the same, or another folder")
+        self.study.set_user_attr("about", now)
+        if not self.study.trials:
+            self.study.enqueue_trial(dict(own))
+
+    @property
+    def trials(self) -> list[Trial]:
+        """Those that are done, in the order in which they were chosen."""
+        return [_trial(each) for each in self.study.trials if each.state in (TrialState.COMPLETE, TrialState.FAIL)]
+
+    @property
+    def best(self) -> Trial:
+        """The one of the smallest displacement.
+
+        Raises:
+            UserError: all failed.
+        """
+        scored = [(trial.errors.ade, trial) for trial in self.trials if trial.errors is not None]
+        if not scored:
+            raise UserError(
+                f"none of {len(self.trials)} trials has a score; the first ended with: {self.trials[0].failure}"
+            )
+        return min(scored, key=lambda each: each[0])[1]
+
+    def to_json(self) -> dict[str, Any]:
+        """The trials for programs."""
+        trials = [
+            {
+                "number": trial.number,
+                "settings": trial.settings,
+                "ade": trial.errors.ade if trial.errors else None,
+                "one_step_rmse": trial.errors.rmse if trial.errors else None,
+                "failure": trial.failure,
+            }
+            for trial in self.trials
+        ]
+        return {"best": self.best.number, "trials": trials}
+
+    def run(self, objective: Objective, count: int, workers: Workers = HERE, progress: Progress | None = None) -> None:
+        """Goes on until there are ``count`` trials.
+
+        Args:
+            objective: trains with settings and scores; a :class:`UserError` is a failed trial.
+            count: trials in all.
+            workers: where trials are done.
+            progress: told of each that is.
+        """
+        while True:
+            self._ask(count)
+            open_ones = self.study.get_trials(states=[TrialState.RUNNING])
+            if not open_ones:
+                return
+            tasks = [(objective, trial.number, trial.params) for trial in open_ones]
+            for k, outcome in each(_outcome, tasks, workers):
+                self._tell(open_ones[k], outcome)
+                if progress is not None:
+                    progress(len(self.trials), count)
+
+    def _ask(self, count: int) -> None:
+        """Chooses settings until a wave is complete, unless one is under way."""
+        while (asked := len(self.study.get_trials(states=_CHOSEN))) < count:
+            if asked % WAVE == 0 and self.study.get_trials(states=[TrialState.RUNNING]):
+                return
+            self.study.sampler = optuna.samplers.TPESampler(
+                seed=1000 * self.seed + asked, n_startup_trials=2 * WAVE, constant_liar=True
+            )
+            self.study.ask(self.distributions)
+
+    def _tell(self, trial: FrozenTrial, outcome: Errors | str) -> None:
+        live = optuna.Trial(self.study, trial._trial_id)
+        if isinstance(outcome, str):
+            live.set_user_attr(_FAILURE, outcome)
+            self.study.tell(trial.number, state=TrialState.FAIL)
+        else:
+            live.set_user_attr(_RMSE, list(outcome.rmse))
+            self.study.tell(trial.number, outcome.ade)
+
+
+_CHOSEN = (TrialState.RUNNING, TrialState.COMPLETE, TrialState.FAIL)
+
+
+def _outcome(task: tuple[Objective, int, dict[str, Any]]) -> Errors | str:
+    objective, number, settings = task
+    try:
+        return objective(number, settings)
+    except UserError as error:
+        return str(error)
+
+
+def _trial(found: FrozenTrial) -> Trial:
+    errors = None
+    if found.state == TrialState.COMPLETE:
+        assert found.value is not None
+        v_x, v_y, omega = found.user_attrs[_RMSE]
+        errors = Errors(found.value, (v_x, v_y, omega))
+    return Trial(found.number, dict(found.params), errors, found.user_attrs.get(_FAILURE, ""))
