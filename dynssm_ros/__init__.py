@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         race,
         recorded,
         replay,
+        review_season,
         simulate,
         sweep,
         train,
@@ -39,7 +40,7 @@ _HOMES = {
     **dict.fromkeys(
         (
             "calibrate", "diagnose", "evaluate", "extract", "extract_season", "inspect", "load_model", "race", "recorded",
-            "replay", "simulate", "sweep", "train",
+            "replay", "review_season", "simulate", "sweep", "train",
         ),
         "api",
     ),

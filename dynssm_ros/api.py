@@ -15,13 +15,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from dynssm_ros import __version__
 from dynssm_ros.errors import ConfigurationError, DataWarning
 from dynssm_ros.extras import require
-from dynssm_ros.parallel import HERE, Workers
+from dynssm_ros.files import checksum, content_key, digest, write_json
+from dynssm_ros.parallel import HERE, Workers, each
 from dynssm_ros.progress import Progress
 from dynssm_ros.runtime.plausibility import implausible_rows
 from dynssm_ros.signals.recording import Recording, concatenate
-from dynssm_ros.signals.season import recording_files
+from dynssm_ros.signals.season import Season, recording_files
 from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from dynssm_ros.control.race import Race
     from dynssm_ros.control.settings import Objective
     from dynssm_ros.evaluation.open_loop import Evaluation
+    from dynssm_ros.evaluation.season_review import Review
     from dynssm_ros.evaluation.sweep import Errors, Space, Sweep
     from dynssm_ros.identification.calibration import Calibration
     from dynssm_ros.identification.diagnosis import Diagnosis
@@ -39,7 +42,7 @@ if TYPE_CHECKING:
     from dynssm_ros.runtime.artifact import Artifact
     from dynssm_ros.runtime.models import WindowModel
     from dynssm_ros.signals.inspection import Inspection
-    from dynssm_ros.signals.season import Season, Session
+    from dynssm_ros.signals.season import Session
     from dynssm_ros.simulation.laps import Run
     from dynssm_ros.simulation.plant import PlantKind
     from dynssm_ros.track.racing_line import LineKind
@@ -313,6 +316,66 @@ def model_config(model: ModelConfig | PathLike, seed: int | None = None, epochs:
     given = {key: value for key, value in (("seed", seed), ("epochs", epochs)) if value is not None}
     config = load_model_config(model) if isinstance(model, (str, Path)) else model
     return config.with_training(**given)
+
+
+def review_season(
+    season: Season | PathLike,
+    models: Sequence[PathLike],
+    vehicle: Vehicle | PathLike,
+    out: PathLike,
+    where: str | None = None,
+    stretch: float | None = None,
+    workers: Workers = HERE,
+    on_progress: Progress | None = None,
+) -> list[Review]:
+    """Looks at each session of a season: scores models, calibrates the car, and says what its simulation gets wrong.
+
+    Args:
+        season: folder of it.
+        models: folders or names; the calibrated car, and the same with an average of its errors, are scored beside them.
+        vehicle: the car as it is known: simple models are of it, calibration and diagnosis start from it.
+        out: folder for what is found in each session, which is not looked at again while it is as it was.
+        where: chooses sessions.
+        stretch: length of the stretches of sessions that coefficients are of (s); if not given, whole sessions.
+        workers: where sessions are looked at; those of a cluster find all folders by the same paths.
+        on_progress: called with the sessions that are done.
+
+    Returns:
+        In the order of driving.
+
+    Example:
+        >>> for alarm in alarms(review_season("season", ["model"], "av21.yaml", "review")):  # doctest: +SKIP
+        ...     print(alarm.review.session, alarm.words)
+    """
+    require("season", "train", "race")
+    from dynssm_ros.evaluation.season_review import SIMPLE
+
+    opened = season if isinstance(season, Season) else Season.load(season)
+    names = [*dict.fromkeys([*map(str, models), *SIMPLE])]
+    task = partial(_reviewed, names, _vehicle(vehicle), Path(out), stretch)
+    sessions = [(session, opened.file(session.place)) for session in opened.chosen(where)]
+    found: dict[int, Review] = {}
+    for k, review in each(task, sessions, workers):
+        found[k] = review
+        if on_progress is not None:
+            on_progress(len(found), len(sessions))
+    return [found[k] for k in sorted(found)]
+
+
+def _reviewed(models: list[str], car: Vehicle, out: Path, stretch: float | None, task: tuple[Session, Path]) -> Review:
+    """What is found in a session, or was found in it before."""
+    from dynssm_ros.evaluation.season_review import read_review, review
+
+    session, file = task
+    trained = [digest(Path(name)) for name in models if Path(name).exists()]
+    key = content_key([__version__, car.model_dump(mode="json"), models, trained, stretch, checksum(file)])
+    kept = out / "sessions" / f"{'-'.join(session.place)}.json"
+    known = read_review(kept)
+    if known is not None and known.key == key:
+        return known
+    found = review(Recording.load(file), session, key, open_models(models, car), car, stretch)
+    write_json(kept, found.model_dump(mode="json"))
+    return found
 
 
 def sweep(

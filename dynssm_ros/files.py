@@ -204,6 +204,11 @@ def digest(path: Path) -> str:
     return total.hexdigest()
 
 
+def content_key(content: Any) -> str:
+    """SHA-256 of what JSON can hold: the same content has the same key."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
 def files_in(path: Path) -> list[Path]:
     """A file, or all files in a folder, however deep; none if nothing is there."""
     return [file for file in (sorted(path.rglob("*")) if path.is_dir() else [path]) if file.is_file()]

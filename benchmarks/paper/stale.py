@@ -6,14 +6,12 @@ documentation asks for it.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 import sys
 from pathlib import Path
 
 from benchmarks.paper.plan import Plan, load_plan
-from dynssm_ros.files import replacing
+from dynssm_ros.files import content_key, replacing
 from dynssm_ros.vehicle import load_vehicle
 
 NOTE = (
@@ -35,7 +33,7 @@ def fingerprint(plan: Plan) -> str:
         },
         "vehicles": sorted(load_vehicle(name).model_dump_json() for name in plan.vehicles),
     }
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return content_key(content)
 
 
 def signed(text: str, plan: Plan) -> str:

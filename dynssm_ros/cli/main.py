@@ -22,6 +22,7 @@ from dynssm_ros.cli.extract import extract
 from dynssm_ros.cli.inspect import inspect
 from dynssm_ros.cli.race import race
 from dynssm_ros.cli.replay import replay
+from dynssm_ros.cli.season import season
 from dynssm_ros.cli.simulate import simulate
 from dynssm_ros.cli.sweep import sweep
 from dynssm_ros.cli.train import train
@@ -39,7 +40,7 @@ app = typer.Typer(
 # click's base of all usage errors, wherever typer keeps its click
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
-for command in (inspect, simulate, extract, calibrate, train, sweep, evaluate, replay, diagnose, race):
+for command in (inspect, simulate, extract, calibrate, train, sweep, evaluate, replay, diagnose, season, race):
     app.command()(command)
 
 

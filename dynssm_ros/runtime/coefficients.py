@@ -33,7 +33,8 @@ SPREAD: dict[str, float] = {
 }  # fmt: skip
 """Standard deviation of each coefficient's change from one day to another: a share of its nominal value, for the shifts of
 the slip angles in rad. Coefficients that are not named stay as calibrated."""
-_ABSOLUTE = ("S_hf", "S_vf", "S_hr", "S_vr")
+SHIFTS = ("S_hf", "S_vf", "S_hr", "S_vr")
+"""Coefficients that are about zero: a share of them says nothing."""
 _BLOCK_S = 0.3
 _MEMORY_S = 300.0  # over which changes return to the calibrated values
 _ERROR_MEMORY_S = 2.0  # of the physics' slow error
@@ -46,6 +47,13 @@ _EVIDENCE_WANTED = 3.0  # log likelihood ratio that makes a change as likely as 
 _LEAST_EVIDENCE, _MOST_EVIDENCE = -2.0, 12.0  # as in a cumulative sum test: a long calm must not delay the alarm
 _FEWEST = 10  # blocks that tell what is usual
 _SECANT = 0.5  # of the spread: step of the derivatives
+
+
+def daily_change(vehicle: Vehicle, spread: Mapping[str, float] = SPREAD) -> Vector:
+    """Standard deviations of the coefficients' changes from one day to another, ``(17,)``, by :data:`SPREAD`."""
+    size = np.where(np.isin(COEFFICIENTS, SHIFTS), 1.0, np.abs(vehicle.nominal))
+    change: Vector = size * [spread.get(name, 0.0) for name in COEFFICIENTS]
+    return change
 
 
 class BlockErrors(NamedTuple):
@@ -88,8 +96,7 @@ class CoefficientEstimator:
         self._stepping: tuple[Integrator, int] = integrator, substeps
         self._effects = vehicle.active_effects
         self._carries = carries(self._effects)
-        size = np.where(np.isin(COEFFICIENTS, _ABSOLUTE), 1.0, np.abs(self.nominal))
-        change = size * [spread.get(name, 0.0) for name in COEFFICIENTS]
+        change = daily_change(vehicle, spread)
         known = np.array([vehicle.coefficients[name].std or 0.0 for name in COEFFICIENTS])
         self.adapted = np.flatnonzero(change > 0)
         """Which of the coefficients can change."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +10,7 @@ from pathlib import Path
 
 from dynssm_ros import __version__
 from dynssm_ros.errors import ConfigurationError, UserError
-from dynssm_ros.files import digest, files_in, require_replaceable
+from dynssm_ros.files import content_key, digest, files_in, require_replaceable
 from dynssm_ros.parallel import HERE, Workers, each
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.extraction import extract
@@ -42,8 +40,7 @@ class Log:
     @property
     def settings(self) -> str:
         """See :class:`Session`."""
-        content = [self.signal_map.model_dump(mode="json"), self.rate, self.drop_bad, __version__]
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        return content_key([self.signal_map.model_dump(mode="json"), self.rate, self.drop_bad, __version__])
 
 
 def logs_of(

@@ -1,0 +1,73 @@
+"""``dynssm season``: a season in review, on one page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dynssm_ros import api
+from dynssm_ros.cli.console import (
+    AddressOption,
+    BackendOption,
+    JobsOption,
+    JsonOption,
+    VehicleOption,
+    WhereOption,
+    console,
+    progress_bar,
+    write_results,
+)
+from dynssm_ros.extras import require
+from dynssm_ros.parallel import Workers
+
+
+def season(
+    folder: Annotated[Path, typer.Argument(help="Season, as `extract` writes it.", metavar="SEASON")],
+    vehicle: VehicleOption,
+    out: Annotated[Path, typer.Option(help="Folder for report.html and results.json.", file_okay=False)],
+    model: Annotated[
+        list[str] | None,
+        typer.Option(help="Model folder to score beside the simple models; repeat for more.", metavar="NAME_OR_DIR"),
+    ] = None,
+    stretch: Annotated[
+        float | None,
+        typer.Option(
+            help="Length of the stretches that coefficients are of (s).", min=10.0, show_default="whole sessions"
+        ),
+    ] = None,
+    jobs: JobsOption = None,
+    backend: BackendOption = "processes",
+    address: AddressOption = None,
+    json: JsonOption = None,
+    where: WhereOption = None,
+) -> None:
+    """Review a season: each model in each session, coefficients over time, causes that come and go, alarms."""
+    require("season", "train", "race", "report")
+    from dynssm_ros.evaluation.season_review import alarms
+    from dynssm_ros.reporting.season_report import alarm_table, season_report, session_table
+
+    with progress_bar("reviewing") as progress:
+        reviews = api.review_season(
+            folder, model or [], vehicle, out, where, stretch, Workers(jobs, backend, address), progress
+        )
+    raised = alarms(reviews)
+    protocol = {
+        "Season": str(folder) + (f" where {where}" if where else ""),
+        "Vehicle": vehicle,
+        "Models": ", ".join(model or []) or "the simple ones alone",
+        "Coefficients": "of whole sessions" if stretch is None else f"of stretches of {stretch:g} s",
+        "Each session": "alone; online layers start from their prior",
+    }
+    season_report(reviews, raised, protocol).save(out / "report.html")
+    found = {
+        "sessions": [review.model_dump(mode="json", exclude={"key"}) for review in reviews],
+        "alarms": [
+            {"session": alarm.review.session, "subject": alarm.subject, "words": alarm.words} for alarm in raised
+        ],
+    }
+    write_results(found, out, json)
+    console.print(session_table(reviews, raised).brief.rich())
+    console.print(alarm_table(raised).brief.rich())
+    console.print(f"{out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)
