@@ -184,7 +184,7 @@ def causes(reviews: Sequence[Review]) -> Figure:
             row = names.index(cause.effect)
             axes.scatter(k, row, s=20 + 500 * max(cause.gain, 0.0), color=PALETTE[0], alpha=0.55, lw=0)
             axes.annotate(
-                _size(cause), (k, row), (0, -11), textcoords="offset points", ha="center", fontsize=6.5, color=MEASURED
+                _size(cause), (k, row), (13, 0), textcoords="offset points", va="center", fontsize=7, color=MEASURED
             )
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.3, -0.6)
