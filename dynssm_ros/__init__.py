@@ -69,6 +69,7 @@ __all__ = [
     "register_model",
     "register_plant",
     "replay",
+    "review_season",
     "save_vehicle",
     "simulate",
     "sweep",

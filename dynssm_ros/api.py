@@ -422,46 +422,23 @@ def sweep(
     """
     require("sweep", "sweep", "train", "race")
     from dynssm_ros.evaluation.sweep import Space, Sweep
-    from dynssm_ros.learning.models.registry import load_model_config
+    from dynssm_ros.learning.models.registry import field_of, load_model_config
 
     space = space if isinstance(space, Space) else Space.load(space)
-    car, config = _vehicle(vehicle), load_model_config(model).model_dump(mode="json")
+    car, config = _vehicle(vehicle), load_model_config(model)
     for logs in (recordings, validation):
         _opened(logs, car)  # what is wrong with them is said once
     about = {
-        "model": config, "vehicle": car.model_dump(mode="json"), "recordings": [str(log) for log in _files(recordings)],
-        "validation": [str(log) for log in _files(validation)], "holdout": holdout, "commands": commands, "epochs": epochs,
+        "model": config.model_dump(mode="json"), "vehicle": car.model_dump(mode="json"), "holdout": holdout,
+        "recordings": list(map(_name, _files(recordings))), "validation": list(map(_name, _files(validation))),
+        "commands": commands, "epochs": epochs,
     }  # fmt: skip
-    found = Sweep(Path(out), space, {name: _field(config, name) for name in space.choices}, seed, about)
+    found = Sweep(Path(out), space, {name: field_of(config, name) for name in space.choices}, seed, about)
     objective = partial(
         _scored, list(_files(recordings)), list(_files(validation)), model, car, Path(out), holdout, commands, epochs
     )
     found.run(objective, trials, workers, on_progress)
     return found
-
-
-def _field(config: Mapping[str, Any], name: str) -> Any:
-    """A field of a model file by its dotted name."""
-    value: Any = config
-    for part in name.split("."):
-        if not isinstance(value, Mapping) or part not in value:
-            raise ConfigurationError(f"{name}: no field of the model file; expected one, as training.learning_rate")
-        value = value[part]
-    return value
-
-
-def swept(model: PathLike, settings: Mapping[str, Any]) -> ModelConfig:
-    """A model file with other values of fields, by their dotted names."""
-    from dynssm_ros.learning.models.registry import load_model_config
-
-    overrides: dict[str, Any] = {}
-    for name, value in settings.items():
-        *blocks, field = name.split(".")
-        inner = overrides
-        for block in blocks:
-            inner = inner.setdefault(block, {})
-        inner[field] = value
-    return load_model_config(model, overrides)
 
 
 def _scored(
@@ -471,11 +448,12 @@ def _scored(
     """Trains with settings, and scores on laps that were left out."""
     from dynssm_ros.evaluation.open_loop import evaluate
     from dynssm_ros.evaluation.sweep import STRIDE, Errors
+    from dynssm_ros.learning.models.registry import load_model_config, overrides
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         part = 0.0 if validation else holdout
-        config = model_config(swept(model, settings), None, epochs)
+        config = model_config(load_model_config(model, overrides(settings)), None, epochs)
         train(recordings, config, car, out / "trials" / f"{number:03d}", part, commands)
         trained = load_model(out / "trials" / f"{number:03d}")
         logs = [log.with_commands(trained.commands) for log in _opened(validation or recordings, car)]
@@ -781,10 +759,9 @@ def _opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
     opened = []
     for log in _files(logs):
         recording = log if isinstance(log, Recording) else Recording.load(log)
-        where = ", ".join(recording.info.source) if isinstance(log, Recording) else log
         if car is not None and math.isclose(car.sampling_time, recording.T_s):  # else the command ends with that
             for words in implausible_rows(recording, car):
-                warnings.warn(f"{where}: {words}", DataWarning, stacklevel=3)
+                warnings.warn(f"{_name(log)}: {words}", DataWarning, stacklevel=3)
         opened.append(recording)
     return opened
 
@@ -798,6 +775,10 @@ def _files(logs: Log | Sequence[Log]) -> Iterator[Log]:
     """Recordings or their files, those of seasons one by one."""
     for log in _several(logs):
         yield from [log] if isinstance(log, Recording) else recording_files([log])
+
+
+def _name(log: Log) -> str:
+    return ", ".join(log.info.source) if isinstance(log, Recording) else str(log)
 
 
 def _several(logs: Log | Sequence[Log]) -> list[Log]:

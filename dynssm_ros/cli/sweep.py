@@ -57,6 +57,7 @@ def sweep(
 ) -> None:
     """Train a model with other settings again and again, and see which predict laps best that were left out."""
     require("sweep", "sweep", "train", "report")
+    from dynssm_ros.learning.models.registry import load_model_config, overrides
     from dynssm_ros.reporting.sweep_report import sweep_report, trial_table, verdict
 
     logs, left_out = recording_files(recordings, where), recording_files(validation or [])
@@ -65,7 +66,7 @@ def sweep(
             logs, model, vehicle, out, space, trials, holdout, left_out, commands, seed, epochs,
             Workers(jobs, backend, address), progress,
         )  # fmt: skip
-    best = api.swept(model, found.best.settings)
+    best = load_model_config(model, overrides(found.best.settings))
     with replacing(out / "best.yaml") as aside:
         aside.write_text(yaml.safe_dump(best.model_dump(mode="json"), sort_keys=False), encoding="utf-8")
     names = ", ".join(path.name for path in recordings) + (f" where {where}" if where else "")

@@ -44,8 +44,8 @@ class Accuracy(StrictModel):
     rmse: tuple[float, float, float] = Field(description="of one step: v_x, v_y (m/s), omega (rad/s)")
 
 
-class Coefficient(StrictModel):
-    """As the rows of a stretch have it."""
+class Estimate(StrictModel):
+    """Of a coefficient, by the rows of a stretch."""
 
     value: float
     std: float
@@ -55,7 +55,7 @@ class Stretch(StrictModel):
     """A part of a session, and its coefficients."""
 
     start: str = Field(description="UTC")
-    coefficients: dict[str, Coefficient]
+    coefficients: dict[str, Estimate]
 
 
 class Found(StrictModel):
@@ -152,7 +152,7 @@ def _stretches(recording: Recording, session: Session, vehicle: Vehicle, stretch
     for after, part in _parts(recording, stretch):
         fit = calibrate(part, loose, starts=1)
         both = zip(COEFFICIENTS, fit.theta, fit.std, strict=True)
-        coefficients = {name: Coefficient(value=float(value), std=float(std)) for name, value, std in both}
+        coefficients = {name: Estimate(value=float(value), std=float(std)) for name, value, std in both}
         start = (begin + timedelta(seconds=after)).isoformat(timespec="seconds")
         found.append(Stretch(start=start, coefficients=coefficients))
     return tuple(found)
@@ -206,7 +206,7 @@ def alarms(reviews: Sequence[Review]) -> list[Alarm]:
 
 def _moved(reviews: Sequence[Review]) -> Iterator[Alarm]:
     for name in COEFFICIENTS:
-        since: dict[str, list[Coefficient]] = defaultdict(list)
+        since: dict[str, list[Estimate]] = defaultdict(list)
         for each in reviews:
             for stretch in each.stretches:
                 now = stretch.coefficients[name]
@@ -224,7 +224,7 @@ def _moved(reviews: Sequence[Review]) -> Iterator[Alarm]:
                 before.append(now)
 
 
-def expected(before: Iterable[Coefficient]) -> tuple[float, float]:
+def expected(before: Iterable[Estimate]) -> tuple[float, float]:
     """Mean of stretches, and the standard deviation of another one about it, but for its own."""
     value, variance = (np.array(each) for each in zip(*((one.value, one.std**2) for one in before), strict=True))
     weight = 1 / variance

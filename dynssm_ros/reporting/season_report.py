@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from dynssm_ros.evaluation.coefficients import coefficient_unit
-from dynssm_ros.evaluation.season_review import Alarm, Coefficient, Found, Review, expected
+from dynssm_ros.evaluation.season_review import Alarm, Estimate, Found, Review, expected
 from dynssm_ros.reporting.evaluation_figures import MEASURED, PALETTE, WIDTH, model_colours, styled
 from dynssm_ros.reporting.page import Report, Section
 from dynssm_ros.reporting.tables import Column, Table, Value
@@ -153,7 +153,7 @@ def coefficients(reviews: Sequence[Review], alarms: Sequence[Alarm]) -> Figure:
     return figure
 
 
-def _points(reviews: Sequence[tuple[int, Review]], name: str) -> tuple[list[float], list[Coefficient]]:
+def _points(reviews: Sequence[tuple[int, Review]], name: str) -> tuple[list[float], list[Estimate]]:
     """Where a coefficient's values are on the axis of sessions, and the values."""
     places, points = [], []
     for k, each in reviews:

@@ -10,7 +10,7 @@ import pytest
 from dynssm_ros.api import review_season
 from dynssm_ros.evaluation.season_review import (
     Accuracy,
-    Coefficient,
+    Estimate,
     Found,
     Review,
     Stretch,
@@ -38,7 +38,7 @@ def a_review(
 ) -> Review:
     """A session whose other coefficients are as in the vehicle file."""
     values = dict(zip(COEFFICIENTS, ORCA.nominal, strict=True)) | {"D_f": D_f}
-    coefficients = {name: Coefficient(value=value, std=std) for name, value in values.items()}
+    coefficients = {name: Estimate(value=value, std=std) for name, value in values.items()}
     none = (0.0, 0.0, 0.0)
     return Review(
         key="", car=car, track="club", session=f"run_{k}", start=f"2026-06-{k + 1:02d}T10:00:00+00:00", seconds=60.0,
@@ -73,12 +73,12 @@ def test_what_varies_from_session_to_session_anyway_is_no_alarm() -> None:
 def test_the_spread_between_sessions_is_recovered() -> None:
     draw = np.random.default_rng(2)
     points = [
-        Coefficient(value=3 + 0.5 * draw.standard_normal() + 0.2 * draw.standard_normal(), std=0.2) for _ in range(4000)
+        Estimate(value=3 + 0.5 * draw.standard_normal() + 0.2 * draw.standard_normal(), std=0.2) for _ in range(4000)
     ]
     mean, std = expected(points)
     assert mean == pytest.approx(3.0, abs=0.03)
     assert std == pytest.approx(0.5, rel=0.05)
-    assert expected([Coefficient(value=1.0, std=0.1)] * 4) == (pytest.approx(1.0), pytest.approx(0.05))
+    assert expected([Estimate(value=1.0, std=0.1)] * 4) == (pytest.approx(1.0), pytest.approx(0.05))
 
 
 def test_models_that_lose_and_errors_that_rise_are_named() -> None:

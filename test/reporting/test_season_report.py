@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dynssm_ros.cli.main import main
-from dynssm_ros.evaluation.season_review import Accuracy, Coefficient, Found, Review, Stretch, alarms
+from dynssm_ros.evaluation.season_review import Accuracy, Estimate, Found, Review, Stretch, alarms
 from dynssm_ros.reporting.season_report import season_report, session_table
 from dynssm_ros.signals.season import Season, Session
 from dynssm_ros.simulation.laps import as_recording, simulate
@@ -19,7 +19,7 @@ ORCA = load_vehicle("orca")
 
 def a_review(k: int, car: str = "orca", D_r: float = 0.17) -> Review:
     values = dict(zip(COEFFICIENTS, ORCA.nominal, strict=True)) | {"D_r": D_r}
-    coefficients = {name: Coefficient(value=value, std=0.002) for name, value in values.items()}
+    coefficients = {name: Estimate(value=value, std=0.002) for name, value in values.items()}
     errors = {"dynssm": Accuracy(ade=0.01 + 0.001 * k, rmse=(0.0, 0.0, 0.0))}
     return Review(
         key="", car=car, track="club", session=f"run_{k}", start=f"2026-06-{k + 1:02d}T10:00:00+00:00", seconds=600.0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,32 @@ def parse_model_config(content: dict[str, Any], source: str | Path) -> ModelConf
         start = _with_base(_referred(Path(source), fine_tuning["starts_from"]))
         content = content | {"fine_tuning": fine_tuning | {"starts_from": start}}
     return configuration.validate(MODELS[kind].CONFIG, content, source)
+
+
+def field_of(config: ModelConfig, name: str) -> Any:
+    """A field of a model file by its dotted name, such as ``training.learning_rate``.
+
+    Raises:
+        ConfigurationError: the model file has none of that name.
+    """
+    value: Any = config.model_dump(mode="json")
+    for part in name.split("."):
+        if not isinstance(value, dict) or part not in value:
+            raise ConfigurationError(f"{name}: no field of the model file; expected one, as training.learning_rate")
+        value = value[part]
+    return value
+
+
+def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields by dotted names as blocks, for :func:`load_model_config`."""
+    nested: dict[str, Any] = {}
+    for name, value in settings.items():
+        *blocks, field = name.split(".")
+        inner = nested
+        for block in blocks:
+            inner = inner.setdefault(block, {})
+        inner[field] = value
+    return nested
 
 
 def _with_base(path: Path, depth: int = 0) -> dict[str, Any]:
