@@ -267,6 +267,7 @@ def train(
     device: str = "cpu",
     on_progress: Callable[[int, int, str], None] | None = None,
     picture: Callable[[Trained, Path], None] | None = None,
+    memory: float | None = None,
 ) -> TrainingResult:
     """Trains a model and writes its folder: card, weights, ONNX graph, metrics. Continues after a kill.
 
@@ -282,6 +283,8 @@ def train(
         device: ``cpu`` or ``cuda``.
         on_progress: called after each epoch with epochs done, epochs at most and a line about them.
         picture: draws the training to the file in the folder that it is given.
+        memory: what the rows of the recordings' files may take (MB): a sample of all stays, the rest comes and goes. If not
+            given, all stays.
 
     Example:
         >>> laps = recorded(simulate("orca", "club", duration=20.0))
@@ -293,15 +296,21 @@ def train(
     from dynssm_ros.identification.calibration import calibrate
     from dynssm_ros.learning.export import check_replaceable, save_artifact
     from dynssm_ros.learning.stages import check_device, checkpoints, train
+    from dynssm_ros.learning.streaming import Stream
 
     check_device(device)
     folder = Path(out) if Path(out).name else Path(out).absolute()  # "." has no name to put the checkpoint beside
     check_replaceable(folder)
     config = model_config(model, seed, epochs)
     checkpoint, car = checkpoint_of(folder), _vehicle(vehicle)
+    if memory is None:
+        stream, data = None, _joined(_opened(recordings, car), commands, holdout)
+    else:
+        stream = Stream(_streamed(recordings, car), memory, commands, holdout)
+        data = stream.sample()
     trained = train(
-        _joined(_opened(recordings, car), commands, holdout), config, car, checkpoint, device, on_progress,
-        lambda data, car, integrator: calibrate(data, car, integrator=integrator).vehicle,
+        data, config, car, checkpoint, device, on_progress,
+        lambda data, car, integrator: calibrate(data, car, integrator=integrator).vehicle, stream,
     )  # fmt: skip
     artifact = save_artifact(trained, folder, {"holdout": holdout, "device": device}, picture)
     for path in checkpoints(config, checkpoint):
@@ -764,6 +773,16 @@ def _opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
                 warnings.warn(f"{_name(log)}: {words}", DataWarning, stacklevel=3)
         opened.append(recording)
     return opened
+
+
+def _streamed(logs: Log | Sequence[Log], car: Vehicle) -> list[Path]:
+    """Files of recordings, each of which was looked at; see :func:`_opened`."""
+    files = [log for log in _files(logs) if not isinstance(log, Recording)]
+    if len(files) < sum(1 for _ in _files(logs)):
+        raise ConfigurationError("memory: a recording that is not in a file cannot come and go; expected files")
+    for file in files:
+        _opened(file, car)
+    return [Path(file) for file in files]
 
 
 def _joined(recordings: Sequence[Recording], commands: Commands | None, holdout: float) -> Recording:

@@ -34,6 +34,13 @@ def train(
     seed: Annotated[int | None, typer.Option(help="Instead of the model file's.", min=0)] = None,
     epochs: Annotated[int | None, typer.Option(help="Instead of the model file's, in each stage.", min=1)] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    memory: Annotated[
+        float | None,
+        typer.Option(
+            help="What the rows may take (MB): a sample of all recordings stays, the rest comes and goes.",
+            show_default="all stays",
+        ),
+    ] = None,
     where: WhereOption = None,
 ) -> None:
     """Train a model on recordings and write its folder: card, weights, ONNX, metrics, loss picture."""
@@ -41,7 +48,7 @@ def train(
         try:
             trained, artifact = api.train(
                 recording_files(recordings, where), model, vehicle, out, holdout, commands, seed, epochs, device, progress,
-                None if missing_libraries("report") else _draw_losses,
+                None if missing_libraries("report") else _draw_losses, memory,
             )  # fmt: skip
         except KeyboardInterrupt:
             folder = out.absolute()

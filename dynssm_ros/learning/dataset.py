@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -42,6 +42,13 @@ class SplitConfig(StrictModel):
         return 1, 1
 
 
+class Digest(Protocol):
+    """As of :mod:`hashlib`."""
+
+    def update(self, data: bytes, /) -> None:
+        """Adds bytes."""
+
+
 @dataclass(frozen=True)
 class TrainingWindows:
     """TrainingWindows that end at ``ends`` in the rows ``matrix`` ``(N, 7)``; formed batch by batch, never stored."""
@@ -68,6 +75,22 @@ class TrainingWindows:
         """All of them in order, as :meth:`batch` has them, so many at a time."""
         for begin in range(0, len(self), size):
             yield self.batch(slice(begin, begin + size))
+
+    def epoch(self, draw: torch.Generator, size: int) -> Iterator[tuple[Tensor, Tensor]]:
+        """All of them once in random order, so many at a time."""
+        order = torch.randperm(len(self), generator=draw).to(self.ends.device)
+        for index in torch.split(order, size) if len(order) else ():
+            yield self.batch(index)
+
+    @property
+    def mean_increment(self) -> Tensor:
+        """Mean of the measured increments, ``(3,)``."""
+        return self.increments.mean(0)
+
+    def identify(self, digest: Digest) -> None:
+        """Adds what it is to a checksum."""
+        digest.update(np.ascontiguousarray(self.matrix.numpy()).tobytes())
+        digest.update(self.ends.numpy().tobytes())
 
     def to(self, device: torch.device) -> TrainingWindows:
         """The same windows on ``device``."""

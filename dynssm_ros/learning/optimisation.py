@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -21,6 +20,7 @@ from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import COMPONENTS, LossConfig, Scales, rollout_objective, scales
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
+from dynssm_ros.learning.streaming import StreamedWindows
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
@@ -86,7 +86,7 @@ class Optimisation:
         vehicle: Vehicle,
         model: TrainableModel,
         scale: Normalisation,
-        training: TrainingWindows,
+        training: TrainingWindows | StreamedWindows,
         validation: TrainingWindows,
         checkpoint: Path,
         device: torch.device,
@@ -101,6 +101,7 @@ class Optimisation:
         s_y, s_delta = scales(config.loss, scale)
         self.scales: Scales = (s_y.to(device), s_delta.to(device))
         self.H = config.rows(vehicle.sampling_time)
+        self.device = device
         self.training, self.validation = training.to(device), validation.to(device)
         self.trained = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         self.optimiser, self.schedule = self._optimiser(1.0)
@@ -188,12 +189,10 @@ class Optimisation:
 
     def _epoch(self) -> dict[str, float]:
         self.model.train()
-        order = torch.randperm(len(self.training), generator=self.shuffle).to(self.training.ends.device)
-        batches = torch.split(order, self.settings.batch_size)
         totals = dict.fromkeys(COMPONENTS, 0.0)
         steps = self._ramped()
-        for index in batches:
-            window, target = self.augmentation(*self.training.batch(index))
+        for batch in self.training.epoch(self.shuffle, self.settings.batch_size):
+            window, target = self.augmentation(*batch)
             terms = self._terms(window, target, steps)
             loss = torch.stack(list(terms.values())).sum()
             self.optimiser.zero_grad()
@@ -202,7 +201,7 @@ class Optimisation:
                 nn.utils.clip_grad_norm_(self.trained, self.settings.gradient_clip)
             self.optimiser.step()
             for term, value in terms.items():
-                totals[term] += value.item() * len(index) / len(order)
+                totals[term] += value.item() * len(target) / len(self.training)
         return totals
 
     @torch.no_grad()
@@ -245,7 +244,7 @@ class Optimisation:
         try:
             with zipfile.ZipFile(self.checkpoint) as archive:
                 damaged = archive.testzip()  # torch does not compare the checksums that it writes
-            content = torch.load(self.checkpoint, map_location=self.training.ends.device, weights_only=True)
+            content = torch.load(self.checkpoint, map_location=self.device, weights_only=True)
         except Exception:  # whatever a foreign or damaged file raises: it is not ours to continue
             return 0
         if damaged or not isinstance(content, dict) or content.get("identity") != self.identity:
@@ -273,9 +272,11 @@ def squared_errors(model: TrainableModel, windows: TrainingWindows) -> Tensor:
     return squares / len(windows)
 
 
-def unexplained(model: TrainableModel, training: TrainingWindows, validation: TrainingWindows) -> float:
+def unexplained(
+    model: TrainableModel, training: TrainingWindows | StreamedWindows, validation: TrainingWindows
+) -> float:
     """Mean squared error on ``validation`` over that of predicting the mean change in ``training``, mean of the states."""
-    of_mean = (validation.increments - training.increments.mean(0)).double().square().mean(0).cpu()
+    of_mean = (validation.increments - training.mean_increment).double().square().mean(0).cpu()
     return float((squared_errors(model, validation) / of_mean).mean())
 
 
@@ -283,10 +284,9 @@ def _empty_history() -> History:
     return {f"{part}/{term}": [] for part in ("train", "validation") for term in COMPONENTS}
 
 
-def _identity(config: ModelConfig, vehicle: Vehicle, training: TrainingWindows) -> str:
+def _identity(config: ModelConfig, vehicle: Vehicle, training: TrainingWindows | StreamedWindows) -> str:
     """Names a training by code, data, car and configuration, so that a checkpoint is never continued for another."""
     digest = hashlib.sha256(f"{__version__} {torch.__version__} {config.model_dump_json()}".encode())
     digest.update(vehicle.model_dump_json().encode())
-    digest.update(np.ascontiguousarray(training.matrix.numpy()).tobytes())
-    digest.update(training.ends.numpy().tobytes())
+    training.identify(digest)
     return digest.hexdigest()

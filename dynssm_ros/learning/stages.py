@@ -23,6 +23,7 @@ from dynssm_ros.learning.optimisation import (
     squared_errors,
     unexplained,
 )
+from dynssm_ros.learning.streaming import Stream
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.online import OnlineLayer
@@ -92,6 +93,7 @@ def train(
     device: str = "cpu",
     progress: NamedProgress | None = None,
     calibrate: Calibrate | None = None,
+    stream: Stream | None = None,
 ) -> Trained:
     """Trains a model; ``checkpoint`` is kept up to date and continued from if it belongs to the same training.
 
@@ -107,6 +109,7 @@ def train(
         progress: called after each epoch.
         calibrate: from the data of a stage and the vehicle to the calibrated one, for models whose physics asks for it;
             ``None``: the vehicle is taken as calibrated. All stages step as the first.
+        stream: of which ``recording`` is the sample, and whose other rows are trained on as well.
 
     Raises:
         RecordingError: another sampling time than the vehicle's, or too little data.
@@ -128,13 +131,14 @@ def train(
         """One stage, from what the model starts from on."""
         car = calibrate(data, vehicle, integrator) if calibrate is not None and calibrates else vehicle
         report, file, start = _stage(progress, name, stage, stages), files[stage], None
+        more = stream if stage == 0 else None  # the others only tell how large errors are
         if len(stages) == 1 and of.start is None:
             report = progress
         if of.start is not None:
             first = _stage(progress, of.start.name if name == of.name else f"{name}: {of.start.name}", stage, stages)
-            start = _train(data, of.start, car, _start_of(file), device, first)
+            start = _train(data, of.start, car, _start_of(file), device, first, stream=more)
             report = _stage(progress, name, stage, stages, start.config.training.effort[0])
-        return _train(data, of, car, file, device, report, start)
+        return _train(data, of, car, file, device, report, start, more)
 
     trained = run(recording, config, 0, config.name, physics.integrator)
     if config.online is None:
@@ -225,6 +229,7 @@ def _train(
     device: str,
     progress: NamedProgress | None,
     start: Trained | None = None,
+    stream: Stream | None = None,
 ) -> Trained:
     """One stage; ``start`` is the outcome of the stage before."""
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
@@ -247,11 +252,12 @@ def _train(
     training, validation = _split(recording, config, vehicle, model.EXTRA_ROWS + ahead)
     if start is not None:
         model.take_over(start.model)
+    windows = training if stream is None else stream.windows(training, vehicle.minimum_speed)
     if model.fit(training):
         run = OptimisationResult(model, {})
     else:
         optimisation = Optimisation(
-            config, vehicle, model, scale, training, validation, checkpoint, torch.device(device),
+            config, vehicle, model, scale, windows, validation, checkpoint, torch.device(device),
             anew if start is None else None,
         )  # fmt: skip
         run = optimisation.run(progress)
@@ -261,5 +267,5 @@ def _train(
     return Trained(
         config, vehicle, recording, model, scale, run.history, run.best_epoch, (v_x, v_y, omega),
         unexplained(model, training, held),
-        (len(training), len(validation)), run.resumed_from + (start.resumed_from if start else 0), run.restarts, start,
+        (len(windows), len(validation)), run.resumed_from + (start.resumed_from if start else 0), run.restarts, start,
     )  # fmt: skip

@@ -263,6 +263,19 @@ def _column(file: pq.ParquetFile, name: str, kind: str, path: Path) -> npt.NDArr
     return values
 
 
+def row_count(path: str | Path) -> int:
+    """Rows of a recording's file, whose columns are not read.
+
+    Raises:
+        RecordingError: missing, not Parquet, or damaged.
+    """
+    path = Path(path)
+    if not os.path.isfile(path):
+        raise RecordingError(f"{path}: no such recording; `dynssm extract` makes one from a bag")
+    with _readable(path), pq.ParquetFile(path) as file:
+        return int(file.metadata.num_rows)
+
+
 def concatenate(recordings: Sequence[Recording]) -> Recording:
     """Joins recordings of one car, one after the other; segments stay apart.
 
