@@ -268,6 +268,7 @@ def train(
     on_progress: Callable[[int, int, str], None] | None = None,
     picture: Callable[[Trained, Path], None] | None = None,
     memory: float | None = None,
+    processes: int = 1,
 ) -> TrainingResult:
     """Trains a model and writes its folder: card, weights, ONNX graph, metrics. Continues after a kill.
 
@@ -285,6 +286,8 @@ def train(
         picture: draws the training to the file in the folder that it is given.
         memory: what the rows of the recordings' files may take (MB): a sample of all stays, the rest comes and goes. If not
             given, all stays.
+        processes: that share each batch of the optimisation (extra ``processes``). A script that is run needs
+            ``if __name__ == "__main__"`` around its call.
 
     Example:
         >>> laps = recorded(simulate("orca", "club", duration=20.0))
@@ -311,6 +314,7 @@ def train(
     trained = train(
         data, config, car, checkpoint, device, on_progress,
         lambda data, car, integrator: calibrate(data, car, integrator=integrator).vehicle, stream,
+        processes,
     )  # fmt: skip
     artifact = save_artifact(trained, folder, {"holdout": holdout, "device": device}, picture)
     for path in checkpoints(config, checkpoint):

@@ -14,6 +14,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "report": ("matplotlib", "jinja2", "scipy"),
     "scale": ("joblib",),
     "sweep": ("optuna",),
+    "processes": ("lightning_fabric",),
     "ray": ("joblib", "ray"),
     "dask": ("joblib", "dask", "distributed"),
     "ros": ("rclpy",),

@@ -41,6 +41,7 @@ def train(
             show_default="all stays",
         ),
     ] = None,
+    processes: Annotated[int, typer.Option(help="That share each batch; of a GPU each has its own.", min=1)] = 1,
     where: WhereOption = None,
 ) -> None:
     """Train a model on recordings and write its folder: card, weights, ONNX, metrics, loss picture."""
@@ -49,6 +50,7 @@ def train(
             trained, artifact = api.train(
                 recording_files(recordings, where), model, vehicle, out, holdout, commands, seed, epochs, device, progress,
                 None if missing_libraries("report") else _draw_losses, memory,
+                processes,
             )  # fmt: skip
         except KeyboardInterrupt:
             folder = out.absolute()

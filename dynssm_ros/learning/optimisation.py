@@ -20,6 +20,7 @@ from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import COMPONENTS, LossConfig, Scales, rollout_objective, scales
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
+from dynssm_ros.learning.processes import Group, run_in_processes
 from dynssm_ros.learning.streaming import StreamedWindows
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
@@ -76,8 +77,9 @@ class Optimisation:
         training: windows to train on.
         validation: windows that say which epoch is best.
         checkpoint: file that is kept up to date.
-        device: to compute on.
         anew: gives the model with other weights, for a restart; ``None``: it is not restarted.
+        device: to compute on.
+        group: the processes that train.
     """
 
     def __init__(
@@ -89,11 +91,13 @@ class Optimisation:
         training: TrainingWindows | StreamedWindows,
         validation: TrainingWindows,
         checkpoint: Path,
+        anew: Callable[[int], TrainableModel] | None,
         device: torch.device,
-        anew: Callable[[int], TrainableModel] | None = None,
+        group: Group | None = None,
     ) -> None:
         self.config = config
         self.anew = anew
+        self.group = group or Group()
         self.loss: LossConfig = config.loss
         self.settings = config.training
         self.steps = rollout_steps(config, vehicle)
@@ -192,26 +196,29 @@ class Optimisation:
         totals = dict.fromkeys(COMPONENTS, 0.0)
         steps = self._ramped()
         for batch in self.training.epoch(self.shuffle, self.settings.batch_size):
-            window, target = self.augmentation(*batch)
+            window, target = map(self.group.share, self.augmentation(*batch))
             terms = self._terms(window, target, steps)
-            loss = torch.stack(list(terms.values())).sum()
+            loss = torch.stack(list(terms.values())).sum() * (weight := self.group.weight(len(batch[1])))
             self.optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
+            self.group.average_gradients(self.trained)
             if self.settings.gradient_clip is not None:
                 nn.utils.clip_grad_norm_(self.trained, self.settings.gradient_clip)
             self.optimiser.step()
             for term, value in terms.items():
-                totals[term] += value.item() * len(target) / len(self.training)
-        return totals
+                totals[term] += value.item() * weight * len(batch[1]) / len(self.training)
+        return self.group.average(totals)
 
     @torch.no_grad()
     def _validate(self) -> dict[str, float]:
         self.model.eval()
         totals = dict.fromkeys(COMPONENTS, 0.0)
-        for window, target in self.validation.batches():
+        for batch in self.validation.batches():
+            window, target = map(self.group.share, batch)
+            weight = self.group.weight(len(batch[1]))
             for term, value in self._terms(window, target, self.steps).items():
-                totals[term] += value.item() * len(target) / len(self.validation)
-        return totals
+                totals[term] += value.item() * weight * len(batch[1]) / len(self.validation)
+        return self.group.average(totals)
 
     def _terms(self, window: Tensor, target: Tensor, steps: int) -> dict[str, Tensor]:
         if self.steps == 1:
@@ -227,6 +234,8 @@ class Optimisation:
         return 1 + round((self.steps - 1) * float(min(max(share, 0.0), 1.0)))
 
     def _save(self) -> None:
+        if self.group.rank:
+            return
         content: dict[str, Any] = vars(self.state) | {
             "identity": self.identity,
             "model": self.model.state_dict(),
@@ -255,6 +264,25 @@ class Optimisation:
         self.shuffle.set_state(content["shuffle"].cpu())
         self.state = _TrainingState(**{name: content[name] for name in vars(self.state)})
         return self.state.epoch
+
+
+def optimise(
+    task: Callable[..., Optimisation], device: torch.device, progress: NamedProgress | None, processes: int = 1
+) -> OptimisationResult:
+    """Runs an :class:`Optimisation` in so many processes; ``task`` makes it of a device and a group.
+
+    Raises:
+        ConfigurationError: it diverges before there is a best model.
+        UserError: a process was killed or has failed.
+    """
+    if processes == 1:
+        return task(device).run(progress)
+    return run_in_processes(processes, device, progress, _member, task)
+
+
+def _member(group: Group, progress: NamedProgress, task: Callable[..., Optimisation]) -> OptimisationResult:
+    result = task(group.device, group).run(progress)
+    return replace(result, model=result.model.cpu())
 
 
 def rollout_steps(config: Any, vehicle: Vehicle) -> int:

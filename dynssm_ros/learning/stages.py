@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from dynssm_ros.learning.optimisation import (
     History,
     Optimisation,
     OptimisationResult,
+    optimise,
     rollout_steps,
     squared_errors,
     unexplained,
@@ -94,6 +96,7 @@ def train(
     progress: NamedProgress | None = None,
     calibrate: Calibrate | None = None,
     stream: Stream | None = None,
+    processes: int = 1,
 ) -> Trained:
     """Trains a model; ``checkpoint`` is kept up to date and continued from if it belongs to the same training.
 
@@ -110,6 +113,7 @@ def train(
         calibrate: from the data of a stage and the vehicle to the calibrated one, for models whose physics asks for it;
             ``None``: the vehicle is taken as calibrated. All stages step as the first.
         stream: of which ``recording`` is the sample, and whose other rows are trained on as well.
+        processes: that share the optimisation.
 
     Raises:
         RecordingError: another sampling time than the vehicle's, or too little data.
@@ -136,9 +140,9 @@ def train(
             report = progress
         if of.start is not None:
             first = _stage(progress, of.start.name if name == of.name else f"{name}: {of.start.name}", stage, stages)
-            start = _train(data, of.start, car, _start_of(file), device, first, stream=more)
+            start = _train(data, of.start, car, _start_of(file), device, first, None, more, processes)
             report = _stage(progress, name, stage, stages, start.config.training.effort[0])
-        return _train(data, of, car, file, device, report, start, more)
+        return _train(data, of, car, file, device, report, start, more, processes)
 
     trained = run(recording, config, 0, config.name, physics.integrator)
     if config.online is None:
@@ -221,6 +225,12 @@ def _stage(
     return lambda done, _, words: progress(before + done, sum(epochs), f"{name}: {words}")
 
 
+def _begin(config: ModelConfig, vehicle: Vehicle, scale: Normalisation, restart: int) -> TrainableModel:
+    """The model before training, with other weights for each restart."""
+    torch.manual_seed(config.training.seed + _SEEDS_APART * restart)
+    return build_model(config, vehicle, scale)
+
+
 def _train(
     recording: Recording,
     config: ModelConfig,
@@ -230,6 +240,7 @@ def _train(
     progress: NamedProgress | None,
     start: Trained | None = None,
     stream: Stream | None = None,
+    processes: int = 1,
 ) -> Trained:
     """One stage; ``start`` is the outcome of the stage before."""
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
@@ -238,11 +249,7 @@ def _train(
     H = config.rows(vehicle.sampling_time)
     plain, _ = _split(recording, config, vehicle)
     scale = normalisation(recording, plain) if start is None else start.normalisation
-
-    def anew(restart: int) -> TrainableModel:
-        torch.manual_seed(config.training.seed + _SEEDS_APART * restart)
-        return build_model(config, vehicle, scale)
-
+    anew = partial(_begin, config, vehicle, scale)
     model = anew(0)
     ahead = rollout_steps(config, vehicle) - 1
     if ahead and model.EXTRA_ROWS:
@@ -256,11 +263,18 @@ def _train(
     if model.fit(training):
         run = OptimisationResult(model, {})
     else:
-        optimisation = Optimisation(
-            config, vehicle, model, scale, windows, validation, checkpoint, torch.device(device),
+        task = partial(
+            Optimisation,
+            config,
+            vehicle,
+            model,
+            scale,
+            windows,
+            validation,
+            checkpoint,
             anew if start is None else None,
-        )  # fmt: skip
-        run = optimisation.run(progress)
+        )
+        run = optimise(task, torch.device(device), progress, processes)
     model = run.model.cpu().eval()
     held = replace(validation, H=H)
     v_x, v_y, omega = squared_errors(model, held).sqrt().tolist()
