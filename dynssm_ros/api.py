@@ -19,7 +19,7 @@ from dynssm_ros import __version__
 from dynssm_ros.errors import ConfigurationError, DataWarning
 from dynssm_ros.extras import require
 from dynssm_ros.files import checksum, content_key, digest, write_json
-from dynssm_ros.parallel import HERE, Workers, each
+from dynssm_ros.parallel import HERE, Workers, connected, each
 from dynssm_ros.progress import Progress
 from dynssm_ros.runtime.plausibility import implausible_rows
 from dynssm_ros.signals.recording import Recording, concatenate
@@ -493,6 +493,7 @@ def evaluate(
     track: Track | PathLike | None = None,
     on_progress: Progress | None = None,
     name: str = "",
+    workers: Workers = HERE,
 ) -> Evaluation:
     """Scores models on recordings: one-step errors, rollouts, displacement, coverage, latency.
 
@@ -508,6 +509,7 @@ def evaluate(
         track: on which errors are placed; if not given, the first full lap of the recording.
         on_progress: called with predictions made.
         name: of the recording, for people; that of its file, or its sources, if not given.
+        workers: where models are scored.
 
     Example:
         >>> laps = recorded(simulate("orca", "club", duration=10.0))
@@ -532,7 +534,9 @@ def evaluate(
         log, split = log.split_last(holdout)[1], f"last {100 * holdout:.3g} % of the recording, as one block"
     if not name:
         name = ", ".join(Path(each).name for each in _several(recordings) if isinstance(each, (str, Path)))
-    return evaluate(log, opened, name, split, min_speed, horizon, stride, line=line, progress=on_progress)
+    return evaluate(
+        log, opened, name, split, min_speed, horizon, stride, line=line, progress=on_progress, workers=workers
+    )
 
 
 def open_models(
@@ -620,6 +624,7 @@ def diagnose(
     on_progress: Callable[[str], None] | None = None,
     exclude: Collection[str] = (),
     suspect: Log | Sequence[Log] = (),
+    workers: Workers = HERE,
 ) -> Diagnosis:
     """Finds out what the simulation gets wrong about measured laps, and why.
 
@@ -635,6 +640,7 @@ def diagnose(
         on_progress: called with what is being done.
         exclude: names of effects that are impossible there, such as wind in a hall.
         suspect: recordings of the same car in which something may have changed since ``recordings``.
+        workers: where candidates are tried.
 
     Example:
         >>> hidden = {"steering_offset": {"offset": 0.03}}
@@ -649,7 +655,8 @@ def diagnose(
     line, car = None if track is None else _track(track).centre, _vehicle(vehicle)
     report = on_progress or (lambda words: None)
     data, changed = ([log.with_commands(commands) for log in _opened(logs, car)] for logs in (recordings, suspect))
-    return diagnose(data, car, horizon, holdout, min_speed, integrator, line, report, exclude, changed)
+    with connected(workers) as pool:
+        return diagnose(data, car, horizon, holdout, min_speed, integrator, line, report, exclude, changed, pool)
 
 
 def race(

@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
+from operator import itemgetter
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, TypeVar
 
 from dynssm_ros.errors import ConfigurationError, ProcessDiedError
-from dynssm_ros.extras import require
+from dynssm_ros.extras import load_plugins, require
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -46,9 +47,62 @@ class Workers:
         if self.jobs is not None and self.jobs < least:
             raise ConfigurationError(f"jobs {self.jobs}: expected {least} or more with backend {self.backend}")
 
+    @property
+    def elsewhere(self) -> bool:
+        """Whether another process than this one works."""
+        return self.backend != "processes" or self.jobs not in (None, 1)
+
 
 HERE = Workers()
 """One after the other, in this process."""
+
+
+class Pool:
+    """Workers that are connected, for pieces of work again and again; see :func:`connected`."""
+
+    def __init__(self, workers: Workers = HERE, died: tuple[type[Exception], ...] = ()) -> None:
+        self._workers, self._died = workers, died
+
+    def each(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+        """See :func:`each`."""
+        if not self._workers.elsewhere or (self._workers.backend == "processes" and len(items) < 2):
+            yield from ((k, function(item)) for k, item in enumerate(items))
+            return
+        left = dict(enumerate(items))
+        for _ in range(_TRIES):
+            try:
+                for k, result in _unordered(function, left):
+                    del left[k]
+                    yield k, result
+            except self._died:
+                continue
+            return
+        raise ProcessDiedError(
+            f"{len(left)} of {len(items)} pieces: a process died in each of {_TRIES} tries; expected less memory per "
+            "process than there is (fewer --jobs)"
+        )
+
+    def map(self, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """Results of ``function`` in the order of ``items``."""
+        return [result for _, result in sorted(self.each(function, items), key=itemgetter(0))]
+
+
+IN_TURN = Pool()
+"""One piece after the other, in this process."""
+
+
+@contextmanager
+def connected(workers: Workers = HERE) -> Iterator[Pool]:
+    """Connects to ``workers`` once, for work that comes in many rounds.
+
+    Raises:
+        MissingExtraError: joblib or the cluster's library is not installed.
+    """
+    if not workers.elsewhere:
+        yield IN_TURN
+        return
+    with _CONNECTED[workers.backend](workers) as died:
+        yield Pool(workers, died)
 
 
 def each(
@@ -67,23 +121,8 @@ def each(
         MissingExtraError: joblib or the cluster's library is not installed.
         ProcessDiedError: processes died again and again.
     """
-    if workers.backend == "processes" and (workers.jobs in (None, 1) or len(items) < 2):
-        yield from ((k, function(item)) for k, item in enumerate(items))
-        return
-    with _CONNECTED[workers.backend](workers) as died:
-        left = dict(enumerate(items))
-        for _ in range(_TRIES):
-            try:
-                for k, result in _unordered(function, left):
-                    del left[k]
-                    yield k, result
-            except died:
-                continue
-            return
-    raise ProcessDiedError(
-        f"{len(left)} of {len(items)} pieces: a process died in each of {_TRIES} tries; expected less memory per "
-        "process than there is (fewer --jobs)"
-    )
+    with connected(workers) as pool:
+        yield from pool.each(function, items)
 
 
 def _unordered(function: Callable[[Item], Result], items: dict[int, Item]) -> Iterator[tuple[int, Result]]:
@@ -94,6 +133,7 @@ def _unordered(function: Callable[[Item], Result], items: dict[int, Item]) -> It
 
 
 def _at(function: Callable[[Item], Result], place: int, item: Item) -> tuple[int, Result]:
+    load_plugins()
     return place, function(item)
 
 

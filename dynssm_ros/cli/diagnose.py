@@ -10,7 +10,10 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.cli.console import (
+    AddressOption,
+    BackendOption,
     CommandsOption,
+    JobsOption,
     JsonOption,
     MinSpeedOption,
     VehicleOption,
@@ -21,6 +24,7 @@ from dynssm_ros.cli.console import (
 )
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
+from dynssm_ros.parallel import Workers
 from dynssm_ros.signals.season import recording_files
 from dynssm_ros.vehicle import save_vehicle
 from dynssm_ros.vehicle.single_track import Integrator
@@ -67,6 +71,9 @@ def diagnose(
     commands: CommandsOption = None,
     json: JsonOption = None,
     where: WhereOption = None,
+    jobs: JobsOption = None,
+    backend: BackendOption = "processes",
+    address: AddressOption = None,
 ) -> None:
     """Find out what the simulation gets wrong about measured laps, and why; write the vehicle file that has it."""
     require("diagnose", "train", "report")
@@ -80,6 +87,7 @@ def diagnose(
         result = api.diagnose(
             given, vehicle, horizon, holdout, min_speed, integrator, track, commands,
             lambda words: progress(min(next(steps), 39), 40, words), exclude or (), suspect or (),
+            Workers(jobs, backend, address),
         )  # fmt: skip
     path = out / "vehicle.yaml"
     about = f"{result.car.vehicle.name}, extended by a diagnosis of {result.protocol['Recording']}: {result.verdict}."

@@ -9,7 +9,10 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.cli.console import (
+    AddressOption,
+    BackendOption,
     CommandsOption,
+    JobsOption,
     JsonOption,
     MinSpeedOption,
     WhereOption,
@@ -19,6 +22,7 @@ from dynssm_ros.cli.console import (
 )
 from dynssm_ros.extras import require
 from dynssm_ros.files import replacing
+from dynssm_ros.parallel import Workers
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.season import recording_files
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
@@ -61,6 +65,9 @@ def evaluate(
     track: TrackOption = None,
     json: JsonOption = None,
     where: WhereOption = None,
+    jobs: JobsOption = None,
+    backend: BackendOption = "processes",
+    address: AddressOption = None,
 ) -> None:
     """Score models on a recording: one-step errors, rollouts, displacement, latency; with an HTML report.
 
@@ -80,6 +87,7 @@ def evaluate(
         evaluation = api.evaluate(
             logs, models, vehicle, holdout, commands, min_speed, horizon, stride, track, progress,
             ", ".join(recording.name for recording in recordings) + (f" where {where}" if where else ""),
+            Workers(jobs, backend, address),
         )  # fmt: skip
     open_loop_report(evaluation).save(out / "report.html")
     with replacing(out / "results.md") as aside:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from dynssm_ros.evaluation.metrics import (
 from dynssm_ros.evaluation.regimes import Regime, driving_regimes, regime_rmse
 from dynssm_ros.evaluation.rollout import score_rollouts
 from dynssm_ros.evaluation.score import Group, Score, grouped
+from dynssm_ros.parallel import HERE, Workers, each
 from dynssm_ros.runtime.models import WindowModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands
@@ -128,6 +130,7 @@ def evaluate(
     calls: int = 200,
     line: ClosedLine | None = None,
     progress: Callable[[int, int], None] | None = None,
+    workers: Workers = HERE,
 ) -> Evaluation:
     """Scores ``models`` on ``recording``.
 
@@ -142,7 +145,8 @@ def evaluate(
         batch: windows per call of a model.
         calls: single predictions timed per model.
         line: closed line that the position on the lap is counted along; the recording's first full lap if ``None``.
-        progress: told of the predictions done and all that will be made.
+        progress: told of the predictions done and all that will be made; with several workers once for each model.
+        workers: where models are scored; their latency is taken here, one after the other.
 
     Raises:
         ArtifactError: a model is for another sampling time or command protocol.
@@ -160,10 +164,22 @@ def evaluate(
             f"recording {name or ', '.join(recording.info.source)} ({split}): no stretch of {H + steps} rows "
             f"(window {H}, horizon {steps}) without a gap at {speed:g} m/s or more among its {len(recording)} rows"
         )
-    tick = _counting(len(models) * (len(rows) + len(starts) * steps), progress)
+    each_model = len(rows) + len(starts) * steps
+    tick = _counting(len(models) * each_model, progress)
     regimes = driving_regimes(recording.matrix[rows])
+    on = _On(recording, rows, regimes, starts, steps, batch)
+    labels = list(models)
+    found: dict[str, Score] = {}
+    for k, score in each(
+        on.score if workers.elsewhere else partial(on.score, tick=tick), list(models.values()), workers
+    ):
+        found[labels[k]] = replace(score, model=models[labels[k]])
+        if workers.elsewhere:
+            tick(each_model)
     scores = {
-        label: _score(model, recording, rows, regimes, starts, steps, batch, calls, tick)
+        label: replace(
+            found[label], latency_us=latency_us(model, gather(recording.matrix, rows[:50], model.H - 1), calls)
+        )
         for label, model in models.items()
     }
     return Evaluation(
@@ -191,37 +207,40 @@ def _counting(total: int, progress: Callable[[int, int], None] | None) -> Tick:
     return tick
 
 
-def _score(
-    model: WindowModel,
-    recording: Recording,
-    rows: Indices,
-    regimes: tuple[Regime, ...],
-    starts: Indices,
-    steps: int,
-    batch: int,
-    calls: int,
-    tick: Tick,
-) -> Score:
-    matrix = recording.matrix
-    increments = matrix[rows + 1, :3] - matrix[rows, :3]
-    with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
-        drive = drive_through(model, recording, batch)
-        predicted = predict_rows(model, matrix, rows, batch, tick, drive)
-        errors = predicted.state - matrix[rows + 1, :3]
-        return Score(
-            model=model,
-            drive=drive,
-            state=predicted.state,
-            theta=predicted.theta,
-            rmse=rmse(errors),
-            max_error=max_error(errors),
-            explained=explained(increments, increments + errors),
-            coverage_90=None if predicted.variance is None else coverage(errors, predicted.variance),
-            regime_rmse=regime_rmse(regimes, errors),
-            coefficients=coefficient_statistics(predicted.theta, model.vehicle),
-            rollout=score_rollouts(model, matrix, starts, steps, recording.T_s, batch, tick, drive),
-            latency_us=latency_us(model, gather(matrix, rows[:50], model.H - 1), calls),
-        )
+@dataclass(frozen=True)
+class _On:
+    """What models are scored on; see :func:`evaluate`."""
+
+    recording: Recording
+    rows: Indices
+    regimes: tuple[Regime, ...]
+    starts: Indices
+    steps: int
+    batch: int
+
+    def score(self, model: WindowModel, tick: Tick = lambda predictions: None) -> Score:
+        """What a model is worth, but for the time that it takes."""
+        recording, rows, batch = self.recording, self.rows, self.batch
+        matrix = recording.matrix
+        increments = matrix[rows + 1, :3] - matrix[rows, :3]
+        with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
+            drive = drive_through(model, recording, batch)
+            predicted = predict_rows(model, matrix, rows, batch, tick, drive)
+            errors = predicted.state - matrix[rows + 1, :3]
+            return Score(
+                model=model,
+                drive=drive,
+                state=predicted.state,
+                theta=predicted.theta,
+                rmse=rmse(errors),
+                max_error=max_error(errors),
+                explained=explained(increments, increments + errors),
+                coverage_90=None if predicted.variance is None else coverage(errors, predicted.variance),
+                regime_rmse=regime_rmse(self.regimes, errors),
+                coefficients=coefficient_statistics(predicted.theta, model.vehicle),
+                rollout=score_rollouts(model, matrix, self.starts, self.steps, recording.T_s, batch, tick, drive),
+                latency_us=np.empty(0),
+            )
 
 
 def horizon_steps(horizon_s: float, T_s: float) -> int:

@@ -9,14 +9,16 @@ Gelman and Gabry 2017). A cause that follows the accidents of one stretch gains 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.identification.noise import Noise
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
 from dynssm_ros.identification.recordings import CrossValidation
+from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.vehicle.effects import EFFECTS
 
 _KNOWN = 2.0  # standard errors that the nominal values must be spared, where left-out units tell nothing
@@ -80,10 +82,11 @@ class LeaveOneOut:
     Args:
         problem: all windows.
         left_out: how.
+        pool: where the fits are made.
     """
 
-    def __init__(self, problem: IdentificationProblem, left_out: CrossValidation) -> None:
-        self._problem, self._left_out = problem, left_out
+    def __init__(self, problem: IdentificationProblem, left_out: CrossValidation, pool: Pool = IN_TURN) -> None:
+        self._problem, self._left_out, self._pool = problem, left_out, pool
         self._known: dict[tuple[int, bool], tuple[Fit, _Predicted]] = {}
 
     def compare(self, without: Fit, fit: Fit) -> Confirmation:
@@ -110,17 +113,20 @@ class LeaveOneOut:
         if key not in self._known:
             near = _held(fit, by_recordings)
             likelihood, error = np.empty(len(fold)), np.empty((len(fold), 3))
-            for number in range(int(fold.max()) + 1):
-                out = fold == number
-                rest, unseen = self._problem.select(~out), self._problem.select(out)
-                start = replace(near, errors=near.errors[~out], jacobian=near.jacobian[~out])
-                noise = Noise(rest.spread, fit.noise.v)
-                found = rest.fit(fit.car, near.free, start, _ROUNDS, rough=True, noise=noise)
-                errors = unseen.errors(found.car)
-                likelihood[out] = unseen.log_likelihood(errors, Noise(unseen.spread, fit.noise.v))
-                error[out] = errors[:, -3:] ** 2
+            out = [fold == number for number in range(int(fold.max()) + 1)]
+            for these, found in zip(out, self._pool.map(partial(_without, self._problem, near), out), strict=True):
+                likelihood[these], error[these] = found
             self._known[key] = fit, _Predicted(likelihood, error)
         return self._known[key][1]
+
+
+def _without(problem: IdentificationProblem, near: Fit, out: Mask) -> _Predicted:
+    """What a fit without some windows says of these."""
+    rest, unseen = problem.select(~out), problem.select(out)
+    start = replace(near, errors=near.errors[~out], jacobian=near.jacobian[~out])
+    found = rest.fit(near.car, near.free, start, _ROUNDS, rough=True, noise=Noise(rest.spread, near.noise.v))
+    errors = unseen.errors(found.car)
+    return _Predicted(unseen.log_likelihood(errors, Noise(unseen.spread, near.noise.v)), errors[:, -3:] ** 2)
 
 
 def _differ_only_in(one: Fit, other: Fit) -> tuple[int, ...]:

@@ -18,6 +18,7 @@ from dynssm_ros.identification.problem import per_unit
 from dynssm_ros.identification.recordings import CrossValidation, RecordingSet, driven_alike
 from dynssm_ros.identification.selection import Refined, Selection
 from dynssm_ros.identification.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
+from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
@@ -44,6 +45,7 @@ def diagnose(
     on_progress: OnProgress = lambda words: None,
     exclude: Collection[str] = (),
     suspect: Sequence[Recording] = (),
+    pool: Pool = IN_TURN,
 ) -> Diagnosis:
     """Finds out what a vehicle file gets wrong about recordings.
 
@@ -61,6 +63,7 @@ def diagnose(
         on_progress: told what is being done.
         exclude: names of effects that are impossible there, such as wind in a hall.
         suspect: recordings of the same car in which something may have changed.
+        pool: where candidates are tried; the result is the same.
 
     Raises:
         RecordingError: another sampling time than the vehicle's, a constant or missing channel, too few rows.
@@ -72,7 +75,7 @@ def diagnose(
     if unknown := sorted(set(exclude) - set(EFFECTS)):
         raise ConfigurationError(f"exclude {', '.join(unknown)}: no such effect; expected some of {', '.join(EFFECTS)}")
     groups = _groups(at, suspects)
-    found = search_causes(at.fitted, at.car, at.left_out, integrator, on_progress, exclude, groups)
+    found = search_causes(at.fitted, at.car, at.left_out, integrator, on_progress, exclude, groups, pool)
     problem, windows = found.problem, found.problem.windows
     on_progress("measuring the improvement on held-out laps")
     selection, without, left, improvement = gated(

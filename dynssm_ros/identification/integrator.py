@@ -19,6 +19,7 @@ from dynssm_ros.identification.problem import Fit, IdentificationProblem, closes
 from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.identification.selection import Search, Selection
 from dynssm_ros.identification.windows import Hold, SimulationWindows
+from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.vehicle.single_track import Integrator
 
 _TRIED = 300  # windows with which the integrator is chosen at first
@@ -58,6 +59,7 @@ def search_causes(
     on_progress: Callable[[str], None],
     exclude: Collection[str] = (),
     groups: Sequence[tuple[int, ...]] = (),
+    pool: Pool = IN_TURN,
 ) -> SearchResult:
     """Searches for causes.
 
@@ -69,12 +71,13 @@ def search_causes(
         on_progress: told what is being done.
         exclude: effects that are not tried.
         groups: of recordings, in each of which an effect may act that the others do not have.
+        pool: where candidates are tried.
     """
 
     def search(windows: SimulationWindows, start: Fit | None = None) -> SearchResult:
         problem = IdentificationProblem(windows, car)
         found, impossible = candidates(problem, car, exclude, groups)
-        searching = Search(problem, car, found, left_out, on_progress)
+        searching = Search(problem, car, found, left_out, on_progress, pool)
         return SearchResult(problem, searching, searching.run(start), impossible)
 
     on_progress("choosing how the model steps")

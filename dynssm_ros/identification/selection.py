@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from dynssm_ros.identification.car import CarEstimate, Values
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
 from dynssm_ros.identification.recordings import CrossValidation
+from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS
 
@@ -116,6 +118,70 @@ class _CandidateStart(NamedTuple):
     expected_delta_bic: float
 
 
+@dataclass(frozen=True)
+class _Trial:
+    """Candidates in several sizes, on some of the windows.
+
+    Attributes:
+        some: those windows.
+        near: the fit without the candidate, there.
+        given: the car as the vehicle file has it.
+        price: of a parameter.
+    """
+
+    some: IdentificationProblem
+    near: Fit
+    given: CarEstimate
+    price: float
+
+    def start(self, scored: ScoredCandidate) -> _CandidateStart:
+        """Where to fit from, and what is reached there.
+
+        What linearised errors promise is too much where an effect grows faster than its size, and too little where the
+        nominal values have hidden it: so several sizes are tried, as they are and with the nominal values moved along, from
+        where they are and from where the vehicle file has them.
+        """
+        some, near, candidate, cars = self.some, self.near, scored.candidate, []
+        for share in _SHARES:
+            values = dict(scored.values)
+            for name in candidate.amplitudes:
+                about = EFFECTS[candidate.effect].PARAMETERS[name]
+                wanted = about.neutral + share * (values[name] - about.neutral)
+                values[name] = float(np.clip(wanted, about.lower, about.upper))
+            cars.append(near.car.with_effect(candidate.effect, values, candidate.only_in))
+        cars += self._from_the_file(candidate, scored.values)
+        warm_started = cars
+        for _ in range(_WARM_STARTS):
+            warm_started = some.warm_started(warm_started, near)
+        cars, free = cars + warm_started, (*near.free, *candidate.free)
+        reached = [
+            some.objective(errors, position(car, free), near.noise)
+            for car, errors in zip(cars, some.errors_of(cars), strict=True)
+        ]
+        expected_delta_bic = near.objective - min(reached) - self.price * len(candidate.parameters)
+        return _CandidateStart(candidate, cars[int(np.argmin(reached))], expected_delta_bic)
+
+    def _from_the_file(self, candidate: Candidate, values: Values) -> list[CarEstimate]:
+        """Cars with the nominal values of the file, and the effect in all sizes."""
+        if candidate.local or len(candidate.amplitudes) > 1:
+            return []
+        (name,), effect = candidate.amplitudes, candidate.effect
+        neutral = EFFECTS[effect].PARAMETERS[name].neutral
+        given = replace(self.near.car, moved=self.given.moved)
+        steps = steps_off(effect, name, BOTH_SIDES_UNITS)
+        return [given.with_effect(effect, values | {name: neutral + step}, candidate.only_in) for step in steps]
+
+
+def _fitted_roughly(problem: IdentificationProblem, near: Fit, start: _CandidateStart) -> Fit:
+    """A candidate fitted together with all that ``near`` has."""
+    return problem.fit(start.car, (*near.free, *start.candidate.free), near, rough=True)
+
+
+def _fitted_on(problem: IdentificationProblem, fit: Fit) -> Fit:
+    """The same, fitted to the end."""
+    return problem.fit(fit.car, fit.free, fit)
+
+
 class Search:
     """Selects effects by what they predict on parts of the data that were left out.
 
@@ -125,6 +191,7 @@ class Search:
         found: the candidates.
         left_out: how windows are left out: recordings in turn, and parts of each.
         on_progress: told what is being done.
+        pool: where candidates are tried.
     """
 
     def __init__(
@@ -134,9 +201,10 @@ class Search:
         found: Sequence[Candidate],
         left_out: CrossValidation,
         on_progress: OnProgress = lambda words: None,
+        pool: Pool = IN_TURN,
     ) -> None:
         self._study, self._given, self.found, self._report = problem, car, list(found), on_progress
-        self._folds = left_out
+        self._folds, self._pool = left_out, pool
         self._price = np.log(3.0 * problem.windows.steps * len(problem.windows))
         on_progress("recalibrating the nominal car")
         self.base = problem.temper(problem.fit(car, ()))
@@ -144,7 +212,7 @@ class Search:
         self._responses = Responses(problem, self.base.car, self.base.errors)
         self._ranked: dict[frozenset[Candidate], list[Refined]] = {}
         self._fits: dict[frozenset[Candidate], Fit] = {frozenset(): self.base}
-        self._left_out = LeaveOneOut(problem, left_out)
+        self._left_out = LeaveOneOut(problem, left_out, pool)
         self.tried: dict[str, float] = {}
 
     def run(self, start: Fit | None = None) -> Selection:
@@ -167,7 +235,7 @@ class Search:
         """Selects anew without an effect."""
         self.found = [candidate for candidate in self.found if candidate.effect != effect]
         self._study.tempering, self._fits, self._ranked = self._tempering, {frozenset(): self.base}, {}
-        self._left_out = LeaveOneOut(self._study, self._folds)
+        self._left_out = LeaveOneOut(self._study, self._folds, self._pool)
         return self.run()
 
     def eliminated(self, chosen: tuple[Candidate, ...]) -> Selection:
@@ -213,15 +281,20 @@ class Search:
             self.tried = {name: p.improvement for name, p in best.items()}
         shortlist = [p for p in best.values() if self._expected_delta_bic(p) >= -self._price][:_SHORTLIST]
         some, near = self._study.part(fit, max(1, len(self._study.windows) // _SHORTLIST_WINDOWS))
+        trial = _Trial(some, near, self._given, self._price)
         starts = sorted(
-            (self._start(some, near, p) for p in shortlist), key=lambda start: start.expected_delta_bic, reverse=True
+            self._pool.map(trial.start, shortlist), key=lambda start: start.expected_delta_bic, reverse=True
         )
         least = max([-self._price, *(_SHORTLIST_SHARE * start.expected_delta_bic for start in starts[:1])])
-        refined = [self._refine(fit, start) for start in starts[:_REFINED] if start.expected_delta_bic >= least]
+        refined = self._refined(fit, [start for start in starts[:_REFINED] if start.expected_delta_bic >= least])
         close = max(
             [-AMBIGUITY_DELTA_BIC, *(_NEAR_BEST_SHARE * r.delta_bic - 2 * AMBIGUITY_DELTA_BIC for r in refined)]
         )
-        refined = [self._polish(key, fit, r) if r.delta_bic > close else r for r in refined]
+        self._polish(key, [r for r in refined if r.delta_bic > close])
+        refined = [
+            self._judge(fit, self._fits[key | {r.candidate}], r.candidate) if r.delta_bic > close else r
+            for r in refined
+        ]
         self._ranked[key] = sorted(refined, key=lambda r: -r.delta_bic)
         return self._ranked[key]
 
@@ -274,64 +347,26 @@ class Search:
         if abs(np.log(inflation / self._study.tempering)) < _ALIKE:
             return
         self._study.tempering = inflation
-        self._ranked, self._left_out = {}, LeaveOneOut(self._study, self._folds)
+        self._ranked, self._left_out = {}, LeaveOneOut(self._study, self._folds, self._pool)
         self._fits = {
             frozenset(): self._study.fit(self.base.car, (), self.base),
             frozenset(chosen): self._study.fit(fit.car, fit.free, fit),
         }
 
-    def _polish(self, before: frozenset[Candidate], without: Fit, rough: Refined) -> Refined:
-        """The same, fitted to the end."""
-        key = before | {rough.candidate}
-        if key not in self._fits:
-            self._fits[key] = self._study.fit(rough.fit.car, rough.fit.free, rough.fit)
-        return self._judge(without, self._fits[key], rough.candidate)
+    def _polish(self, before: frozenset[Candidate], rough: Sequence[Refined]) -> None:
+        """Fits some to the end."""
+        new = {key: r.fit for r in rough if (key := before | {r.candidate}) not in self._fits}
+        fits = self._pool.map(partial(_fitted_on, self._study), list(new.values()))
+        self._fits |= dict(zip(new, fits, strict=True))
 
     def _expected_delta_bic(self, scored: ScoredCandidate) -> float:
         return float(scored.improvement / self._study.tempering - self._price * len(scored.candidate.parameters))
 
-    def _refine(self, fit: Fit, start: _CandidateStart) -> Refined:
-        candidate = start.candidate
-        self._report(f"fitting {candidate.effect}")
-        free = (*fit.free, *candidate.free)
-        return self._judge(fit, self._study.fit(start.car, free, fit, rough=True), candidate)
-
-    def _start(self, some: IdentificationProblem, near: Fit, scored: ScoredCandidate) -> _CandidateStart:
-        """Where to fit from, and what is reached there.
-
-        What linearised errors promise is too much where an effect grows faster than its size, and too little where the
-        nominal values have hidden it: so several sizes are tried, as they are and with the nominal values moved along, from
-        where they are and from where the vehicle file has them.
-        """
-        candidate, cars = scored.candidate, []
-        for share in _SHARES:
-            values = dict(scored.values)
-            for name in candidate.amplitudes:
-                about = EFFECTS[candidate.effect].PARAMETERS[name]
-                wanted = about.neutral + share * (values[name] - about.neutral)
-                values[name] = float(np.clip(wanted, about.lower, about.upper))
-            cars.append(near.car.with_effect(candidate.effect, values, candidate.only_in))
-        cars += self._from_the_file(near, candidate, scored.values)
-        warm_started = cars
-        for _ in range(_WARM_STARTS):
-            warm_started = some.warm_started(warm_started, near)
-        cars, free = cars + warm_started, (*near.free, *candidate.free)
-        reached = [
-            some.objective(errors, position(car, free), near.noise)
-            for car, errors in zip(cars, some.errors_of(cars), strict=True)
-        ]
-        expected_delta_bic = near.objective - min(reached) - self._price * len(candidate.parameters)
-        return _CandidateStart(candidate, cars[int(np.argmin(reached))], expected_delta_bic)
-
-    def _from_the_file(self, near: Fit, candidate: Candidate, values: Values) -> list[CarEstimate]:
-        """Cars with the nominal values of the file, and the effect in all sizes."""
-        if candidate.local or len(candidate.amplitudes) > 1:
-            return []
-        (name,), effect = candidate.amplitudes, candidate.effect
-        neutral = EFFECTS[effect].PARAMETERS[name].neutral
-        given = replace(near.car, moved=self._given.moved)
-        steps = steps_off(effect, name, BOTH_SIDES_UNITS)
-        return [given.with_effect(effect, values | {name: neutral + step}, candidate.only_in) for step in steps]
+    def _refined(self, fit: Fit, starts: Sequence[_CandidateStart]) -> list[Refined]:
+        if starts:
+            self._report(f"fitting {', '.join(start.candidate.effect for start in starts)}")
+        fits = self._pool.map(partial(_fitted_roughly, self._study, fit), starts)
+        return [self._judge(fit, found, start.candidate) for found, start in zip(fits, starts, strict=True)]
 
     def _judge(self, without: Fit, fit: Fit, candidate: Candidate) -> Refined:
         own = self._study.inflation(fit, len(fit.free) - len(without.free))

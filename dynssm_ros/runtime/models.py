@@ -230,6 +230,8 @@ class OnnxModel:
         ArtifactError: ONNX Runtime refuses the graph, or it is not one of such a model.
     """
 
+    _RUNS = ("_session", "_binding", "_window")
+
     def __init__(self, artifact: Artifact) -> None:
         card = artifact.card
         self.artifact = artifact
@@ -245,6 +247,18 @@ class OnnxModel:
         self.online = artifact.online_layer()
         self.prior = card.checksums.get(ONLINE, "")
         """Names the prior of its online layer, for what was learned from it; empty without one."""
+        self._open()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what runs the graph, which each process opens for itself."""
+        return {name: value for name, value in vars(self).items() if name not in self._RUNS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._open()
+
+    def _open(self) -> None:
+        """Opens the graph."""
         options = ort.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
@@ -253,14 +267,16 @@ class OnnxModel:
         options.enable_mem_reuse = False  # small tensors: planning their reuse costs more than their effect states
         options.log_severity_level = 3
         try:
-            self._session = ort.InferenceSession(artifact.onnx, options, providers=["CPUExecutionProvider"])
+            self._session = ort.InferenceSession(self.artifact.onnx, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime raises its own unrelated classes
-            raise ArtifactError(f"{artifact.onnx}: ONNX Runtime refuses it ({' '.join(str(error).split())})") from error
+            raise ArtifactError(
+                f"{self.artifact.onnx}: ONNX Runtime refuses it ({' '.join(str(error).split())})"
+            ) from error
         self._outputs = [output.name for output in self._session.get_outputs()]
         inputs = [(each.name, each.shape[1:]) for each in self._session.get_inputs()]
         if inputs != [("window", [self.H, len(WINDOW_COLUMNS)])] or "increment" not in self._outputs:
             raise ArtifactError(
-                f"{artifact.onnx}: maps {inputs} to {self._outputs}; expected a window of {self.H} rows and "
+                f"{self.artifact.onnx}: maps {inputs} to {self._outputs}; expected a window of {self.H} rows and "
                 f"{len(WINDOW_COLUMNS)} columns to increment, and theta, physics, variance if it has them"
             )
 

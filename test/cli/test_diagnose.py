@@ -46,6 +46,17 @@ def test_the_folder_holds_vehicle_report_and_results(dynssm: Run, offset: tuple[
     assert (status, err) == (0, "")
 
 
+def test_several_processes_find_what_one_finds(dynssm: Run, offset: tuple[Path, Path], tmp_path: Path) -> None:
+    laps, car = offset
+    found = []
+    for jobs in ("1", "2"):
+        out = tmp_path / jobs
+        status, _, _ = dynssm("diagnose", laps, "--vehicle", car, "--out", out, "--integrator", "euler", "--jobs", jobs)
+        assert status == 0
+        found.append(json.loads((out / "results.json").read_text()) | {"vehicle": ""})
+    assert found[0] == found[1]
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

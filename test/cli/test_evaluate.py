@@ -60,6 +60,20 @@ def test_writes_report_results_and_table(dynssm, recording, tmp_path):
 
 
 @pytest.mark.usefixtures("quick_figures")
+def test_several_processes_find_what_one_finds(dynssm, laps, small_model, tmp_path):
+    models = ("--model", "persistence", "--model", small_model, "--model", "single_track", "--vehicle", "orca")
+    found = []
+    for jobs in (1, 2):
+        assert dynssm("evaluate", laps, *models, "--stride", 10, "--jobs", jobs, "--out", tmp_path / str(jobs))[0] == 0
+        results = json.loads((tmp_path / str(jobs) / "results.json").read_text())
+        times = [model.pop("latency_us") for model in results["models"].values()]
+        assert all(time["p50"] > 0 for time in times), "taken here, one after the other"
+        found.append(results)
+    assert list(found[0]["models"]) == list(found[1]["models"])
+    assert found[0] == found[1]
+
+
+@pytest.mark.usefixtures("quick_figures")
 def test_holdout_scores_the_last_block_only(dynssm, recording, tmp_path):
     code, _, _ = dynssm("evaluate", recording, "--model", "persistence", "--holdout", "0.25", "--out", tmp_path / "out")
     results = json.loads((tmp_path / "out" / "results.json").read_text())
