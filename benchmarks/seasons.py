@@ -47,13 +47,14 @@ class Group(NamedTuple):
 def groups(folder: Path, data: Path, count: int) -> list[Group]:
     """Real logs, as far as they are there, and simulated ones until there are ``count``."""
     there = {car: sorted(path.parent for path in data.glob(f"{car}/*/metadata.yaml")) for car in _OPTIONS}
-    there["orca"] += _simulated(folder, count - sum(map(len, there.values())))
+    there["orca"] += simulated_bags(folder, count - sum(map(len, there.values())))
     return [
         Group(bags, (*_OPTIONS[car].split(), "--car", car, "--track", "any")) for car, bags in there.items() if bags
     ]
 
 
-def _simulated(folder: Path, count: int) -> list[Path]:
+def simulated_bags(folder: Path, count: int) -> list[Path]:
+    """So many logs of 2 to 5 minutes with all topics at 100 Hz."""
     car = load_vehicle("orca").model_copy(update={"sampling_time": 1 / _RATE})
     track, bags = load_track("club"), [folder / f"drive_{k}" for k in range(count)]
     with progress_bar("driving") as progress:

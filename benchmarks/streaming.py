@@ -121,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     rows.append([size, some, held, cost.memory, cost.seconds, *cost.rmse])
     except UserError as error:
         sys.exit(f"error: {error}")
-    columns = ("data / memory", "logs", "held", "process (MB)", "time (s)", "v_x (m/s)", "v_y (m/s)", "ω (rad/s)")
+    columns = ("rows / bound", "logs", "held", "MB", "s", "v_x", "v_y", "ω")
     if given.json is not None:
         write_json(given.json, {"rows": [dict(zip(columns, row, strict=True)) for row in rows]})
     console.print(Table(tuple(map(Column, columns)), rows).rich())

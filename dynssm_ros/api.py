@@ -64,7 +64,7 @@ def load_model(name_or_dir: PathLike, vehicle: Vehicle | PathLike | None = None)
     """
     from dynssm_ros.runtime.models import load_model
 
-    return load_model(name_or_dir, None if vehicle is None else _vehicle(vehicle))
+    return load_model(name_or_dir, None if vehicle is None else _vehicle_in_windows(vehicle))
 
 
 def simulate(
@@ -219,6 +219,7 @@ def calibrate(
     seed: int = 0,
     commands: Commands | None = None,
     on_progress: Progress | None = None,
+    track: Track | PathLike | None = None,
 ) -> Calibration:
     """Fits the nominal parameters of a vehicle to measured laps, within their bounds, with standard deviations.
 
@@ -233,6 +234,7 @@ def calibrate(
         seed: of the random ones.
         commands: source of the command inputs; the recording's own if not given.
         on_progress: called after each starting point.
+        track: from whose start the places of the vehicle's effects are counted.
 
     Example:
         >>> laps = recorded(simulate("orca", "club", duration=20.0))
@@ -245,7 +247,8 @@ def calibrate(
 
     car = _vehicle(vehicle)
     data = _joined(_opened(recordings, car), commands, holdout)
-    return calibrate(data, car, horizon, min_speed, integrator, starts, seed, on_progress)
+    line = None if track is None else _centre_line(track, data)
+    return calibrate(data, car, horizon, min_speed, integrator, starts, seed, on_progress, line)
 
 
 class TrainingResult(NamedTuple):
@@ -305,7 +308,7 @@ def train(
     folder = Path(out) if Path(out).name else Path(out).absolute()  # "." has no name to put the checkpoint beside
     check_replaceable(folder)
     config = model_config(model, seed, epochs)
-    checkpoint, car = checkpoint_of(folder), _vehicle(vehicle)
+    checkpoint, car = checkpoint_of(folder), _vehicle_in_windows(vehicle)
     if memory is None:
         stream, data = None, _joined(_opened(recordings, car), commands, holdout)
     else:
@@ -438,7 +441,7 @@ def sweep(
     from dynssm_ros.learning.models.registry import field_of, load_model_config
 
     space = space if isinstance(space, Space) else Space.load(space)
-    car, config = _vehicle(vehicle), load_model_config(model)
+    car, config = _vehicle_in_windows(vehicle), load_model_config(model)
     for logs in (recordings, validation):
         _opened(logs, car)  # what is wrong with them is said once
     about = {
@@ -767,6 +770,19 @@ def recorded(run: Run) -> Recording:
 
 def _vehicle(vehicle: Vehicle | PathLike) -> Vehicle:
     return vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+
+
+def _vehicle_in_windows(vehicle: Vehicle | PathLike) -> Vehicle:
+    """The car as a model of windows can have it; a :class:`DataWarning` names effects that are left out."""
+    car = _vehicle(vehicle)
+    for effect in car.active_effects:
+        if effect.needs:
+            warnings.warn(
+                f"vehicle {car.name}: {effect.NAME} reads {', '.join(effect.needs)}, which windows of rows do not tell, "
+                "so that it is left to the online layer",
+                DataWarning, stacklevel=3,
+            )  # fmt: skip
+    return car.in_windows
 
 
 def _signal_map(signals: SignalMap | PathLike, commands: Commands | None) -> SignalMap:

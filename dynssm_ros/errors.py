@@ -25,7 +25,7 @@ class RecordingError(UserError):
 
 
 class DataWarning(UserWarning):
-    """Data look wrong and are used nevertheless; the text is one complete line."""
+    """What was given looks wrong, or part of it cannot be used here; the text is one complete line."""
 
 
 class ArtifactError(UserError):

@@ -46,6 +46,13 @@ def calibrate(
     ] = 0.0,
     starts: Annotated[int, typer.Option(help="Starting points of the search.", min=1)] = 3,
     seed: Annotated[int, typer.Option(help="Of the random starting points.", min=0)] = 0,
+    track: Annotated[
+        str | None,
+        typer.Option(
+            help="Track along which the places of the vehicle's effects are counted: built-in name or file.",
+            show_default="none; how the road bends is seen from the first full lap",
+        ),
+    ] = None,
     commands: CommandsOption = None,
     json: JsonOption = None,
     where: WhereOption = None,
@@ -53,7 +60,9 @@ def calibrate(
     """Fit the nominal parameters of a vehicle to measured laps, within their bounds."""
     logs = recording_files(recordings, where)
     with progress_bar("calibrating") as progress:
-        result = api.calibrate(logs, vehicle, horizon, min_speed, holdout, integrator, starts, seed, commands, progress)
+        result = api.calibrate(
+            logs, vehicle, horizon, min_speed, holdout, integrator, starts, seed, commands, progress, track
+        )
     source = ", ".join(str(path) for path in recordings) + (f" where {where}" if where else "")
     save_vehicle(
         result.vehicle,

@@ -101,7 +101,7 @@ def inputs(arguments: Sequence[str]) -> list[Path]:
 
 @contextmanager
 def _warning_in_lines() -> Iterator[None]:
-    """Data that look wrong are a line each on stderr, every time; other warnings stay as they are."""
+    """A :class:`DataWarning` is a line each on stderr, every time; other warnings stay as they are."""
     with warnings.catch_warnings():
         others = warnings.showwarning
 

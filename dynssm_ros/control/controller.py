@@ -251,7 +251,7 @@ class Controller:
         if not (car.effect_states and np.all(np.isfinite([*pose, *seen, *feedback]))):
             return np.zeros(len(car.effect_states))
         s = float(self._track.project(pose[:2])[0])
-        context = {"t": t, "s": s, "lap_length": self._track.length, **pose._asdict()}
+        context = {"t": t, **self._track.centre.place(s), **pose._asdict()}
         theta = Coefficients(*(float(value) for value in adapted.first.theta))
         effect_states = settled_effect_states(SCALAR, seen, feedback, theta, car.constants, car.effects, None, context)
         return np.array([effect_states[name] for name in car.effect_states])

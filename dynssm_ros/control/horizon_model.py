@@ -12,7 +12,7 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.buffered import BufferedRows
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
-from dynssm_ros.vehicle.effects.base import SLOWEST
+from dynssm_ros.vehicle.effects.base import PLACE, SLOWEST
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose
 from dynssm_ros.vehicle.low_speed import LowSpeedRolling
 from dynssm_ros.vehicle.single_track import (
@@ -32,7 +32,7 @@ INPUTS = ("increment of r", "increment of delta")
 Travel = Literal["start", "middle"]
 """Which velocity and heading carry a car over a step: those at its start, as forward Euler does in the published data, or
 those at its middle, as on a road."""
-CONTEXT = ("t", "s", "lap_length")
+CONTEXT = ("t", *PLACE)
 """What effects may read beside the pose: time (s), track position and length of the lap (m)."""
 PARAMETERS = len(COEFFICIENTS) + 3 + len(CONTEXT)
 """Per step: the 17 coefficients, the correction of ``v_x, v_y, omega``, the context."""

@@ -210,7 +210,7 @@ class LiveController:
         if self.laps.outside > LOST * self.laps.width:
             return self.brake()
         self._heading += math.remainder(pose.theta - self._heading, 2 * math.pi)
-        context = t, self.laps.s % self._track.length, self._track.length
+        context = t, *self._track.centre.place(self.laps.s % self._track.length).values()
         x = self.remote.start(Pose(pose.x, pose.y, self._heading), seen, self._sent[0], context, self._memory)
         self.remote.measured(stamp, x, context)
         self.remote.update(stamp)

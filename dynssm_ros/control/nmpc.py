@@ -183,7 +183,7 @@ class Nmpc:
         """
         first = slice(0, 1) if x.ndim == 1 else slice(None)
         parts = [np.atleast_2d(part)[first] for part in adapted]
-        context = np.broadcast_to([t, self._on_track, self._track.length], (len(parts[0]), len(CONTEXT)))
+        context = np.broadcast_to([t, *self._place()], (len(parts[0]), len(CONTEXT)))
         p = np.concatenate([*parts, context], axis=1)
         return self.model.step(x, u, p[0] if x.ndim == 1 else p)
 
@@ -221,10 +221,12 @@ class Nmpc:
         p = np.empty((self.settings.N, PARAMETERS))
         p[:, : len(COEFFICIENTS)] = adapted.theta
         p[:, len(COEFFICIENTS) : -len(CONTEXT)] = adapted.correction
-        p[:, -3] = t + self._times(0)[:-1]
-        p[:, -2] = self._on_track
-        p[:, -1] = self._track.length
+        p[:, -len(CONTEXT)] = t + self._times(0)[:-1]
+        p[:, 1 - len(CONTEXT) :] = self._place()
         return p
+
+    def _place(self) -> list[float]:
+        return list(self._track.centre.place(self._on_track).values())
 
     @np.errstate(over="ignore", invalid="ignore")  # what comes of it is looked at
     def _improved(self, now: Vector, guess: Plan, adapted: Adapted, t: float, margins: Margins) -> Plan | None:

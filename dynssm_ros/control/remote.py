@@ -14,8 +14,8 @@ from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehic
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose
 from dynssm_ros.vehicle.single_track import settled_effect_states
 
-Context = tuple[float, float, float]
-"""Time (s), place on the track (m) and length of the lap (m): what effects may read beside the pose."""
+Context = tuple[float, ...]
+"""The values of ``CONTEXT``: what effects may read beside the pose."""
 
 _HELD = np.zeros(len(INPUTS))
 _ROUNDING = 1e-5  # of a coefficient's range: predictors compute in single precision

@@ -26,10 +26,12 @@ from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, closest
 from dynssm_ros.identification.windows import RecordedRows, SimulationWindows, fit_windows, recorded_rows
 from dynssm_ros.progress import Progress
-from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
+from dynssm_ros.track.lap_position import first_lap, lap_context
+from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.effects import require_context
+from dynssm_ros.vehicle.effects.base import LAP
 from dynssm_ros.vehicle.single_track import Integrator
 
 HORIZONS_S = (0.5, 0.25, 0.1)
@@ -78,6 +80,7 @@ def calibrate(
     starts: int = 3,
     seed: int = 0,
     on_progress: Progress | None = None,
+    line: ClosedLine | None = None,
 ) -> Calibration:
     """Fits the nominal coefficients within their bounds; mass and geometry stay.
 
@@ -91,13 +94,15 @@ def calibrate(
         starts: starting points: the nominal values, the middle of the bounds, then seeded random ones.
         seed: of the random starting points.
         on_progress: called after each starting point.
+        line: of the track, from which the places of the vehicle's effects are counted; ``None``: only how the road bends is
+            known, from the first full lap.
 
     Raises:
         RecordingError: another sampling time than the vehicle's, or too few rows.
         ConfigurationError: an effect of the vehicle needs a signal that the recording does not have.
     """
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
-    context = recording_context(recording)
+    context = _context(recording, vehicle, line)
     require_context(vehicle.active_effects, context, f"recording {', '.join(recording.info.source)}")
     speed = vehicle.minimum_speed if min_speed is None else min_speed
     data = recorded_rows(recording, context)
@@ -137,6 +142,14 @@ def calibrate(
         windows.target.shape[0] * windows.target.shape[1],
         windows.steps * recording.T_s,
     )
+
+
+def _context(recording: Recording, vehicle: Vehicle, line: ClosedLine | None) -> dict[str, Vector]:
+    """What is known beside state and inputs. Where a lap starts its first full one does not tell, but how the road bends."""
+    if line is not None or not any("bend" in effect.needs for effect in vehicle.active_effects):
+        return lap_context(recording, line)
+    along = lap_context(recording, first_lap(recording))
+    return {name: signal for name, signal in along.items() if name in recording.columns or name not in LAP}
 
 
 def _fitted(

@@ -245,12 +245,12 @@ def _hidden(sizes: Mapping[str, float]) -> Iterator[str]:
 
 
 def _not_live(vehicle: Vehicle) -> Iterator[str]:
-    """What of the extended car reads signals that a live window has not."""
+    """What of the extended car a live window does not tell."""
     for effect in vehicle.active_effects:
         if effect.needs:
             yield (
-                f"{effect.NAME} reads {', '.join(effect.needs)}: simulate and diagnose know it, train and the predictor node "
-                "do not and say so; take it out of the vehicle file for those"
+                f"{effect.NAME} reads {', '.join(effect.needs)}: simulate, race, calibrate and diagnose know it; models of "
+                "windows do not, so that train leaves it to the online layer"
             )
 
 

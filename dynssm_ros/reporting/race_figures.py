@@ -139,7 +139,9 @@ def _motion(race: Race, with_effects: bool = True, theta: Vector | None = None) 
     """
     course = race.course
     x, y, heading = race.pose.T
-    context = {"t": race.time, "s": race.s, "lap_length": course.track.length, "x": x, "y": y, "theta": heading}
+    centre = course.track.centre
+    place = {"s": race.s, "lap_length": centre.length, "bend": centre.bend(race.s)}
+    context = {"t": race.time, **place, "x": x, "y": y, "theta": heading}
     effects = [effect for effect in course.vehicle.active_effects if not effect.SENSOR]
     acting = Coefficients(*(course.vehicle.nominal if theta is None else theta.T))
     state, command = State(*race.state.T), Applied(*race.command.T)

@@ -72,7 +72,7 @@ def drive_by_commands(
         plant,
         *start,
         last=(LowSpeedRolling(vehicle, plant_type(plant).step(vehicle)),),
-        lap_length=track.length,
+        line=track.centre,
     )
     feedback, s = Applied(0.0, 0.0), 0.0
     for k in itertools.count():

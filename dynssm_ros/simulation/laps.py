@@ -120,7 +120,7 @@ def drive(
     (x, y), theta = line.position(0.0, driver.offset(0.0)), float(line.heading(0.0))
     v_x = 0.7 * driver.speed(0.0)
     state = State(v_x, 0.0, v_x * float(line.curvature(0.0)))
-    car = make_plant(vehicle, plant, Pose(float(x), float(y), theta), state, lap_length=track.length)
+    car = make_plant(vehicle, plant, Pose(float(x), float(y), theta), state, line=track.centre)
     feedback, on_line = Applied(0.0, 0.0), 0.0
     s = float(track.project([x, y])[0])
     for k in itertools.count():

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.double_track import DoubleTrack
+from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step_with_effect_states
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose, world_velocity
@@ -57,8 +58,8 @@ class _Odometer(StageEffect):
 class SingleTrackPlant:
     """The single-track car. The input of a step acts on that step.
 
-    Effects may read from the context ``t`` (s), ``s`` and ``lap_length`` (m), held over a step, and ``x, y, theta`` (m, m,
-    rad). Those that change what is measured leave the motion as it is.
+    Effects may read from the context ``t`` (s), ``s``, ``lap_length`` (m) and ``bend``, held over a step, and ``x, y,
+    theta`` (m, m, rad). Those that change what is measured leave the motion as it is.
 
     Args:
         vehicle: the car with its effects.
@@ -67,7 +68,7 @@ class SingleTrackPlant:
         state: how it moves then.
         first: acts before the vehicle's own effects.
         last: acts after them.
-        lap_length: of the track (m); ``None`` if there is none.
+        line: centre line of the track; ``None`` if there is none.
 
     Raises:
         ConfigurationError: an effect needs a signal that there is not.
@@ -81,7 +82,7 @@ class SingleTrackPlant:
         state: State,
         first: Sequence[StageEffect] = (),
         last: Sequence[StageEffect] = (),
-        lap_length: float | None = None,
+        line: ClosedLine | None = None,
     ) -> None:
         self.state = state
         self._vehicle = vehicle
@@ -92,7 +93,7 @@ class SingleTrackPlant:
         physics = [effect for effect in effects if not effect.SENSOR]
         self._effects: tuple[StageEffect, ...] = (_Odometer(), *first, *physics, *last, *sensors)
         self._steps = 0
-        self._track = {} if lap_length is None else {"lap_length": lap_length}
+        self._line = line
         require_context(effects, {*self._context(0.0), *Pose._fields}, "simulation")
         self._memory = settled_effect_states(
             SCALAR, state, Applied(0.0, 0.0), self._theta, vehicle.constants, self._effects,
@@ -136,7 +137,8 @@ class SingleTrackPlant:
         self._steps += 1
 
     def _context(self, s: float) -> dict[str, float]:
-        return {"t": self._steps * self._vehicle.sampling_time, "s": s, **self._track}
+        place = {"s": s} if self._line is None else self._line.place(s)
+        return {"t": self._steps * self._vehicle.sampling_time, **place}
 
     def _seen(self) -> State:
         """The present state as the sensors see it."""
@@ -179,7 +181,7 @@ class PlantType(Protocol):
         """Physics that it has beyond the single-track equations."""
 
     def make(
-        self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], lap_length: float | None
+        self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], line: ClosedLine | None
     ) -> Plant:
         """A car of that kind; see :class:`SingleTrackPlant` for the arguments and errors."""
 
@@ -199,10 +201,10 @@ class EulerPlant:
         return ()
 
     def make(
-        self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], lap_length: float | None
+        self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], line: ClosedLine | None
     ) -> Plant:
         """The single-track car."""
-        return SingleTrackPlant(vehicle, self.integrator, pose, state, self.first(vehicle), last, lap_length)
+        return SingleTrackPlant(vehicle, self.integrator, pose, state, self.first(vehicle), last, line)
 
 
 class Rk4Plant(EulerPlant):
@@ -256,7 +258,7 @@ def make_plant(
     pose: Pose,
     state: State,
     last: Sequence[StageEffect] = (),
-    lap_length: float | None = None,
+    line: ClosedLine | None = None,
 ) -> Plant:
     """A car of that kind of plant; see :class:`SingleTrackPlant` for the arguments and errors."""
-    return plant_type(kind).make(vehicle, pose, state, last, lap_length)
+    return plant_type(kind).make(vehicle, pose, state, last, line)

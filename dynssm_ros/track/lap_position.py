@@ -38,11 +38,12 @@ def track_position(line: ClosedLine, recording: Recording) -> Vector:
 
 
 def lap_context(recording: Recording, line: ClosedLine | None) -> dict[str, Vector]:
-    """The signals of the recording, and ``s`` (m, in ``[0, lap_length)``) and ``lap_length`` (m) along ``line``."""
+    """The signals of the recording, and its place along ``line``: ``s`` (m, in ``[0, lap_length)``), length, bend."""
     context = recording_context(recording)
     if line is None or "s" in context:
         return context
-    return context | {"s": track_position(line, recording), "lap_length": np.full(len(recording), line.length)}
+    s = track_position(line, recording)
+    return context | {"s": s, "lap_length": np.full(len(recording), line.length), "bend": line.bend(s)}
 
 
 def lap_number(recording: Recording, line: ClosedLine | None) -> Vector | None:

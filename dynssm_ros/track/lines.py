@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from dynssm_ros.arrays import Vector
@@ -16,6 +17,9 @@ from dynssm_ros.arrays import Vector
 Floats = float | Vector
 
 _NEWTON_STEPS = 12
+_BEND_POINTS = 1000
+_SMOOTHED = 0.01  # of the lap: standard deviation
+_SHARPEST = 0.95  # quantile of the curvature
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +64,18 @@ class ClosedLine:
         _, first, second = self._derivatives(s)
         cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
         return np.asarray(cross / np.hypot(first[..., 0], first[..., 1]) ** 3)
+
+    def bend(self, s: Floats) -> Vector:
+        """How sharply the line bends at ``s`` (m, periodic): its curvature over that of its sharpest places.
+
+        Smoothed over about a fiftieth of the lap; from -1 (to the right) to 1 (to the left), which a twentieth of the lap
+        reaches.
+        """
+        return np.interp(np.asarray(s, dtype=np.float64) / self.length % 1.0, *self._bends)
+
+    def place(self, s: float) -> dict[str, float]:
+        """What effects may know of the place ``s`` (m, counting on over the laps)."""
+        return {"s": s, "lap_length": self.length, "bend": float(self.bend(s))}
 
     def project(self, points: npt.ArrayLike, near: npt.ArrayLike | None = None) -> tuple[Vector, Vector]:
         """Foot of the perpendicular from ``points`` (m, shape ``(..., 2)``).
@@ -126,6 +142,15 @@ class ClosedLine:
         a, b, c, d = np.moveaxis(self._pieces[piece], -2, 0)
         h = (at - knots[piece])[..., None]
         return ((a * h + b) * h + c) * h + d, (3 * a * h + 2 * b) * h + c, 6 * a * h + 2 * b
+
+    @cached_property
+    def _bends(self) -> tuple[Vector, Vector]:
+        """Places (laps) and :meth:`bend` there."""
+        lap = np.arange(_BEND_POINTS) / _BEND_POINTS
+        curvature = gaussian_filter1d(self.curvature(lap * self.length), _SMOOTHED * _BEND_POINTS, mode="wrap")
+        sharpest = float(np.quantile(np.abs(curvature), _SHARPEST))
+        bend = np.clip(curvature / max(sharpest, 1e-12), -1.0, 1.0)
+        return np.append(lap, 1.0), np.append(bend, bend[0])
 
     @cached_property
     def _tree(self) -> cKDTree:

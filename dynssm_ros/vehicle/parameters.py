@@ -199,6 +199,14 @@ class Vehicle(StrictModel):
         """Correlation of what is known of the coefficients, ``(17, 17)``."""
         return np.eye(len(COEFFICIENTS)) if self.correlation is None else _symmetric(self.correlation)
 
+    @property
+    def in_windows(self) -> Vehicle:
+        """The same car without effects that read what rows of state and inputs do not tell, such as the place on the lap."""
+        of_windows = [
+            entry for entry, effect in zip(self.effects, self.active_effects, strict=True) if not effect.needs
+        ]
+        return self.model_copy(update={"effects": tuple(of_windows)})
+
     def with_nominal(self, nominal: Vector, std: Vector | None = None, correlation: Vector | None = None) -> Vehicle:
         """The same car with other nominal values and, if given, what is known of them.
 

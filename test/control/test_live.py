@@ -55,7 +55,7 @@ class SteppedCar:
 
     def __init__(self, vehicle, track, v_x=1.5, late=0):
         start = Pose(*(float(v) for v in track.centre.position(0.0)), float(track.centre.heading(0.0)))
-        self.plant = make_plant(vehicle, "euler", start, State(v_x, 0.0, 0.0), lap_length=track.length)
+        self.plant = make_plant(vehicle, "euler", start, State(v_x, 0.0, 0.0), line=track.centre)
         self.stamp, self.sent = STAMP, Applied(0.0, 0.0)
         self.on_the_way, self.late = [], late
 

@@ -104,7 +104,7 @@ def test_an_extended_car_that_no_live_window_can_serve_says_so() -> None:
     car = load_vehicle("av21").with_effect("steering_lag", {"time_constant": 0.1})
     assert list(_not_live(car)) == []
     (note,) = _not_live(car.with_effect("grip_patch", {"factor": 0.8, "centre": 0.3, "length": 0.1}))
-    assert note.startswith("grip_patch reads s, lap_length: simulate and diagnose know it")
+    assert note.startswith("grip_patch reads s, lap_length: simulate, race, calibrate and diagnose know it")
 
 
 def test_what_cannot_be_noticed_is_listed_with_the_driving_that_shows_it() -> None:

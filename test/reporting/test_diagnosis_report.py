@@ -182,9 +182,10 @@ def test_each_cause_has_a_picture_of_how_much_where_and_when(lagging: Lagging) -
 def test_a_curve_along_the_lap_is_drawn_and_its_range_told(lagging: Lagging) -> None:
     found = lagging[2]
     (cause,) = found.causes
-    values = {"angle": 0.01, "cos_1": 0.05, "sin_1": 0.0, "cos_2": 0.0, "sin_2": 0.0, "cos_3": 0.0, "sin_3": 0.0}
+    wave = {f"knot_{k}": float(0.05 * np.cos(np.pi * k / 4)) for k in range(1, 8)}
+    values = {"angle": 0.01, **wave}
     bank = replace(cause, effect="road_bank", values=values, std=dict.fromkeys(values, 1e-3))
-    assert size_in_words(bank) == "road bank (deg) from -2.29 to 3.44 along the lap, 7 parameters"
+    assert size_in_words(bank) == "road bank (deg) from -2.03 to 3.17 along the lap, 8 parameters"
     with_it = found.improvement.errors["extended"][:, found.improvement.horizon]
     figure = cause_pictures(found.improvement.windows, bank.without, with_it, EFFECTS["road_bank"](**values))
     line = np.asarray(figure.axes[-1].lines[0].get_ydata())

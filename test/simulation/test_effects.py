@@ -20,7 +20,7 @@ from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDe
 from dynssm_ros.vehicle.single_track import settled_effect_states, step_with_effect_states
 
 AV21, COURSE = load_vehicle("av21"), load_track("road_course")
-LAP, STEPS, WARM = 1000.0, 25, 8
+LINE, STEPS, WARM = load_track("club").centre.scaled(70.0), 25, 8
 START = Pose(0.0, 0.0, 0.3), State(30.0, 0.1, 0.05)
 SENSORS = [name for name, effect in EFFECTS.items() if issubclass(effect, (MeasurementEffect, OdometryDelay))]
 
@@ -39,11 +39,19 @@ def commands() -> list[Applied]:
 
 def driven(vehicle: Vehicle, kind: PlantKind) -> tuple[np.ndarray, np.ndarray, list[dict[str, float]]]:
     """True and measured states, each ``(STEPS + 1, 3)``, and the signals of each step, under the same commands."""
-    car = make_plant(vehicle, kind, *START, lap_length=LAP)
+    car = make_plant(vehicle, kind, *START, line=LINE)
     true, measured, signals = [car.state], [car.measured], []
     for k, applied in enumerate(commands()):
         s = 30.0 * k * vehicle.sampling_time
-        signals.append({"t": k * vehicle.sampling_time, "s": s, "lap_length": LAP, "theta": car.pose.theta})
+        signals.append(
+            {
+                "t": k * vehicle.sampling_time,
+                "s": s,
+                "lap_length": LINE.length,
+                "bend": float(LINE.bend(s)),
+                "theta": car.pose.theta,
+            }
+        )
         car.advance(applied, s)
         true.append(car.state)
         measured.append(car.measured)
@@ -113,7 +121,7 @@ def test_late_odometry_is_the_true_motion_of_then(kind: PlantKind, late: float, 
 def test_a_signal_that_the_simulation_does_not_have_is_one_clear_line() -> None:
     rolling = AV21.with_effect("road_bank", {"roll_gain": 1.0})
     expected = (
-        r"simulation: effect road_bank needs the signal roll \(rad\), which .* \(t, s, lap_length, x, y, theta\)$"
+        r"simulation: effect road_bank needs the signal roll \(rad\), which .* \(t, s, lap_length, bend, x, y, theta\)$"
     )
     with pytest.raises(ConfigurationError, match=expected):
         simulate(rolling, COURSE, duration=1.0)

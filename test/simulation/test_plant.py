@@ -5,6 +5,7 @@ import pytest
 
 from dynssm_ros.simulation import plant as plant_module
 from dynssm_ros.simulation.plant import Pose, SingleTrackPlant
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, State, load_vehicle
 from dynssm_ros.vehicle.single_track import StageEffect
 
@@ -93,10 +94,11 @@ def test_effects_see_time_place_and_pose():
         def slip(self, xp, q):
             seen.append(dict(q.context))
 
-    car = SingleTrackPlant(load_vehicle("orca"), "euler", Pose(1.0, 2.0, 0.5), State(2.0, 0.0, 0.0), lap_length=9.0)
+    line = load_track("club").centre
+    car = SingleTrackPlant(load_vehicle("orca"), "euler", Pose(1.0, 2.0, 0.5), State(2.0, 0.0, 0.0), line=line)
     car._effects = (*car._effects, Witness())
     car.advance(Applied(0.0, 0.0), s=3.0)
     car.advance(Applied(0.0, 0.0), s=3.1)
-    assert seen[0] == {"t": 0.0, "s": 3.0, "lap_length": 9.0, "x": 1.0, "y": 2.0, "theta": 0.5}
+    assert seen[0] == {"t": 0.0, **line.place(3.0), "x": 1.0, "y": 2.0, "theta": 0.5}
     assert seen[1]["t"] == pytest.approx(0.02)
     assert seen[1]["x"] > 1.0

@@ -23,6 +23,20 @@ def test_circle_has_its_length_curvature_and_heading(direction):
     np.testing.assert_allclose(line.s, np.arange(200) * line.length / 200, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("size", [1.0, 250.0])
+def test_the_bend_goes_with_the_curvature_up_to_the_sharpest_places_whatever_the_size_of_the_track(size):
+    line = built_in_track("oval").centre.scaled(size)
+    s = np.linspace(0.0, line.length, 300)
+    bend, curvature = line.bend(s), line.curvature(s)
+    assert bend.max() == 1.0
+    assert bend.min() >= -0.05, "all its bends go to one side"
+    straight = np.abs(curvature) < 0.01 * np.abs(curvature).max()
+    assert np.abs(bend[straight]).mean() < 0.1
+    np.testing.assert_allclose(line.bend(s + 2 * line.length), bend, atol=1e-9)
+    place = line.place(float(s[7]) + line.length)
+    assert place == {"s": s[7] + line.length, "lap_length": line.length, "bend": pytest.approx(bend[7])}
+
+
 def test_unevenly_spaced_points_still_give_arc_length():
     angle = np.sort(np.random.default_rng(0).uniform(0, 2 * np.pi, 600))
     line = ClosedLine(np.stack([3 * np.cos(angle), 3 * np.sin(angle)], axis=1))

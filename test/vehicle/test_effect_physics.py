@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, motion
@@ -203,8 +204,8 @@ def test_grade_holds_the_car_back_uphill() -> None:
     assert (q.a_y, q.omega_dot) == (PLAIN.a_y, PLAIN.omega_dot)
 
 
-def bank_at(s: float, **parameters: float) -> float:
-    q = act(context={"s": s, "lap_length": 2000.0}, road_bank=parameters)
+def bank_at(s: float, bend: float = 0.0, **parameters: float) -> float:
+    q = act(context={"s": s, "lap_length": 2000.0, "bend": bend}, road_bank=parameters)
     return float(np.arcsin((PLAIN.a_y - q.a_y) / GRAVITY))
 
 
@@ -219,14 +220,23 @@ def test_a_banked_section_is_where_the_file_says() -> None:
     assert bank_at(900.0, angle=0.03, **corner) == pytest.approx(0.03, abs=1e-6)
 
 
-def test_a_wave_of_the_bank_has_its_place_and_period() -> None:
-    assert bank_at(0.0, cos_1=0.1) == pytest.approx(0.1)
-    assert bank_at(1000.0, cos_1=0.1) == pytest.approx(-0.1)
-    assert bank_at(1000.0, cos_2=0.1) == pytest.approx(0.1)
-    assert bank_at(2000.0 / 12, sin_3=0.1) == pytest.approx(0.1)
-    both = bank_at(300.0, angle=0.02, cos_1=0.05, sin_2=-0.04)
-    angle = 2 * np.pi * 300 / 2000
-    assert both == pytest.approx(0.02 + 0.05 * np.cos(angle) - 0.04 * np.sin(2 * angle))
+def test_a_curve_of_the_bank_is_the_periodic_cubic_spline_of_its_coefficients() -> None:
+    coefficients = np.random.default_rng(4).uniform(-0.1, 0.1, 7)
+    knots = {f"knot_{k}": float(value) for k, value in enumerate(coefficients, 1)}
+    around = np.tile([-coefficients.sum(), *coefficients], 3)
+    # a basis function of degree 3 is centred two knots after the first of its five
+    spline = BSpline(np.arange(-10.0, 18.0) * 250.0, around, 3)
+    places = np.linspace(0.0, 2000.0, 41)
+    expected = spline(places)
+    np.testing.assert_allclose([bank_at(float(s), **knots) for s in places], expected, atol=1e-12)
+    assert bank_at(300.0 + 4000.0, angle=0.02, **knots) == pytest.approx(0.02 + float(spline(300.0)))
+    assert np.mean(expected[:-1]) == pytest.approx(0.0, abs=1e-9), "what leans to one side leans to the other elsewhere"
+
+
+def test_a_cambered_road_leans_into_its_bends() -> None:
+    assert bank_at(0.0, bend=1.0, camber=0.1) == pytest.approx(-0.1), "left bend: the right side is up"
+    assert bank_at(0.0, bend=-0.5, camber=0.1) == pytest.approx(0.05)
+    assert bank_at(0.0, bend=0.5, camber=0.1, angle=0.02) == pytest.approx(-0.03)
 
 
 @pytest.mark.parametrize("theta", [0.0, 0.7, 2.5])

@@ -36,7 +36,7 @@ VEHICLE = load_vehicle("av21_paper")
 CONSTANTS = VEHICLE.constants
 THETA = Coefficients(*VEHICLE.nominal)
 STATE, APPLIED = State(30.0, 0.4, 0.2), Applied(0.4, 0.05)
-CONTEXT = {"t": 60.0, "s": 1900.0, "lap_length": 4000.0, "x": 5.0, "y": -3.0, "theta": 1.1, "roll": 0.03}
+CONTEXT = {"t": 60.0, "s": 1900.0, "lap_length": 4000.0, "bend": 0.6, "x": 5.0, "y": -3.0, "theta": 1.1, "roll": 0.03}
 
 
 def act(*effects: Effect, effect_states: dict[str, Array] | None = None) -> Motion:
@@ -338,7 +338,8 @@ def test_only_what_is_used_needs_its_signals() -> None:
     assert level.needs == ()
     require_context((level, build_effect("grip_patch", {"centre": 0.2})), (), "nowhere")
     assert build_effect("road_bank", {"roll_gain": 1.0}).needs == ("roll",)
-    assert build_effect("road_bank", {"cos_2": 0.1}).needs == ("s", "lap_length")
+    assert build_effect("road_bank", {"knot_2": 0.1}).needs == ("s", "lap_length")
+    assert build_effect("road_bank", {"camber": 0.1}).needs == ("bend",)
 
 
 def test_an_effect_takes_many_values_at_once() -> None:

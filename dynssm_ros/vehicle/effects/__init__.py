@@ -22,6 +22,7 @@ from dynssm_ros.vehicle.effects.actuators import (
 from dynssm_ros.vehicle.effects.base import (
     CONTEXT_UNITS,
     LOCATION,
+    PLACE,
     Effect,
     Parameter,
     initial_effect_states,
@@ -54,6 +55,7 @@ __all__ = [
     "CONTEXT_UNITS",
     "EFFECTS",
     "LOCATION",
+    "PLACE",
     "Effect",
     "Parameter",
     "build_effect",

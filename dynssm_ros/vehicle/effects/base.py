@@ -28,13 +28,15 @@ from dynssm_ros.vehicle.single_track import (
 )
 
 CONTEXT_UNITS: dict[str, str] = {
-    "t": "s", "s": "m", "lap_length": "m", "x": "m", "y": "m", "theta": "rad", "roll": "rad",
+    "t": "s", "s": "m", "lap_length": "m", "bend": "1", "x": "m", "y": "m", "theta": "rad", "roll": "rad",
 }  # fmt: skip
 """The signals beside state and inputs that effects may read: time since the start of the drive or recording, position
-along the track's centre line (which may count on over the laps) and the length of a lap, pose, measured roll of the car
-(positive with the left side up)."""
+along the track's centre line (which may count on over the laps), the length of a lap, and how sharply the line bends there
+(from -1 to the right to 1 to the left, its sharpest places), pose, measured roll of the car (positive with the left side
+up)."""
 
-LAP = ("s", "lap_length")
+PLACE = ("s", "lap_length", "bend")
+LAP = PLACE[:2]
 _AT = 1e-3  # of the span, nearer to a bound than which a value is on it
 SLOWEST = 1e-3  # m/s; what divides by the speed does not divide by less
 
@@ -292,6 +294,10 @@ def section(xp: Any, lap: Array, centre: Array, length: Array) -> Array:
         centre: middle of the section (lap).
         length: its length (lap).
     """
+    return (1 + xp.tanh((length / 2 - away(xp, lap, centre)) / (0.1 * length))) / 2
+
+
+def away(xp: Any, lap: Array, centre: Array) -> Array:
+    """Distance of the track position ``lap`` from ``centre`` along the lap, the shorter way round (lap)."""
     angle = 2 * math.pi * (lap - centre)
-    away = abs(xp.arctan2(xp.sin(angle), xp.cos(angle))) / (2 * math.pi)
-    return (1 + xp.tanh((length / 2 - away) / (0.1 * length))) / 2
+    return abs(xp.arctan2(xp.sin(angle), xp.cos(angle))) / (2 * math.pi)

@@ -10,20 +10,21 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, Effect, Parameter, like, section
-from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion
+from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, Effect, Parameter, away, like, section
+from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion, at_least
 
-_HARMONICS = 3
-_WAVES = tuple(f"{wave}_{k}" for k in range(1, _HARMONICS + 1) for wave in ("cos", "sin"))
+_PIECES = 8  # of the curve along the lap
+_KNOTS = tuple(f"knot_{k}" for k in range(1, _PIECES))
 _SECTION = ("section", "centre", "length")
 _CALM = 1e-6  # (m/s)^2; keeps the slope of a square root finite in still air
 
 
 @dataclass(frozen=True)
 class RoadAngle(Effect):
-    """An angle of the road: everywhere the same, on a section of the lap, as a smooth wave over the lap, or their sum.
+    """An angle of the road: everywhere the same, on a section of the lap, as a curve along the lap, or their sum.
 
-    ``cos_k`` and ``sin_k`` are the amplitudes of the ``k``-th harmonic of the lap.
+    The curve is a periodic cubic spline (uniform B-splines; de Boor 1978) with mean zero. ``knot_k`` is its coefficient at
+    ``k / 8`` of the lap; the one at the start of the lap makes their sum zero.
     """
 
     PARAMETERS = {
@@ -31,23 +32,24 @@ class RoadAngle(Effect):
         "section": Parameter("rad", -0.5, 0.5, 0.0, context=LAP, local=True),
         "centre": CENTRE,
         "length": LENGTH,
-        **dict.fromkeys(_WAVES, Parameter("rad", -0.3, 0.3, 0.0, context=LAP)),
+        **dict.fromkeys(_KNOTS, Parameter("rad", -0.3, 0.3, 0.0, context=LAP)),
     }
-    VARIANTS: ClassVar[tuple[tuple[str, ...], ...]] = (("angle",), ("angle", *_SECTION), ("angle", *_WAVES))
+    VARIANTS: ClassVar[tuple[tuple[str, ...], ...]] = (("angle",), ("angle", *_SECTION), ("angle", *_KNOTS))
     angle: Array = 0.0
     section: Array = 0.0
     centre: Array = 0.5
     length: Array = 0.1
-    cos_1: Array = 0.0
-    sin_1: Array = 0.0
-    cos_2: Array = 0.0
-    sin_2: Array = 0.0
-    cos_3: Array = 0.0
-    sin_3: Array = 0.0
+    knot_1: Array = 0.0
+    knot_2: Array = 0.0
+    knot_3: Array = 0.0
+    knot_4: Array = 0.0
+    knot_5: Array = 0.0
+    knot_6: Array = 0.0
+    knot_7: Array = 0.0
 
     def along_lap(self, lap: Vector) -> tuple[str, Vector] | None:
-        """The angle in degrees."""
-        if not set(LAP) & set(self.needs):
+        """The angle in degrees; ``None`` where the place does not matter, or only by how the road bends."""
+        if not set(LAP) & set(self.needs) or "bend" in self.needs:
             return None
         q: Any = SimpleNamespace(v_x=np.zeros_like(lap), context={"s": lap, "lap_length": 1.0})
         return f"{self.NAME.replace('_', ' ')} (deg)", np.degrees(self.here(np, q))
@@ -57,10 +59,10 @@ class RoadAngle(Effect):
         angle = like(q, self.angle)
         if "section" in self.active:
             angle = angle + self.section * section(xp, self.lap(q), self.centre, self.length)
-        for name in _WAVES:
-            if name in self.active:
-                wave, k = name.split("_")
-                angle = angle + getattr(self, name) * getattr(xp, wave)(2 * math.pi * int(k) * self.lap(q))
+        if self.active & set(_KNOTS):
+            knots = [getattr(self, name) for name in _KNOTS]
+            for k, knot in enumerate([-sum(knots), *knots]):
+                angle = angle + knot * _spline(_PIECES * away(xp, self.lap(q), k / _PIECES))
         return angle
 
 
@@ -68,21 +70,30 @@ class RoadAngle(Effect):
 class RoadBank(RoadAngle):
     """``F_y - m g sin(bank)``, bank as roll: positive with the left side up, so that the car is pulled to the right.
 
-    ``roll_gain`` adds that much of the measured roll of the car. The axle loads stay those of the level road.
+    ``camber`` is how far the road leans into its sharpest bends, and less in proportion to the curvature elsewhere, as
+    roads are built. ``roll_gain`` adds that much of the measured roll of the car. The axle loads stay those of the level
+    road.
     """
 
     NAME = "road_bank"
     SUMMARY = "The road leans to one side, so gravity pulls the car sideways."
     ADVICE = "Map the banking of the track, or feed the measured roll to the model."
     MANOEUVRE = "the same stretch at different speeds, straight as far as possible"
-    PARAMETERS = {**RoadAngle.PARAMETERS, "roll_gain": Parameter("1", -2.0, 2.0, 0.0, context=("roll",))}
+    PARAMETERS = {
+        **RoadAngle.PARAMETERS,
+        "camber": Parameter("rad", -0.5, 0.5, 0.0, context=("bend",)),
+        "roll_gain": Parameter("1", -2.0, 2.0, 0.0, context=("roll",)),
+    }
     TYPICAL = (0.015, 0.1)
-    VARIANTS = (*RoadAngle.VARIANTS, ("roll_gain",))
+    VARIANTS = (("angle",), ("camber",), *RoadAngle.VARIANTS[1:], ("roll_gain",))
+    camber: Array = 0.0
     roll_gain: Array = 0.0
 
     def forces(self, xp: Any, q: Motion) -> None:
         """Adds the weight's part across the car."""
         bank = self.here(xp, q)
+        if "camber" in self.active:
+            bank = bank - self.camber * self.read(q, "bend")
         if "roll_gain" in self.active:
             bank = bank + self.roll_gain * self.read(q, "roll")
         q.F_y = q.F_y - q.m * GRAVITY * xp.sin(bank)
@@ -97,7 +108,7 @@ class RoadGrade(RoadAngle):
     ADVICE = "Map the height of the track and give the model its slope."
     MANOEUVRE = "the same stretch with and without throttle"
     PARAMETERS = RoadAngle.PARAMETERS
-    VARIANTS = (("angle",), _SECTION, _WAVES)
+    VARIANTS = (("angle",), _SECTION, _KNOTS)
     OPEN_ROAD = (("angle",),)
     TYPICAL = (0.005, 0.05)
 
@@ -107,9 +118,15 @@ class RoadGrade(RoadAngle):
 
     @classmethod
     def drawn(cls, amount: float, rng: np.random.Generator) -> dict[str, float]:
-        """A wave over the lap with that amplitude: what climbs falls again."""
-        direction = float(rng.uniform(0, 2 * math.pi))
-        return {"cos_1": amount * math.cos(direction), "sin_1": amount * math.sin(direction)}
+        """A wave over the lap with about that amplitude: what climbs falls again."""
+        top = float(rng.uniform(0, _PIECES))
+        return {name: amount * math.cos(2 * math.pi * (k - top) / _PIECES) for k, name in enumerate(_KNOTS, 1)}
+
+
+def _spline(away: Array) -> Array:
+    """The uniform cubic B-spline at a distance in knots, not negative; shifted by whole knots they sum to one."""
+    wide, narrow = at_least(2.0 - away, 0.0), at_least(1.0 - away, 0.0)
+    return (wide * wide * wide - 4.0 * narrow * narrow * narrow) / 6.0
 
 
 @dataclass(frozen=True)
