@@ -13,7 +13,6 @@ from scipy.stats import binomtest
 from benchmarks.hidden_causes.cases import Case, Hidden
 from dynssm_ros.identification.diagnosis import Cause
 from dynssm_ros.vehicle.effects import EFFECTS
-from dynssm_ros.vehicle.effects.base import LOCATION
 
 _NINETY = 1.645  # standard deviations of a 90 % interval
 
@@ -131,11 +130,8 @@ def _share(right: Sequence[bool]) -> dict[str, Any]:
 
 def share_of_range(effect: str, values: Mapping[str, float]) -> float:
     """Where a size lies between just noticeable (0) and large (1), in its logarithm."""
-    about = {name: p for name, p in EFFECTS[effect].PARAMETERS.items() if not p.shape and name in values}
-    place = LOCATION if any(p.local for p in about.values()) else ()
-    off = [values[name] - p.neutral for name, p in about.items() if name not in place]
     least, most = EFFECTS[effect].TYPICAL
-    return float(np.log(np.linalg.norm(off) / least) / np.log(most / least))
+    return float(np.log(EFFECTS[effect].amount(values) / least) / np.log(most / least))
 
 
 def by_size(outcomes: Sequence[Outcome], parts: int = 3) -> list[dict[str, Any]]:

@@ -17,7 +17,7 @@ ADDED = np.array([0.02, -0.01, 0.3])
 
 
 def parameters(vehicle):
-    return np.concatenate([vehicle.nominal, ADDED, [0.5, 0.0, 12.0]])
+    return np.concatenate([vehicle.nominal, ADDED, [0.5, 0.0, 12.0, 0.3]])
 
 
 @pytest.mark.parametrize(("integrator", "substeps"), [("euler", 1), ("rk4", 2)])
@@ -42,7 +42,7 @@ def test_the_true_model_moves_as_its_plant(orca, plant, car, travel, off):
     """State and pose, in a quick turn; with the other travel the published car would be a millimetre beside where it is."""
     driven = make_plant(orca, plant, Pose(*NOW[:3]), State(*NOW[3:6]))
     driven.advance(Applied(*(NOW[6:] + U)))
-    p = np.concatenate([orca.nominal, np.zeros(3), [0.0, 0.0, 12.0]])
+    p = np.concatenate([orca.nominal, np.zeros(3), [0.0, 0.0, 12.0, 0.0]])
     following = {
         each: HorizonModel(SteppedCar(orca.constants, 0.02, (), *car), N, each).step(NOW, U, p)
         for each in ("start", "middle")

@@ -14,7 +14,7 @@ from dynssm_ros.vehicle import COEFFICIENTS, Applied, State
 
 T_S = 20_000_000  # ns
 STAMP = 1_700_000_000_000_000_000
-CONTEXT = (1.0, 2.0, 11.7)
+CONTEXT = (1.0, 2.0, 11.7, 0.4)
 APPLIED = Applied(0.3, 0.1)
 SEEN = State(2.0, 0.1, 1.0)
 BEYOND = np.array([0.02, -0.01, 0.3])  # what the planted predictor adds

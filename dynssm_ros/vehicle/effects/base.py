@@ -157,6 +157,12 @@ class Effect(StageEffect):
         return values
 
     @classmethod
+    def amount(cls, values: Mapping[str, float]) -> float:
+        """How far off neutral an effect with these parameters is: what :meth:`drawn` was given."""
+        about = {name: p for name, p in cls.PARAMETERS.items() if not p.shape and name in values}
+        return math.hypot(*(values[name] - p.neutral for name, p in about.items()))
+
+    @classmethod
     def unusable(cls, constants: Constants) -> str | None:
         """What is wrong with a car of these constants for the effect to be able to act; ``None`` if nothing is."""
         return None

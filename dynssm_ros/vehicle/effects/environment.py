@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -121,6 +122,12 @@ class RoadGrade(RoadAngle):
         """A wave over the lap with about that amplitude: what climbs falls again."""
         top = float(rng.uniform(0, _PIECES))
         return {name: amount * math.cos(2 * math.pi * (k - top) / _PIECES) for k, name in enumerate(_KNOTS, 1)}
+
+    @classmethod
+    def amount(cls, values: Mapping[str, float]) -> float:
+        """The amplitude of such a wave."""
+        knots = [values[name] for name in _KNOTS]
+        return math.sqrt(2.0 / _PIECES) * math.hypot(sum(knots), *knots)
 
 
 def _spline(away: Array) -> Array:
