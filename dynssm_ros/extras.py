@@ -12,6 +12,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "train": ("torch", "onnx", "onnxscript", "scipy"),
     "race": ("casadi", "scipy"),
     "report": ("matplotlib", "jinja2", "scipy"),
+    "formula": ("sklearn",),
     "scale": ("joblib",),
     "sweep": ("optuna",),
     "processes": ("lightning_fabric",),

@@ -43,7 +43,7 @@ ROS = {
 OWNERS = {
     "torch": {"learning"}, "lightning_fabric": {"learning"}, "casadi": {"control"}, "matplotlib": {"reporting"},
     "jinja2": {"reporting"}, "joblib": {"parallel"}, "ray": {"parallel"}, "distributed": {"parallel"},
-    "optuna": {"evaluation"},     "typer": {"cli"}, "rich": {"cli", "reporting"},
+    "optuna": {"evaluation"}, "sklearn": {"identification"}, "typer": {"cli"}, "rich": {"cli", "reporting"},
 }  # fmt: skip
 OWNERS |= {module: {"nodes"} for module in ROS}
 

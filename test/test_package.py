@@ -25,7 +25,12 @@ from dynssm_ros.vehicle.parameters import load_vehicle
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "dynssm_ros"
-PIP_NAMES = {"yaml": "pyyaml", "typing_extensions": "typing-extensions", "lightning_fabric": "lightning-fabric"}
+PIP_NAMES = {
+    "yaml": "pyyaml",
+    "typing_extensions": "typing-extensions",
+    "lightning_fabric": "lightning-fabric",
+    "sklearn": "scikit-learn",
+}
 ROSDEP_KEYS = {
     "onnxruntime": "python3-onnxruntime-pip",
     "rosbags": "python3-rosbags-pip",

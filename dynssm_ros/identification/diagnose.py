@@ -9,8 +9,10 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
+from dynssm_ros.extras import missing_libraries
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.diagnosis import Cause, Diagnosis
+from dynssm_ros.identification.formula import Formula, formulas
 from dynssm_ros.identification.gate import HeldOut, Without, gated
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
@@ -82,6 +84,7 @@ def diagnose(
         found, at.car, HeldOut(at.unseen.stepped_as(windows), at.steps), at.notes
     )
     fit = selection.fit
+    terms = _formulas(windows, fit.car, at.left_out, at.notes, on_progress) if left.is_there else ()
     sizes = minimum_detectable(problem, fit, found.search.found)
     covariance = problem.covariance(fit)
     extended = fit.car.extended(covariance, suspects[-1] if suspects else None)
@@ -113,7 +116,21 @@ def diagnose(
         at.protocol | {"Integrator": windows.integrator, "Inputs between rows": _HELD[windows.hold]},
         windows,
         at.recordings,
+        terms,
     )
+
+
+def _formulas(
+    windows: SimulationWindows, car: CarEstimate, left_out: CrossValidation, notes: list[str], on_progress: OnProgress
+) -> tuple[Formula, ...]:
+    """Terms that the car lacks, as far as the library for it is there."""
+    if missing := missing_libraries("formula"):
+        notes.append(
+            f"what is left could be searched for a formula with {', '.join(missing)}: pip install 'dynssm_ros[formula]'"
+        )
+        return ()
+    on_progress("looking for a formula of what is left")
+    return formulas(windows, car, left_out)
 
 
 def _groups(at: _Prepared, suspects: tuple[int, ...]) -> list[tuple[int, ...]]:

@@ -11,6 +11,7 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.confirmation import Confirmation
+from dynssm_ros.identification.formula import Formula
 from dynssm_ros.identification.improvement import Improvement
 from dynssm_ros.identification.recordings import RecordingSet
 from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance
@@ -85,6 +86,7 @@ class Diagnosis:
         protocol: how it was obtained, by name.
         windows: of the fit.
         recordings: what was diagnosed.
+        formulas: terms that the extended car lacks, where it leaves errors that are no noise.
     """
 
     verdict: Verdict
@@ -102,6 +104,7 @@ class Diagnosis:
     protocol: Mapping[str, str]
     windows: SimulationWindows
     recordings: RecordingSet
+    formulas: tuple[Formula, ...] = ()
 
     @property
     def recalibrated(self) -> dict[str, tuple[float, float]]:
@@ -172,6 +175,16 @@ class Diagnosis:
                 name: {"from": was, "to": now, "standard_deviations": self.moved[name]}
                 for name, (was, now) in self.recalibrated.items()
             },
+            "formulas": [
+                {
+                    "channel": formula.channel,
+                    "terms": formula.terms,
+                    "share": formula.share,
+                    "units": formula.gain.tolist(),
+                    "std": formula.std,
+                }
+                for formula in self.formulas
+            ],
             "notes": list(self.notes),
             "vehicle": vehicle_path,
         }

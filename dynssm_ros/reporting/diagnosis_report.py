@@ -9,6 +9,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
+from dynssm_ros.identification.formula import Formula
 from dynssm_ros.identification.residuals import ExplainedVariance
 from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC
 from dynssm_ros.reporting import diagnosis_figures
@@ -41,6 +42,7 @@ def as_text(diagnosis: Diagnosis) -> str:
     for words in (
         *moved_in_words(diagnosis),
         left_in_words(diagnosis),
+        *map(formula_in_words, diagnosis.formulas),
         *(f"Note: {note}." for note in diagnosis.notes),
     ):
         lines += textwrap.wrap(words, _WIDTH)
@@ -98,6 +100,16 @@ def left_in_words(diagnosis: Diagnosis) -> str:
             f"largest {low:.0f} to {high:.0f} s into {recording}."
         )
     return " ".join(parts)
+
+
+def formula_in_words(formula: Formula) -> str:
+    """The term that is missing, and what it takes away where it was not fitted."""
+    terms = "".join(f" {'-' if c < 0 else '+'} {text(abs(c))} {name}" for name, c in formula.terms.items())
+    parts = int((formula.gain > 0).sum())
+    return (
+        f"d{formula.channel}/dt may lack{terms} (SI units; throttle and steering as applied): on parts of the drive that "
+        f"were left out that takes {percent(formula.share)} of the squared error, in {parts} of {len(formula.gain)} parts."
+    )
 
 
 def moved_in_words(diagnosis: Diagnosis) -> list[str]:
@@ -262,7 +274,8 @@ def _gained(diagnosis: Diagnosis) -> Iterator[Section]:
         "Systematic error and noise",
         "The same errors in two parts: what the signals and the place on the lap predict, and the rest, which is noise "
         "or what the signals do not show. By place alone is what repeats lap after lap. Gone is the share of the "
-        f"systematic squared error of the car {GIVEN} that the extended one does not make. {left_in_words(diagnosis)}",
+        f"systematic squared error of the car {GIVEN} that the extended one does not make. {left_in_words(diagnosis)} "
+        + " ".join(map(formula_in_words, diagnosis.formulas)),
         None,
         _systematic_table(diagnosis),
     )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,12 @@ from benchmarks.hidden_causes.cases import Case, record
 from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.diagnose import diagnose
 from dynssm_ros.identification.diagnosis import Diagnosis
-from dynssm_ros.reporting.diagnosis_report import as_text
+from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report
+from dynssm_ros.simulation.laps import as_recording, simulate
+from dynssm_ros.simulation.plant import Rk4Plant, register_plant
+from dynssm_ros.track.tracks import load_track
+from dynssm_ros.vehicle import Vehicle, load_vehicle
+from dynssm_ros.vehicle.single_track import Motion, StageEffect
 
 Spoil = Callable[[dict[str, Vector], Vector], None]
 CASE = Case({}, 9800, "rk4", 100.0)
@@ -54,3 +61,43 @@ def test_a_sensor_that_was_loose_for_seconds_is_placed_in_time(spoiled: Callable
     low, high = found.clustered.when
     assert 40.0 < low < high < 46.0
     assert "largest 42 to 45 s into" in as_text(found)
+
+
+class Fin(StageEffect):
+    """A fin turns the car's nose into the air: ``M_z = 4 v_x^2 v_y``."""
+
+    def forces(self, xp: Any, q: Motion) -> None:
+        q.M_z = q.M_z + 4.0 * q.v_x * q.v_x * q.v_y
+
+
+class FinnedPlant(Rk4Plant):
+    def first(self, vehicle: Vehicle) -> tuple[StageEffect, ...]:
+        return (Fin(),)
+
+
+def test_a_term_that_no_effect_has_is_proposed_as_a_formula() -> None:
+    register_plant("finned", FinnedPlant())
+    car = load_vehicle("av21")
+    laps = simulate(car, load_track("road_course"), 200.0, plant="finned", seed=5, noise=(0.02, 0.02, 0.003))
+    found = diagnose(as_recording(laps), car)
+    assert (found.verdict, found.causes) == ("unexplained", ())
+    (yaw,) = (formula for formula in found.formulas if formula.channel == "omega")
+    assert "v_x^2 v_y" in yaw.terms
+    assert yaw.terms["v_x^2 v_y"] > 0
+    assert yaw.share > 0.3
+    assert (yaw.gain > 0).all()
+    assert "domega/dt may lack" in as_text(found)
+    assert "v_x^2 v_y" in diagnosis_report(found).html()
+    (told,) = (
+        each for each in json.loads(json.dumps(found.to_json("car.yaml")))["formulas"] if each["channel"] == "omega"
+    )
+    assert told["terms"] == yaw.terms
+
+
+def test_where_the_library_for_formulas_is_missing_a_note_says_how_to_have_it(
+    spoiled: Callable[[Spoil], Diagnosis], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dynssm_ros.identification.diagnose.missing_libraries", lambda *extras: {"sklearn": "formula"})
+    found = spoiled(loose_sensor)
+    assert found.formulas == ()
+    assert any("pip install 'dynssm_ros[formula]'" in note for note in found.notes)

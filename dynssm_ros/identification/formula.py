@@ -1,0 +1,178 @@
+"""A missing term as a formula: sparse regression over signals, kept where it carries over to parts that were left out.
+
+Where a car leaves errors that no effect of the library explains, the acceleration that it lacks is regressed on products of
+signals, a few at a time (Brunton, Proctor and Kutz 2016; of a model's discrepancy: Kaheman et al. 2019). Terms are chosen one
+by one by orthogonal matching pursuit (Pati, Rezaiifar and Krishnaprasad 1993), by scikit-learn (extra ``formula``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.recordings import CrossValidation
+from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+
+_SPAN = 0.12  # s; over which the missing acceleration is taken: shorter is noise, longer the car answers to it
+_BESIDE = 0.1  # s before and after, whose mean are the signals
+_DEGREE = 3
+_TERMS = 3  # in a formula, at most
+_SURE = 3.0  # standard errors by which it must predict what was left out
+_LEAST = 0.01  # of the squared error there that it must take
+_FAR = 4.0  # spreads; what is farther off counts as that far
+_SIGNALS = ("v_x", "v_y", "omega", "throttle", "steering", "t")
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A term that the equations of a car lack.
+
+    Attributes:
+        channel: of whose derivative it is a part, one of ``STATE_SIGNALS``.
+        terms: coefficients by product of signals, in SI units.
+        share: of the squared error of parts that were left out, that it takes.
+        gain: by part, what it takes of the squared error there, in units of its variance, ``(U,)``.
+        std: standard error of the sum of :attr:`gain`, from stretches of a simulation of the fit.
+    """
+
+    channel: str
+    terms: dict[str, float]
+    share: float
+    gain: Vector
+    std: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether it carries over to what it was not fitted to: surely, and more than by the parts' standard error."""
+        total = float(self.gain.sum())
+        return total > max(_SURE * self.std, _standard_error(self.gain)) and self.share > _LEAST
+
+
+class _Missing(NamedTuple):
+    """What a car lacks in short simulations from measured states."""
+
+    signals: Vector
+    """Means of :data:`_SIGNALS`, ``(M, 6)``."""
+    acceleration: Vector
+    """Measured less simulated, ``(M, 3)`` (m/s^2, m/s^2, rad/s^2)."""
+    fold: Indices
+    """Part of the drive that is left out together, ``(M,)``."""
+    block: Indices
+    """Stretch of the simulations of the fit, within which errors hang together, ``(M,)``."""
+
+
+def formulas(windows: SimulationWindows, car: CarEstimate, left_out: CrossValidation) -> tuple[Formula, ...]:
+    """The terms, one for each channel at most, that a car lacks and that carry over.
+
+    Args:
+        windows: simulations of the fit.
+        car: as fitted, with its causes.
+        left_out: how these windows are left out.
+    """
+    missing = _missing(windows, car, left_out)
+    found = (_formula(missing, channel) for channel in range(len(STATE_SIGNALS)))
+    return tuple(formula for formula in found if formula is not None and formula.holds)
+
+
+def _missing(windows: SimulationWindows, car: CarEstimate, left_out: CrossValidation) -> _Missing:
+    """Short simulations, end to end within those of the fit, that start at measured rows.
+
+    The signals are of rows before the start and after the end, whose noise is not that of the two.
+    """
+    T_s = windows.data.T_s
+    steps = max(1, min(round(_SPAN / T_s), windows.steps))
+    shifts = np.arange(0, windows.steps - steps + 1, steps)
+    starts = (windows.starts[:, None] + shifts).ravel()
+    short = replace(windows, starts=starts, steps=steps, warm=windows.warm, every=steps, filtered=False)
+    acceleration = -short.errors(car)[:, 0] / (steps * T_s)
+    width = max(1, round(_BESIDE / T_s))
+    rows, last = windows.data.rows, windows.data.rows.shape[1] - 1
+    beside = np.concatenate([np.arange(-width, 0), np.arange(steps + 1, steps + width + 1)])
+    states = rows[:3, np.clip(starts[:, None] + beside, 0, last)].mean(axis=2)
+    inputs = (rows[3:5] + rows[5:7])[:, starts[:, None] + np.arange(steps)].mean(axis=2)
+    signals = np.stack([*states, *inputs, windows.data.context["t"][starts]], axis=1)
+    unit = np.repeat(left_out.recordings.unit, len(shifts))
+    return _Missing(
+        signals, acceleration, np.unique(unit, return_inverse=True)[1], np.repeat(np.arange(len(windows)), len(shifts))
+    )
+
+
+def _formula(missing: _Missing, channel: int) -> Formula | None:
+    """The terms of a channel, chosen anew without each part to say how much they take there; then the fewest of them."""
+    y = missing.acceleration[:, channel]
+    spread = float(np.sqrt(np.mean(np.clip(y, *np.quantile(y, [0.01, 0.99])) ** 2)))
+    if spread == 0.0:
+        return None
+    y = np.clip(y / spread, -_FAR, _FAR)
+    names, X = _library(missing.signals)
+    scale = np.sqrt((X**2).mean(axis=0))
+    kept = scale > 0
+    names, X, scale = (
+        [name for name, keep in zip(names, kept, strict=True) if keep],
+        X[:, kept] / scale[kept],
+        scale[kept],
+    )
+
+    def better(path: Callable[[Vector, Vector], Vector]) -> Vector:
+        """By how much each squared error is less with a path of coefficients that its part did not see, ``(n, M)``."""
+        predicted = np.empty((_TERMS, len(y)))
+        for part in np.unique(missing.fold):
+            rest = missing.fold != part
+            predicted[:, ~rest] = np.clip(X[~rest] @ path(X[rest], y[rest]), -_FAR, _FAR).T
+        return np.asarray(y**2 - (y - predicted) ** 2)
+
+    gained = better(_pursued)
+    best = int(np.argmax(gained.sum(axis=1)))
+    found = _pursued(X, y)
+    order = sorted(np.flatnonzero(found[:, best]).tolist(), key=lambda k: int(np.argmax(found[k] != 0.0)))
+    same = better(lambda X, y: _fitted(X, y, order))
+    more = same[len(order) - 1] - same[: len(order)]
+    few = next(n for n, each in enumerate(more) if each.sum() <= _standard_error(_sums(missing.block, each)))
+    coefficients = spread * _fitted(X, y, order)[:, few] / scale
+    gain = _sums(missing.fold, gained[best])
+    return Formula(
+        STATE_SIGNALS[channel],
+        {names[k]: float(coefficients[k]) for k in order[: few + 1]},
+        float(gain.sum() / (y**2).sum()),
+        gain,
+        _standard_error(_sums(missing.block, gained[best])),
+    )
+
+
+def _sums(number: Indices, values: Vector) -> Vector:
+    return np.asarray(np.bincount(number, values), dtype=np.float64)
+
+
+def _fitted(X: Vector, y: Vector, order: Sequence[int]) -> Vector:
+    """Coefficients ``(P, n)`` by least squares of the first of some terms, of the first two, and so on."""
+    path = np.zeros((X.shape[1], _TERMS))
+    for n in range(_TERMS):
+        some = order[: n + 1]
+        path[some, n] = np.linalg.lstsq(X[:, some], y, rcond=None)[0]
+    return path
+
+
+def _library(signals: Vector) -> tuple[list[str], Vector]:
+    """Products of up to :data:`_DEGREE` signals: names, and values ``(M, P)``."""
+    from sklearn.preprocessing import PolynomialFeatures
+
+    products = PolynomialFeatures(_DEGREE).fit(signals)
+    return list(products.get_feature_names_out(_SIGNALS)), np.asarray(products.transform(signals))
+
+
+def _pursued(X: Vector, y: Vector) -> Vector:
+    """Coefficients ``(P, n)`` with one term, with two, and so on."""
+    from sklearn.linear_model import orthogonal_mp
+
+    return np.asarray(orthogonal_mp(X, y, n_nonzero_coefs=_TERMS, return_path=True)).reshape(X.shape[1], -1)
+
+
+def _standard_error(parts: Vector) -> float:
+    """Standard error of the sum of independent parts."""
+    return float(np.sqrt(len(parts)) * np.std(parts, ddof=1)) if len(parts) > 1 else float("inf")
