@@ -81,7 +81,8 @@ def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector,
         effect: the cause.
     """
     lap = np.linspace(0.0, 1.0, _PLACES)
-    profile = effect.along_lap(lap)
+    known = windows.data.context
+    profile = effect.along_lap(lap, _bend(known, lap))
     figure = Figure(figsize=(WIDTH, 4.6 if profile else 2.8), layout="constrained")
     grid = figure.add_gridspec(2 if profile else 1, 3, height_ratios=[2.6, 1.4] if profile else None)
     size, there, over = (figure.add_subplot(grid[0, k]) for k in range(3))
@@ -93,7 +94,6 @@ def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector,
     size.set_title("error: orange without, blue with")
     size.grid(axis="x", visible=False)
     gone = ((without**2 - with_it**2) / scale).mean(axis=1)
-    known = windows.data.context
     at = windows.starts + windows.steps // 4
     if {"x", "y"} <= set(known):
         span = max(float(np.quantile(np.abs(gone), 0.95)), 1e-12)
@@ -126,6 +126,13 @@ def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector,
         along.plot(lap * length, values, color=_COLOURS[2])
         along.set(xlabel="position on the lap (m)", ylabel=label)
     return figure
+
+
+def _bend(known: Mapping[str, Vector], lap: Vector) -> Vector | None:
+    """How sharply the road bends at places ``(n,)`` (fractions of the lap); ``None`` if the recording does not tell."""
+    if "bend" not in known:
+        return None
+    return np.asarray(np.interp(lap, known["s"] / known["lap_length"], known["bend"], period=1.0))
 
 
 @styled

@@ -179,6 +179,19 @@ def test_each_cause_has_a_picture_of_how_much_where_and_when(lagging: Lagging) -
     assert "when" in over.get_title("left")
 
 
+def test_the_bank_of_a_cambered_road_is_drawn_along_the_lap(lagging: Lagging) -> None:
+    found = lagging[2]
+    windows, (cause,) = found.improvement.windows, found.causes
+    s = np.linspace(0.0, 900.0, windows.data.rows.shape[1])
+    place = {"s": s % 300.0, "lap_length": np.full(len(s), 300.0), "bend": np.sin(2 * np.pi * s / 300.0)}
+    placed = replace(windows, data=replace(windows.data, context=windows.data.context | place))
+    with_it = found.improvement.errors["extended"][:, found.improvement.horizon]
+    camber = EFFECTS["road_bank"](camber=0.1)
+    drawn = np.asarray(cause_pictures(placed, cause.without, with_it, camber).axes[-1].lines[0].get_ydata())
+    assert (drawn.min(), drawn.max()) == pytest.approx((-np.degrees(0.1), np.degrees(0.1)), rel=1e-2)
+    assert camber.along_lap(np.linspace(0.0, 1.0, 5)) is None
+
+
 def test_a_curve_along_the_lap_is_drawn_and_its_range_told(lagging: Lagging) -> None:
     found = lagging[2]
     (cause,) = found.causes

@@ -211,8 +211,11 @@ class Effect(StageEffect):
             raise ConfigurationError(_lacking(self, signal, q.context))
         return q.context[signal]
 
-    def along_lap(self, lap: Vector) -> tuple[str, Vector] | None:
-        """Name with unit, and values at places ``(n,)`` (fractions of the lap); ``None``: the place does not matter."""
+    def along_lap(self, lap: Vector, bend: Vector | None = None) -> tuple[str, Vector] | None:
+        """Name with unit, and values at places ``(n,)`` (fractions of the lap).
+
+        ``None``: the place does not matter, or only by how the road bends, which is not given.
+        """
         return None
 
     def lap(self, q: Motion) -> Array:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, Effect, Parameter, away, like, section
+from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, PLACE, Effect, Parameter, away, like, section
 from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion, at_least
 
 _PIECES = 8  # of the curve along the lap
@@ -48,11 +48,11 @@ class RoadAngle(Effect):
     knot_6: Array = 0.0
     knot_7: Array = 0.0
 
-    def along_lap(self, lap: Vector) -> tuple[str, Vector] | None:
-        """The angle in degrees; ``None`` where the place does not matter, or only by how the road bends."""
-        if not set(LAP) & set(self.needs) or "bend" in self.needs:
+    def along_lap(self, lap: Vector, bend: Vector | None = None) -> tuple[str, Vector] | None:
+        """The angle in degrees."""
+        if not set(PLACE) & set(self.needs) or ("bend" in self.needs and bend is None):
             return None
-        q: Any = SimpleNamespace(v_x=np.zeros_like(lap), context={"s": lap, "lap_length": 1.0})
+        q: Any = SimpleNamespace(v_x=np.zeros_like(lap), context={"s": lap, "lap_length": 1.0, "bend": bend})
         return f"{self.NAME.replace('_', ' ')} (deg)", np.degrees(self.here(np, q))
 
     def here(self, xp: Any, q: Motion) -> Array:
@@ -90,11 +90,14 @@ class RoadBank(RoadAngle):
     camber: Array = 0.0
     roll_gain: Array = 0.0
 
+    def here(self, xp: Any, q: Motion) -> Array:
+        """The angle at the present place (rad), but for the measured roll."""
+        angle = super().here(xp, q)
+        return angle - self.camber * self.read(q, "bend") if "camber" in self.active else angle
+
     def forces(self, xp: Any, q: Motion) -> None:
         """Adds the weight's part across the car."""
         bank = self.here(xp, q)
-        if "camber" in self.active:
-            bank = bank - self.camber * self.read(q, "bend")
         if "roll_gain" in self.active:
             bank = bank + self.roll_gain * self.read(q, "roll")
         q.F_y = q.F_y - q.m * GRAVITY * xp.sin(bank)

@@ -166,7 +166,7 @@ class GripPatch(Effect):
     centre: Array = 0.5
     length: Array = 0.1
 
-    def along_lap(self, lap: Vector) -> tuple[str, Vector] | None:
+    def along_lap(self, lap: Vector, bend: Vector | None = None) -> tuple[str, Vector] | None:
         """The factor of the grip."""
         return "grip (1)", np.asarray(1.0 + (self.factor - 1.0) * section(np, lap, self.centre, self.length))
 
