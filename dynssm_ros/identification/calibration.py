@@ -107,7 +107,9 @@ def calibrate(
     speed = vehicle.minimum_speed if min_speed is None else min_speed
     data = recorded_rows(recording, context)
     windows = _windows(recording, data, HORIZONS_S if horizon is None else (horizon,), speed)
-    given = CarEstimate.of(vehicle, mass_std=0.0)
+    laps = recording.fingerprints
+    known = vehicle.known_before(laps)
+    given = CarEstimate.of(known, mass_std=0.0).at(vehicle.nominal)
     single = recording.window_ends(1, horizon=1, min_speed=speed)
     one_step = SimulationWindows(data, single, 1, 0)
     points = _starting_points(vehicle, starts, seed)
@@ -124,6 +126,7 @@ def calibrate(
     tick()
     theta = np.array(fit.car.theta)
     calibrated = fit.car.known(problem.covariance(fit)).model_copy(update={"integrator": chosen})
+    calibrated = calibrated.calibrated_on(laps, vehicle)
     std = np.array([calibrated.coefficients[name].std for name in COEFFICIENTS])
     lower, upper = (limit[: len(COEFFICIENTS)] for limit in given.limits)
     held = (fit.position[: len(COEFFICIENTS)] <= lower + _ON_BOUND) | (

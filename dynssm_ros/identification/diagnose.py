@@ -89,6 +89,7 @@ def diagnose(
     covariance = problem.covariance(fit)
     extended = fit.car.extended(covariance, suspects[-1] if suspects else None)
     extended = extended.model_copy(update={"integrator": windows.integrator})
+    extended = extended.calibrated_on(at.recordings.recording.select(~at.recordings.held_out).fingerprints, vehicle)
     std = np.sqrt(np.diag(covariance))
     causes = tuple(
         _cause(one, rest, selection, at.recordings, std) for one, rest in zip(selection.chosen, without, strict=True)
@@ -210,7 +211,14 @@ def _prepare(
         "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * recording.T_s:g} s",
     }
     left_out = together.left_out(fitted.starts, line)
-    return _Prepared(together, fitted, left_out, asked, unseen, CarEstimate.of(vehicle), notes, protocol)
+    known = vehicle.known_before(recording.fingerprints)
+    if known is not vehicle:
+        notes.append(
+            "the vehicle file was calibrated on these laps, which tell nothing new a second time: its coefficients count as "
+            "they were known before"
+        )
+    car = CarEstimate.of(known).at(vehicle.nominal)
+    return _Prepared(together, fitted, left_out, asked, unseen, car, notes, protocol)
 
 
 def _cause(one: Refined, without: Without, selection: Selection, recordings: RecordingSet, std: Vector) -> Cause:

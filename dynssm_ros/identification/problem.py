@@ -140,7 +140,15 @@ class IdentificationProblem:
     def temper(self, fit: Fit) -> Fit:
         """Weighs the data as the errors of ``fit`` hang together, against what is known before, and fits anew."""
         self.tempering = self.inflation(fit)
-        return self.fit(fit.car, fit.free, fit)
+        return self.refit(fit)
+
+    def refit(self, fit: Fit) -> Fit:
+        """The same values fitted anew, as the data are weighed now: from where they are and from what was known; the closer.
+
+        Where the data counted for more, nominal values may lie in a valley that is no longer the deepest.
+        """
+        known = replace(fit.car, moved=np.zeros_like(fit.car.moved))
+        return min(self.fit(fit.car, fit.free, fit), self.fit(known, fit.free), key=lambda each: each.objective)
 
     def errors(self, car: CarEstimate, context: dict[str, float] | None = None) -> Vector:
         """Errors of a car, shape ``(W, 3 K)``."""
@@ -253,6 +261,17 @@ class IdentificationProblem:
             elif not stale:
                 nominal = jacobian[..., :n]
         return Fit(car, free, errors, jacobian, noise, best)
+
+    def recalibrated(self, car: CarEstimate) -> Fit:
+        """The nominal values alone, from where they were known to be; from where ``car`` has them if that is clearly closer.
+
+        So what is found does not hang on a calibration that was made on the same laps before.
+        """
+        starts = {"known": replace(car, moved=np.zeros_like(car.moved)), "given": car}
+        if not car.moved.any():
+            del starts["given"]
+        fits = {name: self.fit(start, ()) for name, start in starts.items()}
+        return fits[closest(fits)]
 
     def select(self, chosen: Indices | Mask) -> IdentificationProblem:
         """Some of the windows, with the noise responses of all."""

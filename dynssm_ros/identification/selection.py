@@ -125,7 +125,7 @@ class _Trial:
     Attributes:
         some: those windows.
         near: the fit without the candidate, there.
-        given: the car as the vehicle file has it.
+        given: the car as it was known.
         price: of a parameter.
     """
 
@@ -203,11 +203,12 @@ class Search:
         on_progress: OnProgress = lambda words: None,
         pool: Pool = IN_TURN,
     ) -> None:
-        self._study, self._given, self.found, self._report = problem, car, list(found), on_progress
+        self._study, self.found, self._report = problem, list(found), on_progress
+        self._known = replace(car, moved=np.zeros_like(car.moved))
         self._folds, self._pool = left_out, pool
         self._price = np.log(3.0 * problem.windows.steps * len(problem.windows))
         on_progress("recalibrating the nominal car")
-        self.base = problem.temper(problem.fit(car, ()))
+        self.base = problem.temper(problem.recalibrated(car))
         self._tempering = problem.tempering
         self._responses = Responses(problem, self.base.car, self.base.errors)
         self._ranked: dict[frozenset[Candidate], list[Refined]] = {}
@@ -281,7 +282,7 @@ class Search:
             self.tried = {name: p.improvement for name, p in best.items()}
         shortlist = [p for p in best.values() if self._expected_delta_bic(p) >= -self._price][:_SHORTLIST]
         some, near = self._study.part(fit, max(1, len(self._study.windows) // _SHORTLIST_WINDOWS))
-        trial = _Trial(some, near, self._given, self._price)
+        trial = _Trial(some, near, self._known, self._price)
         starts = sorted(
             self._pool.map(trial.start, shortlist), key=lambda start: start.expected_delta_bic, reverse=True
         )
@@ -349,8 +350,8 @@ class Search:
         self._study.tempering = inflation
         self._ranked, self._left_out = {}, LeaveOneOut(self._study, self._folds, self._pool)
         self._fits = {
-            frozenset(): self._study.fit(self.base.car, (), self.base),
-            frozenset(chosen): self._study.fit(fit.car, fit.free, fit),
+            frozenset(): self._study.refit(self.base),
+            frozenset(chosen): self._study.refit(fit),
         }
 
     def _polish(self, before: frozenset[Candidate], rough: Sequence[Refined]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,10 +22,11 @@ from dynssm_ros.configuration import StrictModel, describe
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.files import replacing, require_replaceable
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
-from dynssm_ros.signals.signal_map import POSE_SIGNALS, Commands
+from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, Commands
 
 METADATA_KEY = b"dynssm"
 _ROWS_AT_ONCE = 65536  # that are written
+_FINGERPRINT_NS, _FINGERPRINT_ROWS = 10_000_000_000, 5
 _OFF_GRID = 0.01  # of T_s that rows may be off their grid
 COLUMN_UNITS = {
     "v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "r_fb": "1", "delta_fb": "rad", "r_cmd": "1", "delta_cmd": "rad",
@@ -87,6 +89,14 @@ class Recording:
     def matrix(self) -> Vector:
         """The model's input rows, shape ``(N, 7)`` in the order of ``WINDOW_COLUMNS``."""
         return np.stack([self.columns[name] for name in WINDOW_COLUMNS], axis=1)
+
+    @property
+    def fingerprints(self) -> tuple[str, ...]:
+        """Of the first rows in every ten seconds, by which the same laps are known again, whole or in part; sorted."""
+        first = np.flatnonzero(np.diff(self.time // _FINGERPRINT_NS, prepend=-1))
+        motion = np.stack([self.columns[name] for name in STATE_SIGNALS], axis=1)
+        rows = [motion[k : k + _FINGERPRINT_ROWS].tobytes() for k in first]
+        return tuple(sorted({hashlib.sha256(row).hexdigest()[:8] for row in rows}))
 
     def window_ends(self, H: int, horizon: int = 1, min_speed: float = -np.inf) -> Indices:
         """Rows ``t`` such that rows ``t-H+1 .. t+horizon`` lie in one segment and nowhere below ``min_speed``.

@@ -6,7 +6,7 @@ Names and units are the paper's (Table I); a file is checked completely when it 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ COEFFICIENT_UNITS: dict[str, str] = {
 }  # fmt: skip
 COEFFICIENTS: tuple[str, ...] = Coefficients._fields
 assert tuple(COEFFICIENT_UNITS) == COEFFICIENTS
+_LAPS = 1000  # fingerprints in a file, at most
 _DRAWN = 1e-4  # share by which correlations are drawn to independence when they are written
 
 
@@ -105,6 +106,15 @@ class EffectEntry(StrictModel):
         return self
 
 
+class KnownBefore(StrictModel):
+    """What was known of the coefficients before they were calibrated."""
+
+    laps: tuple[str, ...] = Field(description="fingerprints of what they were calibrated on since")
+    nominal: dict[str, float]
+    std: dict[str, float | None]
+    correlation: tuple[tuple[float, ...], ...] | None = None
+
+
 class Vehicle(StrictModel):
     """A car as the whole package knows it."""
 
@@ -128,6 +138,10 @@ class Vehicle(StrictModel):
         default=None, description="of the steps that the coefficients were calibrated for; null: of any"
     )
     effects: tuple[EffectEntry, ...] = ()
+    before: KnownBefore | None = Field(
+        default=None,
+        description="what was known before the calibration: laps that were calibrated on tell nothing new a second time",
+    )
 
     @property
     def model_integrator(self) -> Integrator:
@@ -224,13 +238,38 @@ class Vehicle(StrictModel):
         known = {} if std is None else {"correlation": None if correlation is None else _rows(correlation)}
         return self.model_copy(update={"coefficients": coefficients} | known)
 
+    def known_before(self, laps: Collection[str]) -> Vehicle:
+        """The car as it was known before it was calibrated on ``laps`` (fingerprints); itself if it was not.
+
+        A third of them is enough: the rest may have been held out.
+        """
+        before = self.before
+        if before is None or 3 * len({*before.laps} & {*laps}) < len(laps):
+            return self
+        coefficients = {
+            name: c.model_copy(update={"nominal": before.nominal[name], "std": before.std[name]})
+            for name, c in self.coefficients.items()
+        }
+        return self.model_copy(update={"coefficients": coefficients, "correlation": before.correlation, "before": None})
+
+    def calibrated_on(self, laps: Collection[str], given: Vehicle) -> Vehicle:
+        """The same car, calibrated on ``laps`` (fingerprints) from the file ``given``."""
+        before = given.before or KnownBefore(
+            laps=(),
+            nominal={name: c.nominal for name, c in given.coefficients.items()},
+            std={name: c.std for name, c in given.coefficients.items()},
+            correlation=given.correlation,
+        )
+        known = before.model_copy(update={"laps": tuple(sorted({*before.laps, *laps})[:_LAPS])})
+        return self.model_copy(update={"before": known})
+
     def unmeasured(self) -> Vehicle:
         """The same car of which nothing but the bounds is known: values in their middle, no standard deviations."""
         coefficients = {
             name: c.model_copy(update={"nominal": sum(c.bounds) / 2, "std": None})
             for name, c in self.coefficients.items()
         }
-        return self.model_copy(update={"coefficients": coefficients, "correlation": None})
+        return self.model_copy(update={"coefficients": coefficients, "correlation": None, "before": None})
 
     def with_effect(self, name: str, parameters: dict[str, float]) -> Vehicle:
         """The same car with one more effect.
