@@ -56,6 +56,11 @@ class CarEstimate:
         grown = base * np.log(np.where(scales, theta, 1.0) / base)
         return replace(self, moved=np.append(np.where(scales, grown, theta - nominal) / known, self.moved[-1]))
 
+    @property
+    def as_known(self) -> CarEstimate:
+        """The same car with its nominal values where they were known to be."""
+        return replace(self, moved=np.zeros_like(self.moved))
+
     def in_units(self, relative: Vector) -> Vector:
         """Standard deviations of the coefficients from those of :attr:`moved`, ``(17,)``."""
         nominal, scales = self.vehicle.nominal, _scaling(self.vehicle)

@@ -73,10 +73,12 @@ def search_causes(
         groups: of recordings, in each of which an effect may act that the others do not have.
         pool: where candidates are tried.
     """
+    # noise is carried along as by the car that was known, so that a calibration on the same laps changes nothing
+    known = car.as_known
 
     def search(windows: SimulationWindows, start: Fit | None = None) -> SearchResult:
-        problem = _recalibrated_problem(windows, car)
-        found, impossible = candidates(problem, car, exclude, groups)
+        problem = IdentificationProblem(windows, known)
+        found, impossible = candidates(problem, known, exclude, groups)
         searching = Search(problem, car, found, left_out, on_progress, pool)
         return SearchResult(problem, searching, searching.run(start), impossible)
 
@@ -90,17 +92,13 @@ def search_causes(
     found = search(windows_of[first])
     fit = found.selection.fit
     fits = {
-        one: IdentificationProblem(windows_of[one], fit.car, found.problem.tempering).fit(fit.car, fit.free)
+        one: fit
+        if one == first
+        else IdentificationProblem(windows_of[one], known, found.problem.tempering).fit(fit.car, fit.free)
         for one in options
     }
     last = closest(fits)
     return found if last == first else search(windows_of[last], fits[first])
-
-
-def _recalibrated_problem(windows: SimulationWindows, car: CarEstimate) -> IdentificationProblem:
-    """The windows with noise as the recalibrated car carries it along, whatever the vehicle file is like."""
-    problem = IdentificationProblem(windows, car)
-    return IdentificationProblem(windows, problem.temper(problem.recalibrated(car)).car)
 
 
 def _stepped(windows: SimulationWindows, car: CarEstimate, stepping: Stepping) -> tuple[SimulationWindows, Fit]:
@@ -112,8 +110,8 @@ def _stepped(windows: SimulationWindows, car: CarEstimate, stepping: Stepping) -
     windows = replace(windows, hold=hold)
     some = windows.select(np.arange(0, len(windows), -(-len(windows) // _TRIED)))
     trial = some.with_integrator(integrator, car.vehicle)
-    fit = IdentificationProblem(trial, car).recalibrated(car)
+    fit = IdentificationProblem(trial, car.as_known).recalibrated(car)
     finer = trial.with_integrator(integrator, car.vehicle.with_nominal(np.array(fit.car.theta)))
     if finer.substeps > trial.substeps:
-        trial, fit = finer, IdentificationProblem(finer, car).fit(fit.car, ())
+        trial, fit = finer, IdentificationProblem(finer, car.as_known).fit(fit.car, ())
     return replace(windows, integrator=integrator, substeps=trial.substeps), fit

@@ -147,8 +147,8 @@ class IdentificationProblem:
 
         Where the data counted for more, nominal values may lie in a valley that is no longer the deepest.
         """
-        known = replace(fit.car, moved=np.zeros_like(fit.car.moved))
-        return min(self.fit(fit.car, fit.free, fit), self.fit(known, fit.free), key=lambda each: each.objective)
+        anew = self.fit(fit.car.as_known, fit.free)
+        return min(self.fit(fit.car, fit.free, fit), anew, key=lambda each: each.objective)
 
     def errors(self, car: CarEstimate, context: dict[str, float] | None = None) -> Vector:
         """Errors of a car, shape ``(W, 3 K)``."""
@@ -267,7 +267,7 @@ class IdentificationProblem:
 
         So what is found does not hang on a calibration that was made on the same laps before.
         """
-        starts = {"known": replace(car, moved=np.zeros_like(car.moved)), "given": car}
+        starts = {"known": car.as_known, "given": car}
         if not car.moved.any():
             del starts["given"]
         fits = {name: self.fit(start, ()) for name, start in starts.items()}

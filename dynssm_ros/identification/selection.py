@@ -204,7 +204,7 @@ class Search:
         pool: Pool = IN_TURN,
     ) -> None:
         self._study, self.found, self._report = problem, list(found), on_progress
-        self._known = replace(car, moved=np.zeros_like(car.moved))
+        self._known = car.as_known
         self._folds, self._pool = left_out, pool
         self._price = np.log(3.0 * problem.windows.steps * len(problem.windows))
         on_progress("recalibrating the nominal car")
