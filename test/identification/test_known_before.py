@@ -1,0 +1,82 @@
+"""What laps told once they do not tell a second time: calibrations and diagnoses begin from what was known before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dynssm_ros.identification.calibration import calibrate
+from dynssm_ros.identification.diagnose import diagnose
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.simulation.laps import as_recording, simulate
+from dynssm_ros.track.tracks import load_track
+from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle, save_vehicle
+
+ORCA = load_vehicle("orca")
+NOISE = (0.01, 0.01, 0.03)
+
+
+def laps(seed: int, duration: float = 40.0) -> Recording:
+    car = ORCA.with_effect("steering_offset", {"offset": 0.03})
+    return as_recording(simulate(car, load_track("club"), duration, plant="rk4", seed=seed, noise=NOISE))
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return laps(1)
+
+
+@pytest.fixture(scope="module")
+def calibrated(recording: Recording) -> Vehicle:
+    return calibrate(recording, ORCA, 0.3, integrator="rk4", starts=1).vehicle
+
+
+def test_a_calibration_notes_its_laps_and_what_was_known_before(recording: Recording, calibrated: Vehicle) -> None:
+    assert calibrated.before is not None
+    assert calibrated.before.laps == recording.fingerprints
+    assert len(recording.fingerprints) >= 4
+    before = calibrated.known_before(recording.fingerprints)
+    np.testing.assert_array_equal(before.nominal, ORCA.nominal)
+    assert [before.coefficients[name].std for name in COEFFICIENTS] == [
+        ORCA.coefficients[name].std for name in COEFFICIENTS
+    ]
+    assert before.integrator == calibrated.integrator == "rk4"
+
+
+def test_the_same_laps_make_a_calibration_no_surer(recording: Recording, calibrated: Vehicle) -> None:
+    again = calibrate(recording, calibrated, 0.3, integrator="rk4", starts=1)
+    first = np.array([calibrated.coefficients[name].std for name in COEFFICIENTS], dtype=float)
+    np.testing.assert_allclose(again.std, first, rtol=0.05)
+    np.testing.assert_allclose(again.theta, calibrated.nominal, atol=0.1 * first.max(), rtol=0.05)
+    other = calibrate(laps(2), calibrated, 0.3, integrator="rk4", starts=1)
+    assert np.median(other.std / first) < 0.9, "other laps do tell something new"
+    assert other.vehicle.before is not None
+    assert set(other.vehicle.before.laps) > set(recording.fingerprints)
+
+
+def test_parts_of_the_laps_are_known_again_and_others_are_not(recording: Recording, calibrated: Vehicle) -> None:
+    first, last = recording.split_last(0.25)
+    assert calibrated.known_before(first.fingerprints).before is None
+    assert calibrated.known_before(last.fingerprints).before is None
+    assert calibrated.known_before(laps(2).fingerprints) is calibrated
+    moved = replace(recording, columns=recording.columns | {"v_x": recording["v_x"] + 1e-9})
+    assert not set(moved.fingerprints) & set(recording.fingerprints)
+    assert ORCA.known_before(recording.fingerprints) is ORCA
+
+
+def test_a_vehicle_file_keeps_it(calibrated: Vehicle, tmp_path: Path) -> None:
+    save_vehicle(calibrated, tmp_path / "car.yaml")
+    assert load_vehicle(tmp_path / "car.yaml").before == calibrated.before
+
+
+def test_a_diagnosis_is_the_same_before_and_after_a_calibration(recording: Recording, calibrated: Vehicle) -> None:
+    shipped, after = (diagnose(recording, car, 0.3, integrator="rk4") for car in (ORCA, calibrated))
+    assert [cause.effect for cause in shipped.causes] == ["steering_offset"]
+    assert [(c.effect, c.values, c.std) for c in after.causes] == [(c.effect, c.values, c.std) for c in shipped.causes]
+    assert any("was calibrated on these laps" in note for note in after.notes)
+    assert not any("was calibrated on these laps" in note for note in shipped.notes)
+    assert after.vehicle.before is not None
+    np.testing.assert_array_equal(list(after.vehicle.before.nominal.values()), ORCA.nominal)
