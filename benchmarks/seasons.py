@@ -37,19 +37,19 @@ _OPTIONS = {
 }  # by the folder of the car's real logs
 
 
-class Group(NamedTuple):
+class LogGroup(NamedTuple):
     """Logs that one command takes."""
 
     bags: list[Path]
     options: tuple[str, ...]
 
 
-def groups(folder: Path, data: Path, count: int) -> list[Group]:
+def groups(folder: Path, data: Path, count: int) -> list[LogGroup]:
     """Real logs, as far as they are there, and simulated ones until there are ``count``."""
     there = {car: sorted(path.parent for path in data.glob(f"{car}/*/metadata.yaml")) for car in _OPTIONS}
     there["orca"] += simulated_bags(folder, count - sum(map(len, there.values())))
     return [
-        Group(bags, (*_OPTIONS[car].split(), "--car", car, "--track", "any")) for car, bags in there.items() if bags
+        LogGroup(bags, (*_OPTIONS[car].split(), "--car", car, "--track", "any")) for car, bags in there.items() if bags
     ]
 
 
@@ -67,7 +67,7 @@ def simulated_bags(folder: Path, count: int) -> list[Path]:
     return bags
 
 
-def seconds(found: Sequence[Group], out: Path, jobs: int) -> float:
+def seconds(found: Sequence[LogGroup], out: Path, jobs: int) -> float:
     """How long the commands take that extract all groups into the season ``out``."""
     begin = time.monotonic()
     for group in found:

@@ -302,7 +302,7 @@ def train(
     from dynssm_ros.identification.calibration import calibrate
     from dynssm_ros.learning.export import check_replaceable, save_artifact
     from dynssm_ros.learning.stages import check_device, checkpoints, train
-    from dynssm_ros.learning.streaming import Stream
+    from dynssm_ros.learning.streaming import RowStream
 
     check_device(device)
     folder = Path(out) if Path(out).name else Path(out).absolute()  # "." has no name to put the checkpoint beside
@@ -312,7 +312,7 @@ def train(
     if memory is None:
         stream, data = None, _joined(_opened(recordings, car), commands, holdout)
     else:
-        stream = Stream(_streamed(recordings, car), memory, commands, holdout)
+        stream = RowStream(_streamed(recordings, car), memory, commands, holdout)
         data = stream.sample()
     trained = train(
         data, config, car, checkpoint, device, on_progress,

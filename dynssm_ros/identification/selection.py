@@ -119,7 +119,7 @@ class _CandidateStart(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Trial:
+class _SizeSearch:
     """Candidates in several sizes, on some of the windows.
 
     Attributes:
@@ -282,7 +282,7 @@ class Search:
             self.tried = {name: p.improvement for name, p in best.items()}
         shortlist = [p for p in best.values() if self._expected_delta_bic(p) >= -self._price][:_SHORTLIST]
         some, near = self._study.part(fit, max(1, len(self._study.windows) // _SHORTLIST_WINDOWS))
-        trial = _Trial(some, near, self._known, self._price)
+        trial = _SizeSearch(some, near, self._known, self._price)
         starts = sorted(
             self._pool.map(trial.start, shortlist), key=lambda start: start.expected_delta_bic, reverse=True
         )

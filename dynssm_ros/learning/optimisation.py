@@ -20,7 +20,7 @@ from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import COMPONENTS, LossConfig, Scales, rollout_objective, scales
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
-from dynssm_ros.learning.processes import Group, run_in_processes
+from dynssm_ros.learning.processes import ProcessGroup, run_in_processes
 from dynssm_ros.learning.streaming import StreamedWindows
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
@@ -93,11 +93,11 @@ class Optimisation:
         checkpoint: Path,
         anew: Callable[[int], TrainableModel] | None,
         device: torch.device,
-        group: Group | None = None,
+        group: ProcessGroup | None = None,
     ) -> None:
         self.config = config
         self.anew = anew
-        self.group = group or Group()
+        self.group = group or ProcessGroup()
         self.loss: LossConfig = config.loss
         self.settings = config.training
         self.steps = rollout_steps(config, vehicle)
@@ -280,7 +280,7 @@ def optimise(
     return run_in_processes(processes, device, progress, _member, task)
 
 
-def _member(group: Group, progress: NamedProgress, task: Callable[..., Optimisation]) -> OptimisationResult:
+def _member(group: ProcessGroup, progress: NamedProgress, task: Callable[..., Optimisation]) -> OptimisationResult:
     result = task(group.device, group).run(progress)
     return replace(result, model=result.model.cpu())
 

@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 logging.getLogger("lightning_fabric").setLevel(logging.ERROR)  # in processes that are begun, which import this after it
 
 
-class Group:
+class ProcessGroup:
     """The processes of a training; as it stands, this one alone.
 
     Attributes:
@@ -54,7 +54,7 @@ class Group:
         return values
 
 
-class FabricGroup(Group):
+class FabricProcessGroup(ProcessGroup):
     """Processes that Fabric has begun."""
 
     def __init__(self, fabric: Any) -> None:
@@ -79,7 +79,7 @@ def run_in_processes(
     count: int,
     device: torch.device,
     progress: NamedProgress | None,
-    function: Callable[[Group, NamedProgress, Any], Result],
+    function: Callable[[ProcessGroup, NamedProgress, Any], Result],
     what: Any,
 ) -> Result:
     """Calls ``function`` with the group, a progress and ``what`` in ``count`` processes; returns what the first one does.
@@ -126,10 +126,10 @@ def _listen(told: Any, progress: NamedProgress | None, results: list[Any]) -> No
             progress(*news)
 
 
-def _member(fabric: Any, function: Callable[[Group, NamedProgress, Any], Any], what: bytes, told: Any) -> None:
+def _member(fabric: Any, function: Callable[[ProcessGroup, NamedProgress, Any], Any], what: bytes, told: Any) -> None:
     """What each process does."""
     torch.set_num_threads(1)
-    group = FabricGroup(fabric)
+    group = FabricProcessGroup(fabric)
     result = function(group, lambda *news: told.put(news) if group.rank == 0 else None, pickle.loads(what))  # noqa: S301
     if group.rank == 0:
         told.put(pickle.dumps(result))

@@ -25,7 +25,7 @@ from dynssm_ros.learning.optimisation import (
     squared_errors,
     unexplained,
 )
-from dynssm_ros.learning.streaming import Stream
+from dynssm_ros.learning.streaming import RowStream
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.online import OnlineLayer
@@ -95,7 +95,7 @@ def train(
     device: str = "cpu",
     progress: NamedProgress | None = None,
     calibrate: Calibrate | None = None,
-    stream: Stream | None = None,
+    stream: RowStream | None = None,
     processes: int = 1,
 ) -> Trained:
     """Trains a model; ``checkpoint`` is kept up to date and continued from if it belongs to the same training.
@@ -239,7 +239,7 @@ def _train(
     device: str,
     progress: NamedProgress | None,
     start: Trained | None = None,
-    stream: Stream | None = None,
+    stream: RowStream | None = None,
     processes: int = 1,
 ) -> Trained:
     """One stage; ``start`` is the outcome of the stage before."""

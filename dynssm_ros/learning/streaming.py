@@ -42,7 +42,7 @@ class Piece:
         return self.last - self.first
 
 
-class Stream:
+class RowStream:
     """Logs of one car that are trained on.
 
     Args:
@@ -107,7 +107,7 @@ class StreamedWindows:
         counts: windows of each piece of the stream.
     """
 
-    stream: Stream
+    stream: RowStream
     resident: TrainingWindows
     min_speed: float
     counts: tuple[int, ...]

@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 from dynssm_ros import train
 from dynssm_ros.errors import UserError
 from dynssm_ros.learning.models.registry import load_model_config
-from dynssm_ros.learning.processes import Group, run_in_processes
+from dynssm_ros.learning.processes import ProcessGroup, run_in_processes
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track
@@ -58,7 +58,7 @@ def laps() -> Recording:
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 7, 64])
 def test_weighted_means_of_shares_are_the_mean_of_the_batch(rows: int) -> None:
-    batch, groups = torch.randn(rows, 4, dtype=torch.float64), [Group() for _ in range(3)]
+    batch, groups = torch.randn(rows, 4, dtype=torch.float64), [ProcessGroup() for _ in range(3)]
     for rank, group in enumerate(groups):
         group.rank, group.count = rank, 3
     means = [group.share(batch).mean(0) * group.weight(rows) for group in groups]
@@ -68,7 +68,7 @@ def test_weighted_means_of_shares_are_the_mean_of_the_batch(rows: int) -> None:
 def test_gradients_of_two_processes_are_those_of_one(members: ModuleType) -> None:
     batch = torch.randn(7, 4, generator=torch.Generator().manual_seed(0))
     together, mean = run_in_processes(2, CPU, None, members.gradients, batch)
-    alone, _ = members.gradients(Group(), None, batch)
+    alone, _ = members.gradients(ProcessGroup(), None, batch)
     np.testing.assert_allclose(together, alone, rtol=1e-6)
     assert mean == {"rank": 0.5}
 

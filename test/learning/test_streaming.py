@@ -11,7 +11,7 @@ import torch
 from dynssm_ros import train
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.dataset import SplitConfig, all_windows, split_windows
-from dynssm_ros.learning.streaming import Stream, StreamedWindows
+from dynssm_ros.learning.streaming import RowStream, StreamedWindows
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track
@@ -39,7 +39,7 @@ def pairs(batches: list[tuple[torch.Tensor, torch.Tensor]]) -> set[bytes]:
 
 @pytest.mark.parametrize("room", [300, 1500, 10**6])
 def test_an_epoch_has_every_window_once_and_no_validation_row(files: list[Path], room: int) -> None:
-    stream = Stream(files, 2400 * SAMPLE_MB)
+    stream = RowStream(files, 2400 * SAMPLE_MB)
     stream.room = room
     stream.pieces = [part for piece in stream.pieces for part in stream._cut(piece)]
     training, held = split_windows(stream.sample(), H, SplitConfig(), 0.0, 1)
@@ -60,7 +60,7 @@ def test_an_epoch_has_every_window_once_and_no_validation_row(files: list[Path],
 
 
 def test_the_order_is_another_one_in_each_epoch_and_the_same_for_the_same_seed(files: list[Path]) -> None:
-    stream = Stream(files, 2400 * SAMPLE_MB)
+    stream = RowStream(files, 2400 * SAMPLE_MB)
     training, _ = split_windows(stream.sample(), H, SplitConfig(), 0.0, 1)
     windows = stream.windows(training, 0.0)
     assert isinstance(windows, StreamedWindows)
@@ -74,7 +74,7 @@ def test_the_order_is_another_one_in_each_epoch_and_the_same_for_the_same_seed(f
 
 
 def test_the_sample_is_of_all_logs_and_within_the_memory(files: list[Path]) -> None:
-    stream = Stream(files, 3000 * SAMPLE_MB)
+    stream = RowStream(files, 3000 * SAMPLE_MB)
     sample = stream.sample()
     assert len(sample) == pytest.approx(3000, abs=5)
     assert len(sample.info.source) == 3
@@ -82,18 +82,18 @@ def test_the_sample_is_of_all_logs_and_within_the_memory(files: list[Path]) -> N
     np.testing.assert_allclose(lengths / len(sample), [0.5, 1 / 3, 1 / 6], atol=0.01)
     rest = sum(piece.rows for piece in stream.pieces)
     assert rest + len(sample) == 6003
-    assert sum(piece.rows for piece in Stream(files, 3000 * SAMPLE_MB, holdout=0.5).pieces) < rest / 2
+    assert sum(piece.rows for piece in RowStream(files, 3000 * SAMPLE_MB, holdout=0.5).pieces) < rest / 2
 
 
 def test_with_room_for_all_the_sample_is_all(files: list[Path]) -> None:
-    stream = Stream(files, 1000.0)
+    stream = RowStream(files, 1000.0)
     assert len(stream.sample()) == 6003
     assert [piece.rows for piece in stream.pieces] == []
 
 
 def test_too_little_room_is_refused(files: list[Path]) -> None:
     with pytest.raises(ConfigurationError, match=r"memory 1 MB: room for 833 rows; expected at least 2\.4 MB"):
-        Stream(files, 1.0)
+        RowStream(files, 1.0)
 
 
 def test_a_model_is_trained_on_what_does_not_fit_and_what_is_not_in_a_file_is_refused(
