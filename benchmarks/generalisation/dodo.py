@@ -16,6 +16,7 @@ from typing import Any
 from doit import get_var
 from doit.tools import config_changed
 
+from benchmarks.generalisation import ablations
 from benchmarks.generalisation.cells import cells
 from benchmarks.generalisation.page import FIGURE, PAGE, heat_map, page, summary
 from benchmarks.generalisation.run import cell_file, model_folder, models_of, read_cell, score_cell
@@ -35,7 +36,7 @@ SETS = get_var("sets", _SHIPPED)
 MODEL_SETS = tuple(SETS.split(","))
 ARGUMENTS = " ".join(
     f"{name}={value}"
-    for name, value, usual in (("part", PART, _DEVELOPMENT), ("sets", SETS, _SHIPPED))
+    for name, value, usual in (("part", PART, _DEVELOPMENT), ("sets", SETS, _SHIPPED), ("only", ",".join(ONLY), ""))
     if value != usual
 )
 DOIT_CONFIG = doit_config(OUT / "doit.json")
@@ -81,4 +82,7 @@ def write_page() -> None:
     text = page(known, ARGUMENTS, len(CELLS) - len(known))
     with replacing(PAGE_FOLDER / PAGE) as aside:
         aside.write_text(text, encoding="utf-8")
+    if "ablations" in MODEL_SETS:
+        with replacing(PAGE_FOLDER / ablations.PAGE) as aside:
+            aside.write_text(ablations.page(known, ARGUMENTS), encoding="utf-8")
     print(text)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.generalisation import ablations
 from benchmarks.generalisation import cells as of_cells
 from benchmarks.generalisation.cells import CARS, CHANGES, NOISE_LEVELS, PLANTS, Cell, Training, simulated_cells
 from benchmarks.generalisation.page import errors, heat_map, page, ratios, summary
@@ -136,3 +137,33 @@ def test_a_cell_from_laps_to_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert content is not None
     assert set(content["scores"]) == {*BASELINES, "rls (offline)"}
     assert np.all(errors(content, "rls") < errors(content, "single_track"))
+
+
+def of_models(**levels):
+    """Scores of a cell: one-step errors of one level, and the square of it along the path."""
+    return {
+        "scores": {name: {"rmse": [e, e, e], "ade": e * e, "fde": e, "coverage": None} for name, e in levels.items()}
+    }
+
+
+def test_a_part_earns_what_errors_grow_without_it():
+    part = ablations.Part("network", "full", "less")
+    one, other = list(simulated_cells())[:2]
+    found = ablations.earned({one: of_models(full=1.0, less=2.0), other: of_models(full=1.0, less=0.5)}, part)
+    assert found == (pytest.approx(1.0), pytest.approx(1.0), 2)
+    assert not found.earns
+    found = ablations.earned({one: of_models(full=1.0, less=1.1), other: of_models(third=1.0)}, part)
+    assert found == (pytest.approx(1.1), pytest.approx(1.21), 1)
+    assert found.earns
+    assert ablations.earned({one: of_models(third=1.0)}, part) is None
+    exact = ablations.earned({one: of_models(full=1e-9, less=1e-7)}, part)
+    assert exact[:2] == (1.0, 1.0), "no ratio where both are exact"
+
+
+def test_every_ablation_has_a_row_on_its_page():
+    shown = {name for part in ablations.PARTS for name in part[1:]}
+    assert set(ABLATIONS) <= shown
+    known = {cell: of_models(**dict.fromkeys(shown, 1.0)) for cell in simulated_cells()}
+    text = ablations.page(known, "part=all sets=shipped,ablations")
+    assert text.count("| 1.000 | 1.000 | 1.000 | 1.000 | no |") == len(ablations.PARTS)
+    assert "dodo.py part=all sets=shipped,ablations`" in text
