@@ -239,12 +239,15 @@ class Vehicle(StrictModel):
         return self.model_copy(update={"coefficients": coefficients} | known)
 
     def known_before(self, laps: Collection[str]) -> Vehicle:
-        """The car as it was known before it was calibrated on ``laps`` (fingerprints); itself if it was not.
+        """The car as it was known before it was calibrated on ``laps`` (fingerprints).
 
-        A third of them is enough: the rest may have been held out.
+        Itself if it was not, or if nothing but bounds was known: then the calibration is all that there is. A third of the
+        laps is enough, as the rest may have been held out.
         """
         before = self.before
         if before is None or 3 * len({*before.laps} & {*laps}) < len(laps):
+            return self
+        if all(std is None for std in before.std.values()):
             return self
         coefficients = {
             name: c.model_copy(update={"nominal": before.nominal[name], "std": before.std[name]})

@@ -67,6 +67,11 @@ def test_parts_of_the_laps_are_known_again_and_others_are_not(recording: Recordi
     assert ORCA.known_before(recording.fingerprints) is ORCA
 
 
+def test_where_nothing_was_known_the_calibration_counts(recording: Recording, calibrated: Vehicle) -> None:
+    found = calibrated.calibrated_on(recording.fingerprints, ORCA.unmeasured())
+    assert found.known_before(recording.fingerprints) is found
+
+
 def test_a_vehicle_file_keeps_it(calibrated: Vehicle, tmp_path: Path) -> None:
     save_vehicle(calibrated, tmp_path / "car.yaml")
     assert load_vehicle(tmp_path / "car.yaml").before == calibrated.before
