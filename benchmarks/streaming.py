@@ -8,16 +8,14 @@ the models are compared on a drive that none has seen.
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from benchmarks.scaling import used
 from dynssm_ros.cli.console import console, errors, progress_bar
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.open_loop import evaluate
@@ -32,7 +30,6 @@ from dynssm_ros.vehicle import load_vehicle, save_vehicle
 _RATE, _SECONDS, _DRIVES = 100, 200.0, 6  # Hz and length of a log; drives that are simulated, others are copies
 _NOISE = (0.01, 0.01, 0.03)
 _BYTES = 200  # of a row, as training counts them
-_MIB = 1024.0 / 1e6  # of the kB of the operating system in MB
 
 
 class Cost(NamedTuple):
@@ -78,22 +75,14 @@ def train(files: Sequence[Path], folder: Path, model: str, epochs: int, memory: 
         str(epochs),
     ]
     words += ["--out", str(out), *(() if memory is None else ("--memory", f"{memory:g}"))]
-    command, begin = [sys.executable, "-m", "dynssm_ros.cli.main", *words], time.monotonic()
-    with tempfile.TemporaryFile("w+") as told:
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=told)  # noqa: S603 - own command
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            told.seek(0)
-            raise UserError(f"dynssm train: {told.read().strip()}")
-    seconds = time.monotonic() - begin
+    cost = used(words)
     trained = load_model(out)
     score = evaluate(Recording.load(folder / "left_out.parquet"), {"model": trained}, stride=50, calls=1).scores[
         "model"
     ]
     v_x, v_y, omega = map(float, score.rmse)
     shutil.rmtree(out)
-    return Cost(usage.ru_maxrss * _MIB, seconds, (v_x, v_y, omega))
+    return Cost(cost.memory, cost.seconds, (v_x, v_y, omega))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -98,10 +98,10 @@ class LeaveOneOut:
         number = self._problem.windows.number
         told = np.isin(number, only_in) if only_in else np.ones(len(number), dtype=bool)
         by_window = ((after.likelihood - before.likelihood) / self._problem.tempering)[told]
-        gain, by_block = (_sums(by_window, n[told]) for n in (unit, self._problem.block))
+        gain, by_block = (sums_of(by_window, n[told]) for n in (unit, self._problem.block))
         known = (self._problem.surprise(without) - self._problem.surprise(fit)) / 2.0
         left = after.error[told].sum(axis=0) / np.maximum(before.error[told].sum(axis=0), 1e-300)
-        return Confirmation(gain, max(_spread(gain), _spread(by_block)), known, 1.0 - left)
+        return Confirmation(gain, max(standard_error(gain), standard_error(by_block)), known, 1.0 - left)
 
     def _predicted(self, fit: Fit, by_recordings: bool) -> _Predicted:
         """Of each window by the fit without its fold; noise and the place of a local effect stay as they were found.
@@ -152,11 +152,11 @@ def _held(fit: Fit, recordings: bool) -> Fit:
     return replace(fit, free=free, jacobian=np.delete(fit.jacobian, [len(fit.car.moved) + k for k in held], axis=2))
 
 
-def _sums(values: Vector, number: Indices) -> Vector:
+def sums_of(values: Vector, number: Indices) -> Vector:
     """Sums of values with the same number, of those numbers that there are."""
     return np.bincount(np.unique(number, return_inverse=True)[1], values).astype(np.float64)
 
 
-def _spread(parts: Vector) -> float:
+def standard_error(parts: Vector) -> float:
     """Standard error of the sum of independent parts."""
     return float(np.sqrt(len(parts)) * np.std(parts, ddof=1)) if len(parts) > 1 else float("inf")

@@ -15,6 +15,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.confirmation import standard_error, sums_of
 from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.identification.windows import SimulationWindows
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
@@ -51,7 +52,7 @@ class Formula:
     def holds(self) -> bool:
         """Whether it carries over to what it was not fitted to: surely, and more than by the parts' standard error."""
         total = float(self.gain.sum())
-        return total > max(_SURE * self.std, _standard_error(self.gain)) and self.share > _LEAST
+        return total > max(_SURE * self.std, standard_error(self.gain)) and self.share > _LEAST
 
 
 class _Missing(NamedTuple):
@@ -133,20 +134,16 @@ def _formula(missing: _Missing, channel: int) -> Formula | None:
     order = sorted(np.flatnonzero(found[:, best]).tolist(), key=lambda k: int(np.argmax(found[k] != 0.0)))
     same = better(lambda X, y: _fitted(X, y, order))
     more = same[len(order) - 1] - same[: len(order)]
-    few = next(n for n, each in enumerate(more) if each.sum() <= _standard_error(_sums(missing.block, each)))
+    few = next(n for n, each in enumerate(more) if each.sum() <= standard_error(sums_of(each, missing.block)))
     coefficients = spread * _fitted(X, y, order)[:, few] / scale
-    gain = _sums(missing.fold, gained[best])
+    gain = sums_of(gained[best], missing.fold)
     return Formula(
         STATE_SIGNALS[channel],
         {names[k]: float(coefficients[k]) for k in order[: few + 1]},
         float(gain.sum() / (y**2).sum()),
         gain,
-        _standard_error(_sums(missing.block, gained[best])),
+        standard_error(sums_of(gained[best], missing.block)),
     )
-
-
-def _sums(number: Indices, values: Vector) -> Vector:
-    return np.asarray(np.bincount(number, values), dtype=np.float64)
 
 
 def _fitted(X: Vector, y: Vector, order: Sequence[int]) -> Vector:
@@ -171,8 +168,3 @@ def _pursued(X: Vector, y: Vector) -> Vector:
     from sklearn.linear_model import orthogonal_mp
 
     return np.asarray(orthogonal_mp(X, y, n_nonzero_coefs=_TERMS, return_path=True)).reshape(X.shape[1], -1)
-
-
-def _standard_error(parts: Vector) -> float:
-    """Standard error of the sum of independent parts."""
-    return float(np.sqrt(len(parts)) * np.std(parts, ddof=1)) if len(parts) > 1 else float("inf")
