@@ -209,8 +209,7 @@ def fit_layer(
         precision = rows * prior.gram / prior.noise[:, None, None] + np.eye(len(features.names)) / _LARGEST_CHANGE**2
         covariance = np.linalg.inv(precision).astype(np.float64)
         return OnlineLayer(
-            card, prior.mean, covariance, prior.noise, prior.physics, np.ones(CHANNELS), usual.noise, usual.slow, s_delta,
-            vehicle, *stepping,
+            card, prior.mean, covariance, prior.noise, prior.physics, usual.noise, usual.slow, s_delta, vehicle, *stepping,
         )  # fmt: skip
 
     trials = [

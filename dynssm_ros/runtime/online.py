@@ -41,6 +41,7 @@ _LARGEST = 10.0  # no innovation moves the noise estimate by more than this many
 _NOISE_MEMORY_S = 8.0  # over which the noise and the physics' errors are averaged
 _COVERED, _QUANTILE = 0.9, 1.6448536  # stated intervals are to cover this share of errors
 _WIDTH_RATE, _WIDEST = 0.02, 5.0  # of the stated interval's adaptation: per step, and the largest factor
+_RECENT_S = 1.0  # over which errors are compared with what was stated
 _ROLLOUT_LIMIT = 3.0  # correction in a rollout, in root mean squares of the physics' recent errors
 _SMALLEST = 1e-9  # noise, in units of s_delta
 
@@ -94,7 +95,6 @@ class OnlineLayer:
         covariance: prior covariance of the weights, ``(3, n, n)``.
         noise: variance of one-step errors on the training laps, ``(3,)``, in units of s_delta squared.
         physics: mean square of the physics' one-step errors there, ``(3,)``, in the same units.
-        width: factor of the stated standard deviation that covers 90 % there, ``(3,)``.
         block_noise: variance of the physics' mean errors over blocks of rows, ``(3,)``, in the same units.
         block_slow: the part of it that a block shares with the one before.
         scale: s_delta (m/s, m/s, rad/s), ``(3,)``.
@@ -108,7 +108,6 @@ class OnlineLayer:
     covariance: Vector
     noise: Vector
     physics: Vector
-    width: Vector
     block_noise: Vector
     block_slow: Vector
     scale: Vector
@@ -213,7 +212,7 @@ class OnlineState:
         self.layer = layer
         self.coefficients = layer.estimator()
         self.retained = math.exp(-layer.T_s / layer.card.memory)
-        self._forget = min(1.0, layer.T_s / _NOISE_MEMORY_S)
+        self._forget, self._recently = (min(1.0, layer.T_s / memory) for memory in (_NOISE_MEMORY_S, _RECENT_S))
         self._returning = (1 - self.retained) * layer.mean
         self._widening = (1 - self.retained**2) * layer.covariance
         self.reset()
@@ -225,7 +224,8 @@ class OnlineState:
         self.covariance = layer.covariance.copy()
         self.noise = layer.noise.copy()
         self.physics = layer.physics.copy()
-        self.width = layer.width.copy()
+        self.recent = np.ones(CHANNELS)
+        self.width = np.ones(CHANNELS)
         self.coefficients.reset()
         self.steps = 0
 
@@ -240,9 +240,12 @@ class OnlineState:
         return limit
 
     def variance(self, features: Vector) -> Vector:
-        """Variance of the prediction's error ``(3,)``, in units of s_delta squared, from weights, noise and coverage."""
+        """Variance of the prediction's error ``(3,)``, in units of s_delta squared.
+
+        That of weights and noise, times the square of the latest errors in its units, times what makes 90 % of them fit in.
+        """
         spread = (self.covariance @ features[:, :, None])[:, :, 0]
-        stated: Vector = self.width * self.width * (self.noise + (spread * features).sum(axis=1))
+        stated: Vector = self.width**2 * self.recent * (self.noise + (spread * features).sum(axis=1))
         return stated
 
     def update(self, seen: Seen, row: Vector, increment: Vector) -> None:
@@ -257,19 +260,20 @@ class OnlineState:
         target = increment / scale
         if not math.isfinite(float(target.sum() + features.sum())):
             return
-        mean = self.retained * self.mean + self._returning
-        P = self.retained**2 * self.covariance + self._widening
+        P = self.covariance
         spread = (P @ features[:, :, None])[:, :, 0]
-        error = target - (mean * features).sum(axis=1)
+        error = target - (self.mean * features).sum(axis=1)
         predicted = (spread * features).sum(axis=1)
         size = np.abs(error) / np.sqrt(self.noise + predicted)
         inflation = np.maximum(1.0, size / _OUTLIER)
         gain = spread / (predicted + self.noise * inflation)[:, None]
-        self.mean = mean + gain * error[:, None]
-        self.covariance = P - gain[:, :, None] * spread[:, None, :]
+        self.mean = self.retained * (self.mean + gain * error[:, None]) + self._returning
+        self.covariance = self.retained**2 * (P - gain[:, :, None] * spread[:, None, :]) + self._widening
         # stochastic approximation of the 90 % quantile (adaptive conformal inference, Gibbs and Candes 2021)
-        missed = size > _QUANTILE * self.width
+        missed = size > _QUANTILE * self.width * np.sqrt(self.recent)
         self.width = np.clip(self.width * np.exp(_WIDTH_RATE * (missed - (1.0 - _COVERED))), 1 / _WIDEST, _WIDEST)
+        surprise = np.minimum(size * size, _LARGEST**2 * self.recent)
+        self.recent = np.maximum(self.recent + self._recently * (surprise - self.recent), _SMALLEST**2)
         square = np.minimum(error * error * self.noise / (self.noise + predicted), _LARGEST**2 * self.noise)
         self.noise = np.maximum(self.noise + self._forget * (square - self.noise), _SMALLEST**2)
         of_physics = ((increment - physics) / scale) ** 2
@@ -310,8 +314,8 @@ class OnlineState:
         self.steps = int(about.get("steps", "0"))
 
 
-_SAVED = ("mean", "covariance", "noise", "physics", "width")
-_PRIOR = (*_SAVED, "block_noise", "block_slow")
+_SAVED = ("mean", "covariance", "noise", "physics", "recent", "width")
+_PRIOR = ("mean", "covariance", "noise", "physics", "block_noise", "block_slow")
 
 
 def save_layer(layer: OnlineLayer, path: Path) -> None:

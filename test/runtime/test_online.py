@@ -20,7 +20,7 @@ def make_layer(memory=1e12, prior_rows=10.0, noise=1e-2, mean=None):
     prior = np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)) if mean is None else mean
     covariance = np.tile(np.eye(N) / prior_rows, (3, 1, 1))
     one = np.ones(3)
-    return OnlineLayer(card, prior, covariance, np.full(3, noise), one, one, one, one, SCALE, load_vehicle("orca"))
+    return OnlineLayer(card, prior, covariance, np.full(3, noise), one, one, one, SCALE, load_vehicle("orca"))
 
 
 def drive(layer, features, weights, noise, rng):
@@ -65,6 +65,16 @@ def test_it_finds_planted_weights_and_changed_ones():
     np.testing.assert_allclose(state.mean, after, atol=0.06)
 
 
+def test_the_stated_variance_knows_that_the_weights_move_until_the_next_step():
+    layer = make_layer(memory=2.0, noise=1e-12)
+    state, row = layer.start(), np.ones((3, N))
+    for _ in range(5):
+        learn(state, row, np.ones(3))
+    moved = -np.expm1(-2 * layer.T_s / 2.0) * np.einsum("i,cij,j->c", row[0], layer.covariance, row[0])
+    stated = state.variance(row) / (state.width**2 * state.recent)
+    assert np.all(stated >= moved)
+
+
 def test_without_excitation_it_returns_to_the_prior():
     rng = np.random.default_rng(2)
     layer = make_layer(memory=2.0)
@@ -94,15 +104,19 @@ def test_an_outlier_moves_the_weights_little_and_no_nan_gets_in():
         assert (state.steps, np.array_equal(kept, state.mean)) == (steps, True)
 
 
-@pytest.mark.parametrize("heavy", [False, True])
-def test_its_90_percent_intervals_cover_90_percent(heavy):
+@pytest.mark.parametrize("kind", ["gaussian", "heavy", "smooth"])
+@pytest.mark.parametrize("size", [1.0, 1e-5])
+def test_its_90_percent_intervals_cover_90_percent(kind, size):
     rng = np.random.default_rng(4)
     layer = make_layer(noise=1.0)
     features = rng.standard_normal((5000, 3, N))
-    errors = rng.standard_t(2.5, (5000, 3)) if heavy else rng.standard_normal((5000, 3))
-    targets = (
-        features[:, :, 0] + errors * np.linspace(0.02, 0.2, 5000)[:, None]
-    )  # noise that grows tenfold, prior wrong
+    errors = {
+        "gaussian": rng.standard_normal((5000, 3)),
+        "heavy": rng.standard_t(2.5, (5000, 3)),
+        "smooth": np.sin(np.arange(5000)[:, None] / [17.0, 31.0, 59.0]),
+    }[kind]
+    growing = size * np.linspace(0.02, 0.2, 5000)[:, None]
+    targets = features[:, :, 0] + errors * growing  # the prior's noise is wrong
     learned = layer.drive(Seen(features, features[:, :, 0] * SCALE), ROWS, targets * SCALE, np.arange(5000))
     missed = targets - np.einsum("kci,kci->kc", features, learned.weights)
     covered = np.mean(np.abs(missed) <= 1.6448536 * np.sqrt(learned.variance), axis=0)
@@ -153,7 +167,7 @@ def test_what_was_learned_is_kept_and_belongs_to_its_prior(tmp_path):
     other = layer.start()
     other.load(file, "mine")
     assert other.steps == 30
-    for name in ("mean", "covariance", "noise", "physics", "width"):
+    for name in ("mean", "covariance", "noise", "physics", "recent", "width"):
         np.testing.assert_array_equal(getattr(other, name), getattr(state, name))
     with pytest.raises(ArtifactError, match="learned by another model"):
         other.load(file, "yours")

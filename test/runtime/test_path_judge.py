@@ -16,7 +16,7 @@ NAMES = ("physics", "increment, 1 steps ago", MEAN_ERROR, "one")
 def layer():
     card = OnlineLayerCard(features=NAMES, memory=1000.0, prior_rows=40.0, spread=SPREAD)
     mean, covariance = np.zeros((3, 4)), np.tile(np.eye(4), (3, 1, 1))
-    return OnlineLayer(card, mean, covariance, ONE, ONE, ONE, ONE, ONE, ONE, load_vehicle("orca"))
+    return OnlineLayer(card, mean, covariance, ONE, ONE, ONE, ONE, ONE, load_vehicle("orca"))
 
 
 def see(windows):
