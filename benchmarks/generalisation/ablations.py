@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.generalisation.cells import Cell
 from benchmarks.generalisation.page import EXACT, errors
+from dynssm_ros.learning.models.base import OnlineConfig
 
 PAGE = "ablations.md"
 Known = Mapping[Cell, Mapping[str, Any]]
@@ -22,6 +23,8 @@ class Part(NamedTuple):
     with_it: str
     without: str
 
+
+_MEMORY = OnlineConfig().memory
 
 PARTS = (
     Part("online layer, on network and physics", "dynssm", "dynssm (offline)"),
@@ -37,8 +40,9 @@ PARTS = (
     Part("not in the default: SSM and parameter head", "ssm_and_head", "dynssm"),
     Part("not in the default: SSM and parameter head, without an online layer", "ssm_and_head (offline)", "dynssm (offline)"),
     Part("lags of the online layer, beyond one", "rls", "rls_one_lag"),
-    Part("memory of 20 s instead of 100 s", "rls", "rls_memory_100_s"),
-    Part("memory of 20 s instead of 1 s", "rls", "rls_hardly_learning"),
+    Part("not in the default: 15 lags of everything", "rls_long_lags", "rls"),
+    Part(f"memory of {_MEMORY:g} s instead of 100 s", "rls", "rls_memory_100_s"),
+    Part(f"memory of {_MEMORY:g} s instead of 1 s", "rls", "rls_hardly_learning"),
 )  # fmt: skip
 
 

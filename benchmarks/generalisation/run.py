@@ -30,6 +30,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     },
     "no_mirror": {"base": "dynssm", "training": {"augmentation": {"mirror": False}}},
     "rls_one_lag": {"base": "rls", "online": {"lags": 1, "other_lags": 1, "input_lags": 1}},
+    "rls_long_lags": {"base": "rls", "online": {"lags": 15, "other_lags": 15, "input_lags": 15}},
     "rls_memory_100_s": {"base": "rls", "online": {"memory": 100.0}},
     "rls_hardly_learning": {"base": "rls", "online": {"memory": 1.0}},
 }  # fmt: skip
