@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,13 +11,13 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.extras import missing_libraries
-from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.car import CarEstimate, Values
 from dynssm_ros.identification.diagnosis import Cause, Diagnosis
 from dynssm_ros.identification.formula import Formula, formulas
 from dynssm_ros.identification.gate import HeldOut, Without, gated
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
-from dynssm_ros.identification.problem import per_unit
+from dynssm_ros.identification.problem import Fit, IdentificationProblem, per_unit
 from dynssm_ros.identification.recordings import CrossValidation, RecordingSet, driven_alike
 from dynssm_ros.identification.selection import Refined, Selection
 from dynssm_ros.identification.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
@@ -32,8 +33,9 @@ from dynssm_ros.vehicle.single_track import Integrator
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
 _MOVED = 3.0  # standard deviations beyond which recalibration is a finding
+_NOTED = 0.1  # relative difference of what the vehicle file has
 _DRIVEN_ALIKE = 0.5  # of a recording, that others must have for causes of it alone
-_HELD = {"zero": "held", "first": "a line from row to row"}
+_HELD = {"zero": "held", "first": "a line from sample to sample"}
 
 
 def diagnose(
@@ -87,7 +89,8 @@ def diagnose(
     terms = _formulas(windows, fit.car, at.left_out, at.notes, on_progress) if left.is_there else ()
     sizes = minimum_detectable(problem, fit, found.search.found)
     covariance = problem.covariance(fit)
-    extended = fit.car.extended(covariance, suspects[-1] if suspects else None)
+    live, held = _as_held(problem, fit, at.car)
+    extended = live.car.extended(held.covariance(live), suspects[-1] if suspects else None)
     extended = extended.model_copy(update={"integrator": windows.integrator})
     extended = extended.calibrated_on(at.recordings.recording.select(~at.recordings.held_out).fingerprints, vehicle)
     std = np.sqrt(np.diag(covariance))
@@ -109,7 +112,7 @@ def diagnose(
         (
             *at.notes,
             *(f"{name} cannot be judged: {why}" for name, why in found.impossible.items()),
-            *_steps_otherwise(vehicle, windows),
+            *_steps_otherwise(vehicle, windows, fit.car, live.car),
             *_hidden(sizes),
             *_not_live(extended),
             *_not_written(fit.car, extended),
@@ -244,7 +247,17 @@ def _cause(one: Refined, without: Without, selection: Selection, recordings: Rec
     )
 
 
-def _steps_otherwise(vehicle: Vehicle, windows: SimulationWindows) -> Iterator[str]:
+def _as_held(problem: IdentificationProblem, fit: Fit, given: CarEstimate) -> tuple[Fit, IdentificationProblem]:
+    """The same causes fitted to inputs that are held from sample to sample, as a live prediction has them."""
+    if problem.windows.hold == "zero":
+        return fit, problem
+    held = IdentificationProblem(replace(problem.windows, hold="zero"), given.as_known, problem.tempering)
+    return held.fit(fit.car, fit.free), held
+
+
+def _steps_otherwise(
+    vehicle: Vehicle, windows: SimulationWindows, car: CarEstimate, live: CarEstimate
+) -> Iterator[str]:
     """Where the data ask for other steps than the vehicle file was calibrated for, or than a live prediction can make."""
     if vehicle.integrator not in (None, windows.integrator):
         yield (
@@ -252,10 +265,21 @@ def _steps_otherwise(vehicle: Vehicle, windows: SimulationWindows) -> Iterator[s
             f"calibrate with --integrator {windows.integrator}, else what the steps differ by may be named"
         )
     if windows.hold == "first":
+        samples = " and ".join(f"{n * windows.data.T_s:g}" for n in dict.fromkeys(windows.data.rows_per_sample))
         yield (
-            "the car answers to the inputs half a step earlier than if they were held, so that they are interpolated between "
-            "rows; a live prediction cannot, and errs by that: record them faster, or take the commands"
+            "the car answers to the inputs half a sample earlier than if they were held, so that they are taken for lines "
+            f"from sample to sample ({samples} s apart); a live prediction cannot, and errs by that: record them faster, or "
+            "take the commands. The vehicle file is fitted to inputs that are held"
+            + "".join(_differently(car.effects, live.effects))
         )
+
+
+def _differently(effects: Mapping[str, Values], live: Mapping[str, Values]) -> Iterator[str]:
+    """Effects whose sizes are others with inputs that are held."""
+    for effect, values in effects.items():
+        for name, value in values.items():
+            if abs(live[effect][name] - value) > _NOTED * abs(value):
+                yield f"; {effect}: {name} {live[effect][name]:.3g} there, {value:.3g} in a simulation"
 
 
 def _hidden(sizes: Mapping[str, float]) -> Iterator[str]:

@@ -1,8 +1,9 @@
 """Which steps the simulation makes: Runge-Kutta with inputs that are held, unless the data clearly say otherwise.
 
 Euler steps of the sampling time, as some simulators make them, act about half a step late. Inputs that went on changing
-between the rows act half a step early, as a line from row to row does. Before the causes are known a car that errs may be
-closer to the data with either by chance, so that the choice is made anew with the causes that were found.
+between their samples act half a sample early, as a line from sample to sample does. Steering that lags hides that, so the
+steps are compared with a lag fitted beside. Before the causes are known a car that errs may be closer to the data with either
+by chance, so that the choice is made anew with the causes that were found.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.identification.selection import Search, Selection
 from dynssm_ros.identification.windows import Hold, SimulationWindows
 from dynssm_ros.parallel import IN_TURN, Pool
+from dynssm_ros.vehicle.effects.actuators import SteeringLag
 from dynssm_ros.vehicle.single_track import Integrator
 
 _TRIED = 300  # windows with which the integrator is chosen at first
@@ -91,27 +93,39 @@ def search_causes(
     first = closest(fits)
     found = search(windows_of[first])
     fit = found.selection.fit
-    fits = {
-        one: fit
-        if one == first
-        else IdentificationProblem(windows_of[one], known, found.problem.tempering).fit(fit.car, fit.free)
-        for one in options
-    }
-    last = closest(fits)
-    return found if last == first else search(windows_of[last], fits[first])
+    problems = {one: IdentificationProblem(windows_of[one], known, found.problem.tempering) for one in options}
+    last = closest(
+        {
+            one: _with_lag(problem, fit if one == first else problem.fit(fit.car, fit.free))
+            for one, problem in problems.items()
+        }
+    )
+    return found if last == first else search(windows_of[last], fit)
 
 
 def _stepped(windows: SimulationWindows, car: CarEstimate, stepping: Stepping) -> tuple[SimulationWindows, Fit]:
     """The windows in steps that are short enough for the recalibrated car too, and its fit to some of them.
 
-    That car may be much stiffer than the one of the file, and a simulation whose steps are too long for it runs away.
+    That car may be much stiffer than the one of the file, and a simulation whose steps are too long for it runs away. Its
+    steering may lag.
     """
     integrator, hold = stepping
     windows = replace(windows, hold=hold)
     some = windows.select(np.arange(0, len(windows), -(-len(windows) // _TRIED)))
     trial = some.with_integrator(integrator, car.vehicle)
-    fit = IdentificationProblem(trial, car.as_known).recalibrated(car)
+    problem = IdentificationProblem(trial, car.as_known)
+    fit = problem.recalibrated(car)
     finer = trial.with_integrator(integrator, car.vehicle.with_nominal(np.array(fit.car.theta)))
     if finer.substeps > trial.substeps:
-        trial, fit = finer, IdentificationProblem(finer, car.as_known).fit(fit.car, ())
-    return replace(windows, integrator=integrator, substeps=trial.substeps), fit
+        trial, problem = finer, IdentificationProblem(finer, car.as_known)
+        fit = problem.fit(fit.car, ())
+    return replace(windows, integrator=integrator, substeps=trial.substeps), _with_lag(problem, fit)
+
+
+def _with_lag(problem: IdentificationProblem, fit: Fit) -> Fit:
+    """The same with steering that lags, unless it has it already."""
+    effect, parameter = SteeringLag.NAME, "time_constant"
+    if effect in fit.car.effects or any(entry.name == effect for entry in fit.car.vehicle.effects):
+        return fit
+    lagging = fit.car.with_effect(effect, {parameter: problem.windows.data.T_s})
+    return problem.fit(lagging, (*fit.free, (effect, parameter)), fit)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.identification.problem import BLOCK
-from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
+from dynssm_ros.identification.windows import RecordedRows, SimulationWindows, rows_per_sample
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
 from dynssm_ros.track.lines import ClosedLine
@@ -91,7 +91,8 @@ class RecordingSet:
     def rows(self, line: ClosedLine | None) -> RecordedRows:
         """As simulations read them, with the place on the lap along ``line``; ``t`` is the recording's own clock."""
         context = lap_context(self.recording, line) | {"t": self.clock}
-        return RecordedRows(self.recording.matrix.T, context, self.recording.T_s, self.time, self.number)
+        samples = rows_per_sample(self.recording)
+        return RecordedRows(self.recording.matrix.T, context, self.recording.T_s, self.time, self.number, samples)
 
     def place(self, time: float) -> tuple[str, float]:
         """The recording that is at a :attr:`time`, and its own clock (s) there."""

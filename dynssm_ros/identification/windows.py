@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -21,7 +22,7 @@ from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.single_track import Integrator, settled_effect_states, settling_rate, step_with_effect_states
 
 Hold = Literal["zero", "first"]
-"""What is taken for the inputs between two rows: those of the first row, or a line from row to row."""
+"""What is taken for the inputs between two samples: the first one, or a line from sample to sample."""
 
 _LONGEST = 1.5  # integration step, times the rate at which the linear car settles
 _FINEST = 16  # integration steps per sampling time, at most
@@ -45,6 +46,7 @@ class RecordedRows:
         T_s: sampling time (s).
         time: of each row since the first (s), shape ``(N,)``.
         number: of the recording that each row is of, shape ``(N,)``.
+        rows_per_sample: of throttle and steering: that many rows show a sample before the next one comes.
     """
 
     rows: Vector
@@ -52,6 +54,26 @@ class RecordedRows:
     T_s: float
     time: Vector
     number: Indices
+    rows_per_sample: tuple[int, int] = (1, 1)
+
+    @cached_property
+    def lines(self) -> Vector:
+        """Applied throttle and steering if they move in lines from one sample to the next, shape ``(2, N)``.
+
+        Rows that hold a sample tell when it was taken only where they change: a line begins as long before as samples are
+        apart, and after the last change.
+        """
+        stretch = np.concatenate([[0], np.flatnonzero(np.diff(self.time) > 1.5 * self.T_s) + 1, [len(self.time)]])
+        lines = np.array(applied_inputs(self.rows), dtype=np.float64)
+        for values, apart in zip(lines, self.rows_per_sample, strict=True):
+            held = values.copy()
+            for first, end in pairwise(stretch):
+                before = first
+                for row in first + 1 + np.flatnonzero(np.diff(held[first:end])):
+                    begin = max(before, row - apart)
+                    values[begin : row + 1] = np.linspace(held[row - 1], held[row], row - begin + 1)
+                    before = row
+        return lines
 
 
 @dataclass(frozen=True)
@@ -66,7 +88,7 @@ class SimulationWindows:
         integrator: how the model steps.
         substeps: integration steps per sampling time.
         every: compared is every so many rows, so that ``K = steps / every``.
-        hold: of the inputs between rows. A line, which a live prediction cannot know, acts half a step earlier.
+        hold: of the inputs between samples. A line, which a live prediction cannot know, acts half a sample earlier.
         filtered: whether a simulation is led up to its start by the rows before as an observer is, and not put on the
             measured row. The noise of a row would otherwise be seen in what the car does next, and effects that answer
             to it, such as a relaxing tyre, be taken for smaller than they are.
@@ -203,8 +225,8 @@ class SimulationWindows:
         """One step from the rows ``k`` after the starts."""
         applied = applied_inputs(rows)
         if self.hold == "first":
-            following = applied_inputs(self.data.rows[:, self.starts + k + 1])
-            applied = Applied(*((now + then) / 2 for now, then in zip(applied, following, strict=True)))
+            lines, now = self.data.lines, self.starts + k
+            applied = Applied(*(lines[:, now] + lines[:, now + 1]) / 2)
         return step_with_effect_states(
             np,
             state,
@@ -223,7 +245,17 @@ class SimulationWindows:
 def recorded_rows(recording: Recording, context: dict[str, Vector]) -> RecordedRows:
     """The rows of a single recording with other signals by name."""
     time, number = (recording.time - recording.time[0]) / 1e9, np.zeros(len(recording), dtype=np.intp)
-    return RecordedRows(recording.matrix.T, context, recording.T_s, time, number)
+    return RecordedRows(recording.matrix.T, context, recording.T_s, time, number, rows_per_sample(recording))
+
+
+def rows_per_sample(recording: Recording) -> tuple[int, int]:
+    """Rows from one sample of the applied throttle and steering to the next; see :class:`RecordedRows`."""
+    source = "command" if recording.info.commands == "topics" else "feedback"
+    throttle, steering = (
+        max(1, round(recording.info.held_periods.get(f"{name}_{source}", 0.0) / recording.T_s))
+        for name in ("throttle", "steering")
+    )
+    return throttle, steering
 
 
 def compared_every(steps: int) -> int:

@@ -104,7 +104,10 @@ def left_in_words(diagnosis: Diagnosis) -> str:
 
 def formula_in_words(formula: Formula) -> str:
     """The term that is missing, and what it takes away where it was not fitted."""
-    terms = "".join(f" {'-' if c < 0 else '+'} {text(abs(c))} {name}" for name, c in formula.terms.items())
+    terms = "".join(
+        f" {'-' if c < 0 else '+'} {text(abs(c))}{'' if name == '1' else f' {name}'}"
+        for name, c in formula.terms.items()
+    )
     parts = int((formula.gain > 0).sum())
     return (
         f"d{formula.channel}/dt may lack{terms} (SI units; throttle and steering as applied): on parts of the drive that "

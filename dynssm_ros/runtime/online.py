@@ -302,6 +302,7 @@ class OnlineState:
             raise ArtifactError(f"{path}: not a readable online state ({error})") from error
         if about.get("prior") != owner:
             raise ArtifactError(f"{path}: was learned by another model; expected the state of prior {owner[:12]}")
+        arrays.setdefault("recent", np.ones(CHANNELS))  # states of 0.3.0 have none
         estimator = self.coefficients.kept()
         for name in (*_SAVED, *(f"coefficients.{name}" for name in estimator)):
             value = arrays.get(name)

@@ -53,7 +53,8 @@ def extract(
             commands=signal_map.commands,
             source=(Path(path).name,),
             signal_map=signal_map.name,
-            held=held,
+            held=tuple(held),
+            held_periods=held,
             notes=tuple(notes),
         )
         recordings.append(resample(streams, rate, signal_map.max_gap, signal_map.commands, info))
@@ -76,19 +77,19 @@ def pose_velocities(streams: Mapping[str, Stream], window: float, where: str) ->
     return {name: Stream(stamps[rows], values) for name, values in zip(STATE_SIGNALS, found.T, strict=True)}
 
 
-def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: float) -> tuple[str, ...]:
-    """The signals that keep their last sample until the next, on a grid of ``period`` (ns).
+def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: float) -> dict[str, float]:
+    """The signals that keep their last sample until the next, on a grid of ``period`` (ns), and how long they do (s).
 
     Actuators that come more slowly than the rows would else look ahead of what a live node knows.
     """
-    held = []
+    held = {}
     for name, source in signal_map.active_signals().items():
         stamps = streams[name].stamps if name in streams else np.empty(0, np.int64)
-        slow = len(stamps) > 1 and float(np.median(np.diff(stamps))) > _SLOW * period
-        usual = "zero" if slow and name not in (*STATE_SIGNALS, *POSE_SIGNALS) else "first"
+        between = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+        usual = "zero" if between > _SLOW * period and name not in (*STATE_SIGNALS, *POSE_SIGNALS) else "first"
         if (source.hold or usual) == "zero":
-            held.append(name)
-    return tuple(held)
+            held[name] = between / 1e9
+    return held
 
 
 def read_streams(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -44,6 +44,9 @@ class RecordingInfo(StrictModel):
     signal_map: str = ""
     held: tuple[str, ...] = Field(
         default=(), description="signals that keep their last sample until the next; the others are interpolated"
+    )
+    held_periods: dict[str, float] = Field(
+        default_factory=dict, description="usual time from one sample of a held signal to the next (s)"
     )
     notes: tuple[str, ...] = Field(default=(), description="what was recovered, dropped or bridged")
 
@@ -286,6 +289,11 @@ def row_count(path: str | Path) -> int:
         return int(file.metadata.num_rows)
 
 
+def _longest(periods: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The longest period of each signal."""
+    return {name: max(each.get(name, 0.0) for each in periods) for name in sorted(set().union(*periods))}
+
+
 def concatenate(recordings: Sequence[Recording]) -> Recording:
     """Joins recordings of one car, one after the other; segments stay apart.
 
@@ -312,6 +320,7 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
             "source": tuple(s for r in recordings for s in r.info.source),
             "notes": tuple(n for r in recordings for n in r.info.notes),
             "held": tuple(dict.fromkeys(name for r in recordings for name in r.info.held)),
+            "held_periods": _longest([r.info.held_periods for r in recordings]),
         }
     )
     return Recording(

@@ -11,9 +11,10 @@ import pytest
 from dynssm_ros.identification.car import CarEstimate, prior_std
 from dynssm_ros.identification.noise import Noise, NoiseResponse, fit_noise, weights
 from dynssm_ros.identification.problem import IdentificationProblem, position, with_values
-from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
+from dynssm_ros.identification.windows import Hold, RecordedRows, SimulationWindows
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import simulate
+from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle
 
@@ -193,3 +194,36 @@ def test_the_extended_vehicle_is_the_car_as_fitted(laps: Callable[..., tuple[Rec
     assert [(entry.name, entry.parameters) for entry in vehicle.effects] == [("mass", {"factor": 1.1})]
     some = windows(AV21, duration=10.0)
     np.testing.assert_allclose(some.errors(CarEstimate.of(vehicle)), some.errors(car), atol=1e-12)
+
+
+def test_lines_from_sample_to_sample_begin_a_sample_before_the_row_that_changes() -> None:
+    held = np.repeat([0.0, 0.0, 3.0, 3.0, 6.0], 3)
+    rows = np.zeros((7, 15))
+    rows[3], rows[4] = held, np.arange(15.0)
+    time = 0.02 * np.arange(15)
+    time[12:] += 1.0  # a gap: the last sample is of another stretch
+    data = RecordedRows(rows, {}, 0.02, time, np.zeros(15, dtype=np.intp), (3, 1))
+    throttle, steering = data.lines
+    np.testing.assert_allclose(throttle, [0, 0, 0, 0, 1, 2, 3, 3, 3, 3, 3, 3, 6, 6, 6])
+    np.testing.assert_array_equal(steering, rows[4])
+
+
+@pytest.mark.parametrize("hold", ["zero", "first"])
+def test_a_lag_is_seen_through_actuators_that_are_sampled_slowly(hold: Hold) -> None:
+    """What a driver does between two samples is nearer to a line than to the older one, which is 0.05 s old in the mean."""
+    car = load_vehicle("orca").with_effect("steering_lag", {"time_constant": 0.1})
+    road, noise = load_track("club"), (0.002, 0.002, 0.005)
+    run = simulate(car, road, duration=40.0, plant="rk4", noise=noise, seed=4, style=Style(0.6))
+    rows = np.concatenate([run.measured.T, run.feedback.T, (run.command - run.feedback).T])
+    applied = rows[3:5] + rows[5:]
+    rows[3:5], rows[5:] = applied[:, np.arange(rows.shape[1]) // 5 * 5], 0.0
+    time = (run.time - run.time[0]) / 1e9
+    data = RecordedRows(rows, {"t": time}, car.sampling_time, time, np.zeros(len(time), dtype=np.intp), (5, 5))
+    some = SimulationWindows(data, np.arange(40, rows.shape[1] - 13, 12), 12, 32, "rk4", 4, filtered=True, hold=hold)
+    start = CarEstimate.of(load_vehicle("orca")).with_effect("steering_lag", {"time_constant": 0.05})
+    fit = IdentificationProblem(some, start).fit(start, (("steering_lag", "time_constant"),))
+    found = fit.car.effects["steering_lag"]["time_constant"]
+    if hold == "first":
+        assert found == pytest.approx(0.1, abs=0.015)
+    else:
+        assert found < 0.075

@@ -67,6 +67,7 @@ def test_the_signals_of_a_bag_come_out_as_they_went_in(make_bag: Any, drive: Any
         "source": ("bag",),
         "signal_map": "default",
         "held": (),
+        "held_periods": {},
         "notes": (),
     }
     t = seconds(recording)
@@ -83,6 +84,7 @@ def test_actuators_that_are_slower_than_the_rows_are_held_unless_the_map_says_ot
     actuators = [name for name in signals if name.startswith(("throttle", "steering"))]
     recording = extract([bag], DEFAULT, 100.0)
     assert recording.info.held == tuple(actuators)
+    assert recording.info.held_periods == pytest.approx(dict.fromkeys(actuators, 0.05))
     changes = np.flatnonzero(np.diff(recording["delta_fb"]))
     assert 0 < len(changes) <= len(recording) / 4
     assert set(np.diff(changes)) == {int(np.diff(changes)[0])}
