@@ -117,7 +117,7 @@ def diagnose(
             *_not_live(extended),
             *_not_written(fit.car, extended),
         ),
-        at.protocol | {"Integrator": windows.integrator, "Inputs between rows": _HELD[windows.hold]},
+        at.protocol | {"Integrator": windows.integrator, "Inputs between samples": _HELD[windows.hold]},
         windows,
         at.recordings,
         terms,
