@@ -66,6 +66,8 @@ class RecordedRows:
         stretch = np.concatenate([[0], np.flatnonzero(np.diff(self.time) > 1.5 * self.T_s) + 1, [len(self.time)]])
         lines = np.array(applied_inputs(self.rows), dtype=np.float64)
         for values, apart in zip(lines, self.rows_per_sample, strict=True):
+            if apart == 1:
+                continue
             held = values.copy()
             for first, end in pairwise(stretch):
                 before = first
