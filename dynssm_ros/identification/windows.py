@@ -63,7 +63,8 @@ class RecordedRows:
         Rows that hold a sample tell when it was taken only where they change: a line begins as long before as samples are
         apart, and after the last change.
         """
-        stretch = np.concatenate([[0], np.flatnonzero(np.diff(self.time) > 1.5 * self.T_s) + 1, [len(self.time)]])
+        cut = (np.diff(self.time) > 1.5 * self.T_s) | (np.diff(self.number) != 0)
+        stretch = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(cut) + 1]])
         lines = np.array(applied_inputs(self.rows), dtype=np.float64)
         for values, apart in zip(lines, self.rows_per_sample, strict=True):
             if apart == 1:

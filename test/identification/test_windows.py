@@ -202,10 +202,13 @@ def test_lines_from_sample_to_sample_begin_a_sample_before_the_row_that_changes(
     rows[3], rows[4] = held, np.arange(15.0)
     time = 0.02 * np.arange(15)
     time[12:] += 1.0  # a gap: the last sample is of another stretch
-    data = RecordedRows(rows, {}, 0.02, time, np.zeros(15, dtype=np.intp), (3, 1))
+    one = np.zeros(15, dtype=np.intp)
+    data = RecordedRows(rows, {}, 0.02, time, one, (3, 1))
     throttle, steering = data.lines
     np.testing.assert_allclose(throttle, [0, 0, 0, 0, 1, 2, 3, 3, 3, 3, 3, 3, 6, 6, 6])
     np.testing.assert_array_equal(steering, rows[4])
+    two = RecordedRows(rows, {}, 0.02, 0.02 * np.arange(15), np.repeat([0, 1], [12, 3]), (3, 1))
+    np.testing.assert_array_equal(two.lines, data.lines)
 
 
 @pytest.mark.parametrize("hold", ["zero", "first"])
