@@ -74,7 +74,8 @@ class Stand:
 
     @property
     def newest(self) -> list[float]:
-        return list(self.commands[-1].position)
+        """The newest command; NaN before the first."""
+        return list(self.commands[-1].position) if self.commands else [math.nan, math.nan]
 
     def laps(self) -> int:
         return int(self.told[-1][2]["laps"])
