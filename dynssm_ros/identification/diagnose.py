@@ -89,8 +89,8 @@ def diagnose(
     terms = _formulas(windows, fit.car, at.left_out, at.notes, on_progress) if left.is_there else ()
     sizes = minimum_detectable(problem, fit, found.search.found)
     covariance = problem.covariance(fit)
-    live, held = _as_held(problem, fit, at.car)
-    extended = live.car.extended(held.covariance(live), suspects[-1] if suspects else None)
+    live, known = _as_held(problem, fit, covariance, at.car)
+    extended = live.extended(known, suspects[-1] if suspects else None)
     extended = extended.model_copy(update={"integrator": windows.integrator})
     extended = extended.calibrated_on(at.recordings.recording.select(~at.recordings.held_out).fingerprints, vehicle)
     std = np.sqrt(np.diag(covariance))
@@ -112,7 +112,7 @@ def diagnose(
         (
             *at.notes,
             *(f"{name} cannot be judged: {why}" for name, why in found.impossible.items()),
-            *_steps_otherwise(vehicle, windows, fit.car, live.car),
+            *_steps_otherwise(vehicle, windows, fit.car, live),
             *_hidden(sizes),
             *_not_live(extended),
             *_not_written(fit.car, extended),
@@ -247,12 +247,15 @@ def _cause(one: Refined, without: Without, selection: Selection, recordings: Rec
     )
 
 
-def _as_held(problem: IdentificationProblem, fit: Fit, given: CarEstimate) -> tuple[Fit, IdentificationProblem]:
-    """The same causes fitted to inputs that are held from sample to sample, as a live prediction has them."""
+def _as_held(
+    problem: IdentificationProblem, fit: Fit, covariance: Vector, given: CarEstimate
+) -> tuple[CarEstimate, Vector]:
+    """The car with the same causes where inputs are held from sample to sample, as live; and the fit's covariance."""
     if problem.windows.hold == "zero":
-        return fit, problem
+        return fit.car, covariance
     held = IdentificationProblem(replace(problem.windows, hold="zero"), given.as_known, problem.tempering)
-    return held.fit(fit.car, fit.free), held
+    live = held.fit(fit.car, fit.free)
+    return live.car, held.covariance(live)
 
 
 def _steps_otherwise(

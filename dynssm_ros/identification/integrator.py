@@ -19,8 +19,9 @@ from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, closest
 from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.identification.selection import Search, Selection
-from dynssm_ros.identification.windows import Hold, SimulationWindows
+from dynssm_ros.identification.windows import SimulationWindows
 from dynssm_ros.parallel import IN_TURN, Pool
+from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.vehicle.effects.actuators import SteeringLag
 from dynssm_ros.vehicle.single_track import Integrator
 
@@ -93,7 +94,10 @@ def search_causes(
     first = closest(fits)
     found = search(windows_of[first])
     fit = found.selection.fit
-    problems = {one: IdentificationProblem(windows_of[one], known, found.problem.tempering) for one in options}
+    problems = {
+        one: found.problem if one == first else IdentificationProblem(windows_of[one], known, found.problem.tempering)
+        for one in options
+    }
     last = closest(
         {
             one: _with_lag(problem, fit if one == first else problem.fit(fit.car, fit.free))

@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
@@ -18,11 +16,9 @@ from dynssm_ros.errors import RecordingError
 from dynssm_ros.identification.car import CarBatch, CarEstimate
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.single_track import Integrator, settled_effect_states, settling_rate, step_with_effect_states
-
-Hold = Literal["zero", "first"]
-"""What is taken for the inputs between two samples: the first one, or a line from sample to sample."""
 
 _LONGEST = 1.5  # integration step, times the rate at which the linear car settles
 _FINEST = 16  # integration steps per sampling time, at most
@@ -64,18 +60,13 @@ class RecordedRows:
         apart, and after the last change.
         """
         cut = (np.diff(self.time) > 1.5 * self.T_s) | (np.diff(self.number) != 0)
-        stretch = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(cut) + 1]])
-        lines = np.array(applied_inputs(self.rows), dtype=np.float64)
-        for values, apart in zip(lines, self.rows_per_sample, strict=True):
-            if apart == 1:
-                continue
-            held = values.copy()
-            for first, end in pairwise(stretch):
-                before = first
-                for row in first + 1 + np.flatnonzero(np.diff(held[first:end])):
-                    begin = max(before, row - apart)
-                    values[begin : row + 1] = np.linspace(held[row - 1], held[row], row - begin + 1)
-                    before = row
+        rows, lines = np.arange(len(self.time)), np.array(applied_inputs(self.rows), dtype=np.float64)
+        for held, apart in zip(lines, self.rows_per_sample, strict=True):
+            ends = np.flatnonzero((np.diff(held) != 0) | cut) + 1
+            if len(ends):
+                begins = np.maximum(ends - np.where(cut[ends - 1], 1, apart), np.concatenate([[0], ends[:-1]]))
+                at, values = np.stack([begins, ends], axis=1), np.stack([held[ends - 1], held[ends]], axis=1)
+                held[:] = np.interp(rows, at.ravel(), values.ravel())
         return lines
 
 

@@ -315,8 +315,9 @@ class OnlineState:
         self.steps = int(about.get("steps", "0"))
 
 
-_SAVED = ("mean", "covariance", "noise", "physics", "recent", "width")
-_PRIOR = ("mean", "covariance", "noise", "physics", "block_noise", "block_slow")
+_FROM_PRIOR = ("mean", "covariance", "noise", "physics")
+_SAVED = (*_FROM_PRIOR, "recent", "width")
+_PRIOR = (*_FROM_PRIOR, "block_noise", "block_slow")
 
 
 def save_layer(layer: OnlineLayer, path: Path) -> None:

@@ -11,8 +11,9 @@ import pytest
 from dynssm_ros.identification.car import CarEstimate, prior_std
 from dynssm_ros.identification.noise import Noise, NoiseResponse, fit_noise, weights
 from dynssm_ros.identification.problem import IdentificationProblem, position, with_values
-from dynssm_ros.identification.windows import Hold, RecordedRows, SimulationWindows
+from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
 from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import load_track
