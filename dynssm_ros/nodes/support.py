@@ -141,8 +141,8 @@ def spin(node: Node) -> None:
     context as it was and waits again; a node that nothing else wakes would then wait for ever (4 of 240 idle nodes). So
     something wakes it every second, on a clock that simulated time does not stop.
 
-    What is there before the spinning begins stays, so the garbage collector need not look at it again: searching through all
-    libraries would hold a callback up by 20 ms.
+    What is there before the spinning begins stays, so the garbage collector need not search through it again. With the
+    search, the slowest answer at a swap of models took 23 ms, without it 13 ms.
     """
     gc.collect()
     gc.freeze()
