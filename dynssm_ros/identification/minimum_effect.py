@@ -45,7 +45,9 @@ def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable
         form = {name: about[name].neutral for name in candidate.shapes}
         places = [{LOCATION[0]: float(place)} for place in _PLACES] if candidate.local else [{}]
         left = np.median([_left(root * _column(problem, fit, effect, parameter, form | at), J, H) for at in places])
-        out[effect] = float(np.sqrt(needed / left) * unit(effect, parameter)) if left > _NOTHING else float("inf")
+        least = EFFECTS[effect].least(fit.car.vehicle.constants)
+        size = float(np.sqrt(needed / left) * unit(effect, parameter)) if left > _NOTHING else float("inf")
+        out[effect] = max(size, least)
     return out
 
 

@@ -410,12 +410,13 @@ class Search:
 
 
 def _is_little(refined: Refined) -> bool:
-    """Whether a cause of the car is nearer to neutral than what cars of another structure show."""
-    effect, name = refined.candidate.effect, refined.candidate.amplitudes[0]
-    least = EFFECTS[effect].LEAST
-    if not least or refined.candidate.only_in:
+    """Whether a cause of the car is nearer to neutral than what any car shows, or one of another structure."""
+    candidate, car = refined.candidate, refined.fit.car
+    about = EFFECTS[candidate.effect]
+    least = about.least(car.vehicle.constants)
+    if not least or candidate.only_in:
         return False
-    return abs(refined.fit.car.effects[effect][name] - EFFECTS[effect].PARAMETERS[name].neutral) < least
+    return about.amount({name: car.effects[candidate.effect][name] for name in candidate.amplitudes}) < least
 
 
 def _pays(refined: Refined) -> bool:

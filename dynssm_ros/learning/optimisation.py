@@ -180,7 +180,7 @@ class Optimisation:
     def _optimiser(self, share: float) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
         """The optimiser with ``share`` of the learning rate, and its schedule."""
         rate = share * self.settings.learning_rate
-        optimiser = torch.optim.AdamW(self.trained, lr=rate, weight_decay=self.settings.weight_decay)
+        optimiser = torch.optim.AdamW(self.trained, lr=rate, weight_decay=self.settings.weight_decay, fused=True)
         if self.settings.schedule == "constant":
             return optimiser, torch.optim.lr_scheduler.ConstantLR(optimiser, factor=1.0)
         floor = rate * _LEARNING_RATE_FLOOR

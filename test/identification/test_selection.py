@@ -86,9 +86,16 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     assert not _pays(replace(strong, delta_bic=DECISIVE_DELTA_BIC))
     assert not _pays(replace(strong, sure=2.9))
     assert not _pays(replace(strong, confirmation=None))
-    gripping = replace(strong, candidate=Candidate("grip", ("factor",)))
-    for factor, pays in ((0.85, True), (0.95, False)):
-        assert _pays(replace(gripping, fit=replace(fit, car=fit.car.with_effect("grip", {"factor": factor})))) == pays
+    centre_known = 0.02 * (ORCA.constants.l_f + ORCA.constants.l_r)
+    for effect, values, pays in (
+        ("grip", {"factor": 0.85}, True),
+        ("grip", {"factor": 0.95}, False),
+        ("odometry_lever_arm", {"x": -1.1 * centre_known}, True),
+        ("odometry_lever_arm", {"x": 0.9 * centre_known}, False),
+        ("odometry_lever_arm", {"x": 0.9 * centre_known, "y": 0.9 * centre_known}, True),
+    ):
+        sized = replace(strong, candidate=Candidate(effect, tuple(values)))
+        assert _pays(replace(sized, fit=replace(fit, car=fit.car.with_effect(effect, values)))) == pays
     one_day = replace(strong, candidate=replace(FEW[0], only_in=(1,)))
     assert _pays(one_day)
     assert not _pays(replace(one_day, confirmation=replace(everywhere, std=6.0)))

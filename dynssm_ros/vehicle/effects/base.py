@@ -111,7 +111,6 @@ class Effect(StageEffect):
         EFFECT_STATES: names of its own states. :func:`lagged` settles and integrates them.
         SENSOR: it changes what the sensors show; the car moves as without it.
         TYPICAL: how far it is off neutral in a car that is badly set up: just noticeable in ordinary laps, and large.
-        LEAST: how far it must be off neutral to be a cause; less is what a single-track car lacks anyway.
         DIRECTIONS: to which sides of neutral it is met in a car that can be driven; empty: those that its bounds admit.
     """
 
@@ -126,7 +125,6 @@ class Effect(StageEffect):
     SENSOR: ClassVar[bool] = False
     TYPICAL: ClassVar[tuple[float, float]] = (0.0, 0.0)
     DIRECTIONS: ClassVar[tuple[float, ...]] = ()
-    LEAST: ClassVar[float] = 0.0
 
     @classmethod
     def variants(cls) -> tuple[tuple[str, ...], ...]:
@@ -166,6 +164,11 @@ class Effect(StageEffect):
     def unusable(cls, constants: Constants) -> str | None:
         """What is wrong with a car of these constants for the effect to be able to act; ``None`` if nothing is."""
         return None
+
+    @classmethod
+    def least(cls, constants: Constants) -> float:
+        """How far it must be off neutral to be a cause in a car of these constants; less is in any car."""
+        return 0.0
 
     @property
     def parameters(self) -> dict[str, Array]:

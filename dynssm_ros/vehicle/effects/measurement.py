@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from dynssm_ros.vehicle.effects.base import Effect, Parameter, lagged
-from dynssm_ros.vehicle.single_track import Array, Motion, State, at_least
+from dynssm_ros.vehicle.single_track import Array, Constants, Motion, State, at_least
+
+_CENTRE_KNOWN = 0.02  # of the wheelbase
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,11 @@ class OdometryLeverArm(MeasurementEffect):
     VARIANTS = (("x",), ("x", "y"))
     x: Array = 0.0
     y: Array = 0.0
+
+    @classmethod
+    def least(cls, constants: Constants) -> float:
+        """How well anybody knows where the centre of gravity is."""
+        return _CENTRE_KNOWN * (constants.l_f + constants.l_r)
 
     def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
         """Velocity at the sensor."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, SLOWEST, Effect, Parameter, lagged, section
-from dynssm_ros.vehicle.single_track import Array, Motion, at_least
+from dynssm_ros.vehicle.single_track import Array, Constants, Motion, at_least
 
 _LEAST_GRIP = 0.1  # of the nominal, however far a drift has gone
 _LEAST_SHARE = 0.05  # squared share of the lateral force that the longitudinal one leaves at least
@@ -33,9 +33,13 @@ class Grip(Effect):
     }
     VARIANTS = (("factor",), ("factor", "similarity"))
     TYPICAL = (0.13, 0.3)
-    LEAST = 0.1  # the load that leans to one side takes that from the grip of an axle with two wheels
     factor: Array = 1.0
     similarity: Array = 0.0
+
+    @classmethod
+    def least(cls, constants: Constants) -> float:
+        """What the load that leans to one side takes from the grip of an axle with two wheels."""
+        return 0.1
 
     def slip(self, xp: Any, q: Motion) -> None:
         """Scales the slip angles at which the tyres are."""

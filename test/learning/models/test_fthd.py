@@ -14,7 +14,7 @@ import torch
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.ddm import DDM
-from dynssm_ros.learning.models.fthd import physics_loss
+from dynssm_ros.learning.models.fthd import consecutive, physics_loss
 from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import Trained, checkpoints, train
 from dynssm_ros.runtime.artifact import Normalisation
@@ -48,12 +48,27 @@ def with_coefficients(config: ModelConfig, vehicle: Vehicle, theta: np.ndarray) 
 def loss_of(model: DDM, windows: np.ndarray, unit: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> float:
     pairs = torch.tensor(windows, dtype=torch.float32)
     with torch.no_grad():
-        return physics_loss(model, pairs, model(pairs[:, 1:]), torch.tensor(unit)).item()
+        return physics_loss(model, pairs, *consecutive(model, pairs), torch.tensor(unit)).item()
 
 
 def test_the_car_that_drove_agrees_with_its_physics(make_ddm: MakeConfig, short: Recording, orca: Vehicle) -> None:
     windows = np.stack([short.matrix[k : k + 5] for k in range(50, 90)])
     assert loss_of(with_coefficients(make_ddm(), orca, orca.nominal), windows) < 1e-5
+
+
+def test_neighbouring_windows_are_predicted_as_each_alone(
+    make_ddm: MakeConfig, short: Recording, orca: Vehicle
+) -> None:
+    torch.manual_seed(0)
+    model = DDM(make_ddm(), orca, UNIT)
+    pairs = torch.tensor(np.stack([short.matrix[k : k + 5] for k in range(50, 90)]), dtype=torch.float32)
+    with torch.no_grad():
+        together = consecutive(model, pairs)
+        for one, rows in zip(together, (pairs[:, :-1], pairs[:, 1:]), strict=True):
+            alone = model(rows)
+            assert one.increment.numpy() == pytest.approx(alone.increment.numpy(), rel=1e-5, abs=1e-7)
+            assert one.theta.numpy() == pytest.approx(alone.theta.numpy(), rel=1e-5)
+            assert one.deviation is alone.deviation is None
 
 
 def test_the_loss_is_what_two_steps_of_another_car_disagree(
