@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
@@ -114,23 +115,53 @@ class Collector(Node):
             return self.changed.wait_for(condition, timeout)
 
 
+_RESERVED: deque[socket.socket] = deque(maxlen=20)
+"""What keeps other runs on this host out of the domains of the last runs of this process."""
+
+
 def isolated_environment() -> dict[str, str]:
-    """The environment with a random ROS domain on this host only, so that parallel runs do not hear each other."""
-    domains = [domain for domain in range(1, 101) if _is_free(domain)] or [random.SystemRandom().randrange(1, 101)]
-    return os.environ | {
-        "ROS_DOMAIN_ID": str(random.SystemRandom().choice(domains)),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }
+    """The environment with a ROS domain of its own on this host, so that parallel runs do not hear each other."""
+    domains = list(range(1, 101))
+    random.SystemRandom().shuffle(domains)
+    domain = next(filter(_reserve, domains), domains[0])
+    return os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
-def _is_free(domain: int) -> bool:
-    """Whether nobody on this host takes part in ``domain``: its first participant holds a port of its own (DDSI-RTPS)."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("", 7400 + 250 * domain + 10))
-        except OSError:
-            return False
+def _reserve(domain: int) -> bool:
+    """Takes ``domain`` if nobody else has reserved it, nor takes part in it.
+
+    Its first participant holds the port 10 of the domain's 250 (DDSI-RTPS); the last one, which none of them uses, says
+    that it is reserved, also while no participant is there yet.
+    """
+    ports = 7400 + 250 * domain
+    try:
+        reserved = _bound(ports + 249)
+    except OSError:
+        return False
+    try:
+        _bound(ports + 10).close()
+    except OSError:
+        reserved.close()
+        return False
+    if len(_RESERVED) == _RESERVED.maxlen:
+        _RESERVED.popleft().close()
+    _RESERVED.append(reserved)
     return True
+
+
+def _bound(port: int) -> socket.socket:
+    """A socket that holds a UDP port of this host.
+
+    Raises:
+        OSError: somebody has it.
+    """
+    holder = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        holder.bind(("", port))
+    except OSError:
+        holder.close()
+        raise
+    return holder
 
 
 @contextmanager

@@ -26,14 +26,16 @@ PERIOD = 20_000_000  # ns
 
 
 def call(collector: Collector, service: Any, name: str, **request: Any) -> Any:
-    """What a service answers."""
+    """What a service answers that may be asked twice: an answer is lost where its server has not yet met the client."""
     client = collector.create_client(service, name)
     assert client.wait_for_service(20.0)
-    done = threading.Event()
-    future = client.call_async(service.Request(**request))
-    future.add_done_callback(lambda _: done.set())
-    assert done.wait(20.0)
-    return future.result()
+    for _ in range(4):
+        done = threading.Event()
+        future = client.call_async(service.Request(**request))
+        future.add_done_callback(lambda _, done=done: done.set())
+        if done.wait(10.0):
+            return future.result()
+    raise AssertionError(f"{name}: no answer to any of four requests")
 
 
 class Car:

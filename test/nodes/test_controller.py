@@ -190,7 +190,7 @@ def test_the_car_stops_without_its_controller_and_the_controller_brakes_without_
     controller.kill()
     assert stand.wait_for(lambda: speed() < 0.05), "without commands the car brakes until it stands"
     stand.control(line="centre", speed_scale=0.5, rate=rate, watchdog=1.0)
-    assert stand.wait_for(lambda: speed() > 0.5), "a controller that was started again drives on"
+    assert stand.wait_for(lambda: speed() > 0.5), f"a controller that was started again drives on: {stand.told[-1]}"
     simulator.kill()
     assert stand.diagnosed("/vehicle/odometry: silent for")
     assert stand.wait_for(lambda: stand.newest[0] == load_vehicle("orca").inputs.throttle[0])

@@ -92,3 +92,10 @@ def test_a_domain_in_use_is_not_drawn_again() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
         participant.bind(("", 7400 + 250 * domain + 10))
         assert all(int(isolated_environment()["ROS_DOMAIN_ID"]) != domain for _ in range(200))
+
+
+def test_a_domain_is_reserved_before_anybody_takes_part_in_it() -> None:
+    domain = isolated_environment()["ROS_DOMAIN_ID"]
+    of_another_process = f"from benchmarks.live_run import _reserve; print(_reserve({domain}))"
+    asked = subprocess.run([sys.executable, "-c", of_another_process], capture_output=True, text=True, check=True)
+    assert asked.stdout.strip() == "False"
