@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,6 +27,13 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
 H = 5
 ACTUATORS = ("r_fb", "delta_fb", "r_cmd", "delta_cmd")
+TF2_ROS = """
+from geometry_msgs.msg import TransformStamped
+
+class TransformBroadcaster:
+    def __init__(self, node):
+        self.sendTransform = node.create_publisher(TransformStamped, "/stand_in_of_tf", 10).publish
+"""
 
 
 def predictions(model: Path, bag: Path) -> dict[int, Prediction]:
@@ -222,6 +230,45 @@ def test_the_predicted_car_and_its_way_are_drawn(start_car) -> None:
     vehicle = load_vehicle("orca").constants
     assert body.points[0].x - body.points[2].x == pytest.approx(vehicle.l_f + vehicle.l_r), "from axle to axle"
     assert len(way.points) == 10
+
+
+def test_the_predicted_pose_is_sent_to_tf(start_car, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a stand-in of tf2_ros, which is not among the wheels."""
+    from geometry_msgs.msg import TransformStamped
+
+    (tmp_path / "tf2_ros.py").write_text(TF2_ROS)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    car = start_car(tf=True)
+    heard: list[TransformStamped] = []
+    car.collector.create_subscription(TransformStamped, "/stand_in_of_tf", heard.append, 10)
+
+    def comes() -> bool:
+        car.drive_until_answered()
+        return car.collector.wait_for(lambda: bool(heard), 0.1)
+
+    assert any(comes() for _ in range(50))
+    sent = heard[-1]
+    assert (sent.header.frame_id, sent.child_frame_id) == ("map", "base_link_predicted")
+    assert sent.transform.translation.x == pytest.approx(0.02, abs=0.005), "a step of 20 ms at 1 m/s from the origin"
+    assert sent.transform.rotation.w == pytest.approx(1.0, abs=1e-3)
+
+
+def test_parameters_are_listed_described_and_read(start_car, small_model: Path, call_service) -> None:
+    """What `ros2 param list`, `describe` and `get` ask a node for."""
+    from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+
+    car = start_car(wait=False)
+    names = call_service(car.collector, ListParameters, "/dynssm/list_parameters").result.names
+    assert {"model", "model_root", "signals", "max_age", "online", "horizon", "tf", "use_sim_time"} <= set(names)
+    assert "qos_overrides./dynssm/prediction.publisher.reliability" in names
+    asked = ["model", "max_age", "tf"]
+    described = call_service(car.collector, DescribeParameters, "/dynssm/describe_parameters", names=asked).descriptors
+    assert all(one.description.endswith(".") for one in described)
+    (limits,) = described[1].floating_point_range
+    assert (limits.from_value, limits.to_value) == (0.01, 10.0)
+    assert [one.read_only for one in described] == [False, True, True]
+    values = call_service(car.collector, GetParameters, "/dynssm/get_parameters", names=asked).values
+    assert (values[0].string_value, values[1].double_value, values[2].bool_value) == (str(small_model), 0.2, False)
 
 
 def test_the_pose_of_a_prediction_claims_no_certainty(start_car) -> None:
