@@ -115,6 +115,12 @@ class Collector(Node):
             return self.changed.wait_for(condition, timeout)
 
 
+def is_busy() -> bool:
+    """Whether others keep all cores busy, so that a live run is not about the machine's speed."""
+    running = int(Path("/proc/loadavg").read_text(encoding="utf-8").split()[3].partition("/")[0])
+    return running > (os.cpu_count() or 1)
+
+
 _RESERVED: deque[socket.socket] = deque(maxlen=20)
 """What keeps other runs on this host out of the domains of the last runs of this process."""
 

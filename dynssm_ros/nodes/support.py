@@ -34,8 +34,8 @@ NodeType = TypeVar("NodeType", bound=Node)
 
 _AWAKE = 1.0  # s after which a spinning node looks whether it is to end
 
-# sensor data, but deep enough that a pause of the process (a model swap, a busy core) loses nothing
-SENSOR_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=100)
+# sensor data, but deep enough that a pause of the process (a model swap, a busy core) loses nothing: 10 s at 100 Hz
+SENSOR_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1000)
 
 
 # what the nodes publish: who asks for best effort gets that
