@@ -16,7 +16,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from dynssm_ros import load_vehicle
-from dynssm_ros.nodes.support import SENSOR_QOS, run
+from dynssm_ros.nodes.support import NEWEST_QOS, SENSOR_QOS, run
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose
@@ -39,7 +39,7 @@ class OwnMpc(Node):
         self.solver = self._program()
         self.commands = self.create_publisher(JointState, "/vehicle/actuator_command", SENSOR_QOS)
         self.create_subscription(JointState, "/dynssm/parameters", self._adapted, SENSOR_QOS)
-        self.create_subscription(Odometry, "/vehicle/odometry", self._odometry, SENSOR_QOS)
+        self.create_subscription(Odometry, "/vehicle/odometry", self._odometry, NEWEST_QOS)
 
     def _program(self) -> ca.Function:
         """The plan as a function of state, last command, coefficients, points to pass and a first guess."""

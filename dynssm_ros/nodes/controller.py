@@ -15,7 +15,6 @@ from typing import Any, get_args
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.control.live import LiveController
@@ -23,7 +22,17 @@ from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.nodes.managed import ManagedNode
-from dynssm_ros.nodes.support import SENSOR_QOS, actuators, choose, describe, diagnostics, output, relative, run
+from dynssm_ros.nodes.support import (
+    NEWEST_QOS,
+    SENSOR_QOS,
+    actuators,
+    choose,
+    describe,
+    diagnostics,
+    output,
+    relative,
+    run,
+)
 from dynssm_ros.runtime.health import Health, Level
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.history import Refusal
@@ -34,8 +43,6 @@ from dynssm_ros.vehicle import State, load_vehicle
 from dynssm_ros.vehicle.kinematics import Pose
 
 _STEPS = (2, 100)  # of a horizon
-# a controller that was held up goes on from the newest odometry
-_NEWEST = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
 
 
 class ControllerNode(ManagedNode):
@@ -67,7 +74,7 @@ class ControllerNode(ManagedNode):
         # when several messages wait, the executor serves subscriptions in this order
         self.create_subscription(Odometry, relative(PREDICTION_TOPIC), self._on_prediction, SENSOR_QOS)
         self.create_subscription(JointState, relative(PARAMETERS_TOPIC), self._on_parameters, SENSOR_QOS)
-        self.create_subscription(Odometry, relative(ODOMETRY_TOPIC), self._on_odometry, _NEWEST)
+        self.create_subscription(Odometry, relative(ODOMETRY_TOPIC), self._on_odometry, NEWEST_QOS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(self._driver.period / 1e9 / self._rate, self._watch, clock=steady)
         self.create_timer(self._period, self._diagnose, clock=steady)

@@ -36,7 +36,8 @@ _AWAKE = 1.0  # s after which a spinning node looks whether it is to end
 
 # sensor data, but deep enough that a pause of the process (a model swap, a busy core) loses nothing: 10 s at 100 Hz
 SENSOR_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1000)
-
+# for a controller: one that was held up goes on from the newest odometry
+NEWEST_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
 
 # what the nodes publish: who asks for best effort gets that
 _OUTPUT_QOS = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=100)
