@@ -90,6 +90,8 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     for effect, values, pays in (
         ("grip", {"factor": 0.85}, True),
         ("grip", {"factor": 0.95}, False),
+        ("load_transfer", {"height": -0.011}, True),
+        ("load_transfer", {"height": -0.009}, False),
         ("odometry_lever_arm", {"x": -1.1 * centre_known}, True),
         ("odometry_lever_arm", {"x": 0.9 * centre_known}, False),
         ("odometry_lever_arm", {"x": 0.9 * centre_known, "y": 0.9 * centre_known}, True),

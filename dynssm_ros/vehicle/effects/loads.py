@@ -75,6 +75,11 @@ class LoadTransfer(Effect):
     DIRECTIONS = (1.0,)  # a car that can be driven
     height: Array = 0.0
 
+    @classmethod
+    def least(cls, constants: Constants) -> float:
+        """How well anybody knows the height of the centre of gravity."""
+        return 0.01
+
     def inputs(self, xp: Any, q: Motion) -> None:
         """Raises the centre of gravity, from the ground at least."""
         q.h_cg = at_least(q.h_cg + self.height * (q.l_f + q.l_r), 0.0)
