@@ -115,39 +115,28 @@ class Collector(Node):
             return self.changed.wait_for(condition, timeout)
 
 
-def is_busy() -> bool:
-    """Whether others keep all cores busy, so that a live run is not about the machine's speed."""
-    running = int(Path("/proc/loadavg").read_text(encoding="utf-8").split()[3].partition("/")[0])
-    return running > (os.cpu_count() or 1)
-
-
 _RESERVED: deque[socket.socket] = deque(maxlen=20)
 """What keeps other runs on this host out of the domains of the last runs of this process."""
 
 
 def isolated_environment() -> dict[str, str]:
     """The environment with a ROS domain of its own on this host, so that parallel runs do not hear each other."""
-    domains = list(range(1, 101))
-    random.SystemRandom().shuffle(domains)
+    domains = random.SystemRandom().sample(range(1, 101), 100)
     domain = next(filter(_reserve, domains), domains[0])
     return os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
 def _reserve(domain: int) -> bool:
-    """Takes ``domain`` if nobody else has reserved it, nor takes part in it.
+    """Takes ``domain`` if nobody else takes part in it, nor has reserved it.
 
     Its first participant holds the port 10 of the domain's 250 (DDSI-RTPS); the last one, which none of them uses, says
     that it is reserved, also while no participant is there yet.
     """
     ports = 7400 + 250 * domain
     try:
+        _bound(ports + 10).close()
         reserved = _bound(ports + 249)
     except OSError:
-        return False
-    try:
-        _bound(ports + 10).close()
-    except OSError:
-        reserved.close()
         return False
     if len(_RESERVED) == _RESERVED.maxlen:
         _RESERVED.popleft().close()

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,6 +42,19 @@ def predictions(model: Path, bag: Path) -> dict[int, Prediction]:
     predictor = Predictor(OnnxModel(open_artifact(model)), load_signal_map("default"))
     with open_bag(bag) as opened:
         return {o.outcome.stamp: o.outcome for o in replay(opened, predictor) if isinstance(o.outcome, Prediction)}
+
+
+def heard(car: Any, msgtype: Any, topic: str, qos: Any) -> Any:
+    """The newest message of a topic that the node publishes beside its predictions, after driving until there is one."""
+    messages: list[Any] = []
+    car.collector.create_subscription(msgtype, topic, messages.append, qos)
+
+    def comes() -> bool:
+        car.drive_until_answered()
+        return car.collector.wait_for(lambda: bool(messages), 0.1)
+
+    assert any(comes() for _ in range(50))
+    return messages[-1]
 
 
 @pytest.mark.parametrize(("rate", "speed"), [(50.0, 1.0), (100.0, 1.0), (100.0, 2.0)])
@@ -216,15 +230,7 @@ def test_the_predicted_car_and_its_way_are_drawn(start_car) -> None:
     from visualization_msgs.msg import MarkerArray
 
     car = start_car(horizon=0.2, markers=True)
-    drawn: list[MarkerArray] = []
-    car.collector.create_subscription(MarkerArray, "/dynssm/markers", drawn.append, 10)
-
-    def comes() -> bool:
-        car.drive_until_answered()
-        return car.collector.wait_for(lambda: bool(drawn), 0.1)
-
-    assert any(comes() for _ in range(50))
-    body, way = drawn[-1].markers
+    body, way = heard(car, MarkerArray, "/dynssm/markers", 10).markers
     assert (body.header.frame_id, body.id, way.id) == ("map", 0, 1)
     assert body.pose.position.x == way.points[0].x, "the way begins at the predicted car"
     vehicle = load_vehicle("orca").constants
@@ -239,15 +245,7 @@ def test_the_predicted_pose_is_sent_to_tf(start_car, tmp_path: Path, monkeypatch
     (tmp_path / "tf2_ros.py").write_text(TF2_ROS)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
     car = start_car(tf=True)
-    heard: list[TransformStamped] = []
-    car.collector.create_subscription(TransformStamped, "/stand_in_of_tf", heard.append, 10)
-
-    def comes() -> bool:
-        car.drive_until_answered()
-        return car.collector.wait_for(lambda: bool(heard), 0.1)
-
-    assert any(comes() for _ in range(50))
-    sent = heard[-1]
+    sent = heard(car, TransformStamped, "/stand_in_of_tf", 10)
     assert (sent.header.frame_id, sent.child_frame_id) == ("map", "base_link_predicted")
     assert sent.transform.translation.x == pytest.approx(0.02, abs=0.005), "a step of 20 ms at 1 m/s from the origin"
     assert sent.transform.rotation.w == pytest.approx(1.0, abs=1e-3)
@@ -277,16 +275,9 @@ def test_the_pose_of_a_prediction_claims_no_certainty(start_car) -> None:
     from dynssm_ros.nodes.support import SENSOR_QOS
 
     car = start_car()
-    heard: list[Odometry] = []
-    car.collector.create_subscription(Odometry, "/dynssm/prediction", heard.append, SENSOR_QOS)
-
-    def comes() -> bool:
-        car.drive_until_answered()
-        return car.collector.wait_for(lambda: bool(heard), 0.1)
-
-    assert any(comes() for _ in range(50))
-    np.testing.assert_array_equal(np.reshape(heard[-1].pose.covariance, (6, 6)), UNKNOWN * np.eye(6))
-    stated = np.diag(np.reshape(heard[-1].twist.covariance, (6, 6)))
+    prediction = heard(car, Odometry, "/dynssm/prediction", SENSOR_QOS)
+    np.testing.assert_array_equal(np.reshape(prediction.pose.covariance, (6, 6)), UNKNOWN * np.eye(6))
+    stated = np.diag(np.reshape(prediction.twist.covariance, (6, 6)))
     assert (stated[[0, 1, 5]] < 1.0).all()
     np.testing.assert_array_equal(stated[2:5], UNKNOWN)
 

@@ -127,15 +127,13 @@ def test_effects_are_added_to_the_car_and_to_what_is_measured_of_it(start_pit: S
 
 
 def test_predictor_answers_each_odometry_message_of_the_simulated_car(start_pit: StartPit, small_model: Path) -> None:
-    """At half of real time: a process that a busy machine holds up for a second or two hears everything afterwards."""
     with ExitStack() as stack:
         stack.enter_context(predictor_process(small_model, {"diagnostics_period": 0.1}, os.environ.copy()))
-        pit = start_pit("noise:=[0.01, 0.005, 0.05]", "plant:=double_track", "rate:=0.5")
-        assert pit.wait_for(lambda: min(len(pit.run.predicted), len(pit.odometry)) >= 100, 60.0)
+        pit = start_pit("noise:=[0.01, 0.005, 0.05]", "plant:=double_track", "rate:=2.0")
+        assert pit.wait_for(lambda: min(len(pit.run.predicted), len(pit.odometry)) >= 100)
         heard = {header_stamp_ns(m) for m in pit.odometry}
         first, last = min(pit.run.predicted), max(pit.run.predicted)
-        lost = sorted(set(range(first, last + 1, PERIOD)) - set(pit.run.predicted))
-        assert not lost, pit.run.diagnostics[-2:]
+        assert set(range(first, last + 1, PERIOD)) == set(pit.run.predicted), pit.run.diagnostics[-2:]
         actual = {header_stamp_ns(m): m.twist.twist.linear.x for m in pit.odometry}
         errors = [state[0] - actual[stamp] for stamp, state in pit.run.predicted.items() if stamp in actual]
         assert len(heard) > 95
