@@ -130,6 +130,9 @@ def _member(fabric: Any, function: Callable[[ProcessGroup, NamedProgress, Any], 
     """What each process does."""
     torch.set_num_threads(1)
     group = FabricProcessGroup(fabric)
-    result = function(group, lambda *news: told.put(news) if group.rank == 0 else None, pickle.loads(what))  # noqa: S301
+    try:
+        result = function(group, lambda *news: told.put(news) if group.rank == 0 else None, pickle.loads(what))  # noqa: S301
+    finally:
+        torch.distributed.destroy_process_group()  # its threads, if they outlive the interpreter, abort the process
     if group.rank == 0:
         told.put(pickle.dumps(result))
