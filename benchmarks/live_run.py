@@ -278,9 +278,21 @@ def run_live(
                 first = first or message.log_time
                 if progress is not None and len(run.sent) % 25 == 0:
                     progress(round((message.log_time - first) / 1e9), round(min(duration, 1e6)))
-        last = max(run.sent, default=0) + run.T_s
-        collector.wait_for(lambda: last in run.predicted, _DRAIN)
+        wait_for_the_last(run, collector.wait_for)
     return run
+
+
+def wait_for_the_last(run: LiveRun, wait_for: Callable[[Callable[[], bool], float], bool]) -> None:
+    """Waits until the last message is answered, or nothing is for a while: a predictor that was held up has a queue.
+
+    Args:
+        run: all of whose messages are sent.
+        wait_for: as :meth:`Collector.wait_for`.
+    """
+    last, answered = max(run.sent, default=0) + run.T_s, -1
+    while last not in run.predicted and len(run.predicted) > answered:
+        answered = len(run.predicted)
+        wait_for(lambda: last in run.predicted, _DRAIN)
 
 
 def _stamp_of(raw: bytes) -> int:

@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from nav_msgs.msg import Odometry
 
-from benchmarks.live_run import LiveRun, collecting, isolated_environment, predictor_process
+from benchmarks.live_run import (
+    Collector,
+    LiveRun,
+    collecting,
+    isolated_environment,
+    predictor_process,
+    wait_for_the_last,
+)
+from dynssm_ros.configuration import config_root
+from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PREDICTION_TOPIC
 
@@ -23,13 +35,18 @@ def _player(*parameters: str) -> list[str]:
     return [sys.executable, "-m", "dynssm_ros.nodes.player", "--ros-args", *arguments]
 
 
+def wait_for_predictor(collector: Collector) -> None:
+    """Until it publishes."""
+    listening = threading.Event()
+    while not collector.count_publishers(PREDICTION_TOPIC):
+        listening.wait(0.02)  # nobody sets it: discovery raises no event in rclpy
+
+
 def test_player_and_predictor_work_as_separate_processes(small_model: Path, laps_bag: Path) -> None:
     os.environ.update(isolated_environment())
     run = LiveRun(20_000_000)
     with predictor_process(small_model, {}, os.environ.copy()), collecting(run) as collector:
-        listening = threading.Event()
-        while not collector.count_publishers(PREDICTION_TOPIC):
-            listening.wait(0.02)  # nobody sets it: discovery raises no event in rclpy
+        wait_for_predictor(collector)
         player = subprocess.Popen(_player(f"bag:={laps_bag}", "rate:=4.0"), env=os.environ.copy())
         assert player.wait(60) == 0
         last = 1_000_000_000_000_000_000 + 20_000_000_000 + run.T_s
@@ -40,10 +57,7 @@ def test_player_and_predictor_work_as_separate_processes(small_model: Path, laps
 
 def test_a_part_of_a_bag_is_played_with_its_clock(laps_bag: Path) -> None:
     """The last second of the odometry alone; /clock has the times at which it was recorded."""
-    from nav_msgs.msg import Odometry
     from rosgraph_msgs.msg import Clock
-
-    from dynssm_ros.nodes.support import SENSOR_QOS
 
     os.environ.update(isolated_environment())
     stamps: list[int] = []
@@ -85,6 +99,51 @@ def test_a_bag_of_types_that_are_not_installed_names_the_way_out(putnam: Path) -
     assert result.returncode == 1
     assert "raptor_dbw_msgs" in result.stderr
     assert "dynssm extract" in result.stderr
+
+
+def test_on_a_busy_computer_a_predictor_that_is_held_up_for_two_seconds_answers_everything(
+    small_model: Path, laps_bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With ``config/fastdds.xml``, and in processes of their own, for it is read once in each."""
+    os.environ.update(isolated_environment())
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(config_root() / "fastdds.xml"))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")  # LOCALHOST adds transports as they usually are
+    last = 1_000_000_000_000_000_000 + 20_000_000_000
+    run, played = LiveRun(20_000_000, sent={last: 0.0}), []
+    with predictor_process(small_model, {}, os.environ.copy()) as process, collecting(run) as collector:
+
+        def on_odometry(message: Odometry) -> None:
+            with collector.changed:
+                played.append(header_stamp_ns(message))
+                collector.changed.notify_all()
+
+        collector.create_subscription(Odometry, ODOMETRY_TOPIC, on_odometry, SENSOR_QOS)
+        wait_for_predictor(collector)
+        player = subprocess.Popen(_player(f"bag:={laps_bag}", "rate:=4.0"), env=os.environ.copy())
+        assert collector.wait_for(lambda: len(run.predicted) > 200, 30.0)
+        process.send_signal(signal.SIGSTOP)
+        held = len(played)
+        assert collector.wait_for(lambda: len(played) > held + 400, 30.0)  # at 200 a second
+        process.send_signal(signal.SIGCONT)
+        assert player.wait(60) == 0
+        wait_for_the_last(run, collector.wait_for)
+    assert len(run.predicted) == 1001 - 4
+
+
+def test_a_run_waits_for_a_predictor_that_was_held_up_as_long_as_it_answers() -> None:
+    run = LiveRun(10, sent=dict.fromkeys((100, 110, 120, 130, 140), 0.0))
+
+    def wait_for(condition: Callable[[], bool], _timeout: float) -> bool:
+        if len(run.predicted) < answers:  # one in each while
+            run.predicted[110 + 10 * len(run.predicted)] = (0.0, 0.0, 0.0)
+        return condition()
+
+    answers = 3
+    wait_for_the_last(run, wait_for)
+    assert run.missing() == [130, 140]
+    answers = 5
+    wait_for_the_last(run, wait_for)
+    assert run.missing() == []
 
 
 def test_a_domain_in_use_is_not_drawn_again() -> None:
