@@ -17,6 +17,7 @@ from matplotlib.patches import Polygon
 
 from dynssm_ros.arrays import Mask, Vector
 from dynssm_ros.control.race import Race
+from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.evaluation.coefficients import coefficient_label
 from dynssm_ros.files import replacing
 from dynssm_ros.reporting.evaluation_figures import MEASURED, STYLE, model_colours
@@ -124,7 +125,7 @@ def _cars(races: Sequence[Race], axes: Axes, changed: Mask) -> list[_Car]:
 
 def _curves(races: Sequence[Race], strips: Sequence[Axes], name: str, time: Vector, truth: Vector) -> list[_Curve]:
     """The coefficient ``name`` as planned with, beside its ``truth`` over ``time`` (s), then speed and room."""
-    colours, column = model_colours([race.name for race in races]), COEFFICIENTS.index(name)
+    colours = model_colours([race.name for race in races])
     strips[0].set_title(f"{coefficient_label(name)} planned with; dashed: of the car", loc="left", fontsize=9)
     strips[1].set_title("speed (m/s)", loc="left", fontsize=9)
     strips[2].set_title("from the car's centre to the border (m)", loc="left", fontsize=9)
@@ -135,7 +136,7 @@ def _curves(races: Sequence[Race], strips: Sequence[Axes], name: str, time: Vect
     curves = []
     for race, width in zip(races, widths(len(races)), strict=True):
         room = race.course.track.room(race.s, race.lateral)
-        shown = (race.theta[:, column], np.hypot(*race.state[:, :2].T), room)
+        shown = (_planned(race, name), np.hypot(*race.state[:, :2].T), room)
         for strip, values in zip(strips, shown, strict=True):
             (line,) = strip.plot(race.time, values, color=colours[race.name], lw=width)
             curves.append(_Curve(line, race.time, values))
@@ -143,6 +144,12 @@ def _curves(races: Sequence[Race], strips: Sequence[Axes], name: str, time: Vect
     for strip in strips:
         strip.set(xlim=(0.0, float(time[-1])), ylim=strip.get_ylim())
     return [*curves, _Curve(line, time, truth)]
+
+
+def _planned(race: Race, name: str) -> Vector:
+    """The coefficient ``name`` that a car plans with; effects that the true model knows of count as in the driven car."""
+    planned = race.theta[:, COEFFICIENTS.index(name)]
+    return planned if race.name != TRUE else driven_coefficients(race).get(name, planned)
 
 
 def _most_changed(race: Race) -> tuple[str, Vector]:

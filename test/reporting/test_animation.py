@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from dynssm_ros.api import race
-from dynssm_ros.reporting.animation import _changed_stretch, _most_changed, animate
+from dynssm_ros.reporting.animation import _changed_stretch, _most_changed, _planned, animate
 
 PATCH = {"grip_patch": {"factor": 0.8, "centre": 0.5, "length": 0.3}}
 
@@ -29,6 +29,8 @@ def test_belief_is_shown_against_what_is_true(races):
     nominal = races[0].course.vehicle.coefficients[name].nominal
     assert name in ("D_f", "D_r")
     assert np.nanmin(truth) == pytest.approx(0.8 * nominal, rel=1e-3)  # its ends are smooth
+    np.testing.assert_array_equal(_planned(races[0], name), truth)
+    assert set(_planned(races[1], name)) == {nominal}
     (healthy,) = race("orca", "club", ["true"], plant="euler", line="centre", speed_scale=0.6)
     assert not _changed_stretch(healthy, *_most_changed(healthy)).any()
     assert set(_most_changed(healthy)[1]) == {healthy.course.vehicle.coefficients["D_f"].nominal}
