@@ -8,7 +8,7 @@ by chance, so that the choice is made anew with the causes that were found.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -87,31 +87,25 @@ def search_causes(
 
     on_progress("choosing how the model steps")
     options = [one for one in _OPTIONS if integrator in (None, one.integrator)]
-    windows_of = {}
-    fits = {}
-    for one in options:
-        windows_of[one], fits[one] = _stepped(windows, car, one)
-    first = closest(fits)
-    found = search(windows_of[first])
+    stepped = {one: _stepped(windows, car, one) for one in options}
+    first = _closest({one: (problem, fit) for one, (_, problem, fit) in stepped.items()})
+    found = search(stepped[first][0])
     fit = found.selection.fit
-    problems = {
-        one: found.problem if one == first else IdentificationProblem(windows_of[one], known, found.problem.tempering)
-        for one in options
-    }
-    last = closest(
-        {
-            one: _with_lag(problem, fit if one == first else problem.fit(fit.car, fit.free))
-            for one, problem in problems.items()
-        }
-    )
-    return found if last == first else search(windows_of[last], fit)
+    fits = {first: (found.problem, fit)}
+    for one in options:
+        if one != first:
+            problem = IdentificationProblem(stepped[one][0], known, found.problem.tempering)
+            fits[one] = problem, problem.fit(fit.car, fit.free)
+    last = _closest({one: fits[one] for one in options})
+    return found if last == first else search(stepped[last][0], fit)
 
 
-def _stepped(windows: SimulationWindows, car: CarEstimate, stepping: Stepping) -> tuple[SimulationWindows, Fit]:
-    """The windows in steps that are short enough for the recalibrated car too, and its fit to some of them.
+def _stepped(
+    windows: SimulationWindows, car: CarEstimate, stepping: Stepping
+) -> tuple[SimulationWindows, IdentificationProblem, Fit]:
+    """The windows in steps that are short enough for the recalibrated car too; some of them, and that car's fit to these.
 
-    That car may be much stiffer than the one of the file, and a simulation whose steps are too long for it runs away. Its
-    steering may lag.
+    That car may be much stiffer than the one of the file, and a simulation whose steps are too long for it runs away.
     """
     integrator, hold = stepping
     windows = replace(windows, hold=hold)
@@ -123,7 +117,14 @@ def _stepped(windows: SimulationWindows, car: CarEstimate, stepping: Stepping) -
     if finer.substeps > trial.substeps:
         trial, problem = finer, IdentificationProblem(finer, car.as_known)
         fit = problem.fit(fit.car, ())
-    return replace(windows, integrator=integrator, substeps=trial.substeps), _with_lag(problem, fit)
+    return replace(windows, integrator=integrator, substeps=trial.substeps), problem, fit
+
+
+def _closest(fits: Mapping[Stepping, tuple[IdentificationProblem, Fit]]) -> Stepping:
+    """The steps in which the car, with steering that may lag, is closest to the data; those alone if there are no others."""
+    if len(fits) == 1:
+        return next(iter(fits))
+    return closest({one: _with_lag(problem, fit) for one, (problem, fit) in fits.items()})
 
 
 def _with_lag(problem: IdentificationProblem, fit: Fit) -> Fit:
