@@ -29,7 +29,15 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
 
 from benchmarks.fuzz import Traffic
-from benchmarks.live_run import Collector, LiveRun, check_running, collecting, isolated_environment, predictor_process
+from benchmarks.live_run import (
+    Collector,
+    LiveRun,
+    check_running,
+    collecting,
+    isolated_environment,
+    predictor_process,
+    wait_for_the_last,
+)
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
@@ -41,7 +49,7 @@ from dynssm_ros.signals.decoding import header_stamp_ns, live_decoders
 from dynssm_ros.signals.signal_map import load_signal_map
 
 _TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
-_START, _DRAIN = 60.0, 2.0  # s that the node may take until it answers, and for its last answers
+_START, _DRAIN = 60.0, 2.0  # s that the node may take until it answers, and to answer the last swaps
 _SETTLED = 60.0  # s after which memory is to be flat
 _AFTER_SWAP = 1.0  # s in which answers are those of a swap
 _MB = 1e6
@@ -210,8 +218,8 @@ def soak(
                 del run.diagnostics[:-1]
                 if progress is not None:
                     progress(len(held), round(seconds))
-        last = max(run.sent) + run.T_s
-        collector.wait_for(lambda: last in run.predicted and len(swapper.answers) == len(swapper.asked), _DRAIN)
+        wait_for_the_last(run, collector.wait_for)
+        collector.wait_for(lambda: len(swapper.answers) == len(swapper.asked), _DRAIN)
     _judge(run, drive, done)
     if not spoilt:  # else a stamp does not say which message was answered
         _time(run, swapper.asked, done)

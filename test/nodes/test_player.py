@@ -7,21 +7,13 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from nav_msgs.msg import Odometry
 
-from benchmarks.live_run import (
-    Collector,
-    LiveRun,
-    collecting,
-    isolated_environment,
-    predictor_process,
-    wait_for_the_last,
-)
+from benchmarks.live_run import LiveRun, collecting, isolated_environment, predictor_process, wait_for_the_last
 from dynssm_ros.configuration import config_root
 from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.signals.decoding import header_stamp_ns
@@ -35,18 +27,11 @@ def _player(*parameters: str) -> list[str]:
     return [sys.executable, "-m", "dynssm_ros.nodes.player", "--ros-args", *arguments]
 
 
-def wait_for_predictor(collector: Collector) -> None:
-    """Until it publishes."""
-    listening = threading.Event()
-    while not collector.count_publishers(PREDICTION_TOPIC):
-        listening.wait(0.02)  # nobody sets it: discovery raises no event in rclpy
-
-
 def test_player_and_predictor_work_as_separate_processes(small_model: Path, laps_bag: Path) -> None:
     os.environ.update(isolated_environment())
     run = LiveRun(20_000_000)
     with predictor_process(small_model, {}, os.environ.copy()), collecting(run) as collector:
-        wait_for_predictor(collector)
+        assert collector.wait_for(lambda: collector.count_publishers(PREDICTION_TOPIC) > 0, 30.0)
         player = subprocess.Popen(_player(f"bag:={laps_bag}", "rate:=4.0"), env=os.environ.copy())
         assert player.wait(60) == 0
         last = 1_000_000_000_000_000_000 + 20_000_000_000 + run.T_s
@@ -119,7 +104,7 @@ def test_on_a_busy_computer_a_predictor_that_is_held_up_for_two_seconds_answers_
                 collector.changed.notify_all()
 
         collector.create_subscription(Odometry, ODOMETRY_TOPIC, on_odometry, SENSOR_QOS)
-        wait_for_predictor(collector)
+        assert collector.wait_for(lambda: collector.count_publishers(PREDICTION_TOPIC) > 0, 30.0)
         player = subprocess.Popen(_player(f"bag:={laps_bag}", "rate:=4.0"), env=os.environ.copy())
         assert collector.wait_for(lambda: len(run.predicted) > 200, 30.0)
         process.send_signal(signal.SIGSTOP)
