@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
+import subprocess
 from collections.abc import Iterator
 from datetime import datetime, timezone
 from importlib.metadata import version
@@ -88,8 +90,18 @@ def write_documents() -> None:
 def origin() -> str:
     """When, on what and by which versions."""
     libraries = ", ".join(f"{name} {version(name)}" for name in ("torch", "onnxruntime", "numpy"))
-    code = f"dynssm_ros {__version__}, Python {platform.python_version()}, {libraries}"
+    code = f"dynssm_ros {__version__}{commit()}, Python {platform.python_version()}, {libraries}"
     return f"{datetime.now(timezone.utc):%Y-%m-%d} by {code}, on {os.cpu_count()} cores ({processor()})"
+
+
+def commit() -> str:
+    """Of which commit the code is, or that it differs from it; nothing where there is no checkout."""
+    git, code = shutil.which("git"), Path(__file__).parents[2]
+    if git is None or not (code / ".git").exists():
+        return ""
+    told = ["rev-parse", "--short", "HEAD"], ["status", "--porcelain", "--", "dynssm_ros", "benchmarks", "config"]
+    name, changed = (subprocess.check_output([git, *words], cwd=code, text=True).strip() for words in told)  # noqa: S603 - fixed words
+    return f" at commit {name}{' with changes' if changed else ''}"
 
 
 def processor() -> str:

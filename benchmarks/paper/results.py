@@ -18,7 +18,7 @@ from benchmarks.paper.steps import Step
 from benchmarks.tasks import output, split_available
 from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.spread import SeedSpread, spreads
-from dynssm_ros.runtime.artifact import METRICS
+from dynssm_ros.runtime.artifact import METRICS, read_card
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _NOT_MADE = "not made; `make paper` says why"
@@ -51,6 +51,7 @@ class Results:
         races: what was driven in closed loop, by the plan's names, as ``dynssm race`` writes it, as far as it is done.
         rates: by the plan's names of sweeps, then by learning rate: what the trainings say of themselves, as far as done.
         losses: what a training of the paper's model says of itself, by the model's name, as far as done.
+        networks: of a shipping model's trainings, by its name: how many kept the network, and how many there are.
         costs: of the models, by name: parameters, flops, latency_us, integrator.
         missing: why steps are not done, by their titles; steps that only lack others are left out.
         reasons: why scores are not there, by their keys.
@@ -63,6 +64,7 @@ class Results:
     races: Mapping[str, Entry]
     rates: Mapping[str, Mapping[float, Entry]]
     losses: Mapping[str, Entry]
+    networks: Mapping[str, tuple[int, int]]
     costs: Mapping[str, Entry]
     missing: Mapping[str, str]
     reasons: Mapping[str, str]
@@ -213,6 +215,7 @@ def read_results(plan: Plan, reference: Reference, root: Path, steps: Sequence[S
             for name, sweep in plan.sweeps.items()
         },
         losses=_losses(plan, root, done),
+        networks=_networks(plan, root, done),
         costs=_read(root / COSTS)["models"] if COSTS in done else {},
         missing={titles[key]: reasons[key] for key, cause in causes.items() if cause == key}
         | {titles[key]: reason for key, reason in failed.items()},
@@ -231,6 +234,23 @@ def _losses(plan: Plan, root: Path, done: Container[str]) -> dict[str, Entry]:
                 key = model_key(split, study.commands, model, 0)
                 found |= {model: _read(root / key / METRICS)} if key in done else {}
     return found
+
+
+def _networks(plan: Plan, root: Path, done: Container[str]) -> dict[str, tuple[int, int]]:
+    """Whether the network of the model that ships earned its place, over all trainings with an online layer."""
+    kept: dict[str, dict[str, bool]] = {}
+    for study in plan.studies.values():
+        model = plan.car(study).full
+        if model not in study.models:
+            continue
+        keys = [
+            model_key(split, study.commands, model, seed) for split in study.splits for seed in plan.seeds(study, model)
+        ]
+        for key in keys:
+            layer = read_card(root / key).online if key in done else None
+            if layer is not None:
+                kept.setdefault(model, {})[key] = "network" in layer.features
+    return {model: (sum(each.values()), len(each)) for model, each in kept.items()}
 
 
 def by_name(values: Entry) -> Vector:

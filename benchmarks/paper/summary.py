@@ -27,7 +27,7 @@ def summary(results: Results) -> Iterator[str]:
         "ahead."
     )
     yield _table(measured, results).markdown()
-    yield "\n".join(f"- {line}" for line in (*_wins(measured, results), *_parts(measured)))
+    yield "\n".join(f"- {line}" for line in (*_wins(measured, results), *_networks(results), *_parts(measured)))
 
 
 def errors(comparison: Comparison, model: str) -> dict[str, float]:
@@ -88,6 +88,16 @@ def _wins(measured: Sequence[Comparison], results: Results) -> Iterator[str]:
                 ahead.append(f"{comparison.label}, {error}: `{best}`, our errors are {share:.0f} % larger")
     equal = f"by more than {100 * _ALIKE:g} %"
     yield f"A rival wins {equal} in: {'; '.join(ahead)}." if ahead else f"No rival wins {equal} in any study."
+
+
+def _networks(results: Results) -> Iterator[str]:
+    """Whether the networks earned their place."""
+    if results.networks:
+        each = ", ".join(f"{kept} of {n} (`{model}`)" for model, (kept, n) in results.networks.items())
+        yield (
+            "Ours is the calibrated car with an online layer, and with a network if that takes errors off left-out parts of "
+            f"the training's laps. It did in {each} trainings. Without it ours is as good as `rls`, which has the same layer."
+        )
 
 
 def _parts(measured: Sequence[Comparison]) -> Iterator[str]:

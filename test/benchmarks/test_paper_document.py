@@ -106,7 +106,7 @@ def make(scores):
     def results(**changes):
         parts = {
             "plan": plan, "reference": load_reference(), "scores": scores, "races": {}, "rates": {}, "losses": {},
-            "costs": dict.fromkeys(MODELS, cost),
+            "networks": {}, "costs": dict.fromkeys(MODELS, cost),
             "missing": {}, "reasons": {}, "made": Made({"Made": "today"}),
         }  # fmt: skip
         return Results(**parts | changes)
@@ -311,6 +311,12 @@ def test_a_study_of_given_recordings_asks_for_them(make):
 def test_quick_runs_say_so(make):
     assert "Not results" not in document.markdown(make(), {})
     assert "**Not results:** a quick run" in document.markdown(make(made=Made(quick=True)), {})
+
+
+def test_the_first_half_page_says_how_often_the_network_earned_its_place(make):
+    text = "\n".join(summary(make(networks={"dynssm_av21": (2, 9), "dynssm_orca": (0, 3)})))
+    assert "It did in 2 of 9 (`dynssm_av21`), 0 of 3 (`dynssm_orca`) trainings." in text
+    assert "trainings." not in "\n".join(summary(make()))
 
 
 def test_the_first_half_page_says_what_helps_and_where_a_rival_wins(make, scores):
