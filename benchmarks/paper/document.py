@@ -117,6 +117,7 @@ def _introduction(results: Results) -> Iterator[str]:
         "stretches, and no window reaches across a cut. Rows below 5 m/s are left out for the full-size car.",
         "Car: the single-track models and DynSSM start from coefficients calibrated on the training part alone; DDM, FTHD "
         "and the paper's configuration have the paper's bounds.",
+        *_names(results),
         f"Rollouts: over the paper's horizons (0.6 s, 0.3 s for the small car) from one row in {results.plan.stride}; "
         "predicted states are fed back, measured actuator feedback and commands are supplied. The displacement is between "
         "predicted and measured path, both integrated from velocities from the same pose.",
@@ -126,6 +127,14 @@ def _introduction(results: Results) -> Iterator[str]:
         '`benchmarks/paper/plan.yaml` is the plan. `ARGS="test=NAME=R.parquet"` adds a recording to be predicted.',
     ]
     yield "\n".join(f"- {line}" for line in lines)
+
+
+def _names(results: Results) -> Iterator[str]:
+    """The model files of names that only this page has."""
+    models = results.plan.models
+    shipped = {name: model.base for name, model in models.items() if model.base and model.base not in models}
+    if shipped:
+        yield f"Models: {', '.join(f'`{name}` is `{base}`' for name, base in shipped.items())}, each for the car of its name."
 
 
 def _missing(results: Results, data: str) -> Iterator[str]:
