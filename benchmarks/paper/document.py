@@ -55,7 +55,9 @@ def draw(results: Results) -> Iterator[tuple[str, Figure]]:
     for model, training in results.losses.items():
         yield f"losses_{model}", loss_components(training["history"], training["best_epoch"])
     tried = {
-        results.plan.sweeps[name].model: {rate: tables.validation_loss(found) for rate, found in rates.items()}
+        results.plan.sweeps[name].model: {
+            rate: [tables.validation_loss(each) for each in trainings] for rate, trainings in rates.items()
+        }
         for name, rates in results.rates.items()
         if rates
     }

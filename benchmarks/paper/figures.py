@@ -70,18 +70,20 @@ def against_the_full_model(full: Sequence[SeedSpread], ablations: Mapping[str, S
     return figure
 
 
-def learning_rates(tried: Mapping[str, Mapping[float, Sequence[float]]]) -> Figure:
-    """The lowest validation loss so far over the epochs, a panel for each model.
+def learning_rates(tried: Mapping[str, Mapping[float, Sequence[Sequence[float]]]]) -> Figure:
+    """The lowest validation loss so far over the epochs, a panel for each model, a line for each training.
 
     Args:
-        tried: by model, then by learning rate: the loss of each epoch.
+        tried: by model, then by learning rate, for each training: the loss of each epoch.
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 0.28 * WIDTH), layout="constrained")
         for axis, (model, rates) in zip(figure.subplots(1, len(tried), squeeze=False)[0], tried.items(), strict=True):
-            for k, (rate, losses) in enumerate(rates.items()):
-                best = np.minimum.accumulate(np.array(losses, dtype=float)) if len(losses) else np.array([])
-                axis.plot(np.arange(1, len(best) + 1), best, color=PALETTE[k % len(PALETTE)], label=f"{rate:g}")
+            for k, (rate, trainings) in enumerate(rates.items()):
+                for n, losses in enumerate(trainings):
+                    best = np.minimum.accumulate(np.array(losses, dtype=float)) if len(losses) else np.array([])
+                    label = f"{rate:g}" if n == 0 else None
+                    axis.plot(np.arange(1, len(best) + 1), best, color=PALETTE[k % len(PALETTE)], label=label)
             axis.set(title=model, xlabel="epoch", yscale="log")
             axis.legend(fontsize=7)
         figure.supylabel("validation loss", fontsize=9)

@@ -167,6 +167,7 @@ class Sweep(StrictModel):
     commands: Commands
     model: str
     rates: tuple[float, ...] = Field(min_length=2, description="learning rates, in order")
+    seeds: int = Field(default=1, ge=1, description="trainings with each; more than one where one would mislead")
 
 
 class Race(StrictModel):
@@ -315,7 +316,7 @@ class Plan(StrictModel):
             for name, study in self.studies.items()
         }
         races = dict(list(self.races.items())[:1])
-        sweeps = dict(list(self.sweeps.items())[:1])
+        sweeps = {name: sweep.model_copy(update={"seeds": 1}) for name, sweep in list(self.sweeps.items())[:1]}
         short = {"stride": quick.stride, "epochs": quick.epochs, "races": races, "sweeps": sweeps}
         return self.model_copy(update={**short, "drives": drives, "studies": studies})
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.paper.plan import Car, Plan, Study
+from benchmarks.paper.plan import Car, Plan, Study, Sweep
 from benchmarks.paper.racing import NUMBERS
 from benchmarks.paper.reference import Reference
 from benchmarks.paper.schedule import COSTS, model_key, race_key, rate_key, score_key
@@ -49,7 +49,8 @@ class Results:
         reference: the paper's numbers.
         scores: content of the steps that evaluate, by their keys, as far as they are done.
         races: what was driven in closed loop, by the plan's names, as ``dynssm race`` writes it, as far as it is done.
-        rates: by the plan's names of sweeps, then by learning rate: what the trainings say of themselves, as far as done.
+        rates: by the plan's names of sweeps, then by learning rate: what the trainings of all seeds say of themselves, as far
+            as done.
         losses: what a training of the paper's model says of itself, by the model's name, as far as done.
         networks: of a shipping model's trainings, by its name: how many kept the network, and how many there are.
         costs: of the models, by name: parameters, flops, latency_us, integrator.
@@ -62,7 +63,7 @@ class Results:
     reference: Reference
     scores: Mapping[str, Entry]
     races: Mapping[str, Entry]
-    rates: Mapping[str, Mapping[float, Entry]]
+    rates: Mapping[str, Mapping[float, Sequence[Entry]]]
     losses: Mapping[str, Entry]
     networks: Mapping[str, tuple[int, int]]
     costs: Mapping[str, Entry]
@@ -206,14 +207,7 @@ def read_results(plan: Plan, reference: Reference, root: Path, steps: Sequence[S
         reference=reference,
         scores=scores,
         races={name: _read(root / race_key(name) / NUMBERS) for name in plan.races if race_key(name) in done},
-        rates={
-            name: {
-                rate: _read(root / rate_key(sweep, rate) / METRICS)
-                for rate in sweep.rates
-                if rate_key(sweep, rate) in done
-            }
-            for name, sweep in plan.sweeps.items()
-        },
+        rates={name: _rates(sweep, root, done) for name, sweep in plan.sweeps.items()},
         losses=_losses(plan, root, done),
         networks=_networks(plan, root, done),
         costs=_read(root / COSTS)["models"] if COSTS in done else {},
@@ -234,6 +228,13 @@ def _losses(plan: Plan, root: Path, done: Container[str]) -> dict[str, Entry]:
                 key = model_key(split, study.commands, model, 0)
                 found |= {model: _read(root / key / METRICS)} if key in done else {}
     return found
+
+
+def _rates(sweep: Sweep, root: Path, done: Container[str]) -> dict[float, list[Entry]]:
+    """The trainings with each learning rate, one for each seed; rates without one are left out."""
+    keys = {rate: [rate_key(sweep, rate, seed) for seed in range(sweep.seeds)] for rate in sweep.rates}
+    there = {rate: [key for key in each if key in done] for rate, each in keys.items()}
+    return {rate: [_read(root / key / METRICS) for key in each] for rate, each in there.items() if each}
 
 
 def _networks(plan: Plan, root: Path, done: Container[str]) -> dict[str, tuple[int, int]]:

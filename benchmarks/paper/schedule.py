@@ -66,9 +66,9 @@ def model_key(split: str, commands: Commands, model: str, seed: int) -> str:
     return f"models/{split}.{commands}/{model}.{seed}"
 
 
-def rate_key(sweep: Sweep, rate: float) -> str:
-    """Where the training of a sweep with a learning rate lies."""
-    return f"rates/{sweep.split}.{sweep.commands}/{sweep.model}.{rate:g}"
+def rate_key(sweep: Sweep, rate: float, seed: int) -> str:
+    """Where the training of a sweep with a learning rate and a seed lies."""
+    return f"rates/{sweep.split}.{sweep.commands}/{sweep.model}.{rate:g}.{seed}"
 
 
 def vehicle_key(split: str, commands: Commands) -> str:
@@ -181,9 +181,10 @@ class _Site:
         )
 
     def rates(self, sweep: Sweep) -> Iterator[Train]:
-        """The trainings of a sweep, with seed 0."""
-        plain = self._training(sweep.model, 0, {})
-        for rate in sweep.rates:
-            config = plain.config.with_training(learning_rate=rate, restarts=0)
-            title = f"train {sweep.model} at the rate {rate:g}, on {self.shown}"
-            yield replace(plain, key=rate_key(sweep, rate), title=title, config=config)
+        """The trainings of a sweep."""
+        for seed in range(sweep.seeds):
+            plain = self._training(sweep.model, seed, {})
+            for rate in sweep.rates:
+                config = plain.config.with_training(learning_rate=rate, restarts=0)
+                title = f"train {sweep.model} at the rate {rate:g}, seed {seed}, on {self.shown}"
+                yield replace(plain, key=rate_key(sweep, rate, seed), title=title, config=config)

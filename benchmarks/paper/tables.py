@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.paper.reference import Ablation, OpenLoop, Reference
 from benchmarks.paper.results import Comparison, Entry, Results
 from dynssm_ros.evaluation.coefficients import coefficient_unit
-from dynssm_ros.evaluation.spread import SeedSpread
+from dynssm_ros.evaluation.spread import SeedSpread, spreads
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.tables import Column, Table, Value, text
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
@@ -164,15 +164,15 @@ def rate_table(results: Results) -> Table:
     for name, tried in results.rates.items():
         sweep = results.plan.sweeps[name]
         chosen = getattr(results.plan.configured(sweep.model).training, "learning_rate", None)
-        for rate, found in tried.items():
-            loss = min(validation_loss(found), default=None)
-            rows.append(
-                [f"`{sweep.model}`", sweep.split, f"{rate:g}", loss, found["unexplained"], found["best_epoch"],
-                 "yes" if rate == chosen else ""]
-            )  # fmt: skip
+        for rate, trainings in tried.items():
+            losses = [np.array([min(validation_loss(t), default=np.nan), t["unexplained"]]) for t in trainings]
+            epochs = ", ".join(str(t["best_epoch"]) for t in trainings)
+            shown = [f"`{sweep.model}`", sweep.split, f"{rate:g}"]
+            rows.append([*shown, *spreads(losses), epochs, "yes" if rate == chosen else ""])
     return Table(
-        columns, rows, "Seed 0, without restarts. The loss is the mean squared error in m/s, m/s and rad/s; over that of "
-        "predicting the mean change, 1 is a training that has learned nothing."
+        columns, rows, "Without restarts; one training each, or several where one would mislead: then ± is the standard "
+        "deviation over seeds. The loss is the mean squared error in m/s, m/s and rad/s; over that of predicting the mean "
+        "change, 1 is a training that has learned nothing."
     )  # fmt: skip
 
 

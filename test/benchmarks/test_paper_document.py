@@ -349,10 +349,11 @@ def test_the_terms_of_the_loss_are_a_figure(make, tmp_path):
 
 def test_learning_rates_that_were_tried_are_shown_with_the_chosen_one(make, tmp_path):
     found = {"history": {"validation/prediction": [3.0, 1.0, 2.0]}, "best_epoch": 2, "unexplained": 0.25}
-    results = make(rates={"ddm_av21": {0.001: found, 0.004: found | {"unexplained": 1.0}}})
+    results = make(rates={"ddm_av21": {0.001: [found], 0.004: [found | {"unexplained": each} for each in (1.0, 2.0)]}})
     rows = tables.rate_table(results).cells
     assert [[cell.text for cell in row] for row in rows] == [
-        ["`ddm_av21`", "slow", "0.001", "1.00", "0.250", "2", "yes"], ["`ddm_av21`", "slow", "0.004", "1.00", "1.00", "2", ""]
+        ["`ddm_av21`", "slow", "0.001", "1.00", "0.250", "2", "yes"],
+        ["`ddm_av21`", "slow", "0.004", "1.00 ± 0.00", "1.50 ± 0.71", "2, 2", ""],
     ]  # fmt: skip
     document.write(results, tmp_path / "results.md")
     assert "](results_rates.png)" in (tmp_path / "results.md").read_text()
