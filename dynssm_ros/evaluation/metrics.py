@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from statistics import NormalDist
 from time import perf_counter_ns
@@ -60,7 +60,7 @@ def predict_rows(
         rows: last row of each window, shape ``(M,)``, ``M > 0``.
         batch: windows per call.
         tick: told of progress.
-        drive: what the model's online layer knew along the recording; ``None``: it stays out.
+        drive: what the model's online layer knew along these rows; ``None``: it stays out.
     """
     parts = []
     for start in range(0, len(rows), batch):
@@ -71,6 +71,11 @@ def predict_rows(
             predicted = corrected(predicted, windows, model.online, drive.at(chunk))
         parts.append(predicted._replace(seen=None))
         tick(len(chunk))
+    return joined(parts)
+
+
+def joined(parts: Sequence[WindowPrediction]) -> WindowPrediction:
+    """Predictions of several stretches of rows as one, less what was seen; not empty."""
     return WindowPrediction(
         np.concatenate([part.state for part in parts]),
         _join([part.theta for part in parts]),
@@ -80,7 +85,7 @@ def predict_rows(
 
 
 class DriveThrough(NamedTuple):
-    """What an online layer knew along a recording that it was driven through in order."""
+    """What an online layer knew along rows of a recording that it was driven through in order."""
 
     ends: Indices
     """Rows at which it learned, ascending."""
@@ -91,20 +96,30 @@ class DriveThrough(NamedTuple):
         return self.learned.at(np.maximum(np.searchsorted(self.ends, rows, side="right") - 1, 0))
 
 
-def drive_through(model: WindowModel, recording: Recording, batch: int = BATCH) -> DriveThrough | None:
+def drive_through(
+    model: WindowModel, recording: Recording, asked: Sequence[Indices], batch: int = BATCH
+) -> Iterator[tuple[DriveThrough | None, list[Indices]]]:
     """Lets the model's online layer learn wherever its window is whole and the car not slower than its minimum speed.
 
-    Returns:
-        What it knew; ``None`` if nothing learns.
+    It knows a thousand numbers at each row, so it is asked block by block, and what it knew is given up after each.
+
+    Args:
+        model: with or without an online layer.
+        recording: that it is driven through, in order.
+        asked: rows that something is asked at, each ascending.
+        batch: rows of a block.
+
+    Yields:
+        What it knew, with those of each ``asked`` that the block answers for. ``None``, once and with all of them, if
+        nothing learns.
     """
-    layer = model.online
-    if layer is None:
-        return None
-    matrix = recording.matrix
-    ends: Indices = recording.window_ends(model.H, 0, layer.minimum_speed)
-    if len(ends) == 0:
-        return None
-    along, judge, last, parts = Along(layer), PathJudge(layer), None, []
+    layer, matrix = model.online, recording.matrix
+    ends = None if layer is None else recording.window_ends(model.H, 0, layer.minimum_speed)
+    if layer is None or ends is None or len(ends) == 0:
+        yield None, list(asked)
+        return
+    along, judge, last = Along(layer), PathJudge(layer), None
+    blocks = [(np.searchsorted(ends, rows, side="right") - 1).clip(0) // batch for rows in asked]
     for start in range(0, len(ends), batch):
         chunk = ends[start : start + batch]
         seen = seen_by(model, gather(matrix, chunk, model.H - 1))
@@ -113,9 +128,9 @@ def drive_through(model: WindowModel, recording: Recording, batch: int = BATCH) 
         trusted = trusted_along(
             judge, lambda row: matrix[row - model.H + 1 : row + 1], chunk, learned, seen, partial(seen_by, model), last
         )
-        parts.append(learned._replace(trusted=trusted))
         last = int(chunk[-1])
-    return DriveThrough(ends, Learned(*(np.concatenate(each) for each in zip(*parts, strict=True))))
+        own = [rows[block == start // batch] for rows, block in zip(asked, blocks, strict=True)]
+        yield DriveThrough(chunk, learned._replace(trusted=trusted)), own
 
 
 def rmse(errors: Vector) -> Vector:

@@ -22,21 +22,25 @@ from dynssm_ros.evaluation.metrics import (
     explained,
     finite,
     gather,
+    joined,
     latency_us,
     max_error,
     predict_rows,
     rmse,
 )
-from dynssm_ros.evaluation.regimes import Regime, driving_regimes, regime_rmse
-from dynssm_ros.evaluation.rollout import score_rollouts
+from dynssm_ros.evaluation.regimes import Regime, driving_regimes, liveliest, regime_rmse
+from dynssm_ros.evaluation.rollout import Rollout, score_rollouts
 from dynssm_ros.evaluation.score import Group, Score, grouped
 from dynssm_ros.parallel import HERE, Workers, each
 from dynssm_ros.runtime.models import WindowModel
+from dynssm_ros.runtime.online import Learned
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.track.lap_position import first_lap
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
+
+_DRAWN_S = 12.0  # of the drive that trajectories are drawn of
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class Evaluation:
         split: which part of it was scored, for people.
         min_speed: slower stretches were left out (m/s).
         rows: last row of each window; the predicted rows are ``rows + 1``.
+        drawn: rows where rollouts start that are drawn: one after the other, in the liveliest seconds.
         regimes: how these rows were driven.
         scores: by label, in the order in which the models were given.
         line: closed line that the position on the lap is counted along; ``None`` if there is none.
@@ -59,6 +64,7 @@ class Evaluation:
     split: str
     min_speed: float
     rows: Indices
+    drawn: Indices
     regimes: tuple[Regime, ...]
     scores: dict[str, Score]
     line: ClosedLine | None
@@ -167,7 +173,8 @@ def evaluate(
     each_model = len(rows) + len(starts) * steps
     tick = _counting(len(models) * each_model, progress)
     regimes = driving_regimes(recording.matrix[rows])
-    on = _On(recording, rows, regimes, starts, steps, batch)
+    drawn = _liveliest_starts(recording, rows, steps)
+    on = _On(recording, rows, regimes, starts, drawn, steps, batch)
     labels = list(models)
     found: dict[str, Score] = {}
     for k, score in each(
@@ -188,10 +195,20 @@ def evaluate(
         split=split,
         min_speed=speed,
         rows=rows,
+        drawn=drawn,
         regimes=regimes,
         scores=scores,
         line=first_lap(recording) if line is None else line,
     )
+
+
+def _liveliest_starts(recording: Recording, rows: Indices, steps: int) -> Indices:
+    """Starts of rollouts of so many steps, one after the other, where the driving is liveliest."""
+    seconds = max(_DRAWN_S, steps * recording.T_s)
+    time = (recording.time[rows + 1] - recording.time[0]) / 1e9
+    stretch = rows[liveliest(time, recording.matrix[rows + 1, :3], seconds)]
+    starts: Indices = stretch[: len(stretch) - steps + 1 : steps]
+    return starts
 
 
 def _counting(total: int, progress: Callable[[int, int], None] | None) -> Tick:
@@ -215,21 +232,29 @@ class _On:
     rows: Indices
     regimes: tuple[Regime, ...]
     starts: Indices
+    drawn: Indices
     steps: int
     batch: int
 
     def score(self, model: WindowModel, tick: Tick = lambda predictions: None) -> Score:
         """What a model is worth, but for the time that it takes."""
         recording, rows, batch = self.recording, self.rows, self.batch
-        matrix = recording.matrix
+        matrix, T_s = recording.matrix, recording.T_s
         increments = matrix[rows + 1, :3] - matrix[rows, :3]
         with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
-            drive = drive_through(model, recording, batch)
-            predicted = predict_rows(model, matrix, rows, batch, tick, drive)
+            predictions, rollouts, knowledge = [], [], []
+            for drive, (ends, starts, drawn) in drive_through(model, recording, (rows, self.starts, self.drawn), batch):
+                if len(ends):
+                    predictions.append(predict_rows(model, matrix, ends, batch, tick, drive))
+                if len(starts):
+                    rollouts.append(score_rollouts(model, matrix, starts, self.steps, T_s, batch, tick, drive))
+                if drive is not None:
+                    knowledge.append(drive.at(drawn))
+            predicted = joined(predictions)
             errors = predicted.state - matrix[rows + 1, :3]
             return Score(
                 model=model,
-                drive=drive,
+                known=Learned.joined(knowledge) if knowledge else None,
                 state=predicted.state,
                 theta=predicted.theta,
                 rmse=rmse(errors),
@@ -238,7 +263,7 @@ class _On:
                 coverage_90=None if predicted.variance is None else coverage(errors, predicted.variance),
                 regime_rmse=regime_rmse(self.regimes, errors),
                 coefficients=coefficient_statistics(predicted.theta, model.vehicle),
-                rollout=score_rollouts(model, matrix, self.starts, self.steps, recording.T_s, batch, tick, drive),
+                rollout=Rollout.joined(rollouts),
                 latency_us=np.empty(0),
             )
 

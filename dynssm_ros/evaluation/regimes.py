@@ -1,4 +1,7 @@
-"""Driving regimes: how the errors differ between slow and fast, straight and cornering, braking and accelerating."""
+"""Driving regimes: how the errors differ between slow and fast, straight and cornering, braking and accelerating.
+
+Also where the driving is liveliest, for what shows a few seconds of it.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from dynssm_ros.arrays import Vector
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.metrics import rmse
 from dynssm_ros.signals.inputs import applied_inputs
 
@@ -109,3 +112,25 @@ def _members(quantity: str, labels: tuple[str, ...], unit: str, index: npt.NDArr
     for k, label in enumerate(labels):
         if (index == k).any():
             yield Regime(quantity, label, unit, index == k)
+
+
+def liveliest(time: Vector, states: Vector, seconds: float) -> Indices:
+    """Rows of the stretch of ``seconds`` without a gap in which the states change most.
+
+    Args:
+        time: of each row (s), increasing, shape ``(N,)``.
+        states: shape ``(N, 3)``.
+        seconds: length of the stretch; all of the longest gap-free run if no run is that long.
+    """
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    length = max(2, round(seconds / step))
+    runs = np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > 1.5 * step) + 1)
+    long = [run for run in runs if len(run) >= length]
+    if not long:
+        return max(runs, key=len)
+    spread = np.std(states, axis=0)
+    change = np.abs(np.diff(states, axis=0, prepend=states[:1])) / np.where(spread > 0, spread, 1.0)
+    sums = np.concatenate([[0.0], np.cumsum(change.sum(axis=1))])
+    firsts = np.concatenate([run[: len(run) - length + 1] for run in long])
+    first = int(firsts[np.argmax(sums[firsts + length] - sums[firsts])])
+    return np.arange(first, first + length)

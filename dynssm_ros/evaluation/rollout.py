@@ -10,6 +10,7 @@ by up to 0.3 m, as much as the errors in question.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,14 @@ class Rollout:
     def fde(self) -> float:
         """Final displacement error, at the end of the horizon (m)."""
         return float(self.displacement[-1])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Rollout]) -> Rollout:
+        """Those of several stretches as one; not empty."""
+        share = np.array([part.starts for part in parts]) / sum(part.starts for part in parts)
+        square = np.tensordot(share, np.stack([part.rmse**2 for part in parts]), 1)
+        displacement = np.tensordot(share, np.stack([part.displacement for part in parts]), 1)
+        return cls(parts[0].T_s, sum(part.starts for part in parts), np.sqrt(square), displacement)
 
 
 def roll_out(model: WindowModel, stretches: Vector, steps: int, learned: Learned | None = None) -> Vector:
@@ -125,7 +134,7 @@ def score_rollouts(
         T_s: sampling time (s).
         batch: rollouts that run side by side.
         tick: told of progress.
-        drive: what the model's online layer knew along the recording.
+        drive: what the model's online layer knew along these rows.
     """
     squares, distances = np.zeros((steps, 3)), np.zeros(steps)
     for begin in range(0, len(starts), batch):

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.coefficients import CoefficientStatistics
-from dynssm_ros.evaluation.metrics import DriveThrough, by_channel, finite
+from dynssm_ros.evaluation.metrics import by_channel, finite
 from dynssm_ros.evaluation.regimes import Regime
 from dynssm_ros.evaluation.rollout import Rollout
 from dynssm_ros.evaluation.spread import SeedSpread, mean_and_std, spreads
@@ -28,7 +28,7 @@ class Score:
 
     Attributes:
         model: what was scored.
-        drive: what its online layer knew along the recording; ``None`` without one.
+        known: what its online layer knew where the rollouts start that are drawn; ``None`` without one.
         state: its one-step predictions of the rows after the scored ones, shape ``(N, 3)``.
         theta: its coefficients, shape ``(N, 17)``; ``None`` if it has none.
         rmse: one-step root mean square error by channel, shape ``(3,)`` (m/s, m/s, rad/s); so are the next two.
@@ -42,7 +42,7 @@ class Score:
     """
 
     model: WindowModel
-    drive: DriveThrough | None
+    known: Learned | None
     state: Vector
     theta: Vector | None
     rmse: Vector
@@ -53,10 +53,6 @@ class Score:
     coefficients: CoefficientStatistics | None
     rollout: Rollout
     latency_us: Vector
-
-    def known_at(self, rows: Indices) -> Learned | None:
-        """What the model's online layer knew at ``rows``; ``None`` without one."""
-        return None if self.drive is None else self.drive.at(rows)
 
     @property
     def seed(self) -> int | None:

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.evaluation.regimes import liveliest
 from dynssm_ros.identification.improvement import Improvement
 from dynssm_ros.identification.windows import SimulationWindows
 from dynssm_ros.reporting.evaluation_figures import (
@@ -20,7 +21,6 @@ from dynssm_ros.reporting.evaluation_figures import (
     SYMBOLS,
     UNITS,
     WIDTH,
-    liveliest,
     styled,
 )
 from dynssm_ros.reporting.tables import text

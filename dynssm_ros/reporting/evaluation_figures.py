@@ -17,9 +17,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter, ScalarFormatter
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.coefficients import coefficient_unit, range_used, resting
 from dynssm_ros.evaluation.metrics import explained
+from dynssm_ros.evaluation.regimes import liveliest
 from dynssm_ros.reporting.tables import percent, text
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
@@ -351,28 +352,6 @@ def regime_errors(labels: Sequence[str], what: str, rmse: Mapping[str, Vector], 
         panel.grid(axis="x", visible=False)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
-
-
-def liveliest(time: Vector, states: Vector, seconds: float) -> Indices:
-    """Rows of the stretch of ``seconds`` without a gap in which the states change most.
-
-    Args:
-        time: of each row (s), increasing, shape ``(N,)``.
-        states: shape ``(N, 3)``.
-        seconds: length of the stretch; all of the longest gap-free run if no run is that long.
-    """
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    length = max(2, round(seconds / step))
-    runs = np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > 1.5 * step) + 1)
-    long = [run for run in runs if len(run) >= length]
-    if not long:
-        return max(runs, key=len)
-    spread = np.std(states, axis=0)
-    change = np.abs(np.diff(states, axis=0, prepend=states[:1])) / np.where(spread > 0, spread, 1.0)
-    sums = np.concatenate([[0.0], np.cumsum(change.sum(axis=1))])
-    firsts = np.concatenate([run[: len(run) - length + 1] for run in long])
-    first = int(firsts[np.argmax(sums[firsts + length] - sums[firsts])])
-    return np.arange(first, first + length)
 
 
 def _cut_at_holes(x: Vector, values: Vector) -> tuple[Vector, Vector]:

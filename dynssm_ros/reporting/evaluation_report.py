@@ -28,7 +28,6 @@ COMMANDS_IN_WORDS = {
     "none": "none: command inputs are zero",
 }
 _TITLES = {"v_x": "v_x", "v_y": "v_y", "omega": "ω"}
-_STRETCH = 12.0  # s of the drive that trajectories are shown of
 _CUT = f"A model that leaves a panel is over {evaluation_figures.OUTLYING:g} times worse than the middle one of the models."
 _REGIMES_IN_WORDS = {
     "speed": "One-step error in bins of speed.",
@@ -266,7 +265,7 @@ def _sections(evaluation: Evaluation) -> Iterator[Section]:
             {name: group.std(_growth) for name, group in groups.items()},
         ),
     )
-    yield _trajectory_section(evaluation, time)
+    yield _trajectory_section(evaluation)
     for quantity, title in QUANTITIES.items():
         yield _regime_section(evaluation, quantity, title)
     yield from _place_sections(evaluation, states)
@@ -287,13 +286,10 @@ def _sections(evaluation: Evaluation) -> Iterator[Section]:
     )
 
 
-def _trajectory_section(evaluation: Evaluation, time: Vector) -> Section:
+def _trajectory_section(evaluation: Evaluation) -> Section:
     """Rollouts one after the other over the liveliest stretch, each from the measured state."""
     steps, T_s, matrix = evaluation.steps, evaluation.recording.T_s, evaluation.recording.matrix
-    stretch = evaluation.rows[
-        evaluation_figures.liveliest(time, evaluation.measured, max(_STRETCH, evaluation.horizon_s))
-    ]
-    starts = stretch[: len(stretch) - steps + 1 : steps]
+    starts = evaluation.drawn
     driven = slice(starts[0], starts[-1] + steps + 1)
     return Section(
         "Trajectories",
@@ -304,7 +300,7 @@ def _trajectory_section(evaluation: Evaluation, time: Vector) -> Section:
             (evaluation.recording.time[driven] - evaluation.recording.time[0]) / 1e9,
             np.concatenate([np.zeros((1, 2)), path(matrix[driven, :3], T_s)]),
             {
-                name: branches(group.first.model, matrix, starts, steps, T_s, group.first.known_at(starts))
+                name: branches(group.first.model, matrix, starts, steps, T_s, group.first.known)
                 for name, group in evaluation.groups.items()
             },
         ),

@@ -15,6 +15,7 @@ The features are stateless and computed by the model's graph. What is learned is
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -83,6 +84,11 @@ class Learned(NamedTuple):
     def at(self, rows: Indices) -> Learned:
         """What was known at ``rows``."""
         return Learned(*(part[rows] for part in self))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Learned]) -> Learned:
+        """What was known at the rows of several, one after the other; not empty."""
+        return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.evaluation.regimes import QUANTITIES, driving_regimes, regime_rmse
+from dynssm_ros.evaluation.regimes import QUANTITIES, driving_regimes, liveliest, regime_rmse
 
 
 def rows(v_x, omega=0.0, r_fb=0.0, r_cmd=0.0):
@@ -79,3 +79,20 @@ def test_errors_of_a_regime_are_those_of_its_rows():
     values = dict(zip([regime.name for regime in regimes], regime_rmse(regimes, errors), strict=True))
     np.testing.assert_allclose(values["accelerating"], [np.sqrt(12.5), 0.0, 1.0])
     np.testing.assert_allclose(values["braking"], [0.0, 2.0, 1.0])
+
+
+def test_liveliest_stretch_is_where_the_states_change_and_never_spans_a_gap():
+    time = 0.1 * np.r_[0:200, 300:500]
+    states = np.zeros((400, 3))
+    states[:, 0] = 0.001 * np.arange(400)
+    states[330:350, 1] = np.random.default_rng(0).normal(size=20)
+    stretch = liveliest(time, states, 4.0)
+    assert len(stretch) == 40
+    assert stretch[0] <= 330
+    assert stretch[-1] >= 350
+    states[195:205, 2] = np.random.default_rng(0).normal(size=10) * 100
+    assert np.diff(time[liveliest(time, states, 4.0)]).max() < 0.11
+
+
+def test_liveliest_stretch_of_a_short_run_is_all_of_it():
+    np.testing.assert_array_equal(liveliest(np.arange(5.0), np.zeros((5, 3)), 60.0), np.arange(5))

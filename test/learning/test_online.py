@@ -69,6 +69,17 @@ def test_with_sensor_noise_it_beats_the_physics_that_it_starts_from(noisy_laps, 
     assert np.all(np.abs(scores["on"].coverage_90 - 0.9) < 0.03)
 
 
+def test_scores_do_not_depend_on_the_blocks_in_which_a_log_is_driven_through(noisy_laps, noisy_model):
+    cut = noisy_laps.select(np.flatnonzero(np.arange(len(noisy_laps)) % 700 > 90))  # blocks end within gaps, too
+    whole, blocks = (evaluate(cut, {"on": noisy_model}, batch=batch, calls=1).scores["on"] for batch in (4096, 61))
+    np.testing.assert_allclose(blocks.state, whole.state, atol=1e-6)  # the graph is single precision
+    np.testing.assert_allclose(blocks.rollout.displacement, whole.rollout.displacement, rtol=1e-5)
+    np.testing.assert_allclose(blocks.rollout.rmse, whole.rollout.rmse, rtol=1e-5)
+    np.testing.assert_allclose(blocks.known.weights, whole.known.weights, atol=1e-4)
+    assert len(blocks.known.weights) > 3
+    assert blocks.rollout.starts == whole.rollout.starts > 300
+
+
 def test_a_network_that_earns_nothing_is_left_out_of_the_layer(noisy_laps, orca, make_config, tmp_path: Path):
     trained = train(noisy_laps, make_config(online={"folds": 2}), orca, tmp_path / "c.pt")
     assert trained.network_gain < 0.03
@@ -142,10 +153,9 @@ def test_live_predictions_are_those_of_the_evaluation(noisy_laps, noisy_model):
     part = noisy_laps.select(rows)
     predictor = Predictor(noisy_model, SIGNALS)
     found = feed(predictor, part, rows)
-    drive = drive_through(noisy_model, part)
-    shared = [k for k in drive.ends if k in found]
+    ((drive, (shared,)),) = drive_through(noisy_model, part, [np.array(sorted(found))])
     assert len(shared) > 300
-    batch = predict_rows(noisy_model, part.matrix, np.array(shared), drive=drive)
+    batch = predict_rows(noisy_model, part.matrix, shared, drive=drive)
     np.testing.assert_allclose([found[k].state for k in shared], batch.state, atol=1e-5)
     np.testing.assert_allclose([found[k].variance for k in shared], batch.variance, rtol=1e-3)
 

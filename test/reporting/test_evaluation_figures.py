@@ -116,20 +116,3 @@ def test_persistence_never_leaves_a_panel_not_even_beside_perfect_models(drawn):
     rmse = {"a": np.full((1, 3), 1e-16), "b": np.full((1, 3), 1e-16), "persistence": np.full((1, 3), 0.5)}
     axes = drawn(figures.regime_errors(["braking"], "throttle", rmse, dict.fromkeys(rmse, np.zeros((1, 3)))))
     assert all(0.5 < a.get_ylim()[1] < 0.6 for a in axes)
-
-
-def test_liveliest_stretch_is_where_the_states_change_and_never_spans_a_gap():
-    time = 0.1 * np.r_[0:200, 300:500]
-    states = np.zeros((400, 3))
-    states[:, 0] = 0.001 * np.arange(400)
-    states[330:350, 1] = np.random.default_rng(0).normal(size=20)
-    stretch = figures.liveliest(time, states, 4.0)
-    assert len(stretch) == 40
-    assert stretch[0] <= 330
-    assert stretch[-1] >= 350
-    states[195:205, 2] = np.random.default_rng(0).normal(size=10) * 100
-    assert np.diff(time[figures.liveliest(time, states, 4.0)]).max() < 0.11
-
-
-def test_liveliest_stretch_of_a_short_run_is_all_of_it():
-    np.testing.assert_array_equal(figures.liveliest(np.arange(5.0), np.zeros((5, 3)), 60.0), np.arange(5))
