@@ -21,6 +21,10 @@ from dynssm_ros.vehicle.effects import initial_effect_states
 from dynssm_ros.vehicle.effects.carried import CARRIED_S, carries, effect_states_along
 from dynssm_ros.vehicle.single_track import Integrator, step_with_effect_states
 
+_AT_ONCE = 32
+"""Windows that a graph sees at once. Memory that it has used stays with it: two megabytes for each of them with the paper's
+encoders. More at once are no faster."""
+
 
 class WindowPrediction(NamedTuple):
     """What a model says of each of ``N`` windows."""
@@ -305,7 +309,9 @@ class OnnxModel:
             self._session.run_with_iobinding(self._binding)
             results = self._binding.copy_outputs_to_cpu()
         else:
-            results = self._session.run(self._outputs, {"window": windows.astype(np.float32)})
+            blocks = np.split(windows.astype(np.float32), range(_AT_ONCE, len(windows), _AT_ONCE))
+            found = [self._session.run(self._outputs, {"window": block}) for block in blocks]
+            results = [np.concatenate(each) for each in zip(*found, strict=True)]
         by_name = dict(zip(self._outputs, results, strict=True))
         now, theta, physics = windows[:, -1, :3], by_name.get("theta"), by_name.get("physics")
         variance = by_name.get("variance")
