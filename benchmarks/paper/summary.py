@@ -12,6 +12,7 @@ from dynssm_ros.runtime.models import UNTRAINED
 
 _WITHOUT_A_NETWORK = ("ridge", "rls", "gp", "on_track")
 _ALIKE = 0.02  # errors that differ by less are called equal
+_EXACT = 1e-5  # of the error of persistence: below are roundings in single precision
 _ERRORS = ("one step", "path")
 
 
@@ -24,14 +25,22 @@ def summary(results: Results) -> Iterator[str]:
     yield (
         "The model that ships against the best simple one and the best published one of each study. *One step* is the "
         "geometric mean over the three states of its one-step RMSE over theirs, *path* its ADE over theirs; below 1 it is "
-        "ahead."
+        f"ahead. Errors below {_EXACT:g} of those of persistence are roundings and count as that."
     )
     yield _table(measured, results).markdown()
     yield "\n".join(f"- {line}" for line in (*_wins(measured, results), *_networks(results), *_parts(measured)))
 
 
 def errors(comparison: Comparison, model: str) -> dict[str, float]:
-    """One number for all states one step ahead, and the ADE (m)."""
+    """One number for all states one step ahead, and the ADE (m); roundings are as large as these may be."""
+    own = _errors(comparison, model)
+    if "persistence" not in comparison.models:
+        return own
+    least = _errors(comparison, "persistence")
+    return {error: float(np.maximum(own[error], _EXACT * least[error])) for error in _ERRORS}
+
+
+def _errors(comparison: Comparison, model: str) -> dict[str, float]:
     rmse = np.array([each.mean for each in comparison.rmse(model)])
     with np.errstate(divide="ignore", invalid="ignore"):
         step = float(np.exp(np.log(rmse).mean()))

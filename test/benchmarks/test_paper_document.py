@@ -319,6 +319,20 @@ def test_the_first_half_page_says_how_often_the_network_earned_its_place(make):
     assert "trainings." not in "\n".join(summary(make()))
 
 
+def test_errors_that_are_but_roundings_are_equal(make, scores):
+    for content in scores.values():
+        for test in content["tests"].values():
+            test["models"]["single_track"] = [entry(1e-13, ade=1e-13)]
+            test["models"]["dynssm_av21"] = [entry(1e-9, 0, ade=1e-9)]
+            test["models"]["ddm_av21"] = [entry(1e-3, 0, ade=1e-3)]
+    text = "\n".join(summary(make()))
+    assert "No rival wins by more than 2 % in any study." in text
+    (row,) = (line for line in text.splitlines() if line.startswith("| unseen driving, lookahead"))
+    cells = [cell.strip() for cell in row.split("|")]
+    assert cells[4] == cells[6] == "1.00"
+    assert cells[8] == "0.0100"
+
+
 def test_the_first_half_page_says_what_helps_and_where_a_rival_wins(make, scores):
     for content in scores.values():
         for test in content["tests"].values():
