@@ -278,8 +278,10 @@ def _panels(
         panel.set_ylabel(label)
     for spare in list(axes.T.flat)[len(rows) :]:
         spare.set_visible(False)
-    for bottom in axes[-1]:
+    for column in axes.T:
+        bottom = [panel for panel in column if panel.get_visible()][-1]
         bottom.set_xlabel("driven along the centre line (m)")
+        bottom.tick_params(labelbottom=True)
     figure.align_ylabels()
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
