@@ -97,7 +97,7 @@ class Controller:
         self.counts: dict[Status, int] = dict.fromkeys(get_args(Status), 0)
         """Steps by what became of their plan."""
         self._model = model
-        self._calibrated = model.calibrated
+        self._calibrated: Callable[[Vector], Adapted] = lambda s: model.calibrated
         self._track = track
         self._clock = clock
         horizon = HorizonModel(model.car, settings.N, settings.travel, settings.scale.length / settings.scale.time)
@@ -124,10 +124,15 @@ class Controller:
         self._past: Vector | None = None  # the estimated state at the last measurement
         self._expected: Vector | None = None  # by the model, at the next one
 
-    def follow(self, reference: Reference, theta: Vector) -> None:
-        """From now on follows the same line at another speed, with the calibrated car's coefficients ``theta`` ``(17,)``."""
+    def follow(self, reference: Reference, theta: Callable[[Vector], Vector]) -> None:
+        """From now on follows the same line at another speed, with other coefficients of the calibrated car.
+
+        Args:
+            reference: the line.
+            theta: its coefficients ``(N, 17)`` at places along the track (m), ``(N,)``.
+        """
         self._nmpc.follow(reference)
-        self._calibrated = Adapted(theta, self._calibrated.correction)
+        self._calibrated = lambda s: Adapted(theta(s), self._model.calibrated.correction)
 
     @property
     def expected(self) -> Vector | None:
@@ -173,7 +178,9 @@ class Controller:
             self._history.append(np.array([*seen, *commands[0], *(sent[0] if age else planned)]))
             for disturbance in self._disturbances:
                 disturbance.measured(np.array(seen))
-        given = sources(self._calibrated, self._model.read(np.array(self._history), previous))
+        ahead = np.array([pose[:2]]) if previous is None else previous.x[: self._nmpc.settings.N, :2]
+        calibrated = self._calibrated(self._track.project(ahead)[0])
+        given = sources(calibrated, self._model.read(np.array(self._history), previous))
         said = [disturbance.added(one) for disturbance, one in zip(self._disturbances, given, strict=True)]
         adapted = self._evidence.earned(said) if self._wants_evidence else said[-1]
         if is_new or self._past is None:

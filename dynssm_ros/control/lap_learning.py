@@ -5,10 +5,11 @@ section is driven a step faster, if the car stayed away from the borders there a
 too close to a border, and the one before it, go back below what they were driven with, and stay there. One that was slower
 than it has been goes back to what was fastest.
 
-After each lap the coefficients are calibrated on the last ones. No share goes beyond what they allow with what is not known
-of them: the cornering limit that most cars within their covariance reach, over that of the file's car, bounds the shares.
-Where the controller has to stay away from the borders because its model predicts badly, it plans with them instead: if those
-of the laps before have predicted the new lap clearly better than the model's own.
+After each lap the coefficients are calibrated on the last ones, and the grip of each section beside them. No share goes
+beyond what they allow with what is not known of them: the cornering limit that most cars within their covariance reach,
+over that of the file's car, bounds the shares. If the coefficients and the grip of the laps before have predicted a new
+lap clearly better than the model's own coefficients, the calibrated car is planned with them, along the whole horizon.
+What was too close before then counts no longer.
 
 Learning from lap to lap by what a lap measured against the best one is the idea of Rosolia and Borrelli, "Learning model
 predictive control for iterative tasks", 2018, without their terminal set.
@@ -16,11 +17,13 @@ predictive control for iterative tasks", 2018, without their terminal set.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.horizon_model import SteppedCar
@@ -34,7 +37,7 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.track.tracks import Track
-from dynssm_ros.vehicle import State, Vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose
 from dynssm_ros.vehicle.limits import vehicle_limits
 
@@ -49,6 +52,8 @@ _FEWEST_SECTIONS, _MOST_SECTIONS = 4, 40
 _REMEMBERED = 3  # laps that coefficients are calibrated on
 _CLEARLY = 0.9  # of the path error of the model's coefficients, below which others are planned with
 _DRAWS, _CAREFUL = 40, 0.1  # cars within the covariance, and the share of them that are allowed to grip less
+_PEAK = np.isin(COEFFICIENTS, ("D_f", "D_r"))
+_GRIP_STD, _CHANGE = 0.1, 0.02  # of a section's grip before any lap, and to differentiate with
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,7 @@ class LearnedLap:
         allowed: shares that the coefficients allowed, ``(sections,)``.
         margin_used: half the car's width over the least room less caution; 1: a wheel may have been on the border. The first
             lap counts without caution, which is only being learned.
+        grip: of each section over that of these coefficients, as the laps before have shown it, ``(sections,)``.
         vehicle: with the coefficients, and what was known of them, before the lap.
         planned: whether the controller planned with them.
     """
@@ -88,6 +94,7 @@ class LearnedLap:
     shares: Vector
     allowed: Vector
     margin_used: float
+    grip: Vector
     vehicle: Vehicle
     planned: bool
 
@@ -98,6 +105,7 @@ class LearnedLap:
             "speed_scale": self.shares.tolist(),
             "allowed": self.allowed.tolist(),
             "margin_used": self.margin_used,
+            "grip": self.grip.tolist(),
             "coefficients_planned_with": self.planned,
             "coefficients": {
                 name: {"nominal": known.nominal, "std": known.std} for name, known in self.vehicle.coefficients.items()
@@ -113,7 +121,7 @@ class LapLearner:
         track: where.
         reference: the line, at the speed to begin with.
         settings: of the controller.
-        car: the physics of its model.
+        car: the physics of its model; effects that depend on more than the rows of a lap are left out here.
         theta: the model's coefficients, ``(17,)``.
 
     Raises:
@@ -130,7 +138,8 @@ class LapLearner:
         self._limits = reference.limits
         self._line = reference
         self._vehicle = vehicle
-        self._car, self._theta = car, theta
+        self._car = replace(car, effects=tuple(effect for effect in car.effects if not effect.needs))
+        self._theta = theta
         self._N = settings.N
         self._known = vehicle
         self._planned = False
@@ -138,7 +147,9 @@ class LapLearner:
         horizon = HORIZON * settings.scale.time * track.length / reference.lap_time
         sections = int(np.clip(track.length / (_SECTION_HORIZONS * horizon), _FEWEST_SECTIONS, _MOST_SECTIONS))
         self._edges = np.linspace(0.0, track.length, sections + 1)
+        self._centres = (self._edges[1:] + self._edges[:-1]) / 2
         self._at = track.project(reference.line.points)[0]  # of the line's points on the track
+        self._grip, self._careful_grip = np.ones((2, sections))
         self._shares = np.full(sections, reference.share)
         self._ceiling = np.full(sections, np.inf)
         self._best_time, self._best_share = np.full(sections, np.inf), self._shares.copy()
@@ -149,36 +160,54 @@ class LapLearner:
     @property
     def reference(self) -> Reference:
         """The line with the speed for the next lap."""
-        centres = (self._edges[1:] + self._edges[:-1]) / 2
-        share = np.interp(self._at, centres, np.minimum(self._shares, self._allowed), period=self._edges[-1])
+        share = np.interp(self._at, self._centres, np.minimum(self._shares, self._allowed), period=self._edges[-1])
         return replace(self._line, speed=speed_profile(self._line.line, self._limits, share), share=None)
 
-    @property
-    def theta(self) -> Vector:
-        """Coefficients of the calibrated car for the next lap, ``(17,)``."""
-        return self._known.nominal if self._planned else self._theta
+    def theta(self, s: Vector) -> Vector:
+        """Coefficients of the calibrated car at places of the next lap (m), ``(N, 17)``."""
+        return self._known_at(s) if self._planned else np.tile(self._theta, (len(s), 1))
+
+    def _known_at(self, s: Vector) -> Vector:
+        """What is known of the coefficients at places (m), ``(N, 17)``."""
+        grip = np.interp(s, self._centres, self._grip, period=self._edges[-1])
+        found: Vector = self._known.nominal * np.where(_PEAK, grip[:, None], 1.0)
+        return found
 
     def learn(self, lap: LapLog) -> None:
         """Takes a lap that was driven with :attr:`reference`."""
         driven = np.minimum(self._shares, self._allowed)
         times, used = self._by_section(lap)
         self.laps.append(
-            LearnedLap(float(lap.time[-1] - lap.time[0]), driven, self._allowed, used.max(), self._known, self._planned)
+            LearnedLap(
+                float(lap.time[-1] - lap.time[0]),
+                driven,
+                self._allowed,
+                used.max(),
+                self._grip,
+                self._known,
+                self._planned,
+            )
         )
         close = used > _CLOSE
-        if self._logs and (self._planned or close.any()):
-            before = self._path_error(self._known.nominal, lap)  # of coefficients that this lap had no part in
-            self._planned = before < _CLEARLY * self._path_error(self._theta, lap)
+        planned = self._planned
+        if self._logs:
+            before = self._path_error(self._known_at, lap)  # of coefficients that this lap had no part in
+            self._planned = before < _CLEARLY * self._path_error(lambda s: self._theta, lap)
+        is_new = self._planned and not planned
+        if is_new:
+            self._ceiling[:] = np.inf  # what was too close was planned with other coefficients
         close |= np.roll(close, -1)  # what leads there
         slower = ~close & (times > (1 + _SLOWER) * self._best_time)
         better = ~close & (times < self._best_time)
         self._best_time = np.where(better, times, self._best_time)
         self._best_share = np.where(better, driven, self._best_share)
-        self._ceiling = np.where(close, np.minimum(self._ceiling, driven - _STEP / 2), self._ceiling)
-        faster = np.minimum(driven + _STEP, self._ceiling)
+        elsewhere = ~close | is_new
+        self._ceiling = np.where(elsewhere, self._ceiling, np.minimum(self._ceiling, driven - _STEP / 2))
+        faster = np.minimum(np.where(close, driven, driven + _STEP), self._ceiling)
         self._shares = np.where(slower, np.minimum(self._best_share, self._ceiling), faster)
         self._logs = [*self._logs, lap][-_REMEMBERED:]
         self._known = self._calibrated()
+        self._grip, self._careful_grip = self._local_grip()
         self._allowed = self._allowance()
 
     def _by_section(self, lap: LapLog) -> tuple[Vector, Vector]:
@@ -188,10 +217,9 @@ class LapLearner:
         marks = np.interp((self._edges - first) % self._edges[-1], s, lap.time)
         around = lap.time[-1] - lap.time[0]
         times = np.diff(marks) % around
-        section = np.searchsorted(self._edges, (lap.s % self._edges[-1]), "right") - 1
         room = lap.room - (lap.caution if self.laps else 0.0)
         used = np.zeros(len(times))
-        np.maximum.at(used, np.clip(section, 0, len(times) - 1), self._half_width / np.maximum(room, 1e-9))
+        np.maximum.at(used, self._section(lap.s), self._half_width / np.maximum(room, 1e-9))
         return times, used
 
     def _calibrated(self) -> Vehicle:
@@ -207,13 +235,14 @@ class LapLearner:
         except (RecordingError, ConfigurationError):
             return self._known
 
-    def _path_error(self, theta: Vector, lap: LapLog) -> float:
+    def _path_error(self, theta: Callable[[Vector], Vector], lap: LapLog) -> float:
         """RMS distance (m) between predicted and measured paths at the end of a horizon, both from their velocities."""
         starts = np.arange(0, len(lap.rows) - self._N - 1, max(1, self._N // 4))
         rows = lap.rows[starts]
         predicted = measured = Pose(*np.zeros((3, len(starts))))
         for k in range(self._N):
-            following, now, seen = stepped(self._car, rows, theta), lap.rows[starts + k], lap.rows[starts + k + 1]
+            following = stepped(self._car, rows, theta(lap.s[starts + k]))
+            now, seen = lap.rows[starts + k], lap.rows[starts + k + 1]
             predicted = _moved(predicted, rows, following, self._car.T_s)
             measured = _moved(measured, now, seen, self._car.T_s)
             rows = np.concatenate([following, seen[:, 3:]], axis=1)
@@ -225,10 +254,35 @@ class LapLearner:
         careful = np.quantile(lateral, _CAREFUL, axis=0) / self._limits.lateral
         speed = speed_profile(self._line.line, self._limits)
         at_points = np.interp(speed, self._limits.speed, careful)
-        section = np.clip(np.searchsorted(self._edges, self._at, "right") - 1, 0, len(self._shares) - 1)
+        section = self._section(self._at)
         least = np.full(len(self._shares), np.inf)
         np.minimum.at(least, section, at_points)
-        return _MOST * np.where(np.isfinite(least), least, careful.min())
+        return _MOST * self._careful_grip * np.where(np.isfinite(least), least, careful.min())
+
+    def _local_grip(self) -> tuple[Vector, Vector]:
+        """Grip of each section over that of the known coefficients: the likely one, and one that nine of ten reach.
+
+        Least squares of the one-step errors of v_y and omega on what more grip of all tyres would change, with a prior of 1.
+        """
+        total, along = np.zeros((2, len(self._shares)))
+        theta = self._known.nominal
+        more, less = (np.where(_PEAK, (1 + change) * theta, theta) for change in (_CHANGE, -_CHANGE))
+        for log in self._logs:
+            rows = log.rows[:-1]
+            error = (log.rows[1:, :3] - stepped(self._car, rows, theta))[:, 1:]
+            answer = (stepped(self._car, rows, more) - stepped(self._car, rows, less))[:, 1:] / (2 * _CHANGE)
+            weight = 1.0 / np.maximum(np.mean(error**2, axis=0), 1e-12)
+            section = self._section(log.s[:-1])
+            np.add.at(total, section, (answer**2 * weight).sum(axis=1))
+            np.add.at(along, section, (answer * error * weight).sum(axis=1))
+        precision = total + _GRIP_STD**-2
+        grip = 1.0 + along / precision
+        return grip, grip - NormalDist().inv_cdf(1.0 - _CAREFUL) * precision**-0.5
+
+    def _section(self, s: Vector) -> npt.NDArray[np.intp]:
+        """In which section places (m) are."""
+        found: npt.NDArray[np.intp] = np.searchsorted(self._edges, s % self._edges[-1], "right") - 1
+        return found.clip(0, len(self._shares) - 1)
 
     def _possible_limits(self) -> Sequence[tuple[Vector, Vector]]:
         """Speeds and cornering limits of cars within the covariance of the coefficients; the known car's first."""

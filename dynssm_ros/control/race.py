@@ -223,7 +223,7 @@ class _Drive:
         if course.learning is not None:
             theta = model.calibrated.first.theta
             self._learner = LapLearner(course.learning, track, course.reference, settings, model.car, theta)
-            self.pilot.follow(self._learner.reference, theta)
+            self.pilot.follow(self._learner.reference, self._learner.theta)
         self.s, self._lateral = (float(value) for value in track.project(pose[:2]))
         self.start, self.goal = self.s, self.s + course.laps * track.length
 

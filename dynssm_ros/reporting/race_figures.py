@@ -198,23 +198,23 @@ def coefficients(races: Sequence[Race]) -> Figure:
 
 @styled
 def learning(races: Sequence[Race]) -> Figure:
-    """Lap times, shares of the limits, margins and coefficients, lap by lap."""
+    """Lap times, shares of the limits, margins, grip and coefficients, lap by lap; bands are all sections."""
     races = [race for race in races if race.learned]
     colours = model_colours([race.name for race in races])
     known = {name for race in races for name in _learned_most(race)}
     names = [name for name in COEFFICIENTS if name in known]
     figure = Figure(figsize=(WIDTH, 0.8 + 1.9 * (2 + -(-len(names) // 2))), layout="constrained")
     panels = figure.subplots(2 + -(-len(names) // 2), 2, sharex=True, squeeze=False)
-    labels = ("lap time (s)", "share of the limits", "margin used", "")
+    labels = ("lap time (s)", "share of the limits", "margin used", "grip of the sections")
     for panel, label in zip(panels.flat, labels, strict=False):
         panel.set_ylabel(label)
-    panels[1, 1].set_visible(False)
     for race in races:
         colour, laps = colours[race.name], np.arange(1, len(race.learned) + 1)
-        shares = np.array([lap.shares for lap in race.learned])
         panels[0, 0].plot(laps, [lap.time for lap in race.learned], "o-", ms=4, color=colour, label=race.name)
-        panels[0, 1].plot(laps, shares.mean(axis=1), "o-", ms=4, color=colour)
-        panels[0, 1].fill_between(laps, shares.min(axis=1), shares.max(axis=1), color=colour, alpha=0.15, lw=0)
+        by_section = [[lap.shares for lap in race.learned], [lap.grip for lap in race.learned]]
+        for panel, sections in zip(panels[:2, 1], map(np.array, by_section), strict=True):
+            panel.plot(laps, sections.mean(axis=1), "o-", ms=4, color=colour)
+            panel.fill_between(laps, sections.min(axis=1), sections.max(axis=1), color=colour, alpha=0.15, lw=0)
         panels[1, 0].plot(laps, np.minimum([lap.margin_used for lap in race.learned], 1.5), "o-", ms=4, color=colour)
         for panel, name in zip(panels[2:].flat, names, strict=False):
             values = np.array([lap.vehicle.coefficients[name].nominal for lap in race.learned])

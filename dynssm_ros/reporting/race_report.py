@@ -134,8 +134,9 @@ def race_report(races: Sequence[Race]) -> Report:
                 "Faster every lap",
                 "Lap times. The share of the file's car's accelerations that each lap was driven with: mean over its "
                 "sections, the least and the largest. How close the car came to a border: 1 is a wheel on it, and from 0.75 "
-                "on a section is driven slower. The coefficients that were calibrated on the laps before, with two standard "
-                "deviations; the dashed line is what the effects of the driven car come to.",
+                "on a section is driven slower. The grip of the sections over that of the coefficients beside it. The "
+                "coefficients that were calibrated on the laps before, with two standard deviations; the dashed line is what "
+                "the effects of the driven car come to.",
                 learning(races),
             ),
         )

@@ -103,6 +103,34 @@ def test_a_line_with_a_speed_of_its_own_is_refused(orca, club):
         LapLearner(orca, club, own, Settings.of(orca), SteppedCar.of(orca), orca.nominal)
 
 
+def test_grip_is_learned_where_it_is_and_bounds_the_speed_there(orca, club):
+    """On two fifths of the lap the car grips a fifth less; nobody tells."""
+    driven = orca.with_effect("grip_patch", {"factor": 0.8, "centre": 0.5, "length": 0.4})
+    settings, line = replace(Settings.of(orca), deadline=np.inf), load_reference("racing", orca, club, SAFE)
+    sensing = Sensing((0.01, 0.01, 0.03), (0.002, 0.002, 0.002), 0.02)
+    course = Course(driven, club, "rk4", line, settings, 4, sensing=sensing, learning=orca)
+    outcome = race(course, Fixed("file", SteppedCar.of(orca, "rk4", 2), orca.nominal))
+    assert outcome.completed
+    assert outcome.outside == 0
+    last = outcome.learned[-1]
+    centres = (np.arange(len(last.grip)) + 0.5) / len(last.grip)
+    inside, outside = np.abs(centres - 0.5) < 0.15, np.abs(centres - 0.5) > 0.28
+    assert last.grip[inside].mean() / last.grip[outside].mean() == pytest.approx(0.8, abs=0.05)
+    assert last.allowed[inside].max() < 0.92 * last.allowed[outside].min()
+    assert last.planned
+    np.testing.assert_array_equal(outcome.learned[0].grip, 1.0)
+    assert outcome.to_json()["learned"][-1]["grip"] == last.grip.tolist()
+
+
+def test_a_model_that_knows_of_the_place_learns_without_it(learner, orca, club):
+    driven = orca.with_effect("grip_patch", {"factor": 0.8, "centre": 0.5, "length": 0.4})
+    knowing = LapLearner(orca, club, learner._line, Settings.of(orca), SteppedCar.of(driven), orca.nominal)
+    knowing._calibrated = lambda: orca
+    for _ in range(2):
+        knowing.learn(lap(learner))
+    assert len(knowing.laps) == 2
+
+
 def test_a_car_with_less_grip_than_its_file_learns_it_and_comes_round_faster(orca, club):
     """The front tyres grip 15 % less than the controller's model has it."""
     driven = orca.with_effect("front_grip", {"factor": 0.85})
