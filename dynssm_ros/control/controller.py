@@ -97,7 +97,7 @@ class Controller:
         self.counts: dict[Status, int] = dict.fromkeys(get_args(Status), 0)
         """Steps by what became of their plan."""
         self._model = model
-        self._calibrated: Callable[[Vector], Adapted] = lambda s: model.calibrated
+        self._theta: Callable[[Vector], Vector] | None = None  # of the calibrated car; the model's
         self._track = track
         self._clock = clock
         horizon = HorizonModel(model.car, settings.N, settings.travel, settings.scale.length / settings.scale.time)
@@ -132,7 +132,7 @@ class Controller:
             theta: its coefficients ``(N, 17)`` at places along the track (m), ``(N,)``.
         """
         self._nmpc.follow(reference)
-        self._calibrated = lambda s: Adapted(theta(s), self._model.calibrated.correction)
+        self._theta = theta
 
     @property
     def expected(self) -> Vector | None:
@@ -178,9 +178,7 @@ class Controller:
             self._history.append(np.array([*seen, *commands[0], *(sent[0] if age else planned)]))
             for disturbance in self._disturbances:
                 disturbance.measured(np.array(seen))
-        ahead = np.array([pose[:2]]) if previous is None else previous.x[: self._nmpc.settings.N, :2]
-        calibrated = self._calibrated(self._track.project(ahead)[0])
-        given = sources(calibrated, self._model.read(np.array(self._history), previous))
+        given = sources(self._calibrated(pose, previous), self._model.read(np.array(self._history), previous))
         said = [disturbance.added(one) for disturbance, one in zip(self._disturbances, given, strict=True)]
         adapted = self._evidence.earned(said) if self._wants_evidence else said[-1]
         if is_new or self._past is None:
@@ -197,6 +195,13 @@ class Controller:
             self._gather(at, first, said, bool(np.all(np.isfinite([*pose, *seen, *feedback]))))
         self.counts[plan.status] += 1
         return Decision(command, plan, adapted, float(margins.lateral[-1]), weights, self._clock() - began)
+
+    def _calibrated(self, pose: Pose, previous: Plan | None) -> Adapted:
+        """The calibrated car, along the plan where its coefficients depend on the place."""
+        ahead = np.array([pose[:2]]) if previous is None else previous.x[: self._nmpc.settings.N, :2]
+        if self._theta is None or not np.all(np.isfinite(ahead)):
+            return self._model.calibrated
+        return Adapted(self._theta(self._track.project(ahead)[0]), self._model.calibrated.correction)
 
     def _gather(self, t: float, increments: Vector, said: Sequence[Adapted], is_sound: bool) -> None:
         """Takes what was said at the last measurement (s), and what was sent from there on, as evidence.
