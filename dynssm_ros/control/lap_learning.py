@@ -7,9 +7,10 @@ than it has been goes back to what was fastest.
 
 After each lap the coefficients are calibrated on the last ones, and the grip of each section beside them. No share goes
 beyond what they allow with what is not known of them: the cornering limit that most cars within their covariance reach,
-over that of the file's car, bounds the shares. If the coefficients and the grip of the laps before have predicted a new
-lap clearly better than the model's own coefficients, the calibrated car is planned with them, along the whole horizon.
-What was too close before then counts no longer.
+over that of the file's car, bounds the shares. The grip of the sections counts if a new lap is predicted clearly better
+with that of the laps before than without. If the coefficients of the laps before predict it clearly better than the
+model's own, the calibrated car is planned with them, along the whole horizon. What was too close before then counts no
+longer.
 
 Learning from lap to lap by what a lap measured against the best one is the idea of Rosolia and Borrelli, "Learning model
 predictive control for iterative tasks", 2018, without their terminal set.
@@ -50,7 +51,7 @@ _SLOWER = 0.01  # share of a section's best time
 _SECTION_HORIZONS = 1.5  # length of a section, in horizons at the line's mean speed
 _FEWEST_SECTIONS, _MOST_SECTIONS = 4, 40
 _REMEMBERED = 3  # laps that coefficients are calibrated on
-_CLEARLY = 0.9  # of the path error of the model's coefficients, below which others are planned with
+_CLEARLY = 0.9  # of the path error, below which other coefficients, or the grip of each section, are believed
 _DRAWS, _CAREFUL = 40, 0.1  # cars within the covariance, and the share of them that are allowed to grip less
 _PEAK = np.isin(COEFFICIENTS, ("D_f", "D_r"))
 _GRIP_STD, _CHANGE = 0.1, 0.02  # of a section's grip before any lap, and to differentiate with
@@ -85,7 +86,7 @@ class LearnedLap:
         allowed: shares that the coefficients allowed, ``(sections,)``.
         margin_used: half the car's width over the least room less caution; 1: a wheel may have been on the border. The first
             lap counts without caution, which is only being learned.
-        grip: of each section over that of these coefficients, as the laps before have shown it, ``(sections,)``.
+        grip: of each section over that of these coefficients, ``(sections,)``; 1 as long as that is not believed.
         vehicle: with the coefficients, and what was known of them, before the lap.
         planned: whether the controller planned with them.
     """
@@ -150,6 +151,7 @@ class LapLearner:
         self._centres = (self._edges[1:] + self._edges[:-1]) / 2
         self._at = track.project(reference.line.points)[0]  # of the line's points on the track
         self._grip, self._careful_grip = np.ones((2, sections))
+        self._is_local = False
         self._shares = np.full(sections, reference.share)
         self._ceiling = np.full(sections, np.inf)
         self._best_time, self._best_share = np.full(sections, np.inf), self._shares.copy()
@@ -165,12 +167,13 @@ class LapLearner:
 
     def theta(self, s: Vector) -> Vector:
         """Coefficients of the calibrated car at places of the next lap (m), ``(N, 17)``."""
-        return self._known_at(s) if self._planned else np.tile(self._theta, (len(s), 1))
+        theta = self._known.nominal if self._planned else self._theta
+        return self._on_the_road(theta, s) if self._planned and self._is_local else np.tile(theta, (len(s), 1))
 
-    def _known_at(self, s: Vector) -> Vector:
-        """What is known of the coefficients at places (m), ``(N, 17)``."""
+    def _on_the_road(self, theta: Vector, s: Vector) -> Vector:
+        """Coefficients with the grip of the sections, at places (m), ``(N, 17)``."""
         grip = np.interp(s, self._centres, self._grip, period=self._edges[-1])
-        found: Vector = self._known.nominal * np.where(_PEAK, grip[:, None], 1.0)
+        found: Vector = theta * np.where(_PEAK, grip[:, None], 1.0)
         return found
 
     def learn(self, lap: LapLog) -> None:
@@ -179,21 +182,17 @@ class LapLearner:
         times, used = self._by_section(lap)
         self.laps.append(
             LearnedLap(
-                float(lap.time[-1] - lap.time[0]),
-                driven,
-                self._allowed,
-                used.max(),
-                self._grip,
-                self._known,
-                self._planned,
+                time=float(lap.time[-1] - lap.time[0]),
+                shares=driven,
+                allowed=self._allowed,
+                margin_used=used.max(),
+                grip=self._grip if self._is_local else np.ones(len(driven)),
+                vehicle=self._known,
+                planned=self._planned,
             )
         )
         close = used > _CLOSE
-        planned = self._planned
-        if self._logs:
-            before = self._path_error(self._known_at, lap)  # of coefficients that this lap had no part in
-            self._planned = before < _CLEARLY * self._path_error(lambda s: self._theta, lap)
-        is_new = self._planned and not planned
+        is_new = self._believe(lap)
         if is_new:
             self._ceiling[:] = np.inf  # what was too close was planned with other coefficients
         close |= np.roll(close, -1)  # what leads there
@@ -209,6 +208,22 @@ class LapLearner:
         self._known = self._calibrated()
         self._grip, self._careful_grip = self._local_grip()
         self._allowed = self._allowance()
+
+    def _believe(self, lap: LapLog) -> bool:
+        """Chooses what to plan with, by how well it predicts a lap that it had no part in.
+
+        Returns:
+            Whether that is the calibrated coefficients for the first time, or again.
+        """
+        if not self._logs:
+            return False
+        known, planned = self._known.nominal, self._planned
+        own = self._path_error(lambda s: self._theta, lap)
+        same = self._path_error(lambda s: known, lap)
+        local = self._path_error(lambda s: self._on_the_road(known, s), lap)
+        self._is_local = local < _CLEARLY * same
+        self._planned = (local if self._is_local else same) < _CLEARLY * own
+        return self._planned and not planned
 
     def _by_section(self, lap: LapLog) -> tuple[Vector, Vector]:
         """Time in each section (s), and the margin used there at most."""
@@ -257,7 +272,8 @@ class LapLearner:
         section = self._section(self._at)
         least = np.full(len(self._shares), np.inf)
         np.minimum.at(least, section, at_points)
-        return _MOST * self._careful_grip * np.where(np.isfinite(least), least, careful.min())
+        local = self._careful_grip if self._is_local else 1.0
+        return _MOST * local * np.where(np.isfinite(least), least, careful.min())
 
     def _local_grip(self) -> tuple[Vector, Vector]:
         """Grip of each section over that of the known coefficients: the likely one, and one that nine of ten reach.
