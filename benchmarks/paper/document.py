@@ -31,7 +31,7 @@ def write(results: Results, path: Path) -> None:
     drawn = dict(draw(results))
     for name, figure in drawn.items():
         with replacing(path.with_name(f"{path.stem}_{name}.png")) as aside:
-            figure.savefig(aside, dpi=_DPI, metadata={"Software": None})
+            figure.savefig(aside, dpi=_DPI, bbox_inches="tight", metadata={"Software": None})
     with replacing(path) as aside:
         text = markdown(results, {name: f"{path.stem}_{name}.png" for name in drawn})
         aside.write_text(signed(text, results.plan), encoding="utf-8")
