@@ -71,7 +71,7 @@ class DriveLaps(Step):
             write_json(folder / NUMBERS, race_json(races))
             for figure in race.figures:
                 getattr(race_figures, figure)(races).savefig(
-                    folder / f"{figure}.png", dpi=_DPI, metadata={"Software": None}
+                    folder / f"{figure}.png", dpi=_DPI, bbox_inches="tight", metadata={"Software": None}
                 )
 
     def _line(self) -> str | Path:
