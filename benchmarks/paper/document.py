@@ -23,7 +23,6 @@ _DATA = {
     "development": "Development data: models and their settings were chosen with such data in sight.",
     "test": "Test data: nothing was chosen by it.",
 }
-_DPI = 130
 
 
 def write(results: Results, path: Path) -> None:
@@ -31,7 +30,7 @@ def write(results: Results, path: Path) -> None:
     drawn = dict(draw(results))
     for name, figure in drawn.items():
         with replacing(path.with_name(f"{path.stem}_{name}.png")) as aside:
-            figure.savefig(aside, dpi=_DPI, bbox_inches="tight", metadata={"Software": None})
+            figures.save(figure, aside)
     with replacing(path) as aside:
         text = markdown(results, {name: f"{path.stem}_{name}.png" for name in drawn})
         aside.write_text(signed(text, results.plan), encoding="utf-8")

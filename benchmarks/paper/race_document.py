@@ -9,6 +9,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from benchmarks.paper.document import MADE_BY
+from benchmarks.paper.figures import save
 from benchmarks.paper.plan import MID_RANGE, Race
 from benchmarks.paper.race_figures import lap_over_speed_scale
 from benchmarks.paper.reference import ClosedLoop
@@ -35,7 +36,6 @@ _CAPTIONS = {
     "speed_scale": "Lap time over the factor on the line's speed; hollow at the top: not completed",
 }
 _SWEEP = 3  # races that differ in nothing but their speed_scale and make a figure together
-_DPI = 130
 
 
 def write_races(results: Results, root: Path, path: Path) -> None:
@@ -50,7 +50,7 @@ def write_races(results: Results, root: Path, path: Path) -> None:
     for names in _sweeps(results):
         pictures[names[-1]]["speed_scale"] = f"{path.stem}_{names[0]}_pace.png"
         with replacing(path.with_name(pictures[names[-1]]["speed_scale"])) as aside:
-            _over_pace(results, names).savefig(aside, format="png", dpi=_DPI, metadata={"Software": None})
+            save(_over_pace(results, names), aside)
     with replacing(path) as aside:
         aside.write_text(signed(races_markdown(results, pictures), results.plan), encoding="utf-8")
 

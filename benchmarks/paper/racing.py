@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
+from benchmarks.paper.figures import save
 from benchmarks.paper.plan import MID_RANGE, Race
 from benchmarks.paper.steps import Step, in_data, named_track
 from dynssm_ros.control.prediction_model import PredictionModel
@@ -24,7 +25,6 @@ from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 
 NUMBERS = "results.json"
-_DPI = 130
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,9 +70,7 @@ class DriveLaps(Step):
             folder.mkdir()
             write_json(folder / NUMBERS, race_json(races))
             for figure in race.figures:
-                getattr(race_figures, figure)(races).savefig(
-                    folder / f"{figure}.png", dpi=_DPI, bbox_inches="tight", metadata={"Software": None}
-                )
+                save(getattr(race_figures, figure)(races), folder / f"{figure}.png")
 
     def _line(self) -> str | Path:
         return self.race.line if self.race.line in get_args(LineKind) else in_data(self.data, self.race.line)

@@ -198,8 +198,10 @@ class Controller:
 
     def _calibrated(self, pose: Pose, previous: Plan | None) -> Adapted:
         """The calibrated car, along the plan where its coefficients depend on the place."""
+        if self._theta is None:
+            return self._model.calibrated
         ahead = np.array([pose[:2]]) if previous is None else previous.x[: self._nmpc.settings.N, :2]
-        if self._theta is None or not np.all(np.isfinite(ahead)):
+        if not np.all(np.isfinite(ahead)):
             return self._model.calibrated
         return Adapted(self._theta(self._track.project(ahead)[0]), self._model.calibrated.correction)
 

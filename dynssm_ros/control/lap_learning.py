@@ -167,13 +167,17 @@ class LapLearner:
 
     def theta(self, s: Vector) -> Vector:
         """Coefficients of the calibrated car at places of the next lap (m), ``(N, 17)``."""
-        theta = self._known.nominal if self._planned else self._theta
-        return self._on_the_road(theta, s) if self._planned and self._is_local else np.tile(theta, (len(s), 1))
+        return self._known_at(s, self._believed_grip) if self._planned else np.tile(self._theta, (len(s), 1))
 
-    def _on_the_road(self, theta: Vector, s: Vector) -> Vector:
-        """Coefficients with the grip of the sections, at places (m), ``(N, 17)``."""
-        grip = np.interp(s, self._centres, self._grip, period=self._edges[-1])
-        found: Vector = theta * np.where(_PEAK, grip[:, None], 1.0)
+    @property
+    def _believed_grip(self) -> Vector:
+        """Grip of each section that is planned with; 1 as long as what was learned of it has not proved to be better."""
+        return self._grip if self._is_local else np.ones_like(self._grip)
+
+    def _known_at(self, s: Vector, grip: Vector) -> Vector:
+        """The calibrated coefficients with the grip of the sections, at places (m), ``(N, 17)``."""
+        here = np.interp(s, self._centres, grip, period=self._edges[-1])
+        found: Vector = self._known.nominal * np.where(_PEAK, here[:, None], 1.0)
         return found
 
     def learn(self, lap: LapLog) -> None:
@@ -186,7 +190,7 @@ class LapLearner:
                 shares=driven,
                 allowed=self._allowed,
                 margin_used=used.max(),
-                grip=self._grip if self._is_local else np.ones(len(driven)),
+                grip=self._believed_grip,
                 vehicle=self._known,
                 planned=self._planned,
             )
@@ -200,8 +204,8 @@ class LapLearner:
         better = ~close & (times < self._best_time)
         self._best_time = np.where(better, times, self._best_time)
         self._best_share = np.where(better, driven, self._best_share)
-        elsewhere = ~close | is_new
-        self._ceiling = np.where(elsewhere, self._ceiling, np.minimum(self._ceiling, driven - _STEP / 2))
+        lower = np.minimum(self._ceiling, driven - _STEP / 2)
+        self._ceiling = np.where(close & ~is_new, lower, self._ceiling)
         faster = np.minimum(np.where(close, driven, driven + _STEP), self._ceiling)
         self._shares = np.where(slower, np.minimum(self._best_share, self._ceiling), faster)
         self._logs = [*self._logs, lap][-_REMEMBERED:]
@@ -217,10 +221,10 @@ class LapLearner:
         """
         if not self._logs:
             return False
-        known, planned = self._known.nominal, self._planned
+        planned = self._planned
         own = self._path_error(lambda s: self._theta, lap)
-        same = self._path_error(lambda s: known, lap)
-        local = self._path_error(lambda s: self._on_the_road(known, s), lap)
+        same = self._path_error(lambda s: self._known.nominal, lap)
+        local = self._path_error(lambda s: self._known_at(s, self._grip), lap)
         self._is_local = local < _CLEARLY * same
         self._planned = (local if self._is_local else same) < _CLEARLY * own
         return self._planned and not planned

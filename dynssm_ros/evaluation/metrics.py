@@ -71,17 +71,7 @@ def predict_rows(
             predicted = corrected(predicted, windows, model.online, drive.at(chunk))
         parts.append(predicted._replace(seen=None))
         tick(len(chunk))
-    return joined(parts)
-
-
-def joined(parts: Sequence[WindowPrediction]) -> WindowPrediction:
-    """Predictions of several stretches of rows as one, less what was seen; not empty."""
-    return WindowPrediction(
-        np.concatenate([part.state for part in parts]),
-        _join([part.theta for part in parts]),
-        _join([part.physics for part in parts]),
-        _join([part.variance for part in parts]),
-    )
+    return WindowPrediction.joined(parts)
 
 
 class DriveThrough(NamedTuple):
@@ -101,7 +91,7 @@ def drive_through(
 ) -> Iterator[tuple[DriveThrough | None, list[Indices]]]:
     """Lets the model's online layer learn wherever its window is whole and the car not slower than its minimum speed.
 
-    It knows a thousand numbers at each row, so it is asked block by block, and what it knew is given up after each.
+    It knows a kilobyte of numbers at each row, so it is asked block by block, and what it knew is given up after each.
 
     Args:
         model: with or without an online layer.
@@ -114,8 +104,7 @@ def drive_through(
         nothing learns.
     """
     layer, matrix = model.online, recording.matrix
-    ends = None if layer is None else recording.window_ends(model.H, 0, layer.minimum_speed)
-    if layer is None or ends is None or len(ends) == 0:
+    if layer is None or len(ends := recording.window_ends(model.H, 0, layer.minimum_speed)) == 0:
         yield None, list(asked)
         return
     along, judge, last = Along(layer), PathJudge(layer), None
@@ -196,8 +185,3 @@ def finite(value: float) -> float | None:
 def by_channel(values: Vector) -> dict[str, float | None]:
     """Names the entries of a ``(3,)`` array."""
     return {name: finite(value) for name, value in zip(STATE_SIGNALS, values, strict=True)}
-
-
-def _join(parts: list[Vector | None]) -> Vector | None:
-    known = [part for part in parts if part is not None]
-    return np.concatenate(known) if known else None

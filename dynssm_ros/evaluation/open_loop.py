@@ -22,7 +22,6 @@ from dynssm_ros.evaluation.metrics import (
     explained,
     finite,
     gather,
-    joined,
     latency_us,
     max_error,
     predict_rows,
@@ -32,7 +31,7 @@ from dynssm_ros.evaluation.regimes import Regime, driving_regimes, liveliest, re
 from dynssm_ros.evaluation.rollout import Rollout, score_rollouts
 from dynssm_ros.evaluation.score import Group, Score, grouped
 from dynssm_ros.parallel import HERE, Workers, each
-from dynssm_ros.runtime.models import WindowModel
+from dynssm_ros.runtime.models import WindowModel, WindowPrediction
 from dynssm_ros.runtime.online import Learned
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands
@@ -250,7 +249,7 @@ class _On:
                     rollouts.append(score_rollouts(model, matrix, starts, self.steps, T_s, batch, tick, drive))
                 if drive is not None:
                     knowledge.append(drive.at(drawn))
-            predicted = joined(predictions)
+            predicted = WindowPrediction.joined(predictions)
             errors = predicted.state - matrix[rows + 1, :3]
             return Score(
                 model=model,
