@@ -80,7 +80,7 @@ def task_document() -> dict[str, Any]:
 
 def write_documents() -> None:
     """The tables of the models, and those of the races."""
-    results = read_results(PLAN, load_reference(), OUT, STEPS, Made({"Made": origin()}, QUICK))
+    results = read_results(PLAN, load_reference(), OUT, STEPS, Made({"Page written": origin()}, QUICK))
     write(results, RESULTS)
     if PLAN.races:
         write_races(results, OUT, RESULTS.with_name(f"{RESULTS.stem}_race.md"))
@@ -88,7 +88,7 @@ def write_documents() -> None:
 
 
 def origin() -> str:
-    """When, on what and by which versions."""
+    """When, on what and by which versions the page was written; a step is measured anew only if its settings change."""
     libraries = ", ".join(f"{name} {version(name)}" for name in ("torch", "onnxruntime", "numpy"))
     code = f"dynssm_ros {__version__}{commit()}, Python {platform.python_version()}, {libraries}"
     return f"{datetime.now(timezone.utc):%Y-%m-%d} by {code}, on {os.cpu_count()} cores ({processor()})"
