@@ -39,6 +39,7 @@ from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDIC
 _END_TIMEOUT = 10.0  # s
 _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
 _DRAIN = 2.0  # s without an answer after the last message before the run counts as over
+PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"  # environment variable that a process reads once
 
 
 @dataclass
@@ -120,10 +121,14 @@ _RESERVED: deque[socket.socket] = deque(maxlen=20)
 
 
 def isolated_environment() -> dict[str, str]:
-    """The environment with a ROS domain of its own on this host, so that parallel runs do not hear each other."""
+    """The environment with a ROS domain of its own on this host, so that parallel runs do not hear each other.
+
+    With a file of Fast DDS profiles the transports are the file's; ``LOCALHOST`` would add those that there are without it.
+    """
     domains = random.SystemRandom().sample(range(1, 101), 100)
     domain = next(filter(_reserve, domains), domains[0])
-    return os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    reach = "SUBNET" if PROFILES in os.environ else "LOCALHOST"
+    return os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": reach}
 
 
 def _reserve(domain: int) -> bool:
@@ -244,6 +249,7 @@ def run_live(
     odometry_topic: str = ODOMETRY_TOPIC,
     parameters: Mapping[str, object] | None = None,
     progress: Callable[[int, int], None] | None = None,
+    held_up: tuple[float, float] | None = None,
 ) -> LiveRun:
     """Starts the predictor, plays ``bag`` to it in real time and collects its answers.
 
@@ -256,6 +262,7 @@ def run_live(
         odometry_topic: whose messages are answered.
         parameters: further ROS parameters of the predictor.
         progress: told of seconds played and to be played.
+        held_up: from when to when in the recording the predictor is stopped, as if it got no computing time (s).
 
     Raises:
         UserError: the predictor does not start; carries its own words.
@@ -271,11 +278,14 @@ def run_live(
                 raise UserError("the predictor did not subscribe to the bag's topics within 30 s")
         collector.wait_for(lambda: collector.count_publishers(PREDICTION_TOPIC) > 0, MATCH_TIMEOUT)
         first: int | None = None
+        signals = deque(zip(held_up or (), (signal.SIGSTOP, signal.SIGCONT), strict=False))
         for message, sent in playback.play(rate, duration):
             if message.topic == odometry_topic:
                 stamp = _stamp_of(message.raw)
                 run.sent[stamp] = sent
                 first = first or message.log_time
+                while signals and message.log_time - first > signals[0][0] * 1e9:
+                    process.send_signal(signals.popleft()[1])
                 if progress is not None and len(run.sent) % 25 == 0:
                     progress(round((message.log_time - first) / 1e9), round(min(duration, 1e6)))
         wait_for_the_last(run, collector.wait_for)
