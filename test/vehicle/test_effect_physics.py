@@ -84,6 +84,18 @@ def test_within_the_dead_band_the_throttle_does_nothing(r: float, acts: float) -
     assert accelerations(q) == pytest.approx(accelerations(act(applied=Applied(acts, 0.05))))
 
 
+def test_beyond_the_power_limit_throttle_and_speed_give_no_more_power() -> None:
+    v_0 = 5.0
+    limited = {"inverse_speed": 1.0 / v_0}
+    at = act(applied=Applied(1.0, 0.0), power_limit=limited)
+    assert 0.99 < at.F_d * STATE.v_x / (PLAIN.theta.C_m1 * v_0) < 1.0
+    assert at.F_rx - at.F_d == pytest.approx(PLAIN.F_rx - PLAIN.F_d)
+    gentle = Applied(0.1, 0.0)
+    assert act(applied=gentle, power_limit=limited).F_d == pytest.approx(act(applied=gentle).F_d, rel=0.01)
+    brakes = Applied(-1.0, 0.0)
+    assert accelerations(act(applied=brakes, power_limit=limited)) == accelerations(act(applied=brakes))
+
+
 def test_front_drive_turns_with_the_front_wheels() -> None:
     share = 0.4
     q, pulled = act(front_drive={"share": share}), share * PLAIN.F_d

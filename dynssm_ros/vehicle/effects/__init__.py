@@ -32,7 +32,7 @@ from dynssm_ros.vehicle.effects.drivetrain import FrontDrive, LockedDifferential
 from dynssm_ros.vehicle.effects.environment import Crosswind, RoadBank, RoadGrade
 from dynssm_ros.vehicle.effects.inertia import Mass, YawInertia
 from dynssm_ros.vehicle.effects.loads import Downforce, LoadSensitivity, LoadTransfer
-from dynssm_ros.vehicle.effects.longitudinal import Drag, DriveGain, RollingResistance
+from dynssm_ros.vehicle.effects.longitudinal import Drag, DriveGain, PowerLimit, RollingResistance
 from dynssm_ros.vehicle.effects.measurement import (
     OdometryDelay,
     OdometryLeverArm,
@@ -90,7 +90,7 @@ def register_effect(effect: type[Effect]) -> type[Effect]:
 for _effect in (
 
         SteeringOffset, SteeringGain, SteeringCurve, SteeringLag, ThrottleDeadBand, ThrottleLag,
-        Drag, RollingResistance, DriveGain,
+        Drag, RollingResistance, DriveGain, PowerLimit,
         Mass, YawInertia,
         Grip, FrontGrip, RearGrip,
         Downforce, LoadSensitivity, LoadTransfer,

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from dynssm_ros.vehicle.effects.base import Effect, Parameter
-from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion
+from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion, at_least
+
+_SHARP = 4  # power of a soft minimum: at the corner a sixth is missing, from one and a half times that on a twentieth
 
 
 @dataclass(frozen=True)
@@ -61,3 +63,26 @@ class DriveGain(Effect):
         """Scales the force of drive and brakes."""
         q.F_rx = q.F_rx + (self.factor - 1.0) * q.F_d
         q.F_d = q.F_d * self.factor
+
+
+@dataclass(frozen=True)
+class PowerLimit(Effect):
+    """``F_d / (1 + (F_d v_x / P)^4)^(1/4)``: the drive has at most the power ``P = C_m1 / inverse_speed``.
+
+    ``1 / inverse_speed`` is the speed from which on full throttle asks for all of it. Brakes have no limit.
+    """
+
+    NAME = "power_limit"
+    SUMMARY = "The engine has only so much power, so that at speed more throttle gives no more force."
+    ADVICE = "Take the greatest power, C_m1 / inverse_speed, from the engine's data; at speed throttle gives no more."
+    MANOEUVRE = "full throttle from low speed up to top speed"
+    PARAMETERS = {"inverse_speed": Parameter("s/m", 0.0, 1.0, 0.0)}
+    TYPICAL = (0.045, 0.15)
+    inverse_speed: Array = 0.0
+
+    def drive(self, xp: Any, q: Motion) -> None:
+        """Takes off the force that there is no power for."""
+        asked = at_least(q.F_d, 0.0) * self.inverse_speed * q.v_x / q.theta.C_m1  # of all the power
+        missing = q.F_d * (1.0 - (1.0 + asked**_SHARP) ** (-1.0 / _SHARP))
+        q.F_rx = q.F_rx - missing
+        q.F_d = q.F_d - missing
