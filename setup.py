@@ -77,6 +77,7 @@ setup(
         "all": sorted({each for extra in EXTRAS.values() for each in extra}),
         "docs": ["sphinx", "myst-parser", "furo"],
         "test": [
+            "commonroad-vehicle-models",  # a car that somebody else wrote, for the benchmark of hidden causes
             "doit",  # the benchmarks' workflow
             "hypothesis",
             "mypy",

@@ -1,9 +1,9 @@
 """Cases with a hidden cause: simulated laps whose car has effects that the vehicle file does not know.
 
-In every case the sensors are noisy, and driver and track differ. The car is one of three truths: single-track in steps of
-1 ms, four wheels, or one of another make (:mod:`benchmarks.hidden_causes.foreign`). The nominal values of the vehicle file
-are off by about 2 %. Of the car of another make nobody knows them: its file comes from a drive without hidden effects,
-calibrated from nothing but the bounds and then diagnosed, as a team would begin.
+In every case the sensors are noisy, and driver and track differ. The car is one of four truths: single-track in steps of
+1 ms, four wheels, one of another make (:mod:`benchmarks.hidden_causes.foreign`), or one that somebody else wrote
+(:mod:`benchmarks.hidden_causes.multi_body`). The nominal values of the vehicle file are off by about 2 %. Of the last two
+nobody knows them: their file comes from a drive without hidden effects, calibrated and then diagnosed, as a team would begin.
 
 Sizes. An effect is just noticeable where its estimate stands seven standard deviations from neutral on the reference
 drive: 90 s of the road course at 25 Hz in moderate style, the noise of ``NOISE``, and nominal values free as far as the
@@ -17,10 +17,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import cycle
 
 import numpy as np
 
-from benchmarks.hidden_causes import foreign
+from benchmarks.hidden_causes import foreign, multi_body
 from dynssm_ros.identification.calibration import calibrate
 from dynssm_ros.identification.diagnose import diagnose
 from dynssm_ros.signals.recording import Recording
@@ -41,9 +42,9 @@ _RATES = (0.04, 0.04, 0.04, 0.02)  # s: sampling times, drawn with equal chance
 _KNOWN = 0.02  # how well the vehicle file says that they are known
 _SHIFTS = {"S_hf": 0.0007, "S_hr": 0.0007, "S_vf": 40.0, "S_vr": 40.0}  # rad, N: the same for values around 0
 _TRIES = 6
-TRUTHS: tuple[PlantKind, ...] = ("rk4", "double_track", foreign.NAME)
+TRUTHS: tuple[PlantKind, ...] = ("rk4", "double_track", foreign.NAME, multi_body.NAME)
 _OTHER_DRIVE = 10**6  # added to the seed
-_REFERENCE_S = 120.0  # of the drive that the file of the car of another make is calibrated on
+_REFERENCE_S = 120.0  # of the drive that the file of a car is calibrated on of which nobody knows the values
 _ROUND = 13  # cases, of which two have a pair of effects and two none
 _PAIRS, _NONE = (4, 10), (6, 12)
 
@@ -92,22 +93,29 @@ def cases(seed: int, count: int, effects: Sequence[str] = tuple(EFFECTS), health
     With ``healthy`` nothing is hidden in any of them.
     """
     rng = np.random.default_rng(seed)
-    turn = 0
+    can_be = {plant: tuple(name for name in effects if _can_be(name, plant)) for plant in TRUTHS}
+    turns = {names: cycle(names) for names in can_be.values()}
     for k in range(count):
-        kind = k % _ROUND
+        kind, plant = k % _ROUND, TRUTHS[k % len(TRUTHS)]
+        can = can_be[plant]
         if healthy or kind in _NONE:
             names: list[str] = []
         elif kind in _PAIRS:
-            names = [effects[i] for i in rng.choice(len(effects), 2, replace=False)]
+            names = [can[i] for i in rng.choice(len(can), 2, replace=False)]
         else:
-            names, turn = [effects[turn % len(effects)]], turn + 1
+            names = [next(turns[can])]
         yield Case(
             {name: size(name, rng) for name in names},
             seed + k,
-            TRUTHS[k % len(TRUTHS)],
+            plant,
             track=str(rng.choice(list(TRACKS))),
             sampling_time=float(rng.choice(_RATES)),
         )
+
+
+def _can_be(effect: str, plant: PlantKind) -> bool:
+    """Whether an effect can be hidden in a car."""
+    return plant != multi_body.NAME or effect in multi_body.HIDES
 
 
 def record(case: Case) -> tuple[Recording, Vehicle]:
@@ -146,17 +154,20 @@ def _drive(case: Case, car: Vehicle, seed: int) -> Recording:
 
 def known(case: Case) -> Vehicle:
     """The car without what is hidden."""
-    return load_vehicle("av21").model_copy(update={"sampling_time": case.sampling_time})
+    name = multi_body.FILE if case.plant == multi_body.NAME else "av21"
+    return load_vehicle(name).model_copy(update={"sampling_time": case.sampling_time})
 
 
 def vehicle_file(case: Case) -> Vehicle:
     """The vehicle file, which does not know what is hidden."""
     car = known(case)
-    if case.plant != foreign.NAME:
+    if case.plant not in (foreign.NAME, multi_body.NAME):
         return off(car, np.random.default_rng([case.seed, 8]))
+    if case.plant == foreign.NAME:
+        car = car.unmeasured()  # the file is that of another car
     reference = replace(case, hidden={}, duration=_REFERENCE_S)
-    healthy = _drive(reference, car, case.seed + _OTHER_DRIVE)
-    calibrated = calibrate(healthy, car.unmeasured(), integrator="rk4").vehicle
+    healthy = _drive(reference, known(case), case.seed + _OTHER_DRIVE)
+    calibrated = calibrate(healthy, car, integrator="rk4").vehicle
     return diagnose(healthy, calibrated, line=case.road.centre).vehicle
 
 

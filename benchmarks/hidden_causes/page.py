@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from benchmarks.hidden_causes import foreign, multi_body
 from benchmarks.hidden_causes.cases import OFF, Case, Hidden
 from benchmarks.hidden_causes.outcomes import Outcome, by_size, rates
 
@@ -21,7 +22,10 @@ _IN_WORDS = {
     "false_alarms": "something is named where nothing is hidden",
     "more_named": "more is named than the one effect that is hidden",
 }
-_PLANTS = {"rk4": "one track, steps of 1 ms", "double_track": "four wheels", "foreign": "another make"}
+_PLANTS = {
+    "rk4": "one track, steps of 1 ms", "double_track": "four wheels", foreign.NAME: "another make",
+    multi_body.NAME: "multi-body",
+}  # fmt: skip
 
 
 def page(outcomes: Sequence[tuple[Case, Outcome | None]], seed: int) -> str:
@@ -64,7 +68,10 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
     yield (
         "Four wheels are a car that the equations do not have: an axle loses grip as load moves from one wheel to the other, "
         "and unequal forces at the steered wheels turn the car. Small effects that are named there stand for this. The car "
-        "of another make has brush tyres, forces that grow less than the load, and steering that gives way."
+        "of another make has brush tyres, forces that grow less than the load, and steering that gives way. The multi-body "
+        "car is CommonRoad's: a body on springs, wheels that spin, PAC2002 tyres with camber and combined slip, brakes on "
+        "all wheels, an engine with a greatest power. Its first drives gave the library the effect `power_limit`; nothing "
+        "else was tuned to it."
     )
     yield ""
     yield f"![What was hidden and what was named first]({FIGURE})"
@@ -99,8 +106,8 @@ def _conditions(outcomes: Sequence[Outcome]) -> Iterator[str]:
     yield ""
     yield (
         f"The vehicle file tells mass and geometry as they are. Its coefficients are off by {100 * OFF:g} % (standard "
-        "deviation), and it says so. That of the car of another make was calibrated on two minutes of a healthy drive, from "
-        "nothing but the bounds, and then diagnosed."
+        "deviation), and it says so. Those of the car of another make and of the multi-body car were calibrated on two "
+        "minutes of a healthy drive, the former from nothing but the bounds, and then diagnosed."
     )
 
 

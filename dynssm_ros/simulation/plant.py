@@ -28,8 +28,9 @@ class Plant(Protocol):
     def pose(self) -> Pose:
         """Where it is."""
 
-    state: State
-    """How it moves."""
+    @property
+    def state(self) -> State:
+        """How it moves."""
 
     @property
     def measured(self) -> State:

@@ -62,18 +62,17 @@ def test_cases_are_counted_by_size() -> None:
     assert [(rate["of"], rate["count"]) for rate in by_size(outcomes)] == [(2, 1), (0, 0), (1, 1)]
 
 
-def test_the_cases_hold_every_effect_none_two_and_four_wheels() -> None:
-    listed = list(cases(0, 143))
-    assert len(listed) == 143
-    assert len({case.name for case in listed}) == 143
+def test_the_cases_hold_every_effect_none_two_and_all_truths() -> None:
+    listed = list(cases(0, 208))
+    assert len(listed) == 208
+    assert len({case.name for case in listed}) == 208
     single = Counter(name for case in listed if len(case.hidden) == 1 for name in case.hidden)
     assert set(single) == set(EFFECTS)
     assert min(single.values()) >= 3
-    assert {case.plant for case in listed if not case.hidden} == {"rk4", "double_track", "foreign"}
-    assert Counter(len(case.hidden) for case in listed)[0] == 22
-    assert Counter(len(case.hidden) for case in listed)[2] == 22
-    assert Counter(len(case.hidden) for case in listed)[1] == 99
-    assert {case.plant for case in listed} == {"rk4", "double_track", "foreign"}
+    truths = {"rk4", "double_track", "foreign", "multi_body"}
+    assert {case.plant for case in listed if not case.hidden} == truths
+    assert Counter(len(case.hidden) for case in listed) == {0: 32, 2: 32, 1: 144}
+    assert {case.plant for case in listed} == truths
     assert {case.track for case in listed} == set(TRACKS)
     assert {case.sampling_time for case in listed} == {0.04, 0.02}
     four_wheels = {len(case.hidden) for case in listed if case.plant == "double_track"}
