@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import signal
 import socket
 import subprocess
@@ -39,6 +40,8 @@ from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDIC
 _END_TIMEOUT = 10.0  # s
 _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
 _DRAIN = 2.0  # s without an answer after the last message before the run counts as over
+_PARTICIPANTS = 20  # of a test's domain, at most
+_SHARED_MEMORY = Path("/dev/shm")  # noqa: S108, which is Fast DDS's choice
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"  # environment variable that a process reads once
 
 
@@ -134,15 +137,20 @@ def isolated_environment() -> dict[str, str]:
 def _reserve(domain: int) -> bool:
     """Takes ``domain`` if nobody else takes part in it, nor has reserved it.
 
-    Its first participant holds the port 10 of the domain's 250 (DDSI-RTPS); the last one, which none of them uses, says
-    that it is reserved, also while no participant is there yet.
+    Its participants hold every other port from the tenth of the domain's 250 on (DDSI-RTPS); the last one, which none of
+    them uses, says that it is reserved, also while no participant is there yet. What killed participants have left in
+    shared memory is removed: messages to the next ones would be lost until Fast DDS finds out that nobody reads there.
     """
     ports = 7400 + 250 * domain
     try:
-        _bound(ports + 10).close()
+        for participant in range(_PARTICIPANTS):
+            _bound(ports + 10 + 2 * participant).close()
         reserved = _bound(ports + 249)
     except OSError:
         return False
+    for left in _SHARED_MEMORY.glob("*fastrtps_port*"):
+        if 0 <= int(re.sub(r"\D", "", left.name.partition("port")[2])) - ports < 250:
+            left.unlink(missing_ok=True)
     if len(_RESERVED) == _RESERVED.maxlen:
         _RESERVED.popleft().close()
     _RESERVED.append(reserved)

@@ -23,6 +23,9 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"  # tests run side by side
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
+# tests make the computer busy, so that it is set up as one; without this file `make demo` runs
+os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(REPOSITORY / "config" / "fastdds.xml"))
+
 
 @pytest.fixture(scope="session")
 def data() -> Path:

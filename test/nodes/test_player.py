@@ -7,14 +7,12 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
 from nav_msgs.msg import Odometry
 
+from benchmarks import live_run
 from benchmarks.live_run import (
     PROFILES,
     LiveRun,
@@ -24,7 +22,6 @@ from benchmarks.live_run import (
     run_live,
     wait_for_the_last,
 )
-from dynssm_ros.configuration import config_root
 from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PREDICTION_TOPIC
@@ -97,16 +94,11 @@ def test_a_bag_of_types_that_are_not_installed_names_the_way_out(putnam: Path) -
 
 
 def test_on_a_busy_computer_a_predictor_that_is_held_up_for_two_seconds_answers_everything(
-    small_model: Path, laps_bag: Path, monkeypatch: pytest.MonkeyPatch
+    small_model: Path, laps_bag: Path
 ) -> None:
-    """With ``config/fastdds.xml``, which a process reads once: so player and listener are a new one too.
-
-    One process without the file is enough to have messages dropped that wait for another one.
-    """
-    monkeypatch.setenv(PROFILES, str(config_root() / "fastdds.xml"))
-    with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
-        play = partial(run_live, small_model, laps_bag, 0.02, rate=4.0, held_up=(6.0, 14.0))
-        run = fresh.submit(play).result()
+    """With ``config/fastdds.xml``, as in all tests: one process without it would have waiting messages dropped."""
+    assert os.environ[PROFILES].endswith("fastdds.xml")
+    run = run_live(small_model, laps_bag, 0.02, rate=4.0, held_up=(6.0, 14.0))
     assert (len(run.predicted), run.missing()) == (1001 - 4, [])
 
 
@@ -131,6 +123,19 @@ def test_a_domain_in_use_is_not_drawn_again() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
         participant.bind(("", 7400 + 250 * domain + 10))
         assert all(int(isolated_environment()["ROS_DOMAIN_ID"]) != domain for _ in range(200))
+
+
+def test_what_killed_participants_left_in_a_domain_is_removed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(live_run, "_SHARED_MEMORY", tmp_path)
+    left = [
+        tmp_path / name.format(7400 + 250 * d + 11)
+        for d in range(101)
+        for name in ("fastrtps_port{}_el", "sem.fastrtps_port{}")
+    ]
+    for file in left:
+        file.touch()
+    domain = int(isolated_environment()["ROS_DOMAIN_ID"])
+    assert {file for file in left if not file.exists()} == set(left[2 * domain : 2 * domain + 2])
 
 
 def test_a_domain_is_reserved_before_anybody_takes_part_in_it() -> None:
