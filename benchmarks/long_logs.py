@@ -25,6 +25,7 @@ from dynssm_ros.vehicle import load_vehicle, save_vehicle
 _RATE = 100  # Hz
 _CAR, _TRACK, _NOISE = "av21", "road_course", "0.01,0.01,0.003"
 _KIB_IN_MB = 1024 / 1e6
+_FIRST = ("extract", "train rls")  # whose outputs others need
 
 
 class Cost(NamedTuple):
@@ -66,7 +67,7 @@ def measure(minutes: float, wanted: Sequence[str] = ()) -> dict[str, Cost]:
         _run(("simulate", *drive, "--noise", _NOISE, "--out", str(folder / "bag")))
         costs, chosen = {}, commands(folder)
         for index, (title, arguments) in enumerate(chosen.items()):
-            if not wanted or title.split()[0] in {*wanted, "extract"}:
+            if not wanted or title in _FIRST or title.split()[0] in wanted:
                 costs[title] = cost = _run(arguments)
                 errors.print(f"{minutes:g} min: {title}: {cost.cpu:.1f} s, {cost.memory:.0f} MB", markup=False)
             progress(index + 1, len(chosen))

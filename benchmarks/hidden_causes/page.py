@@ -76,7 +76,10 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
     yield ""
     yield f"![What was hidden and what was named first]({FIGURE})"
     yield ""
-    yield "Cases of one effect or none; an alternative that is reported counts as named."
+    yield (
+        "Cases of one effect or none; an alternative that is reported counts as named. What is listed as small, within the "
+        "structure of the model, does not."
+    )
     yield from _conditions(outcomes)
     wrong = [o for o in outcomes if not o.right or o.sized is False]
     if wrong:

@@ -98,7 +98,7 @@ def diagnose(
         _cause(one, rest, selection, at.recordings, std) for one, rest in zip(selection.chosen, without, strict=True)
     )
     return Diagnosis(
-        "effects" if causes else "unexplained" if left.is_there else "none",
+        "effects" if not all(cause.small for cause in causes) else "unexplained" if left.is_there else "none",
         causes,
         _moved(fit.car),
         extended,

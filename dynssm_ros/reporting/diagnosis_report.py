@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -35,7 +35,7 @@ _FEW = 4  # parameters of a curve that are shown one by one
 def as_text(diagnosis: Diagnosis) -> str:
     """The result for a terminal: cause, size, evidence, improvement, what to do, what is left."""
     lines = [headline(diagnosis)]
-    for number, cause in enumerate(diagnosis.causes, 1):
+    for number, cause in enumerate((*diagnosis.causes, *diagnosis.small_effects), 1):
         lines += ["", f"{number}. {cause.effect}{_where(cause)}: {size_in_words(cause)}; {_share_in_words(cause)}"]
         lines += [f"   {line}" for words in _about(cause) for line in textwrap.wrap(words, _WIDTH)]
     lines += ["", *gain_in_words(diagnosis)]
@@ -50,17 +50,17 @@ def as_text(diagnosis: Diagnosis) -> str:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """The verdict in a sentence."""
-    if diagnosis.verdict == "effects":
-        large, small = (
-            ", ".join(cause.effect + _where(cause) for cause in diagnosis.causes if cause.small == little)
-            for little in (False, True)
-        )
-        lacks = f"The simulation lacks: {large}." if large else "The simulation is right but for small effects."
-        return f"{lacks} Sure but small, within the structure of the model: {small}." if small else lacks
-    if diagnosis.verdict == "none":
-        return "The simulation is right within the noise of the measurement, once its nominal values are recalibrated."
-    return "Something is wrong that no effect of the library explains."
+    """The verdict in a sentence, and what is small in another."""
+    causes, small = (
+        ", ".join(cause.effect + _where(cause) for cause in each)
+        for each in (diagnosis.causes, diagnosis.small_effects)
+    )
+    words = {
+        "effects": f"The simulation lacks: {causes}.",
+        "none": "The simulation is right within the noise of the measurement, once its nominal values are recalibrated.",
+        "unexplained": "Something is wrong that no effect of the library explains.",
+    }[diagnosis.verdict]
+    return f"{words} Sure but small, within the structure of the model: {small}." if small else words
 
 
 def _share_in_words(cause: Cause) -> str:
@@ -202,7 +202,7 @@ def diagnosis_report(diagnosis: Diagnosis) -> Report:
         f"{headline(diagnosis)} {left_in_words(diagnosis)}".strip(),
         tuple(_sections(diagnosis)),
         diagnosis.protocol,
-        _causes(diagnosis) if diagnosis.causes else None,
+        _causes(diagnosis.found) if diagnosis.found else None,
     )
 
 
@@ -215,7 +215,7 @@ def _about(cause: Cause) -> Iterator[str]:
         yield alternatives_in_words(cause)
 
 
-def _causes(diagnosis: Diagnosis) -> Table:
+def _causes(found: Sequence[Cause]) -> Table:
     columns = (
         Column("cause"), Column("size"), Column("better by", group="left-out parts"), Column("±", group="left-out parts"),
         *(Column(channel, "%", "squared error gone there") for channel in STATE_SIGNALS),
@@ -231,14 +231,14 @@ def _causes(diagnosis: Diagnosis) -> Table:
             100 * cause.heldout_gain,
             ", ".join(cause.alternatives) or "nothing else",
         ]
-        for cause in diagnosis.causes
+        for cause in found
     ]
     return Table(columns, rows)
 
 
 def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
     improvement = diagnosis.improvement
-    for cause in diagnosis.causes:
+    for cause in (*diagnosis.causes, *diagnosis.small_effects):
         yield Section(
             cause.effect + _where(cause),
             " ".join((f"{size_in_words(cause)}.", *_about(cause))),
@@ -318,7 +318,7 @@ def _found(diagnosis: Diagnosis) -> Iterator[Section]:
         "Evidence by effect",
         "How much each effect, alone, would improve the fit of the recalibrated car. Named causes are coloured. Effects "
         "that leave like traces share the evidence; the causes named explain it best together.",
-        diagnosis_figures.evidence(diagnosis.selection.tried, [cause.effect for cause in diagnosis.causes]),
+        diagnosis_figures.evidence(diagnosis.selection.tried, [cause.effect for cause in diagnosis.found]),
     )
     yield Section(
         "What these laps would show",

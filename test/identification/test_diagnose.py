@@ -13,8 +13,8 @@ from benchmarks.hidden_causes.cases import Case, record, size
 from benchmarks.hidden_causes.outcomes import judge
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.identification.diagnose import diagnose
-from dynssm_ros.identification.diagnosis import Diagnosis
-from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report
+from dynssm_ros.identification.diagnosis import Cause, Diagnosis
+from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report, headline
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle
@@ -97,6 +97,7 @@ def test_the_json_is_that_of_the_contract(lagging: tuple[Recording, Vehicle, Dia
     content = json.loads(json.dumps(lagging[2].to_json("out/vehicle.yaml"), allow_nan=False))
     assert content["verdict"] == "effects"
     (cause,) = content["causes"]
+    assert content["small_effects"] == []
     assert set(cause) == {"effect", "parameters", "evidence", "on_bound", "alternatives", "only_in", "small"}
     assert set(cause["parameters"]["time_constant"]) == {"value", "std", "unit"}
     assert cause["parameters"]["time_constant"]["unit"] == "s"
@@ -109,6 +110,25 @@ def test_the_json_is_that_of_the_contract(lagging: tuple[Recording, Vehicle, Dia
         assert list(content["gain"][part]) == ["v_x", "v_y", "omega"]
     assert content["gain"]["horizon_s"] >= 0.5
     assert content["vehicle"] == "out/vehicle.yaml"
+
+
+def test_what_takes_little_off_every_channel_is_small_unless_what_was_known_tells_it(
+    lagging: tuple[Recording, Vehicle, Diagnosis],
+) -> None:
+    found = lagging[2]
+    (cause,) = found.causes
+
+    def taking(share: float, known: float) -> Cause:
+        confirmation = replace(cause.confirmation, share=np.array([0.0, share, -0.1]), known=known)
+        return replace(cause, confirmation=confirmation)
+
+    told = float(cause.confirmation.gain.sum())
+    assert [taking(*each).small for each in ((0.05, 0.0), (0.07, 0.0), (0.05, told + 1.0))] == [True, False, False]
+    little = replace(found, verdict="none", found=(taking(0.05, 0.0),))
+    assert (little.causes, [one.effect for one in little.small_effects]) == ((), ["steering_lag"])
+    assert headline(little).endswith("Sure but small, within the structure of the model: steering_lag.")
+    content = little.to_json("vehicle.yaml")
+    assert (content["causes"], [one["effect"] for one in content["small_effects"]]) == ([], ["steering_lag"])
 
 
 def test_words_and_report_name_cause_size_gain_and_advice(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
