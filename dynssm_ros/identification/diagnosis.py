@@ -23,7 +23,8 @@ from dynssm_ros.vehicle.effects import EFFECTS
 
 Verdict = Literal["effects", "none", "unexplained"]
 
-_SMALL = 0.06  # of the squared error of a channel, on left-out parts: less is within the structure of the model
+_SMALL = 0.06  # of the squared error of a channel, on left-out parts: less is within the structure of the model,
+_HELDOUT_SMALL = 0.01  # as is less than that share of the error on held-out rows, if both are
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
 
@@ -61,11 +62,12 @@ class Cause:
     def small(self) -> bool:
         """Whether it hardly matters, however sure it is: no model is right to the last per mille.
 
-        It takes little off the error of each channel. What a recalibration would make up for is told by what was known, and
-        by how far the coefficients would have to be off, not by the error.
+        It takes little off the error of each channel, on parts that were left out and on held-out rows. What a recalibration
+        would make up for is told by what was known, and by how far the coefficients would have to be off, not by the error.
         """
         told = float(self.confirmation.gain.sum())
-        return float(self.confirmation.share.max()) < _SMALL and self.confirmation.known < told
+        little = float(self.confirmation.share.max()) < _SMALL and self.heldout_gain < _HELDOUT_SMALL
+        return little and self.confirmation.known < told
 
 
 @dataclass(frozen=True)
