@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from benchmarks.hidden_causes import foreign, multi_body
 from benchmarks.hidden_causes.cases import OFF, Case, Hidden
 from benchmarks.hidden_causes.outcomes import Outcome, by_size, rates
+from dynssm_ros.vehicle.effects import EFFECTS
 
 PAGE, FIGURE = "hidden_causes.md", "hidden_causes_confusion.png"
 GOALS = {
@@ -80,6 +81,10 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
         "Cases of one effect or none; an alternative that is reported counts as named. What is listed as small, within the "
         "structure of the model, does not."
     )
+    hidden = {name for outcome in outcomes for name in outcome.hidden}
+    if never := [name for name in EFFECTS if name not in hidden]:
+        yield ""
+        yield f"So few cases did not come to {', '.join(f'`{name}`' for name in never)}."
     yield from _conditions(outcomes)
     wrong = [o for o in outcomes if not o.right or o.sized is False]
     if wrong:

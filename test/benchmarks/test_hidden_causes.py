@@ -167,6 +167,8 @@ def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
     assert "| the same without alternatives | 2 | 50 % | 9 to 91 % | >= 95, 80, 80 % | 1 of 1 | 0 of 1 |" in text
     assert "| `b` | drag coefficient 0.3 | mass factor 1.2 |" in text
     assert "| `a` |" not in text
+    assert "So few cases did not come to `steering_offset`, `steering_gain`, " in text
+    assert "`rolling_resistance`, `drive_gain`, `power_limit`, `yaw_inertia`" in text, "drag and mass were hidden"
 
 
 def test_a_case_is_driven_diagnosed_and_read_back(tmp_path: Path) -> None:
