@@ -149,7 +149,7 @@ def _reserve(domain: int) -> bool:
     except OSError:
         return False
     for left in _SHARED_MEMORY.glob("*fastrtps_port*"):
-        if 0 <= int(re.sub(r"\D", "", left.name.partition("port")[2])) - ports < 250:
+        if (port := re.search(r"port(\d+)", left.name)) and int(port[1]) in range(ports, ports + 250):
             left.unlink(missing_ok=True)
     if len(_RESERVED) == _RESERVED.maxlen:
         _RESERVED.popleft().close()

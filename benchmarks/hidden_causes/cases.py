@@ -43,8 +43,9 @@ _KNOWN = 0.02  # how well the vehicle file says that they are known
 _SHIFTS = {"S_hf": 0.0007, "S_hr": 0.0007, "S_vf": 40.0, "S_vr": 40.0}  # rad, N: the same for values around 0
 _TRIES = 6
 TRUTHS: tuple[PlantKind, ...] = ("rk4", "double_track", foreign.NAME, multi_body.NAME)
+_UNKNOWN = (foreign.NAME, multi_body.NAME)  # cars of which nobody knows the values
 _OTHER_DRIVE = 10**6  # added to the seed
-_REFERENCE_S = 120.0  # of the drive that the file of a car is calibrated on of which nobody knows the values
+_REFERENCE_S = 120.0  # of the drive that the file of such a car is calibrated on
 _ROUND = 13  # cases, of which two have a pair of effects and two none
 _PAIRS, _NONE = (4, 10), (6, 12)
 
@@ -161,13 +162,12 @@ def known(case: Case) -> Vehicle:
 def vehicle_file(case: Case) -> Vehicle:
     """The vehicle file, which does not know what is hidden."""
     car = known(case)
-    if case.plant not in (foreign.NAME, multi_body.NAME):
+    if case.plant not in _UNKNOWN:
         return off(car, np.random.default_rng([case.seed, 8]))
-    if case.plant == foreign.NAME:
-        car = car.unmeasured()  # the file is that of another car
     reference = replace(case, hidden={}, duration=_REFERENCE_S)
-    healthy = _drive(reference, known(case), case.seed + _OTHER_DRIVE)
-    calibrated = calibrate(healthy, car, integrator="rk4").vehicle
+    healthy = _drive(reference, car, case.seed + _OTHER_DRIVE)
+    file = car.unmeasured() if case.plant == foreign.NAME else car  # that of the av21 is of another car
+    calibrated = calibrate(healthy, file, integrator="rk4").vehicle
     return diagnose(healthy, calibrated, line=case.road.centre).vehicle
 
 

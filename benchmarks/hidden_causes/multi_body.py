@@ -11,6 +11,7 @@ import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from dynssm_ros.vehicle import Applied, State, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.parameters import EffectEntry
-from dynssm_ros.vehicle.single_track import GRAVITY, StageEffect
+from dynssm_ros.vehicle.single_track import GRAVITY, StageEffect, integrate
 
 NAME = "multi_body"
 FILE = Path(__file__).with_name("bmw_320i.yaml")
@@ -68,6 +69,9 @@ class MultiBody:
         car.I_z *= changed("yaw_inertia", "factor")
         self._tyres = _gripping(car.tire, changed("grip", "factor"))
         self._on_patch = _gripping(self._tyres, changed("grip_patch", "factor"))
+        self._air = _AIR + changed("drag", "coefficient")
+        self._rolling = GRAVITY * changed("rolling_resistance", "coefficient")
+        self._aside = GRAVITY * math.sin(changed("road_bank", "angle"))
         drift = math.atan2(state.v_y, state.v_x)
         speed = math.hypot(state.v_x, state.v_y)
         self._x: list[float] = init_mb([pose.x, pose.y, 0.0, speed, pose.theta, state.omega, drift], car)
@@ -106,13 +110,15 @@ class MultiBody:
         count = math.ceil(self._T_s / RK4_STEP - 1e-9)
         h = self._T_s / count
         lags = changed("throttle_lag", "time_constant"), changed("steering_lag", "time_constant")
+        gyroscope_lag = changed("yaw_rate_lag", "time_constant")
         for _ in range(count):
             before = self._acting or wanted
             self._acting = Applied(*(_followed(*each, h) for each in zip(before, wanted, lags, strict=True)))
             self._x[_DELTA] = self._acting.delta
-            self._x = self._stepped(self._x, [0.0, _FULL_THROTTLE * self._acting.r], h)
-            lag = changed("yaw_rate_lag", "time_constant")
-            self._late_omega = _followed(self._late_omega, self._x[_OMEGA], lag, h)
+            rates = partial(self._rates, throttle=self._acting.r)
+            change = integrate(rates, tuple(self._x), h, "rk4", 1)
+            self._x = [value + by for value, by in zip(self._x, change, strict=True)]
+            self._late_omega = _followed(self._late_omega, self._x[_OMEGA], gyroscope_lag, h)
             self._past.append(self.state)
 
     def _wanted(self, applied: Applied) -> Applied:
@@ -129,25 +135,13 @@ class MultiBody:
         centre, length = (self._changed("grip_patch", name) for name in ("centre", "length"))
         return abs((s / self._line.length - centre + 0.5) % 1.0 - 0.5) < length / 2
 
-    def _stepped(self, x: list[float], u: list[float], h: float) -> list[float]:
-        """A step of Runge and Kutta."""
-        k1 = self._rates(x, u)
-        k2 = self._rates([a + h / 2 * b for a, b in zip(x, k1, strict=True)], u)
-        k3 = self._rates([a + h / 2 * b for a, b in zip(x, k2, strict=True)], u)
-        k4 = self._rates([a + h * b for a, b in zip(x, k3, strict=True)], u)
-        slopes = zip(x, k1, k2, k3, k4, strict=True)
-        return [a + h / 6 * (b + 2 * c + 2 * d + e) for a, b, c, d, e in slopes]
-
-    def _rates(self, x: list[float], u: list[float]) -> list[float]:
+    def _rates(self, x: Sequence[float], throttle: float) -> tuple[float, ...]:
         """The library's equations with air and road."""
-        rates: list[float] = self._rates_of(x, u, self._car)
-        changed, v = self._changed, x[_V_X]
-        rates[_V_X] -= (_AIR + changed("drag", "coefficient")) * v * v / self._car.m
-        rates[_V_X] -= changed("rolling_resistance", "coefficient") * GRAVITY
-        aside = GRAVITY * math.sin(changed("road_bank", "angle"))
+        rates = self._rates_of(list(x), [0.0, _FULL_THROTTLE * throttle], self._car)
+        rates[_V_X] -= self._air * x[_V_X] ** 2 / self._car.m + self._rolling
         for one in (_V_Y, _V_Y_FRONT, _V_Y_REAR):
-            rates[one] -= aside
-        return rates
+            rates[one] -= self._aside
+        return tuple(rates)
 
 
 def _gripping(tyre: Any, factor: float) -> Any:

@@ -68,11 +68,11 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
     yield ""
     yield (
         "Four wheels are a car that the equations do not have: an axle loses grip as load moves from one wheel to the other, "
-        "and unequal forces at the steered wheels turn the car. Small effects that are named there stand for this. The car "
-        "of another make has brush tyres, forces that grow less than the load, and steering that gives way. The multi-body "
-        "car is CommonRoad's: a body on springs, wheels that spin, PAC2002 tyres with camber and combined slip, brakes on "
-        "all wheels, an engine with a greatest power. Its first drives gave the library the effect `power_limit`; nothing "
-        "else was tuned to it."
+        "and unequal forces at the steered wheels turn the car. An effect that is named there and not hidden may stand for "
+        "this. The car of another make has brush tyres, forces that grow less than the load, and steering that gives way. "
+        "The multi-body car is CommonRoad's: a body on springs, wheels that spin, PAC2002 tyres with camber and combined "
+        "slip, brakes on all wheels, an engine with a greatest power. Its first drives gave the library the effect "
+        "`power_limit`; nothing else was tuned to it."
     )
     yield ""
     yield f"![What was hidden and what was named first]({FIGURE})"

@@ -57,6 +57,11 @@ class Confirmation:
         return float(self.gain.sum()) + self.known
 
     @property
+    def rests_on_known(self) -> bool:
+        """Whether what was known of the nominal values tells more for it than the left-out units."""
+        return self.known > float(self.gain.sum())
+
+    @property
     def holds(self) -> bool:
         """Whether the gain is more than its standard error, and there in half of the units or more.
 
@@ -65,10 +70,9 @@ class Confirmation:
         """
         if self.total <= self.std:
             return False
-        told = float(self.gain.sum())
-        if told >= self.known:
+        if not self.rests_on_known:
             return 2 * int((self.gain > 0).sum()) >= len(self.gain)
-        return told > -self.std and self.known > _KNOWN * self.std
+        return float(self.gain.sum()) > -self.std and self.known > _KNOWN * self.std
 
     @property
     def alike(self) -> bool:

@@ -98,8 +98,7 @@ def diagnose(
         _cause(one, rest, selection, at.recordings, std) for one, rest in zip(selection.chosen, without, strict=True)
     )
     return Diagnosis(
-        "effects" if not all(cause.small for cause in causes) else "unexplained" if left.is_there else "none",
-        causes,
+        tuple(sorted(causes, key=lambda cause: cause.small)),
         _moved(fit.car),
         extended,
         improvement,

@@ -23,8 +23,8 @@ from dynssm_ros.vehicle.effects import EFFECTS
 
 Verdict = Literal["effects", "none", "unexplained"]
 
-_SMALL = 0.06  # of the squared error of a channel, on left-out parts: less is within the structure of the model,
-_HELDOUT_SMALL = 0.01  # as is less than that share of the error on held-out rows, if both are
+_SMALL_SHARE = 0.06  # of the squared error of each channel, on left-out parts
+_SMALL_GAIN = 0.01  # of the error on held-out rows: what takes less of both off is within the structure of the model
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
 
@@ -65,9 +65,8 @@ class Cause:
         It takes little off the error of each channel, on parts that were left out and on held-out rows. What a recalibration
         would make up for is told by what was known, and by how far the coefficients would have to be off, not by the error.
         """
-        told = float(self.confirmation.gain.sum())
-        little = float(self.confirmation.share.max()) < _SMALL and self.heldout_gain < _HELDOUT_SMALL
-        return little and self.confirmation.known < told
+        little = float(self.confirmation.share.max()) < _SMALL_SHARE and self.heldout_gain < _SMALL_GAIN
+        return little and not self.confirmation.rests_on_known
 
 
 @dataclass(frozen=True)
@@ -75,9 +74,7 @@ class Diagnosis:
     """What the simulation gets wrong, and why.
 
     Attributes:
-        verdict: ``effects``: causes are named; ``none``: right within noise; ``unexplained``: wrong, and nothing of the
-            library says why.
-        found: what the data ask for, the strongest first.
+        found: the causes and then the small effects, the strongest of each first.
         moved: coefficients, and ``m``, that are now more than three of the stated standard deviations off what the vehicle
             file has; by name, how many.
         vehicle: the vehicle with effects and refitted nominal values.
@@ -96,7 +93,6 @@ class Diagnosis:
         formulas: terms that the extended car lacks, where it leaves errors that are no noise.
     """
 
-    verdict: Verdict
     found: tuple[Cause, ...]
     moved: Mapping[str, float]
     vehicle: Vehicle
@@ -112,6 +108,13 @@ class Diagnosis:
     windows: SimulationWindows
     recordings: RecordingSet
     formulas: tuple[Formula, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """``effects``: causes are named; ``none``: right within noise; ``unexplained``: wrong, and nothing says why."""
+        if self.causes:
+            return "effects"
+        return "unexplained" if self.left.is_there or self.clustered.is_there else "none"
 
     @property
     def causes(self) -> tuple[Cause, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -35,7 +35,7 @@ _FEW = 4  # parameters of a curve that are shown one by one
 def as_text(diagnosis: Diagnosis) -> str:
     """The result for a terminal: cause, size, evidence, improvement, what to do, what is left."""
     lines = [headline(diagnosis)]
-    for number, cause in enumerate((*diagnosis.causes, *diagnosis.small_effects), 1):
+    for number, cause in enumerate(diagnosis.found, 1):
         lines += ["", f"{number}. {cause.effect}{_where(cause)}: {size_in_words(cause)}; {_share_in_words(cause)}"]
         lines += [f"   {line}" for words in _about(cause) for line in textwrap.wrap(words, _WIDTH)]
     lines += ["", *gain_in_words(diagnosis)]
@@ -202,7 +202,7 @@ def diagnosis_report(diagnosis: Diagnosis) -> Report:
         f"{headline(diagnosis)} {left_in_words(diagnosis)}".strip(),
         tuple(_sections(diagnosis)),
         diagnosis.protocol,
-        _causes(diagnosis.found) if diagnosis.found else None,
+        _causes(diagnosis) if diagnosis.found else None,
     )
 
 
@@ -215,7 +215,7 @@ def _about(cause: Cause) -> Iterator[str]:
         yield alternatives_in_words(cause)
 
 
-def _causes(found: Sequence[Cause]) -> Table:
+def _causes(diagnosis: Diagnosis) -> Table:
     columns = (
         Column("cause"), Column("size"), Column("better by", group="left-out parts"), Column("±", group="left-out parts"),
         *(Column(channel, "%", "squared error gone there") for channel in STATE_SIGNALS),
@@ -231,14 +231,14 @@ def _causes(found: Sequence[Cause]) -> Table:
             100 * cause.heldout_gain,
             ", ".join(cause.alternatives) or "nothing else",
         ]
-        for cause in found
+        for cause in diagnosis.found
     ]
     return Table(columns, rows)
 
 
 def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
     improvement = diagnosis.improvement
-    for cause in (*diagnosis.causes, *diagnosis.small_effects):
+    for cause in diagnosis.found:
         yield Section(
             cause.effect + _where(cause),
             " ".join((f"{size_in_words(cause)}.", *_about(cause))),

@@ -21,10 +21,8 @@ SPEED = 20.0  # m/s
 LINE = load_track("club").scaled(140.0).centre
 
 
-def driven(
-    steps: int = 25, steering: float = 0.0, throttle: float = 0.0, s: float = 0.0, **hidden: dict[str, float]
-) -> Plant:
-    """The car after a second straight ahead or in a bend."""
+def driven(steps: int = 25, steering: float = 0.0, s: float = 0.0, **hidden: dict[str, float]) -> Plant:
+    """The car after a second without throttle."""
     car = make_plant(
         CAR.with_effects(hidden.items()), multi_body.NAME, Pose(0.0, 0.0, 0.0), State(SPEED, 0.0, 0.0), line=LINE
     )

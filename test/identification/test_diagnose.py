@@ -125,7 +125,7 @@ def test_what_takes_little_off_every_channel_is_small_unless_what_was_known_tell
     told = float(cause.confirmation.gain.sum())
     assert taking(0.05, 0.005).small
     assert not any(one.small for one in (taking(0.07, 0.005), taking(0.05, 0.02), taking(0.05, 0.005, told + 1.0)))
-    little = replace(found, verdict="none", found=(taking(0.05, 0.005),))
+    little = replace(found, found=(taking(0.05, 0.005),))
     assert (little.causes, [one.effect for one in little.small_effects]) == ((), ["steering_lag"])
     assert headline(little).endswith("Sure but small, within the structure of the model: steering_lag.")
     content = little.to_json("vehicle.yaml")
