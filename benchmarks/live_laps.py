@@ -50,6 +50,7 @@ class LiveLaps:
         least_room: the least distance of the true car's centre from the borders (m); negative outside of them.
         plans: by what became of them.
         step_p99: of a control step (ms), over the last ones.
+        held_up: by how much the simulated car fell behind real time (s), as it drives nothing that nobody could answer.
         controller: its last words.
         predictor: likewise; empty if there was none.
     """
@@ -58,6 +59,7 @@ class LiveLaps:
     least_room: float
     plans: dict[str, int]
     step_p99: float
+    held_up: float
     controller: str
     predictor: str
 
@@ -133,6 +135,7 @@ def drive_live(
         float(listener.values["simulator"]["least room to the borders so far (m)"]),
         {key.removeprefix("plans "): int(value) for key, value in told.items() if key.startswith("plans ")},
         float(told["step p99 (ms)"]),
+        float(listener.values["simulator"]["held up so far (s)"]),
         listener.words["controller"],
         listener.words["predictor"],
     )

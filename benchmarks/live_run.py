@@ -284,6 +284,9 @@ def run_live(
             check_running("predictor", process)
             if time.monotonic() > deadline:
                 raise UserError("the predictor did not subscribe to the bag's topics within 30 s")
+        # a match has two sides: who listens tells what it has found, and its own publishers are to be found too
+        if not collector.wait_for(lambda: _finds(run.diagnostics, playback.topics), MATCH_TIMEOUT):
+            raise UserError(f"the predictor did not find the bag's topics within {MATCH_TIMEOUT:g} s")
         collector.wait_for(lambda: collector.count_publishers(PREDICTION_TOPIC) > 0, MATCH_TIMEOUT)
         first: int | None = None
         signals = deque(zip(held_up or (), (signal.SIGSTOP, signal.SIGCONT), strict=False))
@@ -298,6 +301,13 @@ def run_live(
                     progress(round((message.log_time - first) / 1e9), round(min(duration, 1e6)))
         wait_for_the_last(run, collector.wait_for)
     return run
+
+
+def _finds(diagnostics: list[tuple[int, str, dict[str, str]]], topics: tuple[str, ...]) -> bool:
+    """Whether the predictor's last diagnostics count a publisher of each of ``topics`` that it listens to."""
+    values = diagnostics[-1][2] if diagnostics else {}
+    counts = [values.get(f"{topic} publishers") for topic in topics]
+    return any(counts) and "0" not in counts
 
 
 def wait_for_the_last(run: LiveRun, wait_for: Callable[[Callable[[], bool], float], bool]) -> None:

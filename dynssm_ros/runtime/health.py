@@ -153,6 +153,7 @@ class Health:
         for topic in self.topics:
             figures[f"{topic} rate (Hz)"] = f"{self.rate(topic, now):.1f}"
             figures[f"{topic} age (s)"] = f"{self.age(topic, now):.3f}"
+            figures[f"{topic} publishers"] = str(self.publishers.get(topic, 0))
         for refusal in Refusal:
             figures[f"refused: {refusal.name.lower()}"] = str(self.refusals[refusal])
         return figures

@@ -33,7 +33,7 @@ PATIENCE = 120.0  # s for a lap, and for processes to start
 def possible_rate() -> float:
     """A quarter of real time, or a tenth while others keep the machine busy: these laps are not about its speed.
 
-    In real time, a machine that stops for 0.1 s drives the small car off the road; `benchmarks.live_laps` is about that.
+    In real time, a controller that stops for 0.1 s drives the small car off the road; `benchmarks.live_laps` is about that.
     """
     running = int(Path("/proc/loadavg").read_text().split()[3].partition("/")[0])
     return 0.25 if running <= (os.cpu_count() or 1) else 0.1
