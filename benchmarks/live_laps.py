@@ -36,7 +36,7 @@ from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 ROAD = ("club", 11)
 """Built-in track and seed of its variation."""
 SPEED_SCALE = 0.8
-_CHANGE = "grip_patch"
+CHANGE = "grip_patch"
 _START = 60.0  # s that processes may take until the first lap begins
 _NODES = {"laps": "controller", "driven (laps)": "simulator", "model": "predictor"}  # what its diagnostics tell
 
@@ -101,7 +101,7 @@ def drive_live(
     Raises:
         UserError: the car does not come round in time, or a node stopped.
     """
-    cell = Cell(car, ROAD, _CHANGE)
+    cell = Cell(car, ROAD, CHANGE)
     vehicle = load_vehicle(CARS[car].vehicle)
     known = vehicle if model is None else load_model(model).vehicle or vehicle
     patience = PATIENCE * load_reference("racing", known, cell.road, SPEED_SCALE).lap_time / rate

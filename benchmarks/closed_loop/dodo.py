@@ -3,13 +3,14 @@
 Variables: ``out`` (folder), ``trained`` (folder of the generalisation matrix: models are taken from there, and trained there
 if they are missing), ``page`` (folder of the page and its figure), ``only`` (words that names of cells must begin with,
 separated by commas), ``part`` (``development``, the default, or ``all``: test cells too), ``sets`` (as of the generalisation
-matrix). What is done is kept; a kill costs the task under way. The tasks ``learn`` and ``learning_page`` run if they are
-named.
+matrix; with ``rivals`` the page is ``closed_loop_rivals.md``). What is done is kept; a kill costs the task under way. The
+tasks ``learn`` and ``learning_page`` run if they are named.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,17 @@ from doit import get_var
 from doit.tools import config_changed
 
 from benchmarks.closed_loop.cells import Cell, cells
-from benchmarks.closed_loop.page import FIGURE, LEARNING_PAGE, PAGE, lap_times, learning_page, page, summary
-from benchmarks.closed_loop.run import cell_file, learn_cell, learning_file, race_cell, read_cell, read_learning
+from benchmarks.closed_loop.page import LEARNING_PAGE, lap_times, learning_page, page, summary
+from benchmarks.closed_loop.run import (
+    BASELINES,
+    CALIBRATES,
+    learn_cell,
+    learning_file,
+    outcome_file,
+    race_model,
+    read_cell,
+    read_learning,
+)
 from benchmarks.generalisation.run import model_folder, models_of
 from benchmarks.generalisation.training_tasks import drive_tasks, train_tasks
 from benchmarks.tasks import doit_config
@@ -36,6 +46,7 @@ ARGUMENTS = [f"{name}={value}" for name, value in VALUES.items() if value != USU
 # ridge has no physics to plan with
 MODELS = tuple(name for name in models_of(VALUES["sets"].split(",")) if name != "ridge")
 LEARNS = "dynssm"
+PAGE = "closed_loop_rivals" if "rivals" in VALUES["sets"] else "closed_loop"
 DOIT_CONFIG = doit_config(OUT / "doit.json") | {"default_tasks": ["page"]}
 CELLS = [
     cell
@@ -56,15 +67,17 @@ def task_train() -> Iterator[dict[str, Any]]:
 
 
 def task_race() -> Iterator[dict[str, Any]]:
-    """Drives each cell."""
+    """Drives each cell with each model."""
     for cell in CELLS:
-        yield {
-            "name": cell.name,
-            "actions": [(race_cell, [cell, OUT, TRAINED, MODELS])],
-            "file_dep": [str(model_folder(cell.training, name, TRAINED) / CARD) for name in MODELS],
-            "targets": [str(cell_file(cell, OUT))],
-            "uptodate": [config_changed(repr((cell, MODELS)))],
-        }
+        for name in (*BASELINES, *MODELS):
+            trained = name if name in MODELS else CALIBRATES
+            yield {
+                "name": f"{cell.name}:{name}",
+                "actions": [(race_model, [cell, name, OUT, TRAINED])],
+                "file_dep": [str(model_folder(cell.training, trained, TRAINED) / CARD)],
+                "targets": [str(outcome_file(cell, name, OUT))],
+                "uptodate": [config_changed(repr(cell))],
+            }
 
 
 def task_page() -> dict[str, Any]:
@@ -96,16 +109,17 @@ def write_learning_page() -> None:
 
 def write_page() -> None:
     """The summary as JSON, the figure and the page."""
-    known = _known(read_cell)
+    known = _known(partial(read_cell, models=MODELS))
     write_json(OUT / "summary.json", summary(known))
-    with replacing(PAGE_FOLDER / FIGURE) as aside:
+    figure = f"{PAGE}.png"
+    with replacing(PAGE_FOLDER / figure) as aside:
         lap_times(known).savefig(aside, format="png", dpi=130, metadata={"Software": None})
-    _write(PAGE, page(known, ARGUMENTS))
+    _write(f"{PAGE}.md", page(known, ARGUMENTS, figure))
 
 
-def _known(read: Callable[[Cell, Path], dict[str, Any] | None]) -> dict[Cell, dict[str, Any]]:
+def _known(read: Callable[..., dict[str, Any] | None]) -> dict[Cell, dict[str, Any]]:
     """The outcomes that there are."""
-    known = {cell: outcome for cell in CELLS if (outcome := read(cell, OUT)) is not None}
+    known = {cell: outcome for cell in CELLS if (outcome := read(cell, out=OUT)) is not None}
     if not known:
         raise UserError(f"only={VALUES['only']} part={VALUES['part']}: no cell was driven")
     return known

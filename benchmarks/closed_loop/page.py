@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 
 from benchmarks.closed_loop.cells import LAPS, OBJECTIVES, PACE, Cell
 from benchmarks.closed_loop.run import AS_IS, CALIBRATED, LEARNING_LAPS, TRUE_PACES
+from benchmarks.generalisation.run import RIVALS
 from dynssm_ros.control.lap_learning import SAFE
 from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.reporting.evaluation_figures import model_colours
 
-PAGE, FIGURE, LEARNING_PAGE = "closed_loop.md", "closed_loop.png", "lap_learning.md"
+LEARNING_PAGE = "lap_learning.md"
 _GOAL = 1.015
 
 Known = Mapping[Cell, Mapping[str, Any]]
@@ -96,13 +97,20 @@ def lap_times(known: Known) -> Figure:
     return figure
 
 
-def page(known: Known, arguments: Sequence[str]) -> str:
-    """The results as Markdown; ``arguments`` of doit's command that differ from the default."""
-    return "\n".join(_lines(known, arguments)) + "\n"
+def page(known: Known, arguments: Sequence[str], figure: str) -> str:
+    """The results as Markdown.
+
+    Args:
+        known: outcomes.
+        arguments: of doit's command that differ from the default.
+        figure: name of the figure's file.
+    """
+    return "\n".join(_lines(known, arguments, figure)) + "\n"
 
 
-def _lines(known: Known, arguments: Sequence[str]) -> Iterator[str]:
-    yield "# Closed loop"
+def _lines(known: Known, arguments: Sequence[str], figure: str) -> Iterator[str]:
+    rivals = [name for name in RIVALS if name in next(iter(known.values()))]
+    yield "# Closed loop with rivals" if rivals else "# Closed loop"
     yield ""
     command = " ".join(["python -m doit -n 2 -f benchmarks/closed_loop/dodo.py", *arguments])
     tracking, progress = (f"{PACE[objective]:g}" for objective in OBJECTIVES)
@@ -121,6 +129,12 @@ def _lines(known: Known, arguments: Sequence[str]) -> Iterator[str]:
         "are planned with as far as they have earned it, and once more as they are. Decisions were taken on development "
         "cells; a hash of the name says which these are. Where the network earned nothing, `dynssm` is `rls`."
     )
+    if rivals:
+        yield ""
+        yield (
+            f"Rivals are {', '.join(f'`{name}`' for name in rivals)} ([what they are](rivals.md)), trained with what their "
+            "authors chose for a car of about that size. Nothing of theirs was decided on these cells."
+        )
     for label, content in summary(known).items():
         if not content["cells"]:
             continue
@@ -145,7 +159,7 @@ def _lines(known: Known, arguments: Sequence[str]) -> Iterator[str]:
             if entry["lost"]:
                 yield f"- `{model}` is lost in {', '.join(entry['lost'])}."
     yield ""
-    yield f"![Last laps over the true model's]({FIGURE})"
+    yield f"![Last laps over the true model's]({figure})"
 
 
 def _both(values: Sequence[float] | None) -> str:

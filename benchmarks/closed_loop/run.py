@@ -20,6 +20,8 @@ from dynssm_ros.files import write_json
 from dynssm_ros.runtime.models import SingleTrack, load_model
 
 CALIBRATED = "calibrated"
+CALIBRATES = "rls"
+"""Whose folder has the calibrated car."""
 TRUE_PACES = (0.9, 1.0, 1.1, 1.2)
 """Shares of the car's limits among which the true model's best is looked for."""
 LEARNING_LAPS = 10
@@ -27,26 +29,26 @@ AS_IS = " as it is"
 """Ends the name of a model that needs no evidence."""
 
 
-def cell_file(cell: Cell, out: Path) -> Path:
-    """Where the outcome of a cell is."""
-    return out / "cells" / f"{cell.name}.json"
+BASELINES = (TRUE, CALIBRATED)
 
 
-def race_cell(cell: Cell, out: Path, trained: Path, models: Iterable[str]) -> None:
-    """Drives a cell with the true model, the calibrated car and all ``models``, each with evidence and as it is.
+def outcome_file(cell: Cell, model: str, out: Path) -> Path:
+    """Where the outcome of a cell with one of the models, or of :data:`BASELINES`, is."""
+    return out / "cells" / cell.name / f"{model}.json"
+
+
+def race_model(cell: Cell, name: str, out: Path, trained: Path) -> None:
+    """Drives a cell with one of :data:`BASELINES`, or with a trained model: with evidence and as it is.
 
     Args:
         cell: to drive.
+        name: of the model.
         out: folder of the outcomes.
         trained: folder of the generalisation matrix, which has the models.
-        models: by name.
     """
     car, road = simulated_car(cell.car), cell.road
     driven = car.with_effects(cell.effects.items())
     reference = load_reference("racing", car, road, PACE[cell.objective])
-    folders = {name: model_folder(cell.training, name, trained) for name in models}
-    calibrated = load_model(next(iter(folders.values()))).vehicle
-    assert calibrated is not None
     outcomes: dict[str, Any] = {}
 
     def drive(name: str, model: PredictionModel, evidence: bool = True) -> None:
@@ -54,12 +56,17 @@ def race_cell(cell: Cell, out: Path, trained: Path, models: Iterable[str]) -> No
         course = Course(driven, road, cell.plant, reference, settings, LAPS, sensing=cell.sensing)
         outcomes[name] = race(course, model).to_json()
 
-    drive(TRUE, true_model(driven, cell.plant))
-    drive(CALIBRATED, Adaptive(SingleTrack(calibrated), car))
-    for name, folder in folders.items():
-        drive(name, Adaptive(load_model(folder), car))
-        drive(name + AS_IS, Adaptive(load_model(folder), car), evidence=False)
-    write_json(cell_file(cell, out), {"models": outcomes})
+    if name == TRUE:
+        drive(TRUE, true_model(driven, cell.plant))
+    elif name == CALIBRATED:
+        calibrated = load_model(model_folder(cell.training, CALIBRATES, trained)).vehicle
+        assert calibrated is not None
+        drive(CALIBRATED, Adaptive(SingleTrack(calibrated), car))
+    else:
+        for evidence in (True, False):
+            model = load_model(model_folder(cell.training, name, trained))
+            drive(name if evidence else name + AS_IS, Adaptive(model, car), evidence)
+    write_json(outcome_file(cell, name, out), {"models": outcomes})
 
 
 def learning_file(cell: Cell, out: Path) -> Path:
@@ -95,10 +102,15 @@ def learn_cell(cell: Cell, out: Path, trained: Path, model: str) -> None:
     write_json(learning_file(cell, out), {"true_best_s": min(best, default=None), "learned": learned.to_json()})
 
 
-def read_cell(cell: Cell, out: Path) -> dict[str, Any] | None:
-    """The outcome of a cell by model; ``None`` if it was not driven."""
-    outcome = _read(cell_file(cell, out))
-    return None if outcome is None else outcome["models"]
+def read_cell(cell: Cell, models: Iterable[str], out: Path) -> dict[str, Any] | None:
+    """The outcomes of a cell with :data:`BASELINES` and ``models``; ``None`` unless it was driven with all of them."""
+    outcomes: dict[str, Any] = {}
+    for name in (*BASELINES, *models):
+        outcome = _read(outcome_file(cell, name, out))
+        if outcome is None:
+            return None
+        outcomes |= outcome["models"]
+    return outcomes
 
 
 def read_learning(cell: Cell, out: Path) -> dict[str, Any] | None:

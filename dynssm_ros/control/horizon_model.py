@@ -130,7 +130,7 @@ class HorizonModel:
 
         Args:
             x: state in the order of ``STATES`` and the car's effect states, shape ``(size,)`` or ``(n, size)``.
-            u: increments of throttle and steering, shape ``(2,)``.
+            u: increments of throttle and steering, shape ``(2,)`` or ``(n, 2)``.
             p: coefficients, correction and context, shape ``(PARAMETERS,)`` or ``(n, PARAMETERS)``.
         """
         count = len(np.atleast_2d(x))

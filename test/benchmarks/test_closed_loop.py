@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.closed_loop.cells import CHANGES, OBJECTIVES, PLANTS, TRACKS, cells, variation
 from benchmarks.closed_loop.page import lap_times, page, summary
-from benchmarks.closed_loop.run import AS_IS, race_cell, read_cell
+from benchmarks.closed_loop.run import AS_IS, race_model, read_cell
 from benchmarks.generalisation.cells import CARS, NOISE_LEVELS
 from benchmarks.generalisation.run import model_folder
 from dynssm_ros.track.tracks import load_track
@@ -58,7 +58,8 @@ def test_the_page_counts_those_that_come_round_and_compares_last_laps():
     models = [part["models"]["dynssm"] for part in parts if part["cells"]]
     assert sum(model["came_round"] for model in models) == 1
     assert [name for model in models for name in model["lost"]] == [every[1].name]
-    words = page(known, ["part=all"])
+    words = page(known, ["part=all"], "laps.png")
+    assert "(laps.png)" in words
     assert "dodo.py part=all" in words
     assert every[1].name in words
     assert len(lap_times(known).axes) == 1
@@ -70,8 +71,13 @@ def test_a_cell_is_driven_with_each_model(small_model, tmp_path):
     folder = model_folder(cell.training, "small", tmp_path / "trained")
     folder.parent.mkdir(parents=True)
     folder.symlink_to(small_model)
-    race_cell(cell, tmp_path, tmp_path / "trained", ["small"])
-    found = read_cell(cell, tmp_path)
+    trained = tmp_path / "trained"
+    (folder.parent / "rls").symlink_to(small_model)
+    for name in ("true", "calibrated"):
+        race_model(cell, name, tmp_path, trained)
+    assert read_cell(cell, ["small"], tmp_path) is None, "not driven with all models yet"
+    race_model(cell, "small", tmp_path, trained)
+    found = read_cell(cell, ["small"], tmp_path)
     assert list(found) == ["true", "calibrated", "small", "small" + AS_IS]
     assert found["true"]["completed"]
     assert len(found["calibrated"]["lap_times_s"]) == 2

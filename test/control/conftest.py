@@ -67,10 +67,11 @@ def horizon_model(orca):
 def controller(horizon_model, orca):
     """Builds a controller of the 1:43 car on ``(track, reference)``."""
 
-    def build(track, reference, objective="tracking", deadline=math.inf, slip=None, lag_bound=None, **options):
+    def build(track, reference, objective="tracking", deadline=math.inf, slip=None, lag_bound=None, N=N, **options):
         settings = replace(Settings.of(orca, objective, N), deadline=deadline)
         settings = settings if slip is None else replace(settings, slip=slip)
         settings = settings if lag_bound is None else replace(settings, lag_bound=lag_bound)
-        return Nmpc(horizon_model, orca.inputs, reference, track, settings, **options)
+        model = horizon_model if horizon_model.N == N else HorizonModel(horizon_model.car, N)
+        return Nmpc(model, orca.inputs, reference, track, settings, **options)
 
     return build

@@ -1,0 +1,147 @@
+"""Laps of the live stack in one process, for many seeds of the noise: ``python -m benchmarks.live_seeds --count 100``.
+
+The same car, road, noise, delay and patch of little grip as in :mod:`benchmarks.live_laps`. Nothing waits for anything: each
+message is answered before the next, so that a drive depends on its seed alone. What is left is whether the controller holds
+the road, whatever is measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.closed_loop.cells import CHANGES, Cell, sensing
+from benchmarks.generalisation.cells import CARS
+from benchmarks.live_laps import CHANGE, ROAD, SPEED_SCALE
+from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.control.live import LiveController
+from dynssm_ros.control.reference import load_reference
+from dynssm_ros.control.settings import Settings
+from dynssm_ros.errors import UserError
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.predictor import Prediction, Predictor
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
+from dynssm_ros.simulation.sensing import Sensors
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, State, load_vehicle
+from dynssm_ros.vehicle.kinematics import Pose
+
+_WATCHDOG = 1.0  # s
+_MAX_AGE = 0.5  # s
+_PATIENCE = 3.0  # times the line's own time that the laps may take
+
+
+class Seeded(NamedTuple):
+    """What became of a drive."""
+
+    seed: int
+    laps: int
+    """Complete ones."""
+    least_room: float
+    """The least distance of the true car's centre from the borders (m); negative outside of them."""
+
+
+def drive_seeded(car: str, seed: int, laps: int, model: Path | None = None) -> Seeded:
+    """Drives laps with the live controller, and with the live predictor if there is a ``model`` folder.
+
+    Args:
+        car: of the robustness matrix.
+        seed: of the noise.
+        laps: to drive; a car that leaves the road ends the drive.
+        model: of the predictor.
+
+    Raises:
+        UserError: the model is damaged, or of another car.
+    """
+    cell, vehicle = Cell(car, ROAD, CHANGE), load_vehicle(CARS[car].vehicle)
+    predictor = None if model is None else Predictor(OnnxModel(open_artifact(model)), load_signal_map("default"))
+    known = vehicle if predictor is None else predictor.model.artifact.card.vehicle
+    reference = load_reference("racing", known, cell.road, SPEED_SCALE)
+    sensed, T_s = replace(sensing(car, 1.0, True), seed=seed), vehicle.sampling_time
+    controller = LiveController(
+        known, reference, cell.road, replace(Settings.of(known), deadline=np.inf), _MAX_AGE, _WATCHDOG, sensed.delay
+    )
+    sensors, time = Sensors(sensed, T_s), 0.0
+    holder = CommandHolder(vehicle, _WATCHDOG, lambda: time)
+    driven = vehicle.with_effects(CHANGES[CHANGE].items())
+    least, end = np.inf, _PATIENCE * (laps + 1) * reference.lap_time
+    for k, sample in enumerate(drive_by_commands(driven, cell.road, "double_track", holder.command)):
+        time = k * T_s
+        least = min(least, float(cell.road.room(sample.s, sample.lateral)))
+        if least < 0 or controller.laps.count >= laps or time > end:
+            break
+        sensors.measure(sample.pose, State(*sample.measured))
+        if not sensors.is_full:
+            continue
+        pose, seen, age = sensors.arrived
+        stamps = round(k * T_s * 1e9), round((k - age) * T_s * 1e9)
+        if predictor is not None:
+            _predict(predictor, controller, stamps, pose, seen, sample.feedback)
+        command = controller.step(stamps[1], pose, seen)
+        if isinstance(command, Applied):
+            holder.receive(command)
+    return Seeded(seed, controller.laps.count, least)
+
+
+def _predict(
+    predictor: Predictor, controller: LiveController, stamps: tuple[int, int], pose: Pose, seen: State, applied: Applied
+) -> None:
+    """Tells the controller what the predictor says.
+
+    Args:
+        predictor: to ask.
+        controller: to tell.
+        stamps: of what the actuators do, and of the odometry (ns).
+        pose: as measured.
+        seen: likewise.
+        applied: what the actuators do.
+    """
+    predictor.observe(stamps[0], {"throttle_feedback": applied.r, "steering_feedback": applied.delta})
+    said = predictor.predict(stamps[1], {**pose._asdict(), **seen._asdict()})
+    if isinstance(said, Prediction):
+        controller.remote.predicted(said.stamp, said.state.tolist())
+        if said.theta is not None:
+            controller.remote.adapted(said.stamp, dict(zip(COEFFICIENTS, said.theta.tolist(), strict=True)))
+        predictor.finish()
+
+
+def words(car: str, drives: Iterable[Seeded]) -> str:
+    """What became of the drives, in a line."""
+    rooms = {drive.seed: drive.least_room for drive in drives}
+    left = [str(seed) for seed, room in rooms.items() if room < 0]
+    return (
+        f"{car}: {len(left)} of {len(rooms)} drives left the road{' with seeds ' + ', '.join(left) if left else ''}; "
+        f"least room to the borders {min(rooms.values()):.3g} m, median {np.median(list(rooms.values())):.3g} m"
+    )
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--car", choices=list(CARS), default="orca")
+    parser.add_argument("--first", type=int, default=0, help="seed")
+    parser.add_argument("--count", type=int, default=100, help="of seeds")
+    parser.add_argument("--laps", type=int, default=2)
+    parser.add_argument("--model", type=Path, help="folder, for the predictor; without it there is none")
+    given = parser.parse_args()
+    drives = []
+    try:
+        with progress_bar("drives") as progress:
+            for seed in range(given.first, given.first + given.count):
+                drives.append(drive_seeded(given.car, seed, given.laps, given.model))
+                progress(len(drives), given.count)
+    except UserError as error:
+        sys.exit(f"error: {error}")
+    console.print(words(given.car, drives), markup=False, soft_wrap=True)
+    sys.exit(0 if all(drive.least_room >= 0 for drive in drives) else 1)
+
+
+if __name__ == "__main__":
+    main()
