@@ -86,7 +86,13 @@ class _Listener:
 
 
 def drive_live(
-    car: str, laps: int, model: Path | None = None, busy: int = 0, rate: float = 1.0, progress: Progress | None = None
+    car: str,
+    laps: int,
+    model: Path | None = None,
+    busy: int = 0,
+    rate: float = 1.0,
+    lockstep: bool = False,
+    progress: Progress | None = None,
 ) -> LiveLaps:
     """Drives laps with the live stack: usual noise, odometry a step late, a patch with four fifths of the grip.
 
@@ -96,6 +102,7 @@ def drive_live(
         model: of the predictor; ``None``: there is none, and the car's file is planned with.
         busy: processes that keep a core busy each.
         rate: speed of the car's time over real time.
+        lockstep: whether the car's time waits for the controller.
         progress: told of laps.
 
     Raises:
@@ -110,6 +117,7 @@ def drive_live(
         os.environ.update(isolated_environment())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         nodes = _parameters(cell, vehicle, known, folder, rate)
+        nodes["simulator"]["lockstep"] = lockstep
         if model is not None:
             nodes["predictor"] = {"model": model}
         stack.enter_context(_kept_busy(busy))

@@ -1,8 +1,9 @@
 """A simulated car on the bus: ``ros2 run dynssm_ros simulator --ros-args -p vehicle:=orca -p track:=club``.
 
 Publishes odometry and actuator feedback once per T_s, as the predictor's default topics. Its own driver laps the track
-and publishes the commands, or, with ``driver:=external``, it obeys those that somebody else sends. All driving is in
-:mod:`dynssm_ros.simulation`; this node converts, keeps the time and publishes.
+and publishes the commands, or, with ``driver:=external``, it obeys those that somebody else sends. With ``lockstep:=true``
+the car's time waits for them. All driving is in :mod:`dynssm_ros.simulation`; this node converts, keeps the time and
+publishes.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from dynssm_ros.nodes.support import (
     set_stamp,
 )
 from dynssm_ros.runtime.health import Level
-from dynssm_ros.signals.decoding import decoders
+from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
@@ -47,6 +48,7 @@ from dynssm_ros.vehicle.kinematics import Pose
 
 DriverKind = Literal["pure_pursuit", "external"]
 _DIAGNOSTICS = 1.0  # s between them
+_UNANSWERED = 2.0  # s that a command is waited for in lockstep
 _LATE = 1.0  # s; a node that was held up for longer goes on from there and does not catch up
 
 
@@ -76,6 +78,13 @@ class SimulatorNode(Node):
             self, "watchdog", 0.2, "Age of an external command, in the car's time, at which it brakes (s).", (0.01, 10.0),
             read_only=True,
         )  # fmt: skip
+        self._lockstep = describe(
+            self,
+            "lockstep",
+            False,
+            "Whether the car's time waits for the external command that is due.",
+            read_only=True,
+        )
         if self._seed < 0:
             raise ConfigurationError(f"parameter seed: {self._seed}; expected at least 0")
         self._vehicle = load_vehicle(vehicle).with_effects(map(parse_effect, effects.split()))
@@ -84,6 +93,7 @@ class SimulatorNode(Node):
         self._sensors = self._make_sensors()
         self._commands = CommandHolder(self._vehicle, watchdog, lambda: self._count * self._vehicle.sampling_time)
         self._obeyed = self._on_road = True
+        self._commanded: tuple[int, float] | None = None  # when the last command acts (ns), and when it came (s)
 
         self._publish_feedback = self.create_publisher(JointState, relative(FEEDBACK_TOPIC), SENSOR_QOS).publish
         self._publish_odometry = self.create_publisher(Odometry, relative(ODOMETRY_TOPIC), SENSOR_QOS).publish
@@ -131,7 +141,9 @@ class SimulatorNode(Node):
     def _on_command(self, message: JointState) -> None:
         values = self._decoder.decode(message)
         command = Applied(*(values.get(name, math.nan) for name in ("throttle_command", "steering_command")))
-        if not self._commands.receive(command):
+        if self._commands.receive(command):
+            self._commanded = header_stamp_ns(message) or self._due, time.monotonic()
+        else:
             self.get_logger().warning(
                 f"{COMMAND_TOPIC}: throttle {command.r:g}, steering {command.delta:g} ignored; expected finite numbers",
                 throttle_duration_sec=1.0,
@@ -140,12 +152,26 @@ class SimulatorNode(Node):
     def _on_time(self) -> None:
         """Publishes the samples that are due; the clock of the steps does not drift from that of the timer."""
         late = time.monotonic() - self._begin - self._count * self._period
+        if self._lockstep and self._is_unanswered():
+            return
         if late > self._catches_up:
             self._begin += late
             self._held_up += late
             late = 0.0
         for _ in range(1 + int(late / self._period)):
             self._publish(next(self._samples))
+
+    @property
+    def _due(self) -> int:
+        """When the next command is to act (ns)."""
+        return self._stamp_of(self._count)
+
+    def _is_unanswered(self) -> bool:
+        """Whether the command that is due is still to come, from somebody who was heard lately."""
+        if self._commanded is None:
+            return False
+        acts, came = self._commanded
+        return acts < self._due and time.monotonic() - came < _UNANSWERED
 
     def _publish(self, sample: Sample) -> None:
         """Actuators first, as a predictor needs them when the odometry arrives."""

@@ -28,15 +28,7 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 
 PERIOD = 20_000_000  # ns
 PATIENCE = 120.0  # s for a lap, and for processes to start
-
-
-def possible_rate() -> float:
-    """A quarter of real time, or a tenth while others keep the machine busy: these laps are not about its speed.
-
-    In real time, a controller that stops for 0.1 s drives the small car off the road; `benchmarks.live_laps` is about that.
-    """
-    running = int(Path("/proc/loadavg").read_text().split()[3].partition("/")[0])
-    return 0.25 if running <= (os.cpu_count() or 1) else 0.1
+RATE = 0.25  # of real time: these laps are not about the machine's speed; `benchmarks.live_laps` is
 
 
 class Stand:
@@ -145,10 +137,9 @@ def assert_possible(commands: list[JointState]) -> None:
 
 
 def test_three_processes_drive_laps_and_the_predictor_may_die(stand: Stand, small_model: Path) -> None:
-    rate = possible_rate()
     predictor = stand.start("predictor", model=small_model, diagnostics_period=0.1)
-    stand.control(line="centre", speed_scale=0.7, rate=rate, watchdog=1.0)
-    stand.start("simulator", driver="external", rate=rate, watchdog=1.0)
+    stand.control(line="centre", speed_scale=0.7, rate=RATE, watchdog=1.0)
+    stand.start("simulator", driver="external", rate=RATE, lockstep=True)
     assert stand.diagnosed("drives, adapted coefficients"), stand.told[-1]
     assert stand.wait_for(lambda: stand.laps() >= 1), stand.told[-1]
     _, words, values = stand.told[-1]
@@ -171,7 +162,7 @@ def test_three_processes_drive_laps_and_the_predictor_may_die(stand: Stand, smal
 
 
 def test_a_lap_with_noise_delay_and_a_patch_of_little_grip_stays_on_the_road(small_model: Path) -> None:
-    driven = drive_live("orca", 2, small_model, rate=possible_rate())
+    driven = drive_live("orca", 2, small_model, rate=RATE, lockstep=True)
     assert driven.least_room > 0
     assert driven.lap_times[1] < 6.0
     assert driven.controller.startswith("drives, adapted coefficients")
@@ -179,9 +170,8 @@ def test_a_lap_with_noise_delay_and_a_patch_of_little_grip_stays_on_the_road(sma
 
 def test_the_car_stops_without_its_controller_and_the_controller_brakes_without_its_car(stand: Stand) -> None:
     """Each of the two is killed in turn; the controller comes back in between."""
-    rate = possible_rate()
-    simulator = stand.start("simulator", driver="external", rate=rate)
-    controller = stand.control(line="centre", speed_scale=0.5, rate=rate, watchdog=1.0)
+    simulator = stand.start("simulator", driver="external", rate=RATE)
+    controller = stand.control(line="centre", speed_scale=0.5, rate=RATE, watchdog=1.0)
 
     def speed() -> float:
         return float(stand.odometry[-1].twist.twist.linear.x)
@@ -189,7 +179,7 @@ def test_the_car_stops_without_its_controller_and_the_controller_brakes_without_
     assert stand.wait_for(lambda: bool(stand.odometry) and speed() > 0.5)  # on the straight after the start
     controller.kill()
     assert stand.wait_for(lambda: speed() < 0.05), "without commands the car brakes until it stands"
-    stand.control(line="centre", speed_scale=0.5, rate=rate, watchdog=1.0)
+    stand.control(line="centre", speed_scale=0.5, rate=RATE, watchdog=1.0)
     assert stand.wait_for(lambda: speed() > 0.5), f"a controller that was started again drives on: {stand.told[-1]}"
     simulator.kill()
     assert stand.diagnosed("/vehicle/odometry: silent for")

@@ -18,7 +18,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 
 from benchmarks.live_run import LiveRun, collecting, isolated_environment, predictor_process
-from dynssm_ros.nodes.support import SENSOR_QOS
+from dynssm_ros.nodes.support import SENSOR_QOS, set_stamp
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.simulation.laps import drive
@@ -49,7 +49,7 @@ class Pit:
         subscribe(JointState, FEEDBACK_TOPIC, lambda m: self._keep(self.feedback, m), SENSOR_QOS)
         subscribe(JointState, COMMAND_TOPIC, lambda m: self._keep(self.command, m), SENSOR_QOS)
         subscribe(Odometry, ODOMETRY_TOPIC, self._on_odometry, SENSOR_QOS)
-        self._send = self.collector.create_publisher(JointState, COMMAND_TOPIC, SENSOR_QOS).publish
+        self.send = self.collector.create_publisher(JointState, COMMAND_TOPIC, SENSOR_QOS).publish
         self.process = subprocess.Popen(
             _simulator(*parameters), env=os.environ.copy(), stderr=subprocess.PIPE, text=True
         )
@@ -74,7 +74,7 @@ class Pit:
             self.odometry.append(message)
             self.collector.changed.notify_all()
         if self.answer is not None:
-            self._send(self.answer)
+            self.send(self.answer)
 
     def _stop(self) -> None:
         self.process.send_signal(signal.SIGINT)
@@ -205,6 +205,25 @@ def test_a_car_that_was_held_up_drives_nothing_that_its_driver_could_not_answer(
     assert {pit.feedback[stamp] for stamp in list(pit.feedback) if stamp > newest} == {(0.4, 0.0)}
     held_up = "held up so far (s)"
     assert pit.wait_for(lambda: any(float(values.get(held_up, 0)) > 0.75 for _, _, values in pit.run.diagnostics))
+
+
+def test_in_lockstep_time_waits_for_the_command_that_is_due_and_goes_on_without_a_driver(start_pit: StartPit) -> None:
+    pit = start_pit("driver:=external", "lockstep:=true", "rate:=5.0", "watchdog:=0.5")
+    assert pit.wait_for(lambda: bool(pit.odometry)), "nobody drives yet: it does not wait"
+    pit.reply(0.4, 0.0)
+    assert pit.wait_for(lambda: pit.v_x > 0.3)
+    pit.answer = None
+    seen = len(pit.odometry)
+    assert not pit.wait_for(lambda: len(pit.odometry) > seen + 1, 0.5), "it waits"
+    due = max(pit.feedback) + PERIOD
+    early, timely = (JointState(name=["throttle", "steering"], position=[0.4, 0.0]) for _ in range(2))
+    for message, stamp in ((early, due - PERIOD), (timely, due)):
+        set_stamp(message.header, stamp)
+    pit.send(early)
+    assert not pit.wait_for(lambda: max(pit.feedback) >= due, 0.3), "a late answer to an earlier step is none"
+    pit.send(timely)
+    assert pit.wait_for(lambda: max(pit.feedback) >= due)
+    assert pit.wait_for(lambda: pit.v_x < 1e-6), "a driver that is gone is not waited for; without commands it brakes"
 
 
 def test_a_car_that_cannot_hold_the_road_ends_in_one_line() -> None:
