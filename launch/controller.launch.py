@@ -19,11 +19,12 @@ ARGUMENTS = {  # name: description, nodes that take it as a parameter
     "objective": ("tracking or progress.", ("controller",)),
     "plant": ("How the car is simulated: euler, rk4 or double_track.", ("simulator",)),
     "effects": ("Physics that only the simulated car has: NAME[:k=v,...], apart by blanks.", ("simulator",)),
+    "lockstep": ("true: the simulated car's time waits for the controller.", ("simulator",)),
     "model": ("Model folder; without one no predictor is started.", ("predictor",)),
     "use_sim_time": ("true: follow /clock, as when a bag is played with it.", ("controller", "simulator", "predictor")),
     "autostart": ("false: a manager of life cycles configures and activates the nodes.", ("controller", "predictor")),
 }
-SWITCHES = ("use_sim_time", "autostart")
+SWITCHES = ("use_sim_time", "autostart", "lockstep")
 NUMBERS = ("scale", "rate", "speed_scale")
 
 

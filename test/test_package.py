@@ -374,6 +374,9 @@ def test_controller_launch_file_starts_the_stack_that_is_asked_for(load_launch: 
     assert nodes["predictor"]["parameters"] == [{"model": "out/model"}]
     assert nodes["simulator"]["parameters"][0]["driver"] == "external"
     assert nodes["controller"]["parameters"][0]["speed_scale"] == 0.7
+    held = {node.named["executable"]: node.named["parameters"][-1] for node in all_launched(file, lockstep="true")}
+    assert held["simulator"]["lockstep"] is True
+    assert "lockstep" not in held["controller"]
     (alone,) = all_launched(file, simulator="false")
     assert alone.named["executable"] == "controller"
 
