@@ -1,7 +1,7 @@
 """Laps of the live stack over DDS, with noise, delay and a patch of little grip: ``python -m benchmarks.live_laps``.
 
-Simulated car, predictor and controller are processes of their own and run in real time, beside processes that keep a core
-busy each. The simulator tells how near the borders the car truly came, whatever is measured of it.
+Simulated car, predictor and controller are processes of their own and run in real time, or in lockstep, beside processes that
+keep a core busy each. The simulator tells how near the borders the car truly came, whatever is measured of it.
 """
 
 from __future__ import annotations
@@ -211,11 +211,14 @@ def main() -> None:
     parser.add_argument("--laps", type=int, default=20)
     parser.add_argument("--model", type=Path, help="folder, for the predictor; without it there is none")
     parser.add_argument("--busy", type=int, default=1, help="processes that keep a core busy each")
+    parser.add_argument("--lockstep", action="store_true", help="the car's time waits for the controller")
     parser.add_argument("--json", type=Path, help="also write the result as JSON")
     given = parser.parse_args()
     try:
         with progress_bar("laps") as progress:
-            driven = drive_live(given.car, given.laps, given.model, given.busy, progress=progress)
+            driven = drive_live(
+                given.car, given.laps, given.model, given.busy, lockstep=given.lockstep, progress=progress
+            )
     except UserError as error:
         sys.exit(f"error: {error}")
     if given.json is not None:
@@ -223,7 +226,8 @@ def main() -> None:
     p50, worst = np.median(driven.lap_times), max(driven.lap_times)
     console.print(
         f"{given.car}: {len(driven.lap_times)} laps, median {p50:.2f} s, worst {worst:.2f} s; least room to the borders "
-        f"{driven.least_room:.3g} m; plans {driven.plans}; step p99 {driven.step_p99:.1f} ms; {driven.controller}; "
+        f"{driven.least_room:.3g} m; plans {driven.plans}; step p99 {driven.step_p99:.1f} ms; the car was held up for "
+        f"{driven.held_up:.3g} s; {driven.controller}; "
         f"predictor: {driven.predictor}",
         markup=False,
         soft_wrap=True,

@@ -268,32 +268,39 @@ class Nmpc:
         again = self._improved(now, plan, adapted, t, margins) or plan
         others = manoeuvres(Applied(now[R], now[DELTA]), self._limits, self.settings.N, self.model.car.T_s)
         u = np.concatenate([[plan.u, again.u], others])
-        x, costs = self._driven(now, u, p, margins)
+        x = self._driven(now, u, p)
+        costs = self._costs(x, u, p, margins)
         own, best = int(np.argmin(costs[:2])), 2 + int(np.argmin(costs[2:]))
         if costs[own] - costs[best] > _CLEARLY * abs(costs[own]):
             return Plan(x[best], u[best])
         return (plan, again)[own]
 
-    def _driven(self, now: Vector, u: Vector, p: Vector, margins: Margins) -> tuple[Vector, Vector]:
-        """Where increments lead by the model, and what the program's objective is there, not linearised.
+    def _driven(self, now: Vector, u: Vector, p: Vector) -> Vector:
+        """Where increments lead by the model, not linearised: states ``(M, N + 1, size)``.
 
         Args:
             now: the present state, ``(size,)``.
             u: sequences of increments, ``(M, N, 2)``.
             p: parameters of the steps, ``(N, PARAMETERS)``.
-            margins: as of :meth:`plan`.
-
-        Returns:
-            States ``(M, N + 1, size)``, and costs ``(M,)``: infinite where a state is not finite.
         """
-        N, w = self.settings.N, self.settings.weights
-        x = np.empty((len(u), N + 1, len(now)))
+        x = np.empty((len(u), len(p) + 1, len(now)))
         x[:, 0] = now
-        for k in range(N):
-            x[:, k + 1] = self.model.step(x[:, k], u[:, k], p[k])
+        for k, parameters in enumerate(p):
+            x[:, k + 1] = self.model.step(x[:, k], u[:, k], parameters)
+        return x
+
+    def _costs(self, x: Vector, u: Vector, p: Vector, margins: Margins) -> Vector:
+        """What the program minimises, ``(M,)``; infinite where a state is not finite.
+
+        Args:
+            x: states, not linearised, ``(M, N + 1, size)``.
+            u: increments that led there, ``(M, N, 2)``.
+            p: parameters of the steps, ``(N, PARAMETERS)``.
+            margins: as of :meth:`plan`.
+        """
         finite = np.all(np.isfinite(x), axis=(1, 2))
-        x[~finite] = now  # their costs are not looked at
-        length, h = self.settings.scale.length, self.model.car.T_s / self.settings.scale.time
+        x = np.where(finite[:, None, None], x, x[:, :1])
+        w, length, h = self.settings.weights, self.settings.scale.length, self.model.car.T_s / self.settings.scale.time
         at = self._reference_points(x)
         tangent, normal = _directions(self._reference.line.heading(at))
         errors = (x[:, 1:, :2] - self._reference.line.position(at)) / length
@@ -304,14 +311,13 @@ class Nmpc:
         beyond = np.max(np.abs(slips) - self._slip_bounds(margins.slip), axis=-1)
         beyond = np.maximum(0.0, np.maximum(beyond, np.maximum(lateral - left, -right - lateral) / length))
         each_step = w.along * along**2 + w.across * across**2 + w.border * (beyond + beyond**2)
-        rates = u**2 @ [w.throttle, w.steering] / h
-        costs = np.sum(h * each_step + rates, axis=-1)
+        costs = np.sum(h * each_step + u**2 @ [w.throttle, w.steering] / h, axis=-1)
         if w.progress > 0:
             costs -= w.progress * (along[:, -1] + (np.broadcast_to(at, along.shape)[:, -1] - self._on_line) / length)
         if w.ending > 0:
             too_fast = (x[:, -1, V_X] - self._reference.speed_at(at[..., -1])) * self.settings.scale.time / length
             costs += w.ending * (np.maximum(0.0, too_fast) + np.maximum(0.0, too_fast) ** 2)
-        return x, np.where(finite, costs, np.inf)
+        return np.where(finite, costs, np.inf)
 
     def _program(
         self, now: Vector, guess: Vector, offset: Vector, slope: Vector, p: Vector, margins: Margins
