@@ -60,21 +60,21 @@ def drive_seeded(car: str, seed: int, laps: int, model: Path | None = None) -> S
     Raises:
         UserError: the model is damaged, or of another car.
     """
-    cell, vehicle = Cell(car, ROAD, CHANGE), load_vehicle(CARS[car].vehicle)
+    road, vehicle = Cell(car, ROAD, CHANGE).road, load_vehicle(CARS[car].vehicle)
     predictor = None if model is None else Predictor(OnnxModel(open_artifact(model)), load_signal_map("default"))
     known = vehicle if predictor is None else predictor.model.artifact.card.vehicle
-    reference = load_reference("racing", known, cell.road, SPEED_SCALE)
+    reference = load_reference("racing", known, road, SPEED_SCALE)
     sensed, T_s = replace(sensing(car, 1.0, True), seed=seed), vehicle.sampling_time
     controller = LiveController(
-        known, reference, cell.road, replace(Settings.of(known), deadline=np.inf), _MAX_AGE, _WATCHDOG, sensed.delay
+        known, reference, road, replace(Settings.of(known), deadline=np.inf), _MAX_AGE, _WATCHDOG, sensed.delay
     )
     sensors, time = Sensors(sensed, T_s), 0.0
     holder = CommandHolder(vehicle, _WATCHDOG, lambda: time)
     driven = vehicle.with_effects(CHANGES[CHANGE].items())
     least, end = np.inf, _PATIENCE * (laps + 1) * reference.lap_time
-    for k, sample in enumerate(drive_by_commands(driven, cell.road, "double_track", holder.command)):
+    for k, sample in enumerate(drive_by_commands(driven, road, "double_track", holder.command)):
         time = k * T_s
-        least = min(least, float(cell.road.room(sample.s, sample.lateral)))
+        least = min(least, float(road.room(sample.s, sample.lateral)))
         if least < 0 or controller.laps.count >= laps or time > end:
             break
         sensors.measure(sample.pose, State(*sample.measured))
