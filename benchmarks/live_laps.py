@@ -30,6 +30,7 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
 from dynssm_ros.progress import Progress
 from dynssm_ros.runtime.models import load_model
+from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.track.tracks import CSV_COLUMNS, Track
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 
@@ -37,6 +38,8 @@ ROAD = ("club", 11)
 """Built-in track and seed of its variation."""
 SPEED_SCALE = 0.8
 CHANGE = "grip_patch"
+PLANT: PlantKind = "double_track"
+WATCHDOG = 1.0  # s, of the simulated car and of its controller
 _START = 60.0  # s that processes may take until the first lap begins
 _NODES = {"laps": "controller", "driven (laps)": "simulator", "model": "predictor"}  # what its diagnostics tell
 
@@ -116,8 +119,7 @@ def drive_live(
     with ExitStack() as stack:
         os.environ.update(isolated_environment())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        nodes = _parameters(cell, vehicle, known, folder, rate)
-        nodes["simulator"]["lockstep"] = lockstep
+        nodes = _parameters(cell, vehicle, known, folder, rate, lockstep)
         if model is not None:
             nodes["predictor"] = {"model": model}
         stack.enter_context(_kept_busy(busy))
@@ -150,7 +152,7 @@ def drive_live(
 
 
 def _parameters(
-    cell: Cell, vehicle: Vehicle, known: Vehicle, folder: Path, rate: float
+    cell: Cell, vehicle: Vehicle, known: Vehicle, folder: Path, rate: float, lockstep: bool
 ) -> dict[str, dict[str, object]]:
     """Of the simulator and the controller, by node.
 
@@ -160,14 +162,15 @@ def _parameters(
         known: the car as the controller knows it.
         folder: for their files.
         rate: speed of the car's time.
+        lockstep: whether it waits for the controller.
     """
     (name, values), sensed = next(iter(CHANGES[cell.change].items())), sensing(cell.car, 1.0, True)
-    road = {"track": _save_track(cell.road, folder / "road.csv"), "rate": rate, "watchdog": 1.0}
+    road = {"track": _save_track(cell.road, folder / "road.csv"), "rate": rate, "watchdog": WATCHDOG}
     for file, car in (("driven.yaml", vehicle), ("known.yaml", known)):
         save_vehicle(car, folder / file)
     return {
         "simulator": road | {
-            "vehicle": folder / "driven.yaml", "driver": "external", "plant": "double_track",
+            "vehicle": folder / "driven.yaml", "driver": "external", "plant": PLANT, "lockstep": lockstep,
             "effects": f"{name}:{','.join(f'{key}={value}' for key, value in values.items())}",
             "noise": list(sensed.noise), "pose_noise": list(sensed.pose_noise), "delay": sensed.delay,
         },
@@ -227,8 +230,7 @@ def main() -> None:
     console.print(
         f"{given.car}: {len(driven.lap_times)} laps, median {p50:.2f} s, worst {worst:.2f} s; least room to the borders "
         f"{driven.least_room:.3g} m; plans {driven.plans}; step p99 {driven.step_p99:.1f} ms; the car was held up for "
-        f"{driven.held_up:.3g} s; {driven.controller}; "
-        f"predictor: {driven.predictor}",
+        f"{driven.held_up:.3g} s; {driven.controller}; predictor: {driven.predictor}",
         markup=False,
         soft_wrap=True,
     )

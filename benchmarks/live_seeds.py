@@ -18,9 +18,10 @@ import numpy as np
 
 from benchmarks.closed_loop.cells import CHANGES, Cell, sensing
 from benchmarks.generalisation.cells import CARS
-from benchmarks.live_laps import CHANGE, ROAD, SPEED_SCALE
+from benchmarks.live_laps import CHANGE, PLANT, ROAD, SPEED_SCALE, WATCHDOG
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.control.live import LiveController
+from dynssm_ros.control.race import PATIENCE
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import UserError
@@ -32,10 +33,6 @@ from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
 from dynssm_ros.simulation.sensing import Sensors
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, State, load_vehicle
 from dynssm_ros.vehicle.kinematics import Pose
-
-_WATCHDOG = 1.0  # s
-_MAX_AGE = 0.5  # s
-_PATIENCE = 3.0  # times the line's own time that the laps may take
 
 
 class Seeded(NamedTuple):
@@ -65,14 +62,13 @@ def drive_seeded(car: str, seed: int, laps: int, model: Path | None = None) -> S
     known = vehicle if predictor is None else predictor.model.artifact.card.vehicle
     reference = load_reference("racing", known, road, SPEED_SCALE)
     sensed, T_s = replace(sensing(car, 1.0, True), seed=seed), vehicle.sampling_time
-    controller = LiveController(
-        known, reference, road, replace(Settings.of(known), deadline=np.inf), _MAX_AGE, _WATCHDOG, sensed.delay
-    )
+    settings = replace(Settings.of(known), deadline=np.inf)
+    controller = LiveController(known, reference, road, settings, max_gap=WATCHDOG, delay=sensed.delay)
     sensors, time = Sensors(sensed, T_s), 0.0
-    holder = CommandHolder(vehicle, _WATCHDOG, lambda: time)
+    holder = CommandHolder(vehicle, WATCHDOG, lambda: time)
     driven = vehicle.with_effects(CHANGES[CHANGE].items())
-    least, end = np.inf, _PATIENCE * (laps + 1) * reference.lap_time
-    for k, sample in enumerate(drive_by_commands(driven, road, "double_track", holder.command)):
+    least, end = np.inf, PATIENCE * (laps + 1) * reference.lap_time
+    for k, sample in enumerate(drive_by_commands(driven, road, PLANT, holder.command)):
         time = k * T_s
         least = min(least, float(road.room(sample.s, sample.lateral)))
         if least < 0 or controller.laps.count >= laps or time > end:

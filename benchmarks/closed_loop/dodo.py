@@ -29,7 +29,7 @@ from benchmarks.closed_loop.run import (
     read_cell,
     read_learning,
 )
-from benchmarks.generalisation.run import model_folder, models_of
+from benchmarks.generalisation.run import RIVALS, model_folder, models_of
 from benchmarks.generalisation.training_tasks import drive_tasks, train_tasks
 from benchmarks.tasks import doit_config
 from dynssm_ros.errors import UserError
@@ -46,7 +46,7 @@ ARGUMENTS = [f"{name}={value}" for name, value in VALUES.items() if value != USU
 # ridge has no physics to plan with
 MODELS = tuple(name for name in models_of(VALUES["sets"].split(",")) if name != "ridge")
 LEARNS = "dynssm"
-PAGE = "closed_loop_rivals" if "rivals" in VALUES["sets"] else "closed_loop"
+PAGE = "closed_loop_rivals" if set(RIVALS) & set(MODELS) else "closed_loop"
 DOIT_CONFIG = doit_config(OUT / "doit.json") | {"default_tasks": ["page"]}
 CELLS = [
     cell

@@ -20,6 +20,7 @@ from dynssm_ros.files import write_json
 from dynssm_ros.runtime.models import SingleTrack, load_model
 
 CALIBRATED = "calibrated"
+BASELINES = (TRUE, CALIBRATED)
 CALIBRATES = "rls"
 """Whose folder has the calibrated car."""
 TRUE_PACES = (0.9, 1.0, 1.1, 1.2)
@@ -27,9 +28,6 @@ TRUE_PACES = (0.9, 1.0, 1.1, 1.2)
 LEARNING_LAPS = 10
 AS_IS = " as it is"
 """Ends the name of a model that needs no evidence."""
-
-
-BASELINES = (TRUE, CALIBRATED)
 
 
 def outcome_file(cell: Cell, model: str, out: Path) -> Path:

@@ -307,16 +307,16 @@ class Nmpc:
         along, across = np.sum(tangent * errors, axis=-1), np.sum(normal * errors, axis=-1)
         s, lateral = self._track.project(x[:, 1:, :2], _along(x[..., :2], self._on_track))
         right, left = self._room(s, margins.lateral)
+        outside = np.maximum(lateral - left, -right - lateral) / length
         slips = np.array([self.model.slip_angles(each[1:], p)[0] for each in x])
-        beyond = np.max(np.abs(slips) - self._slip_bounds(margins.slip), axis=-1)
-        beyond = np.maximum(0.0, np.maximum(beyond, np.maximum(lateral - left, -right - lateral) / length))
-        each_step = w.along * along**2 + w.across * across**2 + w.border * (beyond + beyond**2)
+        slipping = np.max(np.abs(slips) - self._slip_bounds(margins.slip), axis=-1)
+        each_step = w.along * along**2 + w.across * across**2 + w.border * _soft(np.maximum(outside, slipping))
         costs = np.sum(h * each_step + u**2 @ [w.throttle, w.steering] / h, axis=-1)
         if w.progress > 0:
-            costs -= w.progress * (along[:, -1] + (np.broadcast_to(at, along.shape)[:, -1] - self._on_line) / length)
+            costs -= w.progress * (along[:, -1] + (at[..., -1] - self._on_line) / length)
         if w.ending > 0:
             too_fast = (x[:, -1, V_X] - self._reference.speed_at(at[..., -1])) * self.settings.scale.time / length
-            costs += w.ending * (np.maximum(0.0, too_fast) + np.maximum(0.0, too_fast) ** 2)
+            costs += w.ending * _soft(too_fast)
         return np.where(finite, costs, np.inf)
 
     def _program(
@@ -453,6 +453,12 @@ def _along(positions: Vector, s: float) -> Vector:
     """About where positions ``(..., N + 1, 2)`` after the first lie on a line (m), the first being at ``s``: ``(..., N)``."""
     steps = np.diff(positions, axis=-2)
     return np.asarray(s + np.cumsum(np.hypot(steps[..., 0], steps[..., 1]), axis=-1))
+
+
+def _soft(beyond: Vector) -> Vector:
+    """What going beyond a bound costs, in units of its price."""
+    slack = np.maximum(0.0, beyond)
+    return np.asarray(slack + slack**2)
 
 
 def _directions(heading: Vector) -> tuple[Vector, Vector]:

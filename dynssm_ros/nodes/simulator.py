@@ -79,11 +79,7 @@ class SimulatorNode(Node):
             read_only=True,
         )  # fmt: skip
         self._lockstep = describe(
-            self,
-            "lockstep",
-            False,
-            "Whether the car's time waits for the external command that is due.",
-            read_only=True,
+            self, "lockstep", False, "Whether time waits for the external command.", read_only=True
         )
         if self._seed < 0:
             raise ConfigurationError(f"parameter seed: {self._seed}; expected at least 0")
@@ -151,9 +147,9 @@ class SimulatorNode(Node):
 
     def _on_time(self) -> None:
         """Publishes the samples that are due; the clock of the steps does not drift from that of the timer."""
-        late = time.monotonic() - self._begin - self._count * self._period
         if self._lockstep and self._is_unanswered():
             return
+        late = time.monotonic() - self._begin - self._count * self._period
         if late > self._catches_up:
             self._begin += late
             self._held_up += late
