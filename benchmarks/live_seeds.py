@@ -1,8 +1,8 @@
 """Laps of the live stack in one process, for many seeds of the noise: ``python -m benchmarks.live_seeds --count 100``.
 
 The same car, road, noise, delay and patch of little grip as in :mod:`benchmarks.live_laps`. Nothing waits for anything: each
-message is answered before the next, so that a drive depends on its seed alone. What is left is whether the controller holds
-the road, whatever is measured.
+message is answered before the next, so that a drive depends on its seed alone. The predictor's answer is there at the next
+step, as on the bus. What is left is whether the controller holds the road, whatever is measured.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ class Seeded(NamedTuple):
     """Complete ones."""
     least_room: float
     """The least distance of the true car's centre from the borders (m); negative outside of them."""
+    predictions: int
+    """That the controller heard."""
 
 
 def drive_seeded(car: str, seed: int, laps: int, model: Path | None = None) -> Seeded:
@@ -67,7 +69,7 @@ def drive_seeded(car: str, seed: int, laps: int, model: Path | None = None) -> S
     sensors, time = Sensors(sensed, T_s), 0.0
     holder = CommandHolder(vehicle, WATCHDOG, lambda: time)
     driven = vehicle.with_effects(CHANGES[CHANGE].items())
-    least, end = np.inf, PATIENCE * (laps + 1) * reference.lap_time
+    least, end, predictions = np.inf, PATIENCE * (laps + 1) * reference.lap_time, 0
     for k, sample in enumerate(drive_by_commands(driven, road, PLANT, holder.command)):
         time = k * T_s
         least = min(least, float(road.room(sample.s, sample.lateral)))
@@ -78,34 +80,43 @@ def drive_seeded(car: str, seed: int, laps: int, model: Path | None = None) -> S
             continue
         pose, seen, age = sensors.arrived
         stamps = round(k * T_s * 1e9), round((k - age) * T_s * 1e9)
-        if predictor is not None:
-            _predict(predictor, controller, stamps, pose, seen, sample.feedback)
         command = controller.step(stamps[1], pose, seen)
         if isinstance(command, Applied):
             holder.receive(command)
-    return Seeded(seed, controller.laps.count, least)
+        if predictor is not None:
+            _observe(predictor, stamps[0], "feedback", sample.feedback)
+            predictions += _predict(predictor, controller, stamps[1], pose, seen)
+            if isinstance(command, Applied):
+                _observe(predictor, stamps[1] + controller.answered_after, "command", command)
+    return Seeded(seed, controller.laps.count, least, predictions)
 
 
-def _predict(
-    predictor: Predictor, controller: LiveController, stamps: tuple[int, int], pose: Pose, seen: State, applied: Applied
-) -> None:
-    """Tells the controller what the predictor says.
+def _observe(predictor: Predictor, stamp: int, kind: str, inputs: Applied) -> None:
+    """Tells the predictor of the actuators: what they do, or what they are sent (``kind``) from ``stamp`` (ns) on."""
+    predictor.observe(stamp, {f"throttle_{kind}": inputs.r, f"steering_{kind}": inputs.delta})
+
+
+def _predict(predictor: Predictor, controller: LiveController, stamp: int, pose: Pose, seen: State) -> bool:
+    """Tells the controller what the predictor says of odometry.
 
     Args:
         predictor: to ask.
         controller: to tell.
-        stamps: of what the actuators do, and of the odometry (ns).
+        stamp: of the odometry (ns).
         pose: as measured.
         seen: likewise.
-        applied: what the actuators do.
+
+    Returns:
+        Whether it says anything.
     """
-    predictor.observe(stamps[0], {"throttle_feedback": applied.r, "steering_feedback": applied.delta})
-    said = predictor.predict(stamps[1], {**pose._asdict(), **seen._asdict()})
-    if isinstance(said, Prediction):
-        controller.remote.predicted(said.stamp, said.state.tolist())
-        if said.theta is not None:
-            controller.remote.adapted(said.stamp, dict(zip(COEFFICIENTS, said.theta.tolist(), strict=True)))
-        predictor.finish()
+    said = predictor.predict(stamp, {**pose._asdict(), **seen._asdict()})
+    if not isinstance(said, Prediction):
+        return False
+    controller.remote.predicted(said.stamp, said.state.tolist())
+    if said.theta is not None:
+        controller.remote.adapted(said.stamp, dict(zip(COEFFICIENTS, said.theta.tolist(), strict=True)))
+    predictor.finish()
+    return True
 
 
 def words(car: str, drives: Iterable[Seeded]) -> str:

@@ -1,12 +1,13 @@
 """The controller of a car that does not wait: plans for the instant at which the command will act, and tells how it goes.
 
 The odometry of an instant is answered while the car drives on, under the commands that were sent before; the answer acts
-one T_s later, or more where odometry comes late. So each step first carries the measured state to that instant, by what the
-predictor says of the car, and plans from there. The command is stamped with that instant, which is how recordings pair
+one T_s later, or more where odometry comes late. So each step first carries the measured state to that instant, by what is
+known of the car, and plans from there. The command is stamped with that instant, which is how recordings pair
 commands with states.
 
 From far below the line's speed, as from standstill or after a spin, a short horizon sees no way that leads back to the line.
-So pure pursuit drives until the car is up to speed.
+So pure pursuit drives until the car is up to speed. Nothing is proved of the predictor by then: the calibrated car carries
+the state.
 """
 
 from __future__ import annotations
@@ -215,7 +216,7 @@ class LiveController:
         self.remote.measured(stamp, x, context)
         self.remote.update(stamp)
         for increments in np.diff(np.array([self._sent[0], *self._sent]), axis=0):
-            x = self.remote.ahead(x, context, increments)
+            x = self.remote.ahead(x, context, self.remote.calibrated, increments)
         pursued = self._pursued(Pose(*x[:3].tolist()), State(*x[3:6].tolist()))
         self._sent.append(pursued or self._planned_command(t, Pose(pose.x, pose.y, self._heading), seen))
         return self._sent[-1]

@@ -151,15 +151,16 @@ class RemoteModel:
         """What was chosen last; see :class:`~dynssm_ros.control.prediction_model.PredictionModel`."""
         return self.output.adapted
 
-    def ahead(self, x: Vector, context: Context, increments: Vector = _HELD) -> Vector:
-        """The state one T_s after ``x``, by what holds now; see :meth:`measured`.
+    def ahead(self, x: Vector, context: Context, adapted: Adapted, increments: Vector = _HELD) -> Vector:
+        """The state one T_s after ``x``; see :meth:`measured`.
 
         Args:
             x: the controller's state, shape ``(size,)``.
             context: then.
+            adapted: what holds.
             increments: of its actuators, which are held if not given, shape ``(2,)``.
         """
-        return self._step(x, context, *self.output.adapted, increments)
+        return self._step(x, context, *adapted, increments)
 
     def forget(self) -> None:
         """Drops everything that was heard and measured, as after a jump of time."""

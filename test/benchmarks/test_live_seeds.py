@@ -18,8 +18,9 @@ def test_a_drive_depends_on_its_seed_alone(small_model):
     assert first == again
     assert first.least_room != other.least_room
     assert first.laps == 1
+    assert first.predictions > 200
 
 
 def test_the_drives_that_left_the_road_are_named():
-    said = words("orca", [Seeded(3, 2, 0.03), Seeded(4, 1, -0.1), Seeded(5, 2, 0.05)])
+    said = words("orca", [Seeded(3, 2, 0.03, 0), Seeded(4, 1, -0.1, 0), Seeded(5, 2, 0.05, 0)])
     assert said.startswith("orca: 1 of 3 drives left the road with seeds 4; least room to the borders -0.1 m")

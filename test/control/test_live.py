@@ -216,6 +216,18 @@ def test_a_car_that_is_slower_than_the_line_is_brought_up_to_speed(online, orca,
     assert controller.counts["solved"] == len(steps) > 10
 
 
+def test_a_predictor_that_says_nonsense_does_not_steer_a_launch(online, orca, club):
+    def commands(nonsense):
+        controller, car = online("racing", 0.9), SteppedCar(orca, club, v_x=0.0)
+        for _ in range(12):
+            if nonsense:
+                controller.remote.predicted(car.stamp, (0.5, 3.0, -8.0))
+            yield car.answered(controller)
+            assert controller.verdict()[1].startswith("gets up to speed")
+
+    assert list(commands(True)) == list(commands(False))
+
+
 def test_a_gap_ends_the_plan_and_the_car_is_found_wherever_it_is(online, orca, club, steps):
     controller, car = online(), SteppedCar(orca, club)
     for _ in range(10):

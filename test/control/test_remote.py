@@ -76,7 +76,7 @@ def test_one_step_ahead_is_what_the_predictor_says(remote, theta):
     x = odometry(remote)
     output(remote, theta)
     remote.update(STAMP)
-    ahead = remote.ahead(x, CONTEXT)
+    ahead = remote.ahead(x, CONTEXT, remote.output.adapted)
     np.testing.assert_allclose(ahead[3:6], state(remote, theta), atol=1e-12)
     np.testing.assert_array_equal(ahead[6:8], APPLIED)
     turn = 0.02 * (SEEN.omega + ahead[5]) / 2
