@@ -29,11 +29,11 @@ from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.nodes.player import MATCH_TIMEOUT, Playback
-from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC
 
@@ -80,14 +80,19 @@ class LiveRun:
         return sorted(stamp for stamp in self.sent if stamp >= first and stamp + self.T_s not in self.predicted)
 
 
+_EVERYTHING = QoSProfile(
+    depth=1000
+)  # reliable: what is sent late, by a process that was stopped meanwhile, is sent again
+
+
 class Collector(Node):
     """Keeps everything that the predictor publishes."""
 
     def __init__(self, run: LiveRun, context: Context) -> None:
         super().__init__("collector", context=context)
         self._run = run
-        self.create_subscription(Odometry, PREDICTION_TOPIC, self._on_prediction, SENSOR_QOS)
-        self.create_subscription(JointState, PARAMETERS_TOPIC, self._on_parameters, SENSOR_QOS)
+        self.create_subscription(Odometry, PREDICTION_TOPIC, self._on_prediction, _EVERYTHING)
+        self.create_subscription(JointState, PARAMETERS_TOPIC, self._on_parameters, _EVERYTHING)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.changed = threading.Condition()
 

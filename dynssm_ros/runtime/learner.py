@@ -92,7 +92,8 @@ class OnlineLearner:
         while row is not None and row.stamp + self._period <= stamp + slack:
             due = row.stamp + self._period
             if due >= stamp - slack:
-                row = self._learned_row(row, stamp, window if kept is None else kept, predicted)
+                now = window if kept is None else kept
+                row = self._learned_row(self._completed(row, now, cut), stamp, now, predicted)
                 break
             kept = window.copy() if kept is None else kept
             earlier = cut(due)  # in the place of `window`
@@ -112,6 +113,24 @@ class OnlineLearner:
             self.state.update(before.seen, before.values, window[-1, :3] - window[-2, :3])
             self._to_be_judged(window, predicted)
         return row
+
+    def _completed(self, row: _Row, window: Vector, cut: Cut) -> _Row:
+        """``row`` with samples that came after its odometry: till then the last ones before were held.
+
+        Args:
+            row: the last but one of ``window``.
+            window: as of :meth:`corrected`.
+            cut: likewise.
+        """
+        if np.array_equal(window[-2], row.values):
+            return row
+        kept = window.copy()
+        again = cut(row.stamp)  # perhaps in the place of `window`
+        completed = None
+        if not isinstance(again, Refusal) and not np.array_equal(again[-1], row.values):
+            completed = self._row_of(row.stamp, again, self.model.predict(again[None]))
+        window[...] = kept
+        return completed or row
 
     def _first_row(self, stamp: int, window: Vector, predicted: WindowPrediction) -> _Row | None:
         """The first row of a grid, ``None`` if the car is too slow."""

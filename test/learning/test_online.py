@@ -130,8 +130,11 @@ def test_rollouts_of_a_changed_car_stay_as_bounded_as_the_physics(laps, orca, ma
     assert short["on"].rollout.ade < short["off"].rollout.ade
 
 
-def feed(predictor, recording, rows, every=1, start=0):
-    """Plays rows as messages, with ``every`` - 1 messages between two rows; the predictions at the rows."""
+def feed(predictor, recording, rows, every=1, start=0, overtaken=()):
+    """Plays rows as messages, with ``every`` - 1 messages between two rows; the predictions at the rows.
+
+    The actuators of the messages ``overtaken`` come after their odometry.
+    """
     found = {}
     T = recording.T_s
     time = start + np.arange(rows[0] * every, rows[-1] * every + 1) * round(T * 1e9 / every)
@@ -139,10 +142,12 @@ def feed(predictor, recording, rows, every=1, start=0):
         n: np.interp(time, start + np.arange(len(recording)) * round(T * 1e9), v) for n, v in recording.columns.items()
     }
     for k, stamp in enumerate(time.tolist()):
-        predictor.observe(
-            stamp, {f"{n}_feedback": columns[c][k] for n, c in (("throttle", "r_fb"), ("steering", "delta_fb"))}
-        )
+        actuators = {f"{n}_feedback": columns[c][k] for n, c in (("throttle", "r_fb"), ("steering", "delta_fb"))}
+        if k not in overtaken:
+            predictor.observe(stamp, actuators)
         outcome = predictor.predict(stamp, {n: columns[n][k] for n in ("v_x", "v_y", "omega")})
+        if k in overtaken:
+            predictor.observe(stamp, actuators)
         if k % every == 0 and isinstance(outcome, Prediction):
             found[rows[0] + k // every] = outcome
     return found
@@ -168,6 +173,16 @@ def test_odometry_at_four_times_the_rate_teaches_each_step_once(noisy_laps, nois
     feed(fast, part, rows, every=4)
     assert abs(fast.online.steps - slow.online.steps) <= 1
     np.testing.assert_allclose(fast.online.mean, slow.online.mean, atol=0.02)
+
+
+def test_odometry_that_overtakes_its_actuators_teaches_the_same(noisy_laps, noisy_model):
+    rows, overtaken = np.arange(0, 300), {80, 150, 151, 220}
+    part = noisy_laps.select(rows)
+    ordered, disordered = (Predictor(noisy_model, SIGNALS) for _ in range(2))
+    expected, found = feed(ordered, part, rows), feed(disordered, part, rows, overtaken=overtaken)
+    assert {k for k in expected if not np.array_equal(found[k].state, expected[k].state)} == overtaken
+    np.testing.assert_array_equal(disordered.online.mean, ordered.online.mean)
+    assert disordered.online.steps == ordered.online.steps
 
 
 def test_odometry_that_misses_the_grid_teaches_as_many_steps(noisy_laps, noisy_model):

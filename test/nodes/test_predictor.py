@@ -103,7 +103,7 @@ def test_bad_samples_yield_no_prediction_and_the_node_recovers_by_itself(start_c
 def test_outputs_are_reliable_unless_asked_otherwise(start_car, asked: str) -> None:
     given = {} if asked == "reliable" else {"qos_overrides./dynssm/prediction.publisher.reliability": asked}
     car = start_car(**given)
-    car.drive_until_answered()
+    assert car.collector.wait_for(lambda: car.collector.count_publishers("/dynssm/prediction") > 0, 10.0)
     (info,) = car.collector.get_publishers_info_by_topic("/dynssm/prediction")
     assert info.qos_profile.reliability.short_key == asked
 
