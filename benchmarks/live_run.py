@@ -37,6 +37,8 @@ from dynssm_ros.nodes.player import MATCH_TIMEOUT, Playback
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC
 
+# reliable: a message that a process was sending when it was stopped is sent again
+_EVERYTHING = QoSProfile(depth=1000)
 _END_TIMEOUT = 10.0  # s
 _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
 _DRAIN = 2.0  # s without an answer after the last message before the run counts as over
@@ -78,11 +80,6 @@ class LiveRun:
             return sorted(self.sent)
         first = min(self.predicted) - self.T_s
         return sorted(stamp for stamp in self.sent if stamp >= first and stamp + self.T_s not in self.predicted)
-
-
-_EVERYTHING = QoSProfile(
-    depth=1000
-)  # reliable: what is sent late, by a process that was stopped meanwhile, is sent again
 
 
 class Collector(Node):

@@ -121,11 +121,13 @@ def _predict(predictor: Predictor, controller: LiveController, stamp: int, pose:
 
 def words(car: str, drives: Iterable[Seeded]) -> str:
     """What became of the drives, in a line."""
+    drives = list(drives)
     rooms = {drive.seed: drive.least_room for drive in drives}
     left = [str(seed) for seed, room in rooms.items() if room < 0]
     return (
         f"{car}: {len(left)} of {len(rooms)} drives left the road{' with seeds ' + ', '.join(left) if left else ''}; "
-        f"least room to the borders {min(rooms.values()):.3g} m, median {np.median(list(rooms.values())):.3g} m"
+        f"least room to the borders {min(rooms.values()):.3g} m, median {np.median(list(rooms.values())):.3g} m; "
+        f"at least {min(drive.predictions for drive in drives)} predictions heard in each"
     )
 
 

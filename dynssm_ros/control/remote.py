@@ -160,7 +160,7 @@ class RemoteModel:
             adapted: what holds.
             increments: of its actuators, which are held if not given, shape ``(2,)``.
         """
-        return self._step(x, context, *adapted, increments)
+        return self._model.step(x, increments, np.concatenate([*adapted, context]))
 
     def forget(self) -> None:
         """Drops everything that was heard and measured, as after a jump of time."""
@@ -171,10 +171,5 @@ class RemoteModel:
 
     def _correction(self, stamp: int, theta: Vector) -> Vector:
         """What the prediction for ``stamp`` adds to the car's own step with ``theta``; none if that is not finite."""
-        correction = self._state[stamp] - self._step(*self._start[stamp], theta, np.zeros(3))[VELOCITIES]
+        correction = self._state[stamp] - self.ahead(*self._start[stamp], Adapted(theta, np.zeros(3)))[VELOCITIES]
         return correction if np.all(np.isfinite(correction)) else np.zeros(3)
-
-    def _step(
-        self, x: Vector, context: Context, theta: Vector, correction: Vector, increments: Vector = _HELD
-    ) -> Vector:
-        return self._model.step(x, increments, np.concatenate([theta, correction, context]))

@@ -9,7 +9,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.runtime.models import OnnxModel, WindowPrediction, corrected, seen_by
-from dynssm_ros.runtime.online import Learned, OnlineLayer, OnlineState, Seen
+from dynssm_ros.runtime.online import CHANNELS, Learned, OnlineLayer, OnlineState, Seen
 from dynssm_ros.runtime.path_judge import PathJudge
 from dynssm_ros.signals.history import Refusal
 
@@ -60,10 +60,10 @@ class OnlineLearner:
             stamp: of the window's last row.
             window: ``(H, 7)``.
             predicted: by the model, from ``window``.
-            cut: gives the windows of rows between the messages. They may use the memory of ``window``.
+            cut: gives the windows of other rows. They may use the memory of ``window``.
         """
         assert predicted.seen is not None
-        self._learn(stamp, window, predicted, cut)
+        self._learn(stamp, window, predicted, _beside(window, cut))
         self._known = self.learned(predicted.seen)
         self._mean_error = self.layer.mean_error(predicted.seen.features)
         return corrected(predicted, window[None], self.layer, self._known)
@@ -88,49 +88,43 @@ class OnlineLearner:
     def _learn(self, stamp: int, window: Vector, predicted: WindowPrediction, cut: Cut) -> None:
         slack = self._period // 100
         row, self._row = self._row, None
-        kept: Vector | None = None
         while row is not None and row.stamp + self._period <= stamp + slack:
             due = row.stamp + self._period
             if due >= stamp - slack:
-                now = window if kept is None else kept
-                row = self._learned_row(self._completed(row, now, cut), stamp, now, predicted)
+                row = self._learned_row(row, stamp, window, predicted, cut)
                 break
-            kept = window.copy() if kept is None else kept
-            earlier = cut(due)  # in the place of `window`
-            row = (
-                None
-                if isinstance(earlier, Refusal)
-                else self._learned_row(row, due, earlier, self.model.predict(earlier[None]))
-            )
-        if kept is not None:
-            window[...] = kept
+            earlier = cut(due)
+            if isinstance(earlier, Refusal):
+                row = None
+            else:
+                row = self._learned_row(row, due, earlier, self.model.predict(earlier[None]), cut)
         self._row = row or self._first_row(stamp, window, predicted)
 
-    def _learned_row(self, before: _Row, stamp: int, window: Vector, predicted: WindowPrediction) -> _Row | None:
+    def _learned_row(
+        self, before: _Row, stamp: int, window: Vector, predicted: WindowPrediction, cut: Cut
+    ) -> _Row | None:
         """Learns the step that ends with ``window``; returns its last row, ``None`` if the car was too slow there."""
         row = self._row_of(stamp, window, predicted)
         if row is not None:
+            before = self._completed(before, window[-2], cut)
             self.state.update(before.seen, before.values, window[-1, :3] - window[-2, :3])
             self._to_be_judged(window, predicted)
         return row
 
-    def _completed(self, row: _Row, window: Vector, cut: Cut) -> _Row:
-        """``row`` with samples that came after its odometry: till then the last ones before were held.
+    def _completed(self, row: _Row, now: Vector, cut: Cut) -> _Row:
+        """``row`` with inputs that came after its odometry; till then the last ones before were held.
 
         Args:
-            row: the last but one of ``window``.
-            window: as of :meth:`corrected`.
-            cut: likewise.
+            row: as it was when its odometry came.
+            now: about the same row, as it is known now, ``(7,)``.
+            cut: as of :meth:`corrected`.
         """
-        if np.array_equal(window[-2], row.values):
+        if np.array_equal(now[CHANNELS:], row.values[CHANNELS:]):
             return row
-        kept = window.copy()
-        again = cut(row.stamp)  # perhaps in the place of `window`
-        completed = None
-        if not isinstance(again, Refusal) and not np.array_equal(again[-1], row.values):
-            completed = self._row_of(row.stamp, again, self.model.predict(again[None]))
-        window[...] = kept
-        return completed or row
+        window = cut(row.stamp)
+        if isinstance(window, Refusal) or np.array_equal(window[-1], row.values):
+            return row
+        return self._row_of(row.stamp, window, self.model.predict(window[None])) or row
 
     def _first_row(self, stamp: int, window: Vector, predicted: WindowPrediction) -> _Row | None:
         """The first row of a grid, ``None`` if the car is too slow."""
@@ -167,6 +161,20 @@ class OnlineLearner:
             state.coefficients.theta[None],
             np.array([float(self.judge.trusted)]),
         )
+
+
+def _beside(window: Vector, cut: Cut) -> Cut:
+    """``cut`` that leaves ``window`` as it is."""
+
+    def beside(stamp: int) -> Vector | Refusal:
+        kept = window.copy()
+        found = cut(stamp)
+        if not isinstance(found, Refusal):
+            found = found.copy()
+        window[...] = kept
+        return found
+
+    return beside
 
 
 class _Row(NamedTuple):
