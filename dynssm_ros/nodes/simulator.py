@@ -48,7 +48,7 @@ from dynssm_ros.vehicle.kinematics import Pose
 
 DriverKind = Literal["pure_pursuit", "external"]
 _DIAGNOSTICS = 1.0  # s between them
-_UNANSWERED = 2.0  # s that a command is waited for in lockstep
+_UNANSWERED = 10.0  # s that a command is waited for in lockstep: a driver may be held up for seconds
 _LATE = 1.0  # s; a node that was held up for longer goes on from there and does not catch up
 
 
