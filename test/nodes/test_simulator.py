@@ -60,7 +60,7 @@ class Pit:
         return self.odometry[-1].twist.twist.linear.x
 
     def reply(self, throttle: float, steering: float) -> None:
-        """Answers every odometry message from now on with this command."""
+        """Answers every odometry message from now on with this command, for one T_s later."""
         self.answer = JointState(name=["throttle", "steering"], position=[throttle, steering])
 
     def wait_for(self, condition: Callable[[], bool], timeout: float = 20.0) -> bool:
@@ -73,8 +73,10 @@ class Pit:
         with self.collector.changed:
             self.odometry.append(message)
             self.collector.changed.notify_all()
-        if self.answer is not None:
-            self.send(self.answer)
+        answer = self.answer
+        if answer is not None:
+            set_stamp(answer.header, (header_stamp_ns(message) or 0) + PERIOD)
+            self.send(answer)
 
     def _stop(self) -> None:
         self.process.send_signal(signal.SIGINT)
@@ -225,6 +227,8 @@ def test_in_lockstep_time_waits_for_the_command_that_is_due_and_goes_on_without_
     assert not pit.wait_for(lambda: max(pit.feedback) >= due, 0.3), "a late answer to an earlier step is none"
     pit.send(timely)
     assert pit.wait_for(lambda: max(pit.feedback) >= due)
+    pit.send(JointState(name=["throttle", "steering"], position=[0.4, 0.0]))
+    assert pit.wait_for(lambda: max(pit.feedback) >= due + PERIOD), "without a stamp it is for what is due"
     assert pit.wait_for(lambda: pit.v_x < 1e-6), "a driver that is gone is not waited for; without commands it brakes"
 
 
