@@ -1,6 +1,6 @@
 """An MPC of one's own on ``/dynssm/parameters``: some lines of casadi that plan with the predictor's coefficients.
 
-    simulator --ros-args -p driver:=external -p rate:=0.2 &       # the car, five times slower than real time
+    simulator --ros-args -p driver:=external -p lockstep:=true &  # the car, whose time waits for the commands
     predictor --ros-args -p model:=MODEL -p max_age:=1.0 &        # a model trained for the 1:43 car
     python -m examples.an_mpc_of_ones_own
 
@@ -16,7 +16,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from dynssm_ros import load_vehicle
-from dynssm_ros.nodes.support import NEWEST_QOS, SENSOR_QOS, run
+from dynssm_ros.nodes.support import NEWEST_QOS, SENSOR_QOS, actuators, run
+from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose
@@ -84,9 +85,8 @@ class OwnMpc(Node):
             ahead = s + SPEED * self.car.sampling_time * np.arange(2, STEPS + 2)
             guess = np.vstack([self.plan[1:], self.plan[-1:]])
             self.plan = np.array(self.solver(state, self.plan[:1], self.theta, self.centre.position(ahead), guess))
-        command = JointState(name=["throttle", "steering"], position=[float(value) for value in self.plan[0]])
-        command.header.stamp = message.header.stamp
-        self.commands.publish(command)
+        acts = (header_stamp_ns(message) or 0) + round(self.car.sampling_time * 1e9)
+        self.commands.publish(actuators(acts, Applied(*self.plan[0])))
 
 
 def main() -> None:

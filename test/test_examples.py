@@ -60,7 +60,7 @@ def test_an_mpc_of_ones_own_follows_the_line_on_published_coefficients() -> None
         environment = os.environ.copy()
         mpc = subprocess.Popen([sys.executable, "-m", "examples.an_mpc_of_ones_own"], cwd=ROOT, env=environment)
         try:
-            with node_process("simulator", {"driver": "external", "rate": 0.05, "watchdog": 0.5}, environment):
+            with node_process("simulator", {"driver": "external", "lockstep": True, "watchdog": 0.5}, environment):
                 assert collector.wait_for(lambda: len(driven) > 0 and driven[-1].twist.twist.linear.x > 1.0, 120)
                 begin = len(driven)
                 assert collector.wait_for(lambda: len(driven) > begin + 150, 120)
