@@ -18,12 +18,12 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 
 from benchmarks.live_run import LiveRun, collecting, isolated_environment, predictor_process
-from dynssm_ros.nodes.support import SENSOR_QOS, set_stamp
+from dynssm_ros.nodes.support import SENSOR_QOS, actuators
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.simulation.laps import drive
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle import Applied, load_vehicle
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
@@ -44,7 +44,7 @@ class Pit:
         self.odometry: list[Odometry] = []
         self.feedback: dict[int, tuple[float, ...]] = {}
         self.command: dict[int, tuple[float, ...]] = {}
-        self.answer: JointState | None = None
+        self.answer: Applied | None = None
         subscribe = self.collector.create_subscription
         subscribe(JointState, FEEDBACK_TOPIC, lambda m: self._keep(self.feedback, m), SENSOR_QOS)
         subscribe(JointState, COMMAND_TOPIC, lambda m: self._keep(self.command, m), SENSOR_QOS)
@@ -61,7 +61,7 @@ class Pit:
 
     def reply(self, throttle: float, steering: float) -> None:
         """Answers every odometry message from now on with this command, for one T_s later."""
-        self.answer = JointState(name=["throttle", "steering"], position=[throttle, steering])
+        self.answer = Applied(throttle, steering)
 
     def wait_for(self, condition: Callable[[], bool], timeout: float = 20.0) -> bool:
         return self.collector.wait_for(condition, timeout)
@@ -75,8 +75,7 @@ class Pit:
             self.collector.changed.notify_all()
         answer = self.answer
         if answer is not None:
-            set_stamp(answer.header, (header_stamp_ns(message) or 0) + PERIOD)
-            self.send(answer)
+            self.send(actuators((header_stamp_ns(message) or 0) + PERIOD, answer))
 
     def _stop(self) -> None:
         self.process.send_signal(signal.SIGINT)
@@ -220,12 +219,10 @@ def test_in_lockstep_time_waits_for_the_command_that_is_due_and_goes_on_without_
     seen = len(pit.odometry)
     assert not pit.wait_for(lambda: len(pit.odometry) > seen + 1, 3.0), "it waits, also for one that is held up"
     due = max(pit.feedback) + PERIOD
-    early, timely = (JointState(name=["throttle", "steering"], position=[0.4, 0.0]) for _ in range(2))
-    for message, stamp in ((early, due - PERIOD), (timely, due)):
-        set_stamp(message.header, stamp)
-    pit.send(early)
+    throttle = Applied(0.4, 0.0)
+    pit.send(actuators(due - PERIOD, throttle))
     assert not pit.wait_for(lambda: max(pit.feedback) >= due, 0.3), "a late answer to an earlier step is none"
-    pit.send(timely)
+    pit.send(actuators(due, throttle))
     assert pit.wait_for(lambda: max(pit.feedback) >= due)
     pit.send(JointState(name=["throttle", "steering"], position=[0.4, 0.0]))
     assert pit.wait_for(lambda: max(pit.feedback) >= due + PERIOD), "without a stamp it is for what is due"
