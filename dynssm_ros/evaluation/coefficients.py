@@ -62,21 +62,48 @@ def coefficient_label(name: str) -> str:
     return f"{name} ({unit})" if unit else name
 
 
-def coefficient_statistics(theta: Vector | None, vehicle: Vehicle | None) -> CoefficientStatistics | None:
-    """Statistics of the coefficients ``theta`` ``(N, 17)`` between the bounds of ``vehicle``.
+class CoefficientTally:
+    """Statistics of coefficients that come block by block, so that nobody has to hold them all.
 
-    ``None`` for a model without coefficients, without a car of its own, or with constant ones: it adapts nothing.
+    Args:
+        vehicle: whose bounds these are; without it there are no statistics.
     """
-    if theta is None or vehicle is None or not (theta != theta[0]).any():
-        return None
-    return CoefficientStatistics(
-        mean=theta.mean(axis=0),
-        std=theta.std(axis=0),
-        low=theta.min(axis=0),
-        high=theta.max(axis=0),
-        at_bound=resting(theta, vehicle).mean(axis=0),
-        vehicle=vehicle,
-    )
+
+    def __init__(self, vehicle: Vehicle | None):
+        self._vehicle = vehicle
+        self._rows = 0
+        self._low = self._high = np.empty(0)
+        self._mean = self._squares = self._resting = np.zeros(len(COEFFICIENTS))
+
+    def add(self, theta: Vector) -> None:
+        """Counts a block of rows in, ``(N, 17)``, ``N > 0``."""
+        if self._vehicle is None:
+            return
+        if self._rows == 0:
+            self._low = self._high = theta[0]
+        rows = self._rows + len(theta)
+        # Chan, Golub, LeVeque (1983): mean and squared deviations of two sets as one
+        mean = theta.mean(axis=0)
+        apart, share = mean - self._mean, len(theta) / rows
+        self._squares = self._squares + ((theta - mean) ** 2).sum(axis=0) + self._rows * share * apart**2
+        self._mean = self._mean + share * apart
+        self._low, self._high = np.minimum(self._low, theta.min(axis=0)), np.maximum(self._high, theta.max(axis=0))
+        self._resting = self._resting + resting(theta, self._vehicle).sum(axis=0)
+        self._rows = rows
+
+    @property
+    def statistics(self) -> CoefficientStatistics | None:
+        """Of all rows; ``None`` without rows, without a car, or if the coefficients are constant: nothing adapts."""
+        if self._vehicle is None or self._rows == 0 or not (self._high != self._low).any():
+            return None
+        return CoefficientStatistics(
+            mean=self._mean,
+            std=np.sqrt(self._squares / self._rows),
+            low=self._low,
+            high=self._high,
+            at_bound=self._resting / self._rows,
+            vehicle=self._vehicle,
+        )
 
 
 def range_used(theta: Vector, vehicle: Vehicle) -> Vector:

@@ -51,27 +51,25 @@ def predict_rows(
     batch: int = BATCH,
     tick: Tick = silent,
     drive: DriveThrough | None = None,
-) -> WindowPrediction:
-    """The model's predictions of the rows that follow ``rows``; windows exist only for one batch at a time.
+) -> Iterator[WindowPrediction]:
+    """The model's predictions of the rows that follow ``rows``, batch by batch; windows exist for one batch at a time.
 
     Args:
         model: reads windows of ``model.H`` rows.
         matrix: the recording's model inputs, shape ``(N, 7)``.
-        rows: last row of each window, shape ``(M,)``, ``M > 0``.
+        rows: last row of each window, shape ``(M,)``.
         batch: windows per call.
         tick: told of progress.
         drive: what the model's online layer knew along these rows; ``None``: it stays out.
     """
-    parts = []
     for start in range(0, len(rows), batch):
         chunk = rows[start : start + batch]
         windows = gather(matrix, chunk, model.H - 1)
         predicted = model.predict(windows)
         if model.online is not None and drive is not None:
             predicted = corrected(predicted, windows, model.online, drive.at(chunk))
-        parts.append(predicted._replace(seen=None))
+        yield predicted._replace(seen=None)
         tick(len(chunk))
-    return WindowPrediction.joined(parts)
 
 
 class DriveThrough(NamedTuple):

@@ -12,7 +12,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.errors import ArtifactError, RecordingError
-from dynssm_ros.evaluation.coefficients import coefficient_statistics
+from dynssm_ros.evaluation.coefficients import CoefficientTally
 from dynssm_ros.evaluation.metrics import (
     BATCH,
     Tick,
@@ -37,9 +37,11 @@ from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.track.lap_position import first_lap
 from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
 _DRAWN_S = 12.0  # of the drive that trajectories are drawn of
+_COEFFICIENT_ROWS = 20_000  # of which coefficients are kept to be drawn, 17 numbers each; twice that is the most
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class Evaluation:
         split: which part of it was scored, for people.
         min_speed: slower stretches were left out (m/s).
         rows: last row of each window; the predicted rows are ``rows + 1``.
+        every: coefficients are kept of every so-many-th of them.
         drawn: rows where rollouts start that are drawn: one after the other, in the liveliest seconds.
         regimes: how these rows were driven.
         scores: by label, in the order in which the models were given.
@@ -63,6 +66,7 @@ class Evaluation:
     split: str
     min_speed: float
     rows: Indices
+    every: int
     drawn: Indices
     regimes: tuple[Regime, ...]
     scores: dict[str, Score]
@@ -173,7 +177,8 @@ def evaluate(
     tick = _counting(len(models) * each_model, progress)
     regimes = driving_regimes(recording.matrix[rows])
     drawn = _liveliest_starts(recording, rows, steps)
-    on = _On(recording, rows, regimes, starts, drawn, steps, batch)
+    every = max(1, len(rows) // _COEFFICIENT_ROWS)
+    on = _On(recording, rows, every, regimes, starts, drawn, steps, batch)
     labels = list(models)
     found: dict[str, Score] = {}
     for k, score in each(
@@ -194,6 +199,7 @@ def evaluate(
         split=split,
         min_speed=speed,
         rows=rows,
+        every=every,
         drawn=drawn,
         regimes=regimes,
         scores=scores,
@@ -229,6 +235,7 @@ class _On:
 
     recording: Recording
     rows: Indices
+    every: int
     regimes: tuple[Regime, ...]
     starts: Indices
     drawn: Indices
@@ -239,18 +246,18 @@ class _On:
         """What a model is worth, but for the time that it takes."""
         recording, rows, batch = self.recording, self.rows, self.batch
         matrix, T_s = recording.matrix, recording.T_s
-        increments = matrix[rows + 1, :3] - matrix[rows, :3]
+        measured = matrix[rows + 1, :3]
         with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
-            predictions, rollouts, knowledge = [], [], []
+            predicted, rollouts, knowledge = _Predicted(model.vehicle, measured, self.every), [], []
             for drive, (ends, starts, drawn) in drive_through(model, recording, (rows, self.starts, self.drawn), batch):
-                if len(ends):
-                    predictions.append(predict_rows(model, matrix, ends, batch, tick, drive))
+                for prediction in predict_rows(model, matrix, ends, batch, tick, drive):
+                    predicted.add(prediction)
                 if len(starts):
                     rollouts.append(score_rollouts(model, matrix, starts, self.steps, T_s, batch, tick, drive))
                 if drive is not None:
                     knowledge.append(drive.at(drawn))
-            predicted = WindowPrediction.joined(predictions)
-            errors = predicted.state - matrix[rows + 1, :3]
+            errors = predicted.state - measured
+            increments = measured - matrix[rows, :3]
             return Score(
                 model=model,
                 known=Learned.joined(knowledge) if knowledge else None,
@@ -259,12 +266,52 @@ class _On:
                 rmse=rmse(errors),
                 max_error=max_error(errors),
                 explained=explained(increments, increments + errors),
-                coverage_90=None if predicted.variance is None else coverage(errors, predicted.variance),
+                coverage_90=predicted.coverage,
                 regime_rmse=regime_rmse(self.regimes, errors),
-                coefficients=coefficient_statistics(predicted.theta, model.vehicle),
+                coefficients=predicted.coefficients.statistics,
                 rollout=Rollout.joined(rollouts),
                 latency_us=np.empty(0),
             )
+
+
+class _Predicted:
+    """One-step predictions that come batch by batch; the state alone is kept of every row.
+
+    Args:
+        vehicle: of the model, if it has one.
+        measured: states of the predicted rows, shape ``(N, 3)``.
+        every: coefficients are kept of every so-many-th row.
+    """
+
+    def __init__(self, vehicle: Vehicle | None, measured: Vector, every: int):
+        self._measured, self._every = measured, every
+        self._rows = 0
+        self._thetas: list[Vector] = []
+        self._inside: Vector | None = None
+        self.state = np.empty_like(measured)
+        self.coefficients = CoefficientTally(vehicle)
+
+    def add(self, prediction: WindowPrediction) -> None:
+        """Takes the predictions of the next rows in."""
+        rows = slice(self._rows, self._rows + len(prediction.state))
+        self.state[rows] = prediction.state
+        if prediction.theta is not None:
+            self._thetas.append(prediction.theta[-rows.start % self._every :: self._every].copy())
+            self.coefficients.add(prediction.theta)
+        if prediction.variance is not None:
+            share = coverage(prediction.state - self._measured[rows], prediction.variance)
+            self._inside = len(prediction.state) * share + (0.0 if self._inside is None else self._inside)
+        self._rows = rows.stop
+
+    @property
+    def theta(self) -> Vector | None:
+        """Coefficients of the rows of which they are kept, shape ``(M, 17)``; ``None`` if the model has none."""
+        return np.concatenate(self._thetas) if self._thetas else None
+
+    @property
+    def coverage(self) -> Vector | None:
+        """Share of errors inside the stated 90 % interval, shape ``(3,)``; ``None`` if the model states no variances."""
+        return None if self._inside is None else self._inside / self._rows
 
 
 def horizon_steps(horizon_s: float, T_s: float) -> int:

@@ -30,7 +30,7 @@ class Score:
         model: what was scored.
         known: what its online layer knew where the rollouts start that are drawn; ``None`` without one.
         state: its one-step predictions of the rows after the scored ones, shape ``(N, 3)``.
-        theta: its coefficients, shape ``(N, 17)``; ``None`` if it has none.
+        theta: its coefficients in every so-many-th row (``Evaluation.every``), shape ``(M, 17)``; ``None`` if it has none.
         rmse: one-step root mean square error by channel, shape ``(3,)`` (m/s, m/s, rad/s); so are the next two.
         max_error: largest absolute one-step error.
         explained: share of the measured increments that it predicts; 0 for persistence, 1 for a perfect model.

@@ -114,7 +114,9 @@ class PredictorNode(ManagedNode):
 
         self._set_wiring()
         self._listen()
-        self.create_timer(self._period, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._diagnostics_timer = self.create_timer(
+            self._period, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         if self._state:
             self.create_timer(_SAVE_PERIOD_S, self.keep, clock=Clock(clock_type=ClockType.STEADY_TIME))
         model = self._predictor.model
@@ -270,6 +272,9 @@ class PredictorNode(ManagedNode):
         self._publish_diagnostics(
             diagnostics(self, "prediction", vehicle, level, words, values | self._health.values(now))
         )
+        # a period from now: where this takes longer than a period it would be due again at once, and of the messages that
+        # wait the executor serves one from each topic between two timers
+        self._diagnostics_timer.reset()
 
 
 def main(args: list[str] | None = None) -> None:

@@ -270,7 +270,7 @@ def _sections(evaluation: Evaluation) -> Iterator[Section]:
         yield _regime_section(evaluation, quantity, title)
     yield from _place_sections(evaluation, states)
     for name, group in groups.items():
-        yield from _parameter_sections(name, group, time)
+        yield from _parameter_sections(name, group, time[:: evaluation.every])
     covered = coverage_table(evaluation)
     if covered is not None:
         yield Section(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.evaluation.coefficients import coefficient_statistics, coefficient_unit, range_used
+from dynssm_ros.evaluation.coefficients import CoefficientStatistics, CoefficientTally, coefficient_unit, range_used
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
 
 CAR = load_vehicle("orca")
@@ -13,10 +13,17 @@ MIDDLE = (CAR.lower + CAR.upper) / 2
 D_F = COEFFICIENTS.index("D_f")
 
 
+def statistics(*blocks, vehicle=CAR) -> CoefficientStatistics | None:
+    tally = CoefficientTally(vehicle)
+    for block in blocks:
+        tally.add(block)
+    return tally.statistics
+
+
 def test_statistics_are_those_of_the_rows():
     theta = np.tile(MIDDLE, (4, 1))
     theta[:, D_F] = [0.2, 0.3, 0.4, 0.7]
-    found = coefficient_statistics(theta, CAR)
+    found = statistics(theta)
     assert found.mean[D_F] == pytest.approx(0.4)
     assert found.std[D_F] == pytest.approx(np.std([0.2, 0.3, 0.4, 0.7]))
     assert (found.low[D_F], found.high[D_F]) == (0.2, 0.7)
@@ -30,19 +37,34 @@ def test_resting_on_a_bound_is_within_one_percent_of_the_range():
     theta[:2] = CAR.lower
     theta[2] = CAR.upper - 0.009 * span
     theta[3] = CAR.upper - 0.011 * span
-    np.testing.assert_allclose(coefficient_statistics(theta, CAR).at_bound, 3 / 8)
+    np.testing.assert_allclose(statistics(theta).at_bound, 3 / 8)
     np.testing.assert_allclose(range_used(theta, CAR)[:4, 0], [0.0, 0.0, 0.991, 0.989])
 
 
 def test_models_that_adapt_nothing_have_no_statistics():
-    assert coefficient_statistics(None, CAR) is None
-    assert coefficient_statistics(np.tile(MIDDLE, (5, 1)), CAR) is None
-    assert coefficient_statistics(np.random.default_rng(0).normal(size=(5, 17)), None) is None
+    assert statistics() is None
+    assert statistics(np.tile(MIDDLE, (5, 1)), np.tile(MIDDLE, (2, 1))) is None
+    assert statistics(np.random.default_rng(0).normal(size=(5, 17)), vehicle=None) is None
+
+
+def test_blocks_have_the_statistics_of_all_rows():
+    theta = np.random.default_rng(1).uniform(CAR.lower, CAR.upper, size=(100, 17))
+    theta[:40, D_F] = 0.3
+    blocks = statistics(theta[:1], theta[1:40], theta[40:])
+    np.testing.assert_allclose(blocks.mean, theta.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(blocks.std, theta.std(axis=0), rtol=1e-12)
+    np.testing.assert_array_equal(blocks.low, theta.min(axis=0))
+    np.testing.assert_array_equal(blocks.high, theta.max(axis=0))
+    np.testing.assert_allclose(blocks.at_bound, statistics(theta).at_bound, rtol=1e-12)
+
+
+def test_coefficients_that_change_from_block_to_block_alone_are_adapted():
+    assert statistics(np.tile(MIDDLE, (5, 1)), np.tile(CAR.lower, (5, 1))).std[D_F] > 0
 
 
 def test_json_names_coefficients_with_bounds_and_units():
     theta = np.linspace(CAR.lower, CAR.upper, 11)
-    entry = coefficient_statistics(theta, CAR).to_json()
+    entry = statistics(theta).to_json()
     assert list(entry) == list(COEFFICIENTS)
     lower, upper = CAR.coefficients["I_z"].bounds
     inertia = entry["I_z"]

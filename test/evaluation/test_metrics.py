@@ -37,8 +37,8 @@ def test_gather_returns_the_rows_around_each_row():
 
 def test_batches_predict_the_same_as_one_go(rng):
     matrix, rows = rng.normal(size=(101, 7)), np.arange(3, 100)
-    whole = metrics.predict_rows(Average(), matrix, rows, batch=1000)
-    batched = metrics.predict_rows(Average(), matrix, rows, batch=8)
+    (whole,) = metrics.predict_rows(Average(), matrix, rows, batch=1000)
+    batched = WindowPrediction.joined(list(metrics.predict_rows(Average(), matrix, rows, batch=8)))
     np.testing.assert_array_equal(whole.state, batched.state)
     np.testing.assert_array_equal(whole.theta, batched.theta)
     np.testing.assert_allclose(whole.state[10], matrix[10:14, :3].mean(axis=0))
@@ -47,7 +47,10 @@ def test_batches_predict_the_same_as_one_go(rng):
 
 def test_windows_exist_for_one_batch_only(rng):
     model, done = Average(), []
-    metrics.predict_rows(model, rng.normal(size=(101, 7)), np.arange(3, 100), batch=40, tick=done.append)
+    predictions = metrics.predict_rows(model, rng.normal(size=(101, 7)), np.arange(3, 100), batch=40, tick=done.append)
+    next(predictions)
+    assert model.shapes == [(40, 4, 7)]
+    assert [len(each.state) for each in predictions] == [40, 17]
     assert model.shapes == [(40, 4, 7), (40, 4, 7), (17, 4, 7)]
     assert done == [40, 40, 17]
 
@@ -60,9 +63,9 @@ def test_rmse_and_largest_error_of_planted_errors():
 
 def test_rmse_of_persistence_is_the_rms_of_the_increments(rng):
     matrix, rows = rng.normal(size=(50, 7)), np.arange(49)
-    predicted = metrics.predict_rows(Persistence(), matrix, rows).state
+    (predicted,) = metrics.predict_rows(Persistence(), matrix, rows)
     increments = np.diff(matrix[:, :3], axis=0)
-    np.testing.assert_allclose(metrics.rmse(predicted - matrix[1:, :3]), np.sqrt(np.mean(increments**2, axis=0)))
+    np.testing.assert_allclose(metrics.rmse(predicted.state - matrix[1:, :3]), np.sqrt(np.mean(increments**2, axis=0)))
 
 
 def test_explained_is_one_for_truth_zero_for_persistence_and_nan_without_change(rng):

@@ -61,6 +61,24 @@ def test_all_models_are_scored_on_the_rows_that_the_longest_window_allows(record
     assert short.state.shape == (len(together.rows), 3)
 
 
+def test_coefficients_are_kept_of_every_so_many_th_row_and_counted_in_all(recording, monkeypatch):
+    class Adapting(Model):
+        vehicle = load_vehicle("orca")
+
+        def predict(self, windows):
+            theta = np.tile(self.vehicle.nominal, (len(windows), 1))
+            theta[:, 0] = windows[:, -1, 0]
+            return super().predict(windows)._replace(theta=theta)
+
+    monkeypatch.setattr("dynssm_ros.evaluation.open_loop._COEFFICIENT_ROWS", 40)
+    result = evaluate(recording, {"adapting": Adapting()}, min_speed=0.0, batch=16, calls=3)
+    score, driven = result.scores["adapting"], recording.matrix[result.rows, 0]
+    assert result.every == 7
+    np.testing.assert_array_equal(score.theta[:, 0], driven[::7])
+    np.testing.assert_allclose(score.coefficients.std[0], driven.std())
+    assert (score.coefficients.low[0], score.coefficients.high[0]) == (driven.min(), driven.max())
+
+
 def test_persistence_scores_the_rms_of_the_increments_of_exactly_these_rows(recording):
     result = evaluate(recording, {"persistence": Persistence(), "long": Model(H=40)}, calls=3)
     increments = np.diff(recording.matrix[:, :3], axis=0)[39:]

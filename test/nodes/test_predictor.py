@@ -38,6 +38,13 @@ class TransformBroadcaster:
         self.sendTransform = node.create_publisher(TransformStamped, "/stand_in_of_tf", 10).publish
 """
 
+SLOW_TO_DIAGNOSE = """
+import time
+from dynssm_ros.runtime.wiring import Wiring
+
+Wiring.verdict = lambda self: time.sleep(0.15) or ""
+"""
+
 
 def predictions(model: Path, bag: Path) -> dict[int, Prediction]:
     """What replay predicts, by the stamp of the predicted instant."""
@@ -257,6 +264,18 @@ def test_the_predicted_pose_is_sent_to_tf(start_car, tmp_path: Path, monkeypatch
     assert (sent.header.frame_id, sent.child_frame_id) == ("map", "base_link_predicted")
     assert sent.transform.translation.x == pytest.approx(0.02, abs=0.005), "a step of 20 ms at 1 m/s from the origin"
     assert sent.transform.rotation.w == pytest.approx(1.0, abs=1e-3)
+
+
+def test_diagnostics_that_take_longer_than_their_period_leave_time_for_what_waits(
+    start_car, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(SLOW_TO_DIAGNOSE)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    car = start_car()
+    car.drive_until_answered()
+    stamps = [car.step() for _ in range(100)]
+    assert car.answered(stamps[-1], timeout=5.0)
+    assert car.run.predicted.keys() >= set(stamps)
 
 
 def test_parameters_are_listed_described_and_read(start_car, small_model: Path, call_service) -> None:
