@@ -24,11 +24,11 @@ from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.nodes.managed import ManagedNode
 from dynssm_ros.nodes.support import (
     NEWEST_QOS,
-    SENSOR_QOS,
     actuators,
     choose,
     describe,
     diagnostics,
+    listen,
     output,
     relative,
     run,
@@ -69,12 +69,12 @@ class ControllerNode(ManagedNode):
         self._decoder = decoders(load_signal_map("default"))[ODOMETRY_TOPIC]
         self._newest: int | None = None  # stamp of the odometry
 
-        self._publish_command = output(self, JointState, COMMAND_TOPIC)
+        self._publish_command = output(self, JointState, COMMAND_TOPIC).publish
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
         # when several messages wait, the executor serves subscriptions in this order
-        self.create_subscription(Odometry, relative(PREDICTION_TOPIC), self._on_prediction, SENSOR_QOS)
-        self.create_subscription(JointState, relative(PARAMETERS_TOPIC), self._on_parameters, SENSOR_QOS)
-        self.create_subscription(Odometry, relative(ODOMETRY_TOPIC), self._on_odometry, NEWEST_QOS)
+        listen(self, Odometry, relative(PREDICTION_TOPIC), self._on_prediction)
+        listen(self, JointState, relative(PARAMETERS_TOPIC), self._on_parameters)
+        listen(self, Odometry, relative(ODOMETRY_TOPIC), self._on_odometry, NEWEST_QOS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(self._driver.period / 1e9 / self._rate, self._watch, clock=steady)
         self.create_timer(self._period, self._diagnose, clock=steady)

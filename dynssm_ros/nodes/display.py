@@ -59,7 +59,7 @@ class Markers:
     """
 
     def __init__(self, node: Node) -> None:
-        self._publish = output(node, MarkerArray, MARKERS_TOPIC)
+        self._publish = output(node, MarkerArray, MARKERS_TOPIC).publish
 
     def draw(self, header: Header, car: Vehicle, pose: Pose, ahead: Iterable[Pose]) -> None:
         """Sends the markers of one prediction.

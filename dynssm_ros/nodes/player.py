@@ -1,7 +1,7 @@
 """Plays a bag on DDS in real time: ``ros2 run dynssm_ros player --ros-args -p bag:=BAG -p rate:=1.0``.
 
 Messages go out as they were recorded, byte for byte, in their recorded order and rhythm. Before the first one it waits
-until somebody listens, because DDS matching takes a moment and best-effort messages sent before it are lost.
+until somebody listens, because DDS matching takes a moment and messages sent before it are lost.
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ from typing import Any
 
 import rclpy
 from builtin_interfaces.msg import Time
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from dynssm_ros.errors import BagError
-from dynssm_ros.nodes.support import SENSOR_QOS, describe, message_class, relative, run
+from dynssm_ros.nodes.support import describe, message_class, output, run
 from dynssm_ros.signals.bags import BagMessage, open_bag
 
 MATCH_TIMEOUT = 10.0  # s
 _SETTLE = 0.3  # s; the listener's side of a match comes a moment after ours
 _LINGER = 1.0  # s after the last message; best-effort delivery tells no publisher when it is done
+_UNACKNOWLEDGED = 10.0  # s that a reliable listener may take for the last messages
 _SPIN_BELOW = 1e-3  # s; shorter waits are not worth a sleep
 _LONGEST_SLEEP = 0.1  # s; after it, whether the context was shut down is looked at
 
@@ -50,10 +52,7 @@ class Playback:
             if topic not in types:
                 raise BagError(f"{bag}: topic {topic} is missing; the bag has {', '.join(sorted(types))}")
         self.topics = topics or tuple(types)
-        self._publishers = {
-            topic: node.create_publisher(message_class(types[topic]), relative(topic), SENSOR_QOS)
-            for topic in self.topics
-        }
+        self._publishers = {topic: output(node, message_class(types[topic]), topic) for topic in self.topics}
         self._tell_time = node.create_publisher(Clock, "/clock", 10).publish if clock else None
 
     def wait_for_listeners(self, spin: Callable[[float], None], timeout: float = MATCH_TIMEOUT) -> tuple[str, ...]:
@@ -109,6 +108,11 @@ class Playback:
                 self._publishers[message.topic].publish(message.raw)
                 yield message, sent
 
+    @property
+    def acknowledged(self) -> bool:
+        """Whether all who listen reliably have all messages."""
+        return all(publisher.wait_for_all_acked(Duration()) for publisher in self._publishers.values())
+
     def _wait_until(self, due: float) -> None:
         while self._context.ok() and (remaining := due - time.monotonic()) > _SPIN_BELOW:
             time.sleep(min(remaining, _LONGEST_SLEEP))
@@ -145,8 +149,10 @@ class PlayerNode(Node):
 
     def _linger(self) -> None:
         """Stays until listeners have taken the last messages: what this process shares with them goes when it ends."""
-        end = time.monotonic() + _LINGER
-        while rclpy.ok() and time.monotonic() < end:
+        begin = time.monotonic()
+        while rclpy.ok() and (elapsed := time.monotonic() - begin) < _UNACKNOWLEDGED:
+            if elapsed > _LINGER and self.playback.acknowledged:
+                return
             rclpy.spin_once(self, timeout_sec=0.1)
 
 

@@ -24,10 +24,10 @@ from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.nodes.display import Markers, frame_sender
 from dynssm_ros.nodes.managed import ManagedNode
 from dynssm_ros.nodes.support import (
-    SENSOR_QOS,
     describe,
     diagnostics,
     expanded,
+    listen,
     message_class,
     output,
     run,
@@ -105,9 +105,9 @@ class PredictorNode(ManagedNode):
         self._predictor = Predictor(self._open(path), load_signal_map(self._signals), self._max_age, self._online)
         if self._state and pathlib.Path(self._state).exists():
             self._predictor.load_online(pathlib.Path(self._state))
-        self._publish_prediction = output(self, Odometry, PREDICTION_TOPIC)
-        self._publish_parameters = output(self, JointState, PARAMETERS_TOPIC)
-        self._publish_horizon = output(self, Path, HORIZON_TOPIC)
+        self._publish_prediction = output(self, Odometry, PREDICTION_TOPIC).publish
+        self._publish_parameters = output(self, JointState, PARAMETERS_TOPIC).publish
+        self._publish_horizon = output(self, Path, HORIZON_TOPIC).publish
         self._markers = Markers(self) if self._draws else None
         self._send_frame = frame_sender(self) if self._sends_frame else None
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
@@ -148,9 +148,7 @@ class PredictorNode(ManagedNode):
         # actuators come first: when several messages wait, the executor serves subscriptions in this order
         for topic, decoder in by_topic.items():
             receive = self._on_odometry if topic == signal_map.odometry_topic else self._on_actuator
-            self.create_subscription(
-                message_class(decoder.msgtype), decoder.subscribed, partial(receive, decoder), SENSOR_QOS
-            )
+            listen(self, message_class(decoder.msgtype), decoder.subscribed, partial(receive, decoder))
 
     def _on_actuator(self, decoder: TopicDecoder, message: Any) -> None:
         now = time.monotonic()

@@ -21,11 +21,12 @@ from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.nodes.support import (
-    SENSOR_QOS,
     actuators,
     choose,
     describe,
     diagnostics,
+    listen,
+    output,
     relative,
     run,
     set_pose,
@@ -91,13 +92,13 @@ class SimulatorNode(Node):
         self._obeyed = self._on_road = True
         self._commanded: tuple[int, float] | None = None  # when the last command acts (ns), and when it came (s)
 
-        self._publish_feedback = self.create_publisher(JointState, relative(FEEDBACK_TOPIC), SENSOR_QOS).publish
-        self._publish_odometry = self.create_publisher(Odometry, relative(ODOMETRY_TOPIC), SENSOR_QOS).publish
+        self._publish_feedback = output(self, JointState, FEEDBACK_TOPIC).publish
+        self._publish_odometry = output(self, Odometry, ODOMETRY_TOPIC).publish
         if self._driver == "pure_pursuit":
-            self._publish_command = self.create_publisher(JointState, relative(COMMAND_TOPIC), SENSOR_QOS).publish
+            self._publish_command = output(self, JointState, COMMAND_TOPIC).publish
         else:
             self._decoder = decoders(load_signal_map("default"))[COMMAND_TOPIC]
-            self.create_subscription(JointState, relative(COMMAND_TOPIC), self._on_command, SENSOR_QOS)
+            listen(self, JointState, relative(COMMAND_TOPIC), self._on_command)
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
         self._room = self._least = math.inf  # to the borders: now, and the least so far (m)
         self._samples = self._drive()

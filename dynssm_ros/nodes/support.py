@@ -9,6 +9,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Mapping
+from copy import copy
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -21,6 +22,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import JointState
@@ -34,19 +36,35 @@ NodeType = TypeVar("NodeType", bound=Node)
 
 _AWAKE = 1.0  # s after which a spinning node looks whether it is to end
 
-# sensor data, but deep enough that a pause of the process (a model swap, a busy core) loses nothing: 10 s at 100 Hz
-SENSOR_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1000)
+_KEPT = 1000  # messages of a topic: a pause of the process (a model swap, a busy core) loses nothing; 10 s at 100 Hz
+
+SENSOR_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=_KEPT)
 # for a controller: one that was held up goes on from the newest odometry
 NEWEST_QOS = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
-
-# what the nodes publish: who asks for best effort gets that
-_OUTPUT_QOS = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=100)
+_RELIABLE_QOS = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=_KEPT)
 
 
-def output(node: Node, msgtype: Any, topic: str) -> Callable[[Any], None]:
-    """Publishes in the node's namespace, reliably unless ``qos_overrides`` say otherwise; returns what sends a message."""
-    overriding = QoSOverridingOptions.with_default_policies()
-    return node.create_publisher(msgtype, relative(topic), _OUTPUT_QOS, qos_overriding_options=overriding).publish
+def output(node: Node, msgtype: Any, topic: str) -> Publisher:
+    """Publishes in the node's namespace, reliably unless ``qos_overrides`` say otherwise.
+
+    Who asks for best effort gets that.
+    """
+    return node.create_publisher(
+        msgtype,
+        relative(topic),
+        copy(_RELIABLE_QOS),  # rclpy writes the overrides into it
+        qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+    )
+
+
+def listen(node: Node, msgtype: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile = SENSOR_QOS) -> None:
+    """Subscribes with ``qos`` unless ``qos_overrides`` say otherwise: best effort takes what any sensor publishes.
+
+    Reliable, it takes what reliable publishers send alone, and loses nothing of that while it is held up.
+    """
+    node.create_subscription(
+        msgtype, topic, callback, copy(qos), qos_overriding_options=QoSOverridingOptions.with_default_policies()
+    )
 
 
 def message_class(msgtype: str) -> Any:

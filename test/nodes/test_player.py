@@ -24,7 +24,7 @@ from benchmarks.live_run import (
 )
 from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.signals.decoding import header_stamp_ns
-from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PREDICTION_TOPIC
+from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC, PREDICTION_TOPIC
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
@@ -93,12 +93,14 @@ def test_a_bag_of_types_that_are_not_installed_names_the_way_out(putnam: Path) -
     assert "dynssm extract" in result.stderr
 
 
-def test_on_a_busy_computer_a_predictor_that_is_held_up_for_two_seconds_answers_everything(
+def test_a_predictor_that_is_held_up_for_two_seconds_and_listens_reliably_answers_everything(
     small_model: Path, laps_bag: Path
 ) -> None:
-    """With ``config/fastdds.xml``, as in all tests: one process without it would have waiting messages dropped."""
+    """With ``config/fastdds.xml``, as in all tests; best effort, one in fifty such stops still loses what waits."""
     assert os.environ[PROFILES].endswith("fastdds.xml")
-    run = run_live(small_model, laps_bag, 0.02, rate=4.0, held_up=(6.0, 14.0))
+    topics = (ODOMETRY_TOPIC, FEEDBACK_TOPIC, COMMAND_TOPIC)
+    reliable = {f"qos_overrides.{topic}.subscription.reliability": "reliable" for topic in topics}
+    run = run_live(small_model, laps_bag, 0.02, rate=4.0, held_up=(6.0, 14.0), parameters=reliable)
     assert (len(run.predicted), run.missing()) == (1001 - 4, [])
 
 

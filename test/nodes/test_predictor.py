@@ -121,6 +121,8 @@ def test_outputs_are_reliable_unless_asked_otherwise(start_car, asked: str) -> N
     assert heard
     (info,) = car.collector.get_publishers_info_by_topic("/dynssm/prediction")
     assert info.qos_profile.reliability.short_key == asked
+    (other,) = car.collector.get_publishers_info_by_topic("/dynssm/parameters")
+    assert other.qos_profile.reliability.short_key == "reliable"
 
 
 @pytest.mark.parametrize("off", [-1.0, 1.0, 10.0])
