@@ -54,7 +54,6 @@ class Evaluation:
         split: which part of it was scored, for people.
         min_speed: slower stretches were left out (m/s).
         rows: last row of each window; the predicted rows are ``rows + 1``.
-        every: coefficients are kept of every so-many-th of them.
         drawn: rows where rollouts start that are drawn: one after the other, in the liveliest seconds.
         regimes: how these rows were driven.
         scores: by label, in the order in which the models were given.
@@ -66,7 +65,6 @@ class Evaluation:
     split: str
     min_speed: float
     rows: Indices
-    every: int
     drawn: Indices
     regimes: tuple[Regime, ...]
     scores: dict[str, Score]
@@ -81,6 +79,11 @@ class Evaluation:
     def steps(self) -> int:
         """Length of the rollouts in steps."""
         return len(next(iter(self.scores.values())).rollout.time)
+
+    @property
+    def every(self) -> int:
+        """Coefficients are kept of every so-many-th of :attr:`rows`."""
+        return _coefficients_every(self.rows)
 
     @property
     def current(self) -> Vector:
@@ -177,8 +180,7 @@ def evaluate(
     tick = _counting(len(models) * each_model, progress)
     regimes = driving_regimes(recording.matrix[rows])
     drawn = _liveliest_starts(recording, rows, steps)
-    every = max(1, len(rows) // _COEFFICIENT_ROWS)
-    on = _On(recording, rows, every, regimes, starts, drawn, steps, batch)
+    on = _On(recording, rows, regimes, starts, drawn, steps, batch)
     labels = list(models)
     found: dict[str, Score] = {}
     for k, score in each(
@@ -199,12 +201,15 @@ def evaluate(
         split=split,
         min_speed=speed,
         rows=rows,
-        every=every,
         drawn=drawn,
         regimes=regimes,
         scores=scores,
         line=first_lap(recording) if line is None else line,
     )
+
+
+def _coefficients_every(rows: Indices) -> int:
+    return max(1, len(rows) // _COEFFICIENT_ROWS)
 
 
 def _liveliest_starts(recording: Recording, rows: Indices, steps: int) -> Indices:
@@ -235,7 +240,6 @@ class _On:
 
     recording: Recording
     rows: Indices
-    every: int
     regimes: tuple[Regime, ...]
     starts: Indices
     drawn: Indices
@@ -248,7 +252,7 @@ class _On:
         matrix, T_s = recording.matrix, recording.T_s
         measured = matrix[rows + 1, :3]
         with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
-            predicted, rollouts, knowledge = _Predicted(model.vehicle, measured, self.every), [], []
+            predicted, rollouts, knowledge = _OneStep(model.vehicle, measured, _coefficients_every(rows)), [], []
             for drive, (ends, starts, drawn) in drive_through(model, recording, (rows, self.starts, self.drawn), batch):
                 for prediction in predict_rows(model, matrix, ends, batch, tick, drive):
                     predicted.add(prediction)
@@ -274,7 +278,7 @@ class _On:
             )
 
 
-class _Predicted:
+class _OneStep:
     """One-step predictions that come batch by batch; the state alone is kept of every row.
 
     Args:
@@ -287,7 +291,7 @@ class _Predicted:
         self._measured, self._every = measured, every
         self._rows = 0
         self._thetas: list[Vector] = []
-        self._inside: Vector | None = None
+        self._inside: list[Vector] = []  # errors of each batch that are inside the stated interval, ``(3,)``
         self.state = np.empty_like(measured)
         self.coefficients = CoefficientTally(vehicle)
 
@@ -300,7 +304,7 @@ class _Predicted:
             self.coefficients.add(prediction.theta)
         if prediction.variance is not None:
             share = coverage(prediction.state - self._measured[rows], prediction.variance)
-            self._inside = len(prediction.state) * share + (0.0 if self._inside is None else self._inside)
+            self._inside.append(len(prediction.state) * share)
         self._rows = rows.stop
 
     @property
@@ -311,7 +315,7 @@ class _Predicted:
     @property
     def coverage(self) -> Vector | None:
         """Share of errors inside the stated 90 % interval, shape ``(3,)``; ``None`` if the model states no variances."""
-        return None if self._inside is None else self._inside / self._rows
+        return np.sum(self._inside, axis=0) / self._rows if self._inside else None
 
 
 def horizon_steps(horizon_s: float, T_s: float) -> int:

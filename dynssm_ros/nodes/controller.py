@@ -31,6 +31,7 @@ from dynssm_ros.nodes.support import (
     listen,
     output,
     relative,
+    repeat,
     run,
 )
 from dynssm_ros.runtime.health import Health, Level
@@ -77,7 +78,7 @@ class ControllerNode(ManagedNode):
         listen(self, Odometry, relative(ODOMETRY_TOPIC), self._on_odometry, NEWEST_QOS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(self._driver.period / 1e9 / self._rate, self._watch, clock=steady)
-        self.create_timer(self._period, self._diagnose, clock=steady)
+        repeat(self, self._period, self._diagnose)
 
     def _describe_driver(self) -> None:
         """Declares what :meth:`_make_driver` goes by."""

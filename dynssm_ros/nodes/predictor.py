@@ -16,7 +16,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
@@ -30,6 +29,7 @@ from dynssm_ros.nodes.support import (
     listen,
     message_class,
     output,
+    repeat,
     run,
     set_pose,
     set_stamp,
@@ -114,11 +114,9 @@ class PredictorNode(ManagedNode):
 
         self._set_wiring()
         self._listen()
-        self._diagnostics_timer = self.create_timer(
-            self._period, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        repeat(self, self._period, self._diagnose)
         if self._state:
-            self.create_timer(_SAVE_PERIOD_S, self.keep, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            repeat(self, _SAVE_PERIOD_S, self.keep)
         model = self._predictor.model
         self.get_logger().info(
             f"{model.name} ({model.parameters} parameters): {model.H} rows of {model.T_s:g} s, commands {model.commands}"
@@ -270,9 +268,6 @@ class PredictorNode(ManagedNode):
         self._publish_diagnostics(
             diagnostics(self, "prediction", vehicle, level, words, values | self._health.values(now))
         )
-        # a period from now: where this takes longer than a period it would be due again at once, and of the messages that
-        # wait the executor serves one from each topic between two timers
-        self._diagnostics_timer.reset()
 
 
 def main(args: list[str] | None = None) -> None:

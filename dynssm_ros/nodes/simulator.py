@@ -28,6 +28,7 @@ from dynssm_ros.nodes.support import (
     listen,
     output,
     relative,
+    repeat,
     run,
     set_pose,
     set_stamp,
@@ -109,7 +110,7 @@ class SimulatorNode(Node):
         self._catches_up = _LATE if self._driver == "pure_pursuit" else self._period
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(self._period, self._on_time, clock=steady)
-        self.create_timer(_DIAGNOSTICS, self._diagnose, clock=steady)
+        repeat(self, _DIAGNOSTICS, self._diagnose)
         self.get_logger().info(
             f"{self._vehicle.name} on {self._track.name} ({self._track.length:.4g} m), plant {self._plant}, "
             f"driver {self._driver}, {1 / self._period:.4g} Hz"

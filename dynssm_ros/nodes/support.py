@@ -67,6 +67,20 @@ def listen(node: Node, msgtype: Any, topic: str, callback: Callable[[Any], None]
     )
 
 
+def repeat(node: Node, period: float, work: Callable[[], None]) -> None:
+    """Calls ``work`` every ``period`` seconds, of a clock that simulated time does not stop.
+
+    They are counted from the end of the call before. One that takes longer than a period would be due again at once, and
+    of the messages that wait the executor serves one from each topic between two timers.
+    """
+
+    def due() -> None:
+        work()
+        timer.reset()
+
+    timer = node.create_timer(period, due, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
 def message_class(msgtype: str) -> Any:
     """The Python class of ``package/msg/Name``.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -45,21 +45,6 @@ class WindowPrediction(NamedTuple):
         theta, physics, variance = (None if array is None else array[chosen] for array in self[1:4])
         seen = None if self.seen is None else Seen(*(array[chosen] for array in self.seen))
         return WindowPrediction(self.state[chosen], theta, physics, variance, seen)
-
-    @classmethod
-    def joined(cls, parts: Sequence[WindowPrediction]) -> WindowPrediction:
-        """What it says of the windows of several, one after the other, less what was seen; not empty."""
-        return cls(
-            np.concatenate([part.state for part in parts]),
-            _join([part.theta for part in parts]),
-            _join([part.physics for part in parts]),
-            _join([part.variance for part in parts]),
-        )
-
-
-def _join(parts: list[Vector | None]) -> Vector | None:
-    known = [part for part in parts if part is not None]
-    return np.concatenate(known) if known else None
 
 
 def corrected(

@@ -64,18 +64,16 @@ class Wiring:
         self._rows: deque[Vector] = deque(maxlen=max(_FEWEST, round(_SECONDS / T_s)))
         self._last: int | None = None
         self._found: deque[str] = deque(maxlen=_CONFIRMED)
-        constants, unchanged = vehicle.constants, np.ones(len(WINDOW_COLUMNS))
-        wheelbase = constants.l_f + constants.l_r
-        self._words = [
-            *_CHANGES,
-            *(
-                f"the wheelbase is not {wheelbase:.3g} m, but about {factor * wheelbase:.2g} m"
-                for factor in _WHEELBASES
-            ),
-        ]
-        # as it is, then what may be wrong: one after the other this takes 28 ms, at once 4 ms, in which nothing is predicted
-        self._factors = np.stack([unchanged, *_CHANGES.values(), *[unchanged] * len(_WHEELBASES)])[:, None]
-        longer = np.array([1.0, *[1.0] * len(_CHANGES), *_WHEELBASES])[:, None]
+        constants, unchanged = vehicle.constants, _scaled((), 1.0)
+        self._wheelbase = wheelbase = constants.l_f + constants.l_r
+        suspicions = [("", unchanged, 1.0), *((words, factors, 1.0) for words, factors in _CHANGES.items())]
+        for factor in _WHEELBASES:
+            words = f"the wheelbase is not {wheelbase:.3g} m, but about {factor * wheelbase:.2g} m"
+            suspicions.append((words, unchanged, factor))
+        # all at once: one after the other they take 28 ms instead of 4, in which nothing is predicted
+        self._suspicions = [words for words, _, _ in suspicions]
+        self._factors = np.stack([factors for _, factors, _ in suspicions])[:, None]
+        longer = np.array([factor for _, _, factor in suspicions])[:, None]
         self._constants = constants.model_copy(update={"l_f": constants.l_f * longer, "l_r": constants.l_r * longer})
 
     def add(self, stamp: int, row: Vector) -> None:
@@ -104,15 +102,14 @@ class Wiring:
         rows = np.array(self._rows)
         if not np.abs(rows[:, _V_X]).min() >= self._vehicle.minimum_speed:
             return ""
-        wheelbase = self._vehicle.constants.l_f + self._vehicle.constants.l_r
         steering = max(map(abs, self._vehicle.inputs.steering))
         with np.errstate(all="ignore"):
-            cornering = np.sqrt(np.mean((np.abs(rows[:, _V_X]) * np.tan(steering) / wheelbase) ** 2))
+            cornering = np.sqrt(np.mean((np.abs(rows[:, _V_X]) * np.tan(steering) / self._wheelbase) ** 2))
             if not np.std(rows[:, _OMEGA]) + np.std(rows[:, _DELTA]) > _TURNING * min(cornering, steering):
                 return ""
-            as_it_is, *errors = self._errors(rows)
+            errors = self._errors(rows)
         best = int(np.argmin(errors))
-        return self._words[best] if errors[best] < _CLEARLY * as_it_is else ""
+        return self._suspicions[best] if errors[best] < _CLEARLY * errors[0] else ""
 
     def _errors(self, rows: Vector) -> Vector:
         """Mean square of the predicted changes' errors in yaw rate and lateral velocity, over those measured.
@@ -121,7 +118,7 @@ class Wiring:
             rows: what was measured, shape ``(N, 7)``.
 
         Returns:
-            As it is, then with each change, shape ``(C,)``; infinite where the car diverges.
+            As it is, then under each suspicion, shape ``(C,)``; infinite where the car diverges.
         """
         starts = np.linspace(0, len(rows) - 1 - self._ahead, _STARTS).astype(np.intp)
         rows = rows * self._factors

@@ -96,7 +96,7 @@ def test_a_bag_of_types_that_are_not_installed_names_the_way_out(putnam: Path) -
 def test_a_predictor_that_is_held_up_for_two_seconds_and_listens_reliably_answers_everything(
     small_model: Path, laps_bag: Path
 ) -> None:
-    """With ``config/fastdds.xml``, as in all tests; best effort, one in fifty such stops still loses what waits."""
+    """With ``config/fastdds.xml``, as in all tests; best effort, such a stop can still cost what waits."""
     assert os.environ[PROFILES].endswith("fastdds.xml")
     topics = (ODOMETRY_TOPIC, FEEDBACK_TOPIC, COMMAND_TOPIC)
     reliable = {f"qos_overrides.{topic}.subscription.reliability": "reliable" for topic in topics}

@@ -46,6 +46,17 @@ Wiring.verdict = lambda self: time.sleep(0.15) or ""
 """
 
 
+@pytest.fixture
+def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
+    """Writes a module that processes find which are started from now on."""
+
+    def write(name: str, text: str) -> None:
+        (tmp_path / f"{name}.py").write_text(text)
+        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+
+    return write
+
+
 def predictions(model: Path, bag: Path) -> dict[int, Prediction]:
     """What replay predicts, by the stamp of the predicted instant."""
     predictor = Predictor(OnnxModel(open_artifact(model)), load_signal_map("default"))
@@ -255,12 +266,11 @@ def test_the_predicted_car_and_its_way_are_drawn(start_car) -> None:
     assert len(way.points) == 10
 
 
-def test_the_predicted_pose_is_sent_to_tf(start_car, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_predicted_pose_is_sent_to_tf(start_car, stand_in: Callable[[str, str], None]) -> None:
     """With a stand-in of tf2_ros, which is not among the wheels."""
     from geometry_msgs.msg import TransformStamped
 
-    (tmp_path / "tf2_ros.py").write_text(TF2_ROS)
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    stand_in("tf2_ros", TF2_ROS)
     car = start_car(tf=True)
     sent = heard(car, TransformStamped, "/stand_in_of_tf", 10)
     assert (sent.header.frame_id, sent.child_frame_id) == ("map", "base_link_predicted")
@@ -269,10 +279,9 @@ def test_the_predicted_pose_is_sent_to_tf(start_car, tmp_path: Path, monkeypatch
 
 
 def test_diagnostics_that_take_longer_than_their_period_leave_time_for_what_waits(
-    start_car, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    start_car, stand_in: Callable[[str, str], None]
 ) -> None:
-    (tmp_path / "sitecustomize.py").write_text(SLOW_TO_DIAGNOSE)
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    stand_in("sitecustomize", SLOW_TO_DIAGNOSE)
     car = start_car()
     car.drive_until_answered()
     stamps = [car.step() for _ in range(100)]
