@@ -42,6 +42,7 @@ class Pit:
         self.run = LiveRun(PERIOD)
         self.collector = stack.enter_context(collecting(self.run))
         self.odometry: list[Odometry] = []
+        self.arrived: list[float] = []
         self.speed: dict[int, float] = {}
         self.feedback: dict[int, tuple[float, ...]] = {}
         self.command: dict[int, tuple[float, ...]] = {}
@@ -73,6 +74,7 @@ class Pit:
     def _on_odometry(self, message: Odometry) -> None:
         with self.collector.changed:
             self.odometry.append(message)
+            self.arrived.append(time.monotonic())
             self.speed[header_stamp_ns(message) or 0] = message.twist.twist.linear.x
             self.collector.changed.notify_all()
         answer = self.answer
@@ -98,10 +100,11 @@ def test_it_drives_what_simulate_drives_in_real_time(start_pit: StartPit) -> Non
     pit = start_pit("seed:=3")
     assert pit.wait_for(lambda: bool(pit.odometry and pit.feedback and pit.command))  # topics match one by one
     pit.odometry.clear()
-    assert pit.wait_for(lambda: bool(pit.odometry))
-    begin, seen = time.monotonic(), len(pit.odometry)
-    assert pit.wait_for(lambda: len(pit.odometry) >= seen + 100)
-    assert time.monotonic() - begin == pytest.approx(100 * 0.02, abs=0.5)
+    pit.arrived.clear()
+    assert pit.wait_for(lambda: len(pit.odometry) >= 300)
+    # a busy machine hands messages over late: the earliest of each 100 say how time went on
+    late = np.array(pit.arrived[:300]) - 0.02 * np.arange(300)
+    assert np.min(late[200:]) == pytest.approx(np.min(late[:100]), abs=0.25)
 
     stamps = np.array([header_stamp_ns(m) for m in pit.odometry])
     assert set(np.diff(stamps)) == {PERIOD}
