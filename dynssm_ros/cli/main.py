@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import warnings
@@ -45,6 +46,7 @@ for command in (inspect, simulate, extract, calibrate, train, sweep, evaluate, r
 
 
 _OUTPUTS = ("--out", "--bag", "--json", "--online-state")
+_M_MMAP_THRESHOLD, _LARGE = -3, 1_000_000  # an option of mallopt(3), and from how many bytes on an array is large
 
 
 def _print_version(value: bool) -> None:
@@ -69,6 +71,7 @@ def main() -> None:
     ``--force`` may stand anywhere: outputs then replace what others wrote, but never an input.
     """
     arguments = [word for word in sys.argv[1:] if word != "--force"]
+    _give_memory_back()
     try:
         load_plugins()
         with _warning_in_lines(), protecting(inputs(arguments), force=len(arguments) < len(sys.argv) - 1):
@@ -83,6 +86,17 @@ def main() -> None:
         sys.exit(130)
     else:
         sys.exit(status if isinstance(status, int) else 0)
+
+
+def _give_memory_back() -> None:
+    """Has large arrays given back to the system as soon as they are freed.
+
+    glibc does so at first, but keeps larger ones for itself once some were freed. What a command over a long log takes would
+    grow far faster than what it holds.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:  # other C libraries have none
+        mallopt(_M_MMAP_THRESHOLD, _LARGE)
 
 
 def inputs(arguments: Sequence[str]) -> list[Path]:

@@ -101,20 +101,19 @@ def drive_through(
         What it knew, with those of each ``asked`` that the block answers for. ``None``, once and with all of them, if
         nothing learns.
     """
-    layer, matrix = model.online, recording.matrix
-    if layer is None or len(ends := recording.window_ends(model.H, 0, layer.minimum_speed)) == 0:
+    layer, H = model.online, model.H
+    if layer is None or len(ends := recording.window_ends(H, 0, layer.minimum_speed)) == 0:
         yield None, list(asked)
         return
     along, judge, last = Along(layer), PathJudge(layer), None
     blocks = [(np.searchsorted(ends, rows, side="right") - 1).clip(0) // batch for rows in asked]
     for start in range(0, len(ends), batch):
         chunk = ends[start : start + batch]
-        seen = seen_by(model, gather(matrix, chunk, model.H - 1))
-        following = np.minimum(chunk + 1, len(matrix) - 1)
-        learned = along.over(seen, matrix[chunk], matrix[following, :3] - matrix[chunk, :3], chunk)
-        trusted = trusted_along(
-            judge, lambda row: matrix[row - model.H + 1 : row + 1], chunk, learned, seen, partial(seen_by, model), last
-        )
+        windows = recording.rows(chunk[:, None] + np.arange(1 - H, 1))
+        seen, rows = seen_by(model, windows), windows[:, -1]
+        following = recording.rows(np.minimum(chunk + 1, len(recording) - 1))
+        learned = along.over(seen, rows, following[:, :3] - rows[:, :3], chunk)
+        trusted = trusted_along(judge, windows, chunk, learned, seen, partial(seen_by, model), last)
         last = int(chunk[-1])
         own = [rows[block == start // batch] for rows, block in zip(asked, blocks, strict=True)]
         yield DriveThrough(chunk, learned._replace(trusted=trusted)), own

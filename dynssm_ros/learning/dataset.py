@@ -1,4 +1,4 @@
-"""TrainingWindows of a recording as tensors, and their split into training and validation."""
+"""Windows of a recording as tensors, and their split into training and validation."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _BLOCK_SHARE, _BLOCK_RANGE_S = 1 / 40, (1.0, 10.0)  # of the recording; length of validation blocks
 _CONSTANT = 1e-9  # a column that varies less than this is not scaled
@@ -51,7 +54,7 @@ class Digest(Protocol):
 
 @dataclass(frozen=True)
 class TrainingWindows:
-    """TrainingWindows that end at ``ends`` in the rows ``matrix`` ``(N, 7)``; formed batch by batch, never stored."""
+    """Windows that end at ``ends`` in the rows ``matrix`` ``(N, 7)``; formed batch by batch, never stored."""
 
     matrix: Tensor
     ends: Tensor
@@ -66,7 +69,7 @@ class TrainingWindows:
         return self.matrix[self.ends + 1, :3] - self.matrix[self.ends, :3]
 
     def batch(self, index: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """TrainingWindows ``(B, H, 7)`` and their measured increments ``s_{t+1} - s_t`` ``(B, 3)``."""
+        """Windows ``(B, H, 7)`` and their measured increments ``s_{t+1} - s_t`` ``(B, 3)``."""
         ends = self.ends[index]
         rows = ends[:, None] + torch.arange(1 - self.H, 1, device=ends.device)
         return self.matrix[rows], self.matrix[ends + 1, :3] - self.matrix[ends, :3]
@@ -114,6 +117,15 @@ def split_windows(
     Raises:
         RecordingError: too little motion to train on.
     """
+    training, held = split_ends(recording, H, config, min_speed, least)
+    matrix = _matrix(recording)
+    return TrainingWindows(matrix, torch.tensor(training), H), TrainingWindows(matrix, torch.tensor(held), H)
+
+
+def split_ends(
+    recording: Recording, H: int, config: SplitConfig, min_speed: float, least: int
+) -> tuple[Indices, Indices]:
+    """The last rows of the windows of :func:`split_windows`."""
     ends = recording.window_ends(H, min_speed=min_speed)
     if config.validation == "random":
         drawn = np.random.default_rng(config.seed).random(len(recording)) * config.validation_every < 1
@@ -134,34 +146,41 @@ def split_windows(
             f"of {H} rows at {min_speed:g} m/s or more; expected at least {least} and 1 - "
             "more driving is needed"
         )
-    matrix = torch.tensor(recording.matrix, dtype=torch.float32)
-    return TrainingWindows(matrix, torch.tensor(training), H), TrainingWindows(matrix, torch.tensor(held), H)
+    return training, held
 
 
 def all_windows(recording: Recording, H: int, min_speed: float) -> TrainingWindows:
     """Every window of ``recording`` at ``min_speed`` (m/s) or more."""
-    matrix = torch.tensor(recording.matrix, dtype=torch.float32)
-    return TrainingWindows(matrix, torch.tensor(recording.window_ends(H, min_speed=min_speed)), H)
+    return TrainingWindows(_matrix(recording), torch.tensor(recording.window_ends(H, min_speed=min_speed)), H)
 
 
-def normalisation(recording: Recording, windows: TrainingWindows) -> Normalisation:
-    """Scales from the training windows.
+def _matrix(recording: Recording) -> Tensor:
+    """The model's input rows in single precision, ``(N, 7)``."""
+    columns = [recording[name] for name in WINDOW_COLUMNS]
+    return torch.from_numpy(np.stack(columns, axis=1, dtype=np.float32, casting="same_kind"))
+
+
+def normalisation(recording: Recording, ends: Indices) -> Normalisation:
+    """Scales from the training windows, which end at the rows ``ends``.
 
     Raises:
         RecordingError: a state never changes.
     """
-    ends = windows.ends.numpy()
-    rows, targets = recording.matrix[ends], recording.matrix[ends + 1, :3]
-    increments = targets - rows[:, :3]
-    std = rows.std(axis=0)
-    for name, spread in zip(("v_x", "v_y", "omega"), increments.std(axis=0), strict=True):
+    inputs = [_mean_and_std(recording[name][ends]) for name in WINDOW_COLUMNS]
+    targets = [_mean_and_std(recording[name][ends + 1]) for name in STATE_SIGNALS]
+    increments = [_mean_and_std(recording[name][ends + 1] - recording[name][ends]) for name in STATE_SIGNALS]
+    for name, (_, spread) in zip(STATE_SIGNALS, increments, strict=True):
         if spread < _CONSTANT:
             raise RecordingError(
                 f"recording {', '.join(recording.info.source)}: {name} never changes; expected a car that drives corners"
             )
     return Normalisation(
-        input_mean=tuple(rows.mean(axis=0).tolist()),
-        input_std=tuple(np.where(std < _CONSTANT, 1.0, std).tolist()),
-        state_scale=tuple(targets.std(axis=0).tolist()),
-        increment_scale=tuple(increments.std(axis=0).tolist()),
+        input_mean=tuple(mean for mean, _ in inputs),
+        input_std=tuple(1.0 if std < _CONSTANT else std for _, std in inputs),
+        state_scale=tuple(std for _, std in targets),
+        increment_scale=tuple(std for _, std in increments),
     )
+
+
+def _mean_and_std(values: Vector) -> tuple[float, float]:
+    return float(values.mean()), float(values.std())

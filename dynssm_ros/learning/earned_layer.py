@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.learning.dataset import all_windows
 from dynssm_ros.learning.models.base import OnlineConfig, TrainableModel, steps_of
 from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.online import FittedLayer, LayerDrive, LeftOut, OnlineFeatures, fit_layer
@@ -103,16 +102,15 @@ def _errors(base: LayerBase, features: OnlineFeatures, fitted: FittedLayer, part
 
 def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording, base: LayerBase) -> LayerDrive:
     """What the layer sees of the windows of a recording, with what ``model`` predicts from them."""
-    windows = all_windows(recording, base.H, base.vehicle.minimum_speed)
-    ends, matrix = windows.ends.numpy(), recording.matrix
+    ends = recording.window_ends(base.H, min_speed=base.vehicle.minimum_speed)
 
     @torch.no_grad()
     def see(block: slice) -> Seen:
-        window, _ = windows.batch(block)
+        rows = recording.rows(ends[block, None] + np.arange(1 - base.H, 1))
+        window = torch.tensor(rows, dtype=torch.float32)
         return Seen(*(each.double().numpy() for each in features(window, model.eval()(window))))
 
-    starts = np.searchsorted(ends, base.starts(recording))
-    return LayerDrive(see, matrix[ends], matrix[ends + 1, :3] - matrix[ends, :3], ends, starts)
+    return LayerDrive(see, recording, ends, np.searchsorted(ends, base.starts(recording)))
 
 
 @torch.no_grad()
@@ -123,7 +121,7 @@ def _path_error(
     (layer, _, known), steps, starts = left_out, base.path_steps, base.starts(recording)
     if len(starts) == 0:
         return np.empty(0)
-    rows = recording.matrix[starts[:, None] + np.arange(1 - base.H, steps + 1)]
+    rows = recording.rows(starts[:, None] + np.arange(1 - base.H, steps + 1))
     rolled, mean_error = rows.copy(), None
     for k in range(steps):
         window = torch.tensor(rolled[:, k : k + base.H], dtype=torch.float32)

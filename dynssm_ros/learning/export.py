@@ -22,7 +22,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import checksum, replacing
-from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import TrainableModel
 from dynssm_ros.learning.models.registry import build_model, parse_model_config
@@ -258,8 +257,7 @@ def eager_prediction(artifact: Artifact) -> Callable[[], None]:
 
 
 def _sample_windows(trained: Trained, count: int = 256) -> Tensor:
-    """TrainingWindows spread over the training data."""
-    matrix = torch.tensor(trained.recording.matrix, dtype=torch.float32)
+    """Windows spread over the training data."""
     ends = trained.recording.window_ends(trained.H, min_speed=trained.vehicle.minimum_speed)
-    chosen = torch.tensor(ends[np.linspace(0, len(ends) - 1, count).astype(int)])
-    return TrainingWindows(matrix, chosen, trained.H).batch(slice(None))[0]
+    chosen = ends[np.linspace(0, len(ends) - 1, count).astype(int), None] + np.arange(1 - trained.H, 1)
+    return torch.tensor(trained.recording.rows(chosen), dtype=torch.float32)

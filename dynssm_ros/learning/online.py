@@ -21,6 +21,7 @@ from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
 from dynssm_ros.runtime.online import CHANNELS, MEAN_ERROR, Along, Learned, OnlineLayer, OnlineLayerCard, Seen
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 
@@ -136,14 +137,18 @@ class LayerDrive(NamedTuple):
 
     see: Callable[[slice], Seen]
     """Of some of the windows; computed anew each time, so that memory does not grow with the laps."""
-    rows: Vector
-    """The last one of each window, ``(N, 7)``."""
-    increments: Vector
-    """Measured from it to the next, ``(N, 3)`` (m/s, m/s, rad/s)."""
+    recording: Recording
+    """The laps."""
     ends: Indices
-    """Its number, ``(N,)``, ascending."""
+    """The last row of each window, ``(N,)``, ascending."""
     starts: Indices
     """The windows from which paths are predicted, ascending."""
+
+    def measured(self, block: slice) -> tuple[Vector, Vector]:
+        """The last rows of some windows, ``(n, 7)``, and the increments to the next, ``(n, 3)`` (m/s, m/s, rad/s)."""
+        ends = self.ends[block]
+        rows = self.recording.rows(ends)
+        return rows, self.recording.rows(ends + 1)[:, :CHANNELS] - rows[:, :CHANNELS]
 
     def blocks(self) -> Iterator[tuple[slice, Seen]]:
         """All windows in order, some at a time; an empty block if there are none."""
@@ -201,8 +206,8 @@ def fit_layer(
 
     vehicle, stepping = features.physics.vehicle, features.physics.stepping
     nothing = BlockErrors(np.ones(CHANNELS), np.ones(CHANNELS))
-    driven = (np.concatenate(each) for each in zip(*(part[1:4] for part in parts), strict=True))
-    usual = CoefficientEstimator(vehicle, s_delta, nothing, *stepping, config.spread).usual_errors(*driven)
+    estimator = CoefficientEstimator(vehicle, s_delta, nothing, *stepping, config.spread)
+    usual = estimator.usual_errors((part.ends, part.measured) for part in parts)
 
     def layer(prior: _Prior, rows: float, spread: dict[str, float]) -> OnlineLayer:
         card = OnlineLayerCard(features=features.names, memory=config.memory, prior_rows=rows, spread=spread)
@@ -232,10 +237,10 @@ def _along(drive: LayerDrive, layers: list[OnlineLayer]) -> list[LeftOut]:
     squares = np.zeros((len(layers), CHANNELS))
     known: list[list[Learned]] = [[] for _ in layers]
     for block, seen in drive.blocks():
-        increments, ends = drive.increments[block], drive.ends[block]
+        (rows, increments), ends = drive.measured(block), drive.ends[block]
         starts = drive.starts[(drive.starts >= block.start) & (drive.starts < block.stop)] - block.start
         for k, layer in enumerate(layers):
-            learned = learning[k].over(seen, drive.rows[block], increments, ends)
+            learned = learning[k].over(seen, rows, increments, ends)
             errors = (layer.increments(seen.features, learned.weights) - increments) / layer.scale
             squares[k] += np.sum(errors**2, axis=0)
             known[k].append(learned.at(starts))
@@ -267,7 +272,7 @@ class _Moments(NamedTuple):
 def _moments(drive: LayerDrive, s_delta: Vector) -> _Moments:
     parts = []
     for block, (F, physics) in drive.blocks():
-        error = (drive.increments[block] - physics) / s_delta
+        error = (drive.measured(block)[1] - physics) / s_delta
         gram = np.einsum("kci,kcj->cij", F, F, optimize=True)
         parts.append(_Moments(len(error), gram, np.einsum("kci,kc->ci", F, error), np.sum(error**2, axis=0)))
     return _added(parts)

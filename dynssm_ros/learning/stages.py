@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dynssm_ros.arrays import Indices
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.learning.dataset import TrainingWindows, normalisation, split_windows
+from dynssm_ros.learning.dataset import normalisation, split_ends, split_windows
 from dynssm_ros.learning.earned_layer import LayerBase, earned_layer
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.learning.models.registry import build_model
@@ -193,12 +194,10 @@ def check_device(device: str) -> None:
         raise ConfigurationError(f"--device {device}: not available here; expected {' or '.join(available)}")
 
 
-def _split(
-    recording: Recording, config: ModelConfig, vehicle: Vehicle, extra_rows: int = 0
-) -> tuple[TrainingWindows, TrainingWindows]:
-    """Training and validation windows of ``extra_rows`` more rows than the model's."""
-    rows, least = config.rows(vehicle.sampling_time) + extra_rows, config.training.effort[1]
-    return split_windows(recording, rows, config.training, vehicle.minimum_speed, least)
+def _training_ends(recording: Recording, config: ModelConfig, vehicle: Vehicle) -> Indices:
+    """The last rows of the model's training windows."""
+    H, least = config.rows(vehicle.sampling_time), config.training.effort[1]
+    return split_ends(recording, H, config.training, vehicle.minimum_speed, least)[0]
 
 
 def _rest(recording: Recording, part: slice) -> Recording:
@@ -209,7 +208,7 @@ def _rest(recording: Recording, part: slice) -> Recording:
 def _can_be_trained_on(recording: Recording, config: ModelConfig, vehicle: Vehicle) -> bool:
     """Whether ``recording`` has windows enough for training and validation."""
     try:
-        _split(recording, config, vehicle)
+        _training_ends(recording, config, vehicle)
     except RecordingError:
         return False
     return True
@@ -247,8 +246,8 @@ def _train(
     torch.set_num_threads(1)  # batches are small: more threads wait for each other longer than they compute
     vehicle = config.with_physics.modelled(vehicle)
     H = config.rows(vehicle.sampling_time)
-    plain, _ = _split(recording, config, vehicle)
-    scale = normalisation(recording, plain) if start is None else start.normalisation
+    ends = _training_ends(recording, config, vehicle)
+    scale = normalisation(recording, ends) if start is None else start.normalisation
     anew = partial(_begin, config, vehicle, scale)
     model = anew(0)
     ahead = rollout_steps(config, vehicle) - 1
@@ -256,7 +255,8 @@ def _train(
         raise ConfigurationError(
             f"model {config.name}: loss.rollout: kind {config.kind} has a loss of its own; expected 0"
         )
-    training, validation = _split(recording, config, vehicle, model.EXTRA_ROWS + ahead)
+    rows, least = H + model.EXTRA_ROWS + ahead, config.training.effort[1]
+    training, validation = split_windows(recording, rows, config.training, vehicle.minimum_speed, least)
     if start is not None:
         model.take_over(start.model)
     windows = training if stream is None else stream.windows(training, vehicle.minimum_speed)

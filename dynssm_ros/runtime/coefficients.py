@@ -13,7 +13,7 @@ probability that there is one.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import NamedTuple
 
@@ -54,6 +54,10 @@ def daily_change(vehicle: Vehicle, spread: Mapping[str, float] = SPREAD) -> Vect
     size = np.where(np.isin(COEFFICIENTS, SHIFTS), 1.0, np.abs(vehicle.nominal))
     change: Vector = size * [spread.get(name, 0.0) for name in COEFFICIENTS]
     return change
+
+
+Measured = Callable[[slice], tuple[Vector, Vector]]
+"""Some of a drive's rows ``(n, 7)``, and the increments from each to the next, ``(n, 3)`` (m/s, m/s, rad/s)."""
 
 
 class BlockErrors(NamedTuple):
@@ -161,21 +165,20 @@ class CoefficientEstimator:
             if np.isfinite(block).all():
                 self._update(block[:, :7], block[:, 7:])
 
-    def usual_errors(self, rows: Vector, increments: Vector, ends: Indices) -> BlockErrors:
+    def usual_errors(self, laps: Iterable[tuple[Indices, Measured]]) -> BlockErrors:
         """What is usual of the calibrated car, from laps that it was calibrated on.
 
         Args:
-            rows: measured, ``(N, 7)``.
-            increments: from each to the next (m/s, m/s, rad/s), ``(N, 3)``.
-            ends: their row numbers, ascending; blocks have no gap.
+            laps: numbers of rows, ascending, and what was measured at some of them; blocks have no gap.
         """
         errors = []
-        for first in range(0, len(ends) - self.rows + 1, self.rows):
-            block = slice(first, first + self.rows)
-            together = ends[block][-1] - ends[first] == self.rows - 1
-            if together:
-                predicted = self._mean_increments(rows[block], self.nominal[None])[0]
-                errors.append((increments[block].mean(axis=0) - predicted) / self._scale)
+        for ends, measured in laps:
+            for first in range(0, len(ends) - self.rows + 1, self.rows):
+                block = slice(first, first + self.rows)
+                if ends[block][-1] - ends[first] == self.rows - 1:
+                    rows, increments = measured(block)
+                    predicted = self._mean_increments(rows, self.nominal[None])[0]
+                    errors.append((increments.mean(axis=0) - predicted) / self._scale)
         if len(errors) < _FEWEST:
             return BlockErrors(np.full(3, _SMALLEST), np.full(3, _SMALLEST))
         e = np.clip(errors, *np.quantile(errors, [0.01, 0.99], axis=0))

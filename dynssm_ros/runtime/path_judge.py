@@ -123,7 +123,7 @@ class _Pair:
 
 def trusted_along(
     judge: PathJudge,
-    windows: Callable[[int], Vector],
+    windows: Vector,
     ends: Indices,
     learned: Learned,
     seen: Seen,
@@ -134,7 +134,7 @@ def trusted_along(
 
     Args:
         judge: has judged up to there.
-        windows: the window that ends at a row.
+        windows: that end at the rows, ``(N, H, 7)``.
         ends: rows, ascending, ``(N,)``.
         learned: what was known there.
         seen: what the layer saw there.
@@ -146,6 +146,6 @@ def trusted_along(
         if last != row - 1:
             judge.interrupt()
         at, last = np.array([k]), row
-        judge.step(windows(row), Seen(seen.features[at], seen.physics[at]), learned.at(at), see)
+        judge.step(windows[k], Seen(seen.features[at], seen.physics[at]), learned.at(at), see)
         out[k] = judge.trusted
     return out

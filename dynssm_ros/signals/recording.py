@@ -90,8 +90,12 @@ class Recording:
 
     @property
     def matrix(self) -> Vector:
-        """The model's input rows, shape ``(N, 7)`` in the order of ``WINDOW_COLUMNS``."""
-        return np.stack([self.columns[name] for name in WINDOW_COLUMNS], axis=1)
+        """The model's input rows, shape ``(N, 7)`` in the order of ``WINDOW_COLUMNS``; a copy of them all."""
+        return self.rows(slice(None))
+
+    def rows(self, at: slice | Indices) -> Vector:
+        """Some of the model's input rows, by numbers of any shape ``(...)``: ``(..., 7)``."""
+        return np.stack([self.columns[name][at] for name in WINDOW_COLUMNS], axis=-1)
 
     @property
     def fingerprints(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import subprocess
 import sys
 
@@ -47,3 +48,31 @@ def test_a_usage_error_is_one_line_and_exit_status_1(arguments: list[str], expec
     (line,) = result.stderr.strip().splitlines()
     assert line.startswith("error: ")
     assert expected in line
+
+
+_MEMORY = """
+import sys
+import numpy as np
+from dynssm_ros.cli.main import main
+
+resident = lambda: int(open("/proc/self/statm").read().split()[1])
+sys.argv = ["dynssm", "--version"]
+try:
+    main()
+except SystemExit:
+    pass
+np.ones(3_000_000)
+before = resident()
+columns = [(np.ones(200_000), [bytes(1000) for _ in range(20)]) for _ in range(40)]
+small = [each[1] for each in columns]
+highest = resident()
+del columns
+print((resident() - before) / (highest - before))
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc keeps what is freed")
+def test_a_command_gives_large_arrays_back_when_they_are_freed() -> None:
+    """Also those between which small things are kept."""
+    result = subprocess.run([sys.executable, "-c", _MEMORY], capture_output=True, text=True, check=True)
+    assert float(result.stdout.split()[-1]) < 0.05

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.learning.dataset import TrainingWindows, normalisation, split_windows
+from dynssm_ros.learning.dataset import TrainingWindows, normalisation, split_ends, split_windows
 from dynssm_ros.learning.models.base import ModelConfig, TrainingConfig
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
@@ -110,10 +110,10 @@ def test_a_batch_is_windows_in_order_with_the_increment_that_follows() -> None:
 
 def test_scales_are_those_of_the_training_windows(laps: Recording, make_config: Callable[..., ModelConfig]) -> None:
     config = make_config()
-    train, _ = split_windows(laps, config.rows(0.02), config.training, 0.0, config.training.batch_size)
-    found = normalisation(laps, train)
-    now = laps.matrix[train.ends.numpy()]
-    target = laps.matrix[train.ends.numpy() + 1, :3]
+    ends, _ = split_ends(laps, config.rows(0.02), config.training, 0.0, config.training.batch_size)
+    found = normalisation(laps, ends)
+    now = laps.matrix[ends]
+    target = laps.matrix[ends + 1, :3]
     np.testing.assert_allclose(found.input_mean, now.mean(axis=0))
     np.testing.assert_allclose(found.input_std, now.std(axis=0))
     np.testing.assert_allclose(found.state_scale, target.std(axis=0))
@@ -123,9 +123,8 @@ def test_scales_are_those_of_the_training_windows(laps: Recording, make_config: 
 def test_a_constant_input_is_not_scaled(laps: Recording, make_config: Callable[..., ModelConfig]) -> None:
     quiet = laps.with_commands("none")
     config = make_config()
-    found = normalisation(
-        quiet, split_windows(quiet, config.rows(0.02), config.training, 0.0, config.training.batch_size)[0]
-    )
+    ends, _ = split_ends(quiet, config.rows(0.02), config.training, 0.0, config.training.batch_size)
+    found = normalisation(quiet, ends)
     assert found.input_std[5:] == (1.0, 1.0)
     assert found.input_mean[5:] == (0.0, 0.0)
 
@@ -133,9 +132,8 @@ def test_a_constant_input_is_not_scaled(laps: Recording, make_config: Callable[.
 def test_a_state_that_never_changes_is_refused_by_name(laps: Recording) -> None:
     columns = {**laps.columns, "omega": np.zeros(len(laps))}
     straight = Recording(laps.info, laps.time, laps.segment, columns)
-    windows = TrainingWindows(torch.tensor(straight.matrix), torch.tensor(straight.window_ends(4)), 4)
     with pytest.raises(RecordingError, match="drive 0: omega never changes; expected a car that drives corners"):
-        normalisation(straight, windows)
+        normalisation(straight, straight.window_ends(4))
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,8 @@ def estimator(factor=1.0, car=ORCA, **how):
     usual = laps(factor, seed=9)
     scale = np.diff(usual.matrix[:, :3], axis=0).std(axis=0)
     first = CoefficientEstimator(car, scale, BlockErrors(np.ones(3), np.ones(3)), **how)
-    rows = np.arange(len(usual) - 1)
-    errors = first.usual_errors(usual.matrix[:-1], np.diff(usual.matrix[:, :3], axis=0), rows)
+    rows, increments = usual.matrix[:-1], np.diff(usual.matrix[:, :3], axis=0)
+    errors = first.usual_errors([(np.arange(len(rows)), lambda block: (rows[block], increments[block]))])
     return CoefficientEstimator(car, scale, errors, **how)
 
 

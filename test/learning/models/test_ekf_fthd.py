@@ -81,7 +81,7 @@ def test_variances_that_are_learned_from_the_next_measurement_filter_the_noise_a
 ) -> None:
     """The car's coefficients are given; only the noises are learned, and nobody tells them the true states."""
     windows, _ = split_windows(noisy, config.rows(0.02), config.training, 0.0, 64)
-    model = EkfFTHD(config, orca, normalisation(noisy, windows))  # type: ignore[arg-type]
+    model = EkfFTHD(config, orca, normalisation(noisy, windows.ends.numpy()))  # type: ignore[arg-type]
     share = (orca.nominal - orca.lower) / (orca.upper - orca.lower)
     with torch.no_grad():
         model.dense[-1].weight.zero_()  # type: ignore[operator]
