@@ -109,10 +109,10 @@ def drive_through(
     blocks = [(np.searchsorted(ends, rows, side="right") - 1).clip(0) // batch for rows in asked]
     for start in range(0, len(ends), batch):
         chunk = ends[start : start + batch]
-        windows = recording.rows(chunk[:, None] + np.arange(1 - H, 1))
+        windows = recording.windows(chunk, H)
         seen, rows = seen_by(model, windows), windows[:, -1]
-        following = recording.rows(np.minimum(chunk + 1, len(recording) - 1))
-        learned = along.over(seen, rows, following[:, :3] - rows[:, :3], chunk)
+        following = recording.states(np.minimum(chunk + 1, len(recording) - 1))
+        learned = along.over(seen, rows, following - rows[:, :3], chunk)
         trusted = trusted_along(judge, windows, chunk, learned, seen, partial(seen_by, model), last)
         last = int(chunk[-1])
         own = [rows[block == start // batch] for rows, block in zip(asked, blocks, strict=True)]

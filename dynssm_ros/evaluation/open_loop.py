@@ -21,7 +21,6 @@ from dynssm_ros.evaluation.metrics import (
     drive_through,
     explained,
     finite,
-    gather,
     latency_us,
     max_error,
     predict_rows,
@@ -88,12 +87,12 @@ class Evaluation:
     @property
     def current(self) -> Vector:
         """Measured states of :attr:`rows`, shape ``(N, 3)``."""
-        return self.recording.matrix[self.rows, :3]
+        return self.recording.states(self.rows)
 
     @property
     def measured(self) -> Vector:
         """Measured states of the predicted rows, shape ``(N, 3)``."""
-        return self.recording.matrix[self.rows + 1, :3]
+        return self.recording.states(self.rows + 1)
 
     @property
     def persistence_rmse(self) -> Vector:
@@ -178,7 +177,7 @@ def evaluate(
         )
     each_model = len(rows) + len(starts) * steps
     tick = _counting(len(models) * each_model, progress)
-    regimes = driving_regimes(recording.matrix[rows])
+    regimes = driving_regimes(recording.rows(rows))
     drawn = _liveliest_starts(recording, rows, steps)
     on = _On(recording, rows, regimes, starts, drawn, steps, batch)
     labels = list(models)
@@ -190,9 +189,7 @@ def evaluate(
         if workers.elsewhere:
             tick(each_model)
     scores = {
-        label: replace(
-            found[label], latency_us=latency_us(model, gather(recording.matrix, rows[:50], model.H - 1), calls)
-        )
+        label: replace(found[label], latency_us=latency_us(model, recording.windows(rows[:50], model.H), calls))
         for label, model in models.items()
     }
     return Evaluation(
@@ -216,7 +213,7 @@ def _liveliest_starts(recording: Recording, rows: Indices, steps: int) -> Indice
     """Starts of rollouts of so many steps, one after the other, where the driving is liveliest."""
     seconds = max(_DRAWN_S, steps * recording.T_s)
     time = (recording.time[rows + 1] - recording.time[0]) / 1e9
-    stretch = rows[liveliest(time, recording.matrix[rows + 1, :3], seconds)]
+    stretch = rows[liveliest(time, recording.states(rows + 1), seconds)]
     starts: Indices = stretch[: len(stretch) - steps + 1 : steps]
     return starts
 
@@ -250,7 +247,7 @@ class _On:
         """What a model is worth, but for the time that it takes."""
         recording, rows, batch = self.recording, self.rows, self.batch
         matrix, T_s = recording.matrix, recording.T_s
-        measured = matrix[rows + 1, :3]
+        measured = recording.states(rows + 1)
         with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
             predicted, rollouts, knowledge = _OneStep(model.vehicle, measured, _coefficients_every(rows)), [], []
             for drive, (ends, starts, drawn) in drive_through(model, recording, (rows, self.starts, self.drawn), batch):
@@ -261,7 +258,7 @@ class _On:
                 if drive is not None:
                     knowledge.append(drive.at(drawn))
             errors = predicted.state - measured
-            increments = measured - matrix[rows, :3]
+            increments = measured - recording.states(rows)
             return Score(
                 model=model,
                 known=Learned.joined(knowledge) if knowledge else None,

@@ -106,8 +106,7 @@ def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording
 
     @torch.no_grad()
     def see(block: slice) -> Seen:
-        rows = recording.rows(ends[block, None] + np.arange(1 - base.H, 1))
-        window = torch.tensor(rows, dtype=torch.float32)
+        window = torch.tensor(recording.windows(ends[block], base.H), dtype=torch.float32)
         return Seen(*(each.double().numpy() for each in features(window, model.eval()(window))))
 
     return LayerDrive(see, recording, ends, np.searchsorted(ends, base.starts(recording)))
@@ -121,7 +120,7 @@ def _path_error(
     (layer, _, known), steps, starts = left_out, base.path_steps, base.starts(recording)
     if len(starts) == 0:
         return np.empty(0)
-    rows = recording.rows(starts[:, None] + np.arange(1 - base.H, steps + 1))
+    rows = recording.windows(starts, base.H, steps)
     rolled, mean_error = rows.copy(), None
     for k in range(steps):
         window = torch.tensor(rolled[:, k : k + base.H], dtype=torch.float32)

@@ -259,5 +259,5 @@ def eager_prediction(artifact: Artifact) -> Callable[[], None]:
 def _sample_windows(trained: Trained, count: int = 256) -> Tensor:
     """Windows spread over the training data."""
     ends = trained.recording.window_ends(trained.H, min_speed=trained.vehicle.minimum_speed)
-    chosen = ends[np.linspace(0, len(ends) - 1, count).astype(int), None] + np.arange(1 - trained.H, 1)
-    return torch.tensor(trained.recording.rows(chosen), dtype=torch.float32)
+    chosen = ends[np.linspace(0, len(ends) - 1, count).astype(int)]
+    return torch.tensor(trained.recording.windows(chosen, trained.H), dtype=torch.float32)

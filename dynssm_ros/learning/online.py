@@ -148,7 +148,7 @@ class LayerDrive(NamedTuple):
         """The last rows of some windows, ``(n, 7)``, and the increments to the next, ``(n, 3)`` (m/s, m/s, rad/s)."""
         ends = self.ends[block]
         rows = self.recording.rows(ends)
-        return rows, self.recording.rows(ends + 1)[:, :CHANNELS] - rows[:, :CHANNELS]
+        return rows, self.recording.states(ends + 1) - rows[:, :CHANNELS]
 
     def blocks(self) -> Iterator[tuple[slice, Seen]]:
         """All windows in order, some at a time; an empty block if there are none."""

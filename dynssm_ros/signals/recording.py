@@ -97,12 +97,15 @@ class Recording:
         """Some of the model's input rows, by numbers of any shape ``(...)``: ``(..., 7)``."""
         return np.stack([self.columns[name][at] for name in WINDOW_COLUMNS], axis=-1)
 
+    def states(self, at: slice | Indices) -> Vector:
+        """``v_x, v_y, omega`` of some rows, by numbers of any shape ``(...)``: ``(..., 3)``."""
+        return np.stack([self.columns[name][at] for name in STATE_SIGNALS], axis=-1)
+
     @property
     def fingerprints(self) -> tuple[str, ...]:
         """Of the first rows in every ten seconds, by which the same laps are known again, whole or in part; sorted."""
         first = np.flatnonzero(np.diff(self.time // _FINGERPRINT_NS, prepend=-1))
-        motion = np.stack([self.columns[name] for name in STATE_SIGNALS], axis=1)
-        rows = [motion[k : k + _FINGERPRINT_ROWS].tobytes() for k in first]
+        rows = [self.states(slice(k, k + _FINGERPRINT_ROWS)).tobytes() for k in first.tolist()]
         return tuple(sorted({hashlib.sha256(row).hexdigest()[:8] for row in rows}))
 
     def window_ends(self, H: int, horizon: int = 1, min_speed: float = -np.inf) -> Indices:
@@ -118,6 +121,10 @@ class Recording:
         usable = (self.segment[first] == self.segment[last]) & (slow[last + 1] == slow[first])
         selected: Indices = rows[usable]
         return selected
+
+    def windows(self, ends: Indices, H: int, horizon: int = 0) -> Vector:
+        """The model's input rows ``t-H+1 .. t+horizon`` around each ``t`` of ``ends``, ``(n, H + horizon, 7)``."""
+        return self.rows(ends[:, None] + np.arange(1 - H, horizon + 1))
 
     def select(self, rows: slice | npt.NDArray[np.bool_] | Indices) -> Recording:
         """The given rows, as a view where they are a slice; a segment that the selection cuts apart becomes several."""

@@ -272,3 +272,12 @@ def test_recordings_that_do_not_match_are_not_joined(update: dict[str, Any], exp
 def test_nothing_cannot_be_joined() -> None:
     with pytest.raises(RecordingError, match="no recording given"):
         concatenate([])
+
+
+def test_windows_are_the_rows_up_to_each_end_and_over_the_horizon() -> None:
+    r = recording([0] * 20)
+    ends = r.window_ends(4, horizon=3)
+    found = r.windows(ends, 4, 3)
+    assert found.shape == (14, 7, 7)
+    np.testing.assert_array_equal(found[5], r.matrix[ends[5] - 3 : ends[5] + 4])
+    np.testing.assert_array_equal(r.windows(ends, 4)[:, -1, :3], r.states(ends))
