@@ -28,25 +28,9 @@ def silent(predictions: int) -> None:
     """The :data:`Tick` that tells nobody."""
 
 
-def gather(matrix: Vector, rows: Indices, before: int, after: int = 0) -> Vector:
-    """Copies the stretch ``t - before .. t + after`` around each row ``t``.
-
-    Args:
-        matrix: rows of a recording, shape ``(N, C)``.
-        rows: ``t`` of each stretch, shape ``(M,)``.
-        before: number of earlier rows.
-        after: number of later rows.
-
-    Returns:
-        Shape ``(M, before + 1 + after, C)``.
-    """
-    stretches: Vector = matrix[rows[:, None] + np.arange(-before, after + 1)]
-    return stretches
-
-
 def predict_rows(
     model: WindowModel,
-    matrix: Vector,
+    recording: Recording,
     rows: Indices,
     batch: int = BATCH,
     tick: Tick = silent,
@@ -56,7 +40,7 @@ def predict_rows(
 
     Args:
         model: reads windows of ``model.H`` rows.
-        matrix: the recording's model inputs, shape ``(N, 7)``.
+        recording: measured rows.
         rows: last row of each window, shape ``(M,)``.
         batch: windows per call.
         tick: told of progress.
@@ -64,7 +48,7 @@ def predict_rows(
     """
     for start in range(0, len(rows), batch):
         chunk = rows[start : start + batch]
-        windows = gather(matrix, chunk, model.H - 1)
+        windows = recording.windows(chunk, model.H)
         predicted = model.predict(windows)
         if model.online is not None and drive is not None:
             predicted = corrected(predicted, windows, model.online, drive.at(chunk))

@@ -246,15 +246,14 @@ class _On:
     def score(self, model: WindowModel, tick: Tick = lambda predictions: None) -> Score:
         """What a model is worth, but for the time that it takes."""
         recording, rows, batch = self.recording, self.rows, self.batch
-        matrix, T_s = recording.matrix, recording.T_s
         measured = recording.states(rows + 1)
         with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
             predicted, rollouts, knowledge = _OneStep(model.vehicle, measured, _coefficients_every(rows)), [], []
             for drive, (ends, starts, drawn) in drive_through(model, recording, (rows, self.starts, self.drawn), batch):
-                for prediction in predict_rows(model, matrix, ends, batch, tick, drive):
+                for prediction in predict_rows(model, recording, ends, batch, tick, drive):
                     predicted.add(prediction)
                 if len(starts):
-                    rollouts.append(score_rollouts(model, matrix, starts, self.steps, T_s, batch, tick, drive))
+                    rollouts.append(score_rollouts(model, recording, starts, self.steps, batch, tick, drive))
                 if drive is not None:
                     knowledge.append(drive.at(drawn))
             errors = predicted.state - measured

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.evaluation.metrics import BATCH, DriveThrough, Tick, gather, silent
+from dynssm_ros.evaluation.metrics import BATCH, DriveThrough, Tick, silent
 from dynssm_ros.runtime.models import WindowModel, corrected
 from dynssm_ros.runtime.online import Learned
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle.kinematics import path
 
 
@@ -90,25 +91,24 @@ def roll_out(model: WindowModel, stretches: Vector, steps: int, learned: Learned
 
 
 def branches(
-    model: WindowModel, matrix: Vector, starts: Indices, steps: int, T_s: float, learned: Learned | None = None
+    model: WindowModel, recording: Recording, starts: Indices, steps: int, learned: Learned | None = None
 ) -> Vector:
     """Predicted paths that leave the measured one, each at its start.
 
     Args:
         model: reads windows of ``model.H`` rows.
-        matrix: the recording's model inputs, shape ``(N, 7)``, without a gap between the first start and the last end.
+        recording: measured rows, without a gap between the first start and the last end.
         starts: last measured row of each branch, ascending, shape ``(M,)``.
         steps: length of a branch.
-        T_s: sampling time (s).
         learned: what the model's online layer had learned at ``starts``.
 
     Returns:
         Positions ``x, y`` (m) from the start of each branch to its end, shape ``(M, steps + 1, 2)``, in the frame of
         :func:`path` for the measured velocities from ``starts[0]`` on.
     """
-    predicted = roll_out(model, gather(matrix, starts, model.H - 1, steps), steps, learned)
+    predicted = roll_out(model, recording.windows(starts, model.H, steps), steps, learned)
     driven = (
-        path(np.concatenate([matrix[starts[0] : start + 1, :3], states]), T_s)
+        path(np.concatenate([recording.states(slice(starts[0], start + 1)), states]), recording.T_s)
         for start, states in zip(starts, predicted, strict=True)
     )
     return np.stack([np.concatenate([np.zeros((1, 2)), positions])[-steps - 1 :] for positions in driven])
@@ -116,10 +116,9 @@ def branches(
 
 def score_rollouts(
     model: WindowModel,
-    matrix: Vector,
+    recording: Recording,
     starts: Indices,
     steps: int,
-    T_s: float,
     batch: int = BATCH,
     tick: Tick = silent,
     drive: DriveThrough | None = None,
@@ -128,18 +127,17 @@ def score_rollouts(
 
     Args:
         model: the model to score.
-        matrix: the recording's model inputs, shape ``(N, 7)``.
+        recording: measured rows.
         starts: last measured row of each rollout, shape ``(M,)``, ``M > 0``.
         steps: length of the horizon.
-        T_s: sampling time (s).
         batch: rollouts that run side by side.
         tick: told of progress.
         drive: what the model's online layer knew along these rows.
     """
-    squares, distances = np.zeros((steps, 3)), np.zeros(steps)
+    squares, distances, T_s = np.zeros((steps, 3)), np.zeros(steps), recording.T_s
     for begin in range(0, len(starts), batch):
         chunk = starts[begin : begin + batch]
-        stretches = gather(matrix, chunk, model.H - 1, steps)
+        stretches = recording.windows(chunk, model.H, steps)
         known = None if drive is None else drive.at(chunk)
         measured = stretches[:, model.H - 1 :, :3]
         predicted = np.concatenate([measured[:, :1], roll_out(model, stretches, steps, known)], axis=1)

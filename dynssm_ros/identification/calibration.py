@@ -43,7 +43,6 @@ _SEARCH_PRIOR, _POLISHED = 0.1, 3  # weight of what is known before, at first; r
 _INSIDE = 1e-6  # of the range, that a starting point keeps from its bounds
 _WEIGHT_SHOWN = 0.25  # least weight of a coefficient in a direction that the data do not determine
 _ON_BOUND = 1e-6  # of the range in units of a fit
-_AT_ONCE = 16384  # rows whose errors are computed together
 
 
 @dataclass(frozen=True)
@@ -150,8 +149,7 @@ def calibrate(
 
 def _rmse(one_step: SimulationWindows, car: CarEstimate) -> Vector:
     """RMSE of each state over all rows, ``(3,)``, some at a time: a long recording has many."""
-    blocks = (one_step.select(slice(k, k + _AT_ONCE)) for k in range(0, len(one_step), _AT_ONCE))
-    squares = sum(np.sum(block.errors(car)[:, 0] ** 2, axis=0) for block in blocks)
+    squares = sum(np.sum(one_step.select(block).errors(car)[:, 0] ** 2, axis=0) for block in one_step.blocks())
     rmse: Vector = np.sqrt(squares / len(one_step))
     return rmse
 

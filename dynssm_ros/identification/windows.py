@@ -105,6 +105,10 @@ class SimulationWindows:
         """Some of the simulations."""
         return replace(self, starts=self.starts[chosen])
 
+    def blocks(self) -> list[slice]:
+        """All of them, so many at a time as are stepped together."""
+        return [slice(first, first + _AT_ONCE) for first in range(0, len(self), _AT_ONCE)]
+
     def with_integrator(self, integrator: Integrator, vehicle: Vehicle) -> SimulationWindows:
         """The same simulations in Euler steps of the sampling time, or in Runge-Kutta steps that are short enough.
 
@@ -153,8 +157,7 @@ class SimulationWindows:
             context: values that replace signals of the recording, the same in all rows.
         """
         out = np.empty((len(cars), len(self), self.steps // self.every, 3))
-        for first in range(0, len(self), _AT_ONCE):
-            block = slice(first, first + _AT_ONCE)
+        for block in self.blocks():
             self.select(block)._simulate(cars, context, out[:, block])
         limit = _WILD * self.spread
         out -= self.target

@@ -288,8 +288,7 @@ def _sections(evaluation: Evaluation) -> Iterator[Section]:
 
 def _trajectory_section(evaluation: Evaluation) -> Section:
     """Rollouts one after the other over the liveliest stretch, each from the measured state."""
-    steps, T_s, matrix = evaluation.steps, evaluation.recording.T_s, evaluation.recording.matrix
-    starts = evaluation.drawn
+    recording, steps, starts = evaluation.recording, evaluation.steps, evaluation.drawn
     driven = slice(starts[0], starts[-1] + steps + 1)
     return Section(
         "Trajectories",
@@ -297,10 +296,10 @@ def _trajectory_section(evaluation: Evaluation) -> Section:
         "a rollout leaves the measured path (dots) and runs on its own. The plan shows the shape, enlarged; the curves "
         f"at the right are true to scale. {_CUT}",
         track_figures.trajectories(
-            (evaluation.recording.time[driven] - evaluation.recording.time[0]) / 1e9,
-            np.concatenate([np.zeros((1, 2)), path(matrix[driven, :3], T_s)]),
+            (recording.time[driven] - recording.time[0]) / 1e9,
+            np.concatenate([np.zeros((1, 2)), path(recording.states(driven), recording.T_s)]),
             {
-                name: branches(group.first.model, matrix, starts, steps, T_s, group.first.known)
+                name: branches(group.first.model, recording, starts, steps, group.first.known)
                 for name, group in evaluation.groups.items()
             },
         ),

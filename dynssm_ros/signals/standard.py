@@ -19,7 +19,7 @@ from dynssm_ros.signals.messages import (
     odometry,
 )
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS
+from dynssm_ros.signals.signal_map import POSE_SIGNALS
 
 _ORDER = 1000  # ns between the log times of the messages of one instant: actuators first, odometry last
 
@@ -67,9 +67,10 @@ def recording_to_bag(recording: Recording, path: str | Path) -> None:
         if recording.has_pose
         else np.zeros((len(recording), 3))
     )
-    state = np.stack([recording[name] for name in STATE_SIGNALS], axis=1)
     has_commands = recording.info.commands == "topics"
-    write_standard_bag(path, recording.time, state, pose, feedback, command if has_commands else None)
+    write_standard_bag(
+        path, recording.time, recording.states(slice(None)), pose, feedback, command if has_commands else None
+    )
 
 
 def _actuators(stamp: int, values: Vector) -> object:

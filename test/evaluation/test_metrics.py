@@ -28,26 +28,21 @@ class Average:
         return WindowPrediction(windows[:, :, :3].mean(axis=1), windows[:, -1, :1] * np.ones(17), None)
 
 
-def test_gather_returns_the_rows_around_each_row():
-    matrix = np.arange(20.0).reshape(10, 2)
-    stretches = metrics.gather(matrix, np.array([2, 5]), before=2, after=1)
-    np.testing.assert_array_equal(stretches[0], matrix[0:4])
-    np.testing.assert_array_equal(stretches[1], matrix[3:7])
-
-
-def test_batches_predict_the_same_as_one_go(rng):
+def test_batches_predict_the_same_as_one_go(rng, recorded):
     matrix, rows = rng.normal(size=(101, 7)), np.arange(3, 100)
-    (whole,) = metrics.predict_rows(Average(), matrix, rows, batch=1000)
-    batched = list(metrics.predict_rows(Average(), matrix, rows, batch=8))
+    (whole,) = metrics.predict_rows(Average(), recorded(matrix), rows, batch=1000)
+    batched = list(metrics.predict_rows(Average(), recorded(matrix), rows, batch=8))
     np.testing.assert_array_equal(whole.state, np.concatenate([each.state for each in batched]))
     np.testing.assert_array_equal(whole.theta, np.concatenate([each.theta for each in batched]))
     np.testing.assert_allclose(whole.state[10], matrix[10:14, :3].mean(axis=0))
     assert all(each.physics is None for each in batched)
 
 
-def test_windows_exist_for_one_batch_only(rng):
+def test_windows_exist_for_one_batch_only(rng, recorded):
     model, done = Average(), []
-    predictions = metrics.predict_rows(model, rng.normal(size=(101, 7)), np.arange(3, 100), batch=40, tick=done.append)
+    predictions = metrics.predict_rows(
+        model, recorded(rng.normal(size=(101, 7))), np.arange(3, 100), batch=40, tick=done.append
+    )
     next(predictions)
     assert model.shapes == [(40, 4, 7)]
     assert [len(each.state) for each in predictions] == [40, 17]
@@ -61,9 +56,9 @@ def test_rmse_and_largest_error_of_planted_errors():
     np.testing.assert_array_equal(metrics.max_error(errors), [4.0, 0.0, 1.0])
 
 
-def test_rmse_of_persistence_is_the_rms_of_the_increments(rng):
+def test_rmse_of_persistence_is_the_rms_of_the_increments(rng, recorded):
     matrix, rows = rng.normal(size=(50, 7)), np.arange(49)
-    (predicted,) = metrics.predict_rows(Persistence(), matrix, rows)
+    (predicted,) = metrics.predict_rows(Persistence(), recorded(matrix), rows)
     increments = np.diff(matrix[:, :3], axis=0)
     np.testing.assert_allclose(metrics.rmse(predicted.state - matrix[1:, :3]), np.sqrt(np.mean(increments**2, axis=0)))
 

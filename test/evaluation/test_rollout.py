@@ -44,8 +44,8 @@ class Truth:
         return WindowPrediction(next_state(windows[:, -1]) + self.bias, None, None)
 
 
-def test_perfect_model_has_no_error_at_any_step(planted):
-    scored = score_rollouts(Truth(), planted, np.arange(2, 100), 15, T_s)
+def test_perfect_model_has_no_error_at_any_step(planted, recorded):
+    scored = score_rollouts(Truth(), recorded(planted), np.arange(2, 100), 15)
     np.testing.assert_array_equal(scored.rmse, 0.0)
     assert scored.ade == scored.fde == 0.0
     assert scored.time[-1] == pytest.approx(0.6)
@@ -67,40 +67,40 @@ def test_longer_stretches_serve_models_with_shorter_windows(planted):
     np.testing.assert_array_equal(roll_out(Truth(H=15), stretches, 5), roll_out(Truth(H=1), stretches, 5))
 
 
-def test_batches_score_the_same_as_one_go(planted):
+def test_batches_score_the_same_as_one_go(planted, recorded):
     starts = np.arange(2, 100)
-    whole = score_rollouts(Truth(bias=0.1), planted, starts, 10, T_s)
-    batched = score_rollouts(Truth(bias=0.1), planted, starts, 10, T_s, batch=7)
+    whole = score_rollouts(Truth(bias=0.1), recorded(planted), starts, 10)
+    batched = score_rollouts(Truth(bias=0.1), recorded(planted), starts, 10, batch=7)
     np.testing.assert_allclose(whole.rmse, batched.rmse, rtol=1e-12)
     np.testing.assert_allclose(whole.displacement, batched.displacement, rtol=1e-12)
     assert whole.starts == batched.starts == len(starts)
 
 
-def test_persistence_under_constant_acceleration_errs_by_half_a_t_squared():
+def test_persistence_under_constant_acceleration_errs_by_half_a_t_squared(recorded):
     a, n = 4.0, 15
     matrix = np.zeros((60, 7))
     matrix[:, 0] = 10.0 + a * T_s * np.arange(60)
-    scored = score_rollouts(Persistence(), matrix, np.arange(40), n, T_s)
+    scored = score_rollouts(Persistence(), recorded(matrix), np.arange(40), n)
     np.testing.assert_allclose(scored.rmse[:, 0], a * scored.time, rtol=1e-12)
     np.testing.assert_allclose(scored.displacement, a * scored.time**2 / 2, rtol=1e-12)
     assert scored.fde == pytest.approx(a * 0.6**2 / 2)
     assert scored.ade == pytest.approx(np.mean(a * scored.time**2 / 2))
 
 
-def test_branches_of_a_perfect_model_lie_on_the_measured_path(planted):
+def test_branches_of_a_perfect_model_lie_on_the_measured_path(planted, recorded):
     starts, steps = np.array([20, 30, 45]), 10
     driven = np.concatenate([np.zeros((1, 2)), path(planted[20:56, :3], T_s)])
-    for start, branch in zip(starts, branches(Truth(), planted, starts, steps, T_s), strict=True):
+    for start, branch in zip(starts, branches(Truth(), recorded(planted), starts, steps), strict=True):
         np.testing.assert_allclose(branch, driven[start - 20 : start - 20 + steps + 1], atol=1e-12)
 
 
-def test_branches_leave_the_measured_path_by_the_error_of_the_rollout(planted):
+def test_branches_leave_the_measured_path_by_the_error_of_the_rollout(planted, recorded):
     starts, steps = np.arange(5, 65, 10), 10
     model = Truth(bias=0.1)
     driven = np.concatenate([np.zeros((1, 2)), path(planted[5:66, :3], T_s)])
-    apart = branches(model, planted, starts, steps, T_s) - driven[(starts - 5)[:, None] + np.arange(steps + 1)]
+    apart = branches(model, recorded(planted), starts, steps) - driven[(starts - 5)[:, None] + np.arange(steps + 1)]
     np.testing.assert_allclose(apart[:, 0], 0.0, atol=1e-12)
-    scored = score_rollouts(model, planted, starts, steps, T_s)
+    scored = score_rollouts(model, recorded(planted), starts, steps)
     np.testing.assert_allclose(np.linalg.norm(apart[:, 1:], axis=2).mean(axis=0), scored.displacement, rtol=1e-9)
 
 

@@ -160,7 +160,7 @@ def test_live_predictions_are_those_of_the_evaluation(noisy_laps, noisy_model):
     found = feed(predictor, part, rows)
     ((drive, (shared,)),) = drive_through(noisy_model, part, [np.array(sorted(found))])
     assert len(shared) > 300
-    (batch,) = predict_rows(noisy_model, part.matrix, shared, drive=drive)
+    (batch,) = predict_rows(noisy_model, part, shared, drive=drive)
     np.testing.assert_allclose([found[k].state for k in shared], batch.state, atol=1e-5)
     np.testing.assert_allclose([found[k].variance for k in shared], batch.variance, rtol=1e-3)
 

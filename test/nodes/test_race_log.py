@@ -14,7 +14,7 @@ from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.signals.signal_map import STATE_SIGNALS, load_signal_map
+from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.signals.standard import recording_to_bag
 from dynssm_ros.vehicle import load_vehicle
 
@@ -49,7 +49,7 @@ def test_every_odometry_message_after_the_first_window_gets_a_prediction(
     # and they are predictions of this car: two epochs do not beat persistence everywhere, but they are as close
     rows = {int(t): k for k, t in enumerate(driving.time)}
     stamps = [s for s in run.predicted if s in rows and s - run.T_s in rows]
-    states = np.stack([driving[name] for name in STATE_SIGNALS], axis=1)
+    states = driving.states(slice(None))
     predicted = np.array([run.predicted[s] for s in stamps])
     measured = states[[rows[s] for s in stamps]]
     before = states[[rows[s - run.T_s] for s in stamps]]
