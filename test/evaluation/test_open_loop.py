@@ -11,29 +11,15 @@ from dynssm_ros.errors import ArtifactError, RecordingError
 from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
 from dynssm_ros.runtime.models import Persistence, SingleTrack, WindowPrediction
 from dynssm_ros.signals.extraction import extract
-from dynssm_ros.signals.inputs import WINDOW_COLUMNS
-from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import load_vehicle
 
-T_s = 0.04
-
-
-def make_recording(states, segment=None, commands="none"):
-    """A recording of the given states with zero inputs."""
-    N = len(states)
-    columns = {name: np.zeros(N) for name in WINDOW_COLUMNS}
-    columns |= {name: states[:, k].copy() for k, name in enumerate(("v_x", "v_y", "omega"))}
-    info = RecordingInfo(sampling_time=T_s, commands=commands, source=("planted",))
-    time = (np.arange(N) * T_s * 1e9).astype(np.int64)
-    return Recording(info, time, np.zeros(N, np.int32) if segment is None else segment, columns)
-
 
 @pytest.fixture
-def recording():
+def recording(recorded):
     rng = np.random.default_rng(5)
     walk = np.cumsum(rng.normal(size=(300, 3)) * [0.05, 0.01, 0.002], axis=0)
-    return make_recording(walk + np.array([20.0, 0.0, 0.1]))
+    return recorded(walk + np.array([20.0, 0.0, 0.1]))
 
 
 class Model:
@@ -87,11 +73,11 @@ def test_persistence_scores_the_rms_of_the_increments_of_exactly_these_rows(reco
     np.testing.assert_allclose(result.scores["persistence"].explained, 0.0, atol=1e-12)
 
 
-def test_slow_stretches_and_gaps_are_never_part_of_a_window_or_a_horizon():
+def test_slow_stretches_and_gaps_are_never_part_of_a_window_or_a_horizon(recorded):
     states = np.full((200, 3), 20.0)
     states[90] = 1.0
     segment = np.repeat([0, 1], [150, 50]).astype(np.int32)
-    result = evaluate(make_recording(states, segment), {"m": Model(H=5)}, min_speed=5.0, calls=3)
+    result = evaluate(recorded(states, segment), {"m": Model(H=5)}, min_speed=5.0, calls=3)
     for t in result.rows:
         touched = set(range(t - 4, t + 2))
         assert 90 not in touched
@@ -150,7 +136,7 @@ def test_coverage_uses_the_model_s_own_variances(recording):
     np.testing.assert_allclose(honest.coverage_90, 0.9, atol=3 * np.sqrt(0.09 / len(increments)))
 
 
-def test_coverage_uses_the_variance_of_each_prediction():
+def test_coverage_uses_the_variance_of_each_prediction(recorded):
     class Knowing(Model):
         """Reads from the throttle how large the coming step is."""
 
@@ -159,7 +145,7 @@ def test_coverage_uses_the_variance_of_each_prediction():
 
     rng, N = np.random.default_rng(3), 4000
     size = np.where(np.arange(N) % 2 == 0, 1.0, 0.1)
-    restless = make_recording(np.cumsum(rng.normal(size=(N, 3)) * np.roll(size, 1)[:, None], axis=0))
+    restless = recorded(np.cumsum(rng.normal(size=(N, 3)) * np.roll(size, 1)[:, None], axis=0))
     restless.columns["r_fb"][:] = size
     models = {"knowing": Knowing(), "constant": Model(variance=np.full(3, np.mean(size**2)))}
     scores = evaluate(restless, models, min_speed=-np.inf, calls=3).scores
