@@ -34,7 +34,7 @@ HIDES = (
 )  # fmt: skip
 """Effects that can be hidden in it."""
 _CAR = 2  # BMW 320i
-_FULL_THROTTLE = 6.0  # m/s^2
+_FULL_THROTTLE = 6.0  # m/s^2 of the car as it is
 _AIR = 0.45  # N/(m/s)^2, which the library leaves out
 _DELTA, _V_X, _THETA, _OMEGA, _V_Y, _V_Y_FRONT, _V_Y_REAR = 2, 3, 4, 5, 10, 15, 20  # of the library's states
 _LONGEST_DELAY = 0.5  # s
@@ -66,6 +66,9 @@ class MultiBody:
         self._car = car = setup_vehicle_parameters(_CAR)
         more = car.m * (changed("mass", "factor") - 1.0)
         car.m, car.m_s = car.m + more, car.m_s + more
+        # the library is asked for accelerations; engine and brakes of a heavier car are the same
+        self._full_throttle = _FULL_THROTTLE / changed("mass", "factor")
+        car.longitudinal.a_max /= changed("mass", "factor")
         car.I_z *= changed("yaw_inertia", "factor")
         self._tyres = _gripping(car.tire, changed("grip", "factor"))
         self._on_patch = _gripping(self._tyres, changed("grip_patch", "factor"))
@@ -137,7 +140,7 @@ class MultiBody:
 
     def _rates(self, x: Sequence[float], throttle: float) -> tuple[float, ...]:
         """The library's equations with air and road."""
-        rates = self._rates_of(list(x), [0.0, _FULL_THROTTLE * throttle], self._car)
+        rates = self._rates_of(list(x), [0.0, self._full_throttle * throttle], self._car)
         rates[_V_X] -= self._air * x[_V_X] ** 2 / self._car.m + self._rolling
         for one in (_V_Y, _V_Y_FRONT, _V_Y_REAR):
             rates[one] -= self._aside

@@ -34,6 +34,8 @@ class Outcome:
         alternatives: what is reported as explaining the data as well, by what was named.
         evidence: difference in the information criterion, by what was named.
         std: stated standard deviations of what was named, with its parameters.
+        too_small: effects that were hidden and missed, of which the diagnosis says that they would have to be larger to be
+            named.
     """
 
     case: str
@@ -47,6 +49,13 @@ class Outcome:
     alternatives: dict[str, tuple[str, ...]] = field(default_factory=dict)
     evidence: dict[str, float] = field(default_factory=dict)
     std: Hidden = field(default_factory=dict)
+    too_small: tuple[str, ...] = ()
+
+    @property
+    def missed(self) -> tuple[str, ...]:
+        """Effects that were hidden and neither named nor an alternative to one that was."""
+        reached = {*self.named}.union(*self.alternatives.values())
+        return tuple(name for name in self.hidden if name not in reached)
 
     @property
     def strictly_first(self) -> bool:
@@ -69,13 +78,20 @@ class Outcome:
         return self.all if len(self.hidden) > 1 else self.first
 
 
-def judge(case: Case, causes: Sequence[Cause]) -> Outcome:
-    """Compares what was found with what was hidden."""
+def judge(case: Case, causes: Sequence[Cause], noticeable: Mapping[str, float] | None = None) -> Outcome:
+    """Compares what was found with what was hidden.
+
+    Args:
+        case: what was hidden.
+        causes: what was named.
+        noticeable: how far off neutral each effect that is not named would have to be to be named, as the diagnosis says.
+    """
     hidden = set(case.hidden)
     reach = [{cause.effect, *cause.alternatives} for cause in causes]
     first = bool(reach and reach[0] & hidden) if hidden else not causes
     complete = all(any(name in names for names in reach) for name in hidden) if hidden else not causes
     right = [_right_size(cause, case.hidden[cause.effect]) for cause in causes if cause.effect in hidden]
+    least = noticeable or {}
     return Outcome(
         case.name,
         tuple(case.hidden),
@@ -88,6 +104,11 @@ def judge(case: Case, causes: Sequence[Cause]) -> Outcome:
         {cause.effect: tuple(cause.alternatives) for cause in causes},
         {cause.effect: cause.delta_bic for cause in causes},
         {cause.effect: dict(cause.std) for cause in causes},
+        tuple(
+            name
+            for name, values in case.hidden.items()
+            if not any(name in names for names in reach) and EFFECTS[name].amount(values) < least.get(name, 0.0)
+        ),
     )
 
 
@@ -117,6 +138,7 @@ def rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "both_found": _share([o.all for o in two]),
         "false_alarms": _share([not o.first for o in none]),
         "more_named": _share([len(o.named) > 1 for o in one]),
+        "too_small": _share([name in o.too_small for o in outcomes for name in o.missed]),
     }
 
 

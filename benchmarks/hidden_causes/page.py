@@ -22,6 +22,7 @@ _IN_WORDS = {
     "both_found": "both effects of a pair are found",
     "false_alarms": "something is named where nothing is hidden",
     "more_named": "more is named than the one effect that is hidden",
+    "too_small": "what is missed is smaller than what the diagnosis says that it would name there",
 }
 _PLANTS = {
     "rk4": "one track, steps of 1 ms", "double_track": "four wheels", foreign.NAME: "another make",

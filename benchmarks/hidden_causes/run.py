@@ -21,7 +21,8 @@ def run_case(case: Case, folder: Path) -> None:
     try:
         if not laps.exists():
             drive(case).save(laps)
-        outcome = judge(case, diagnose(Recording.load(laps), vehicle_file(case), line=case.road.centre).causes)
+        found = diagnose(Recording.load(laps), vehicle_file(case), line=case.road.centre)
+        outcome = judge(case, found.causes, found.minimum_detectable)
     except SimulationError:
         outcome = None
     write_json(outcome_file(case, folder), {"outcome": None if outcome is None else asdict(outcome)})
@@ -44,6 +45,6 @@ def _name(case: Case) -> str:
 
 
 def _outcome(content: dict[str, Any]) -> Outcome:
-    lists = {key: tuple(content[key]) for key in ("hidden", "named")}
+    lists = {key: tuple(content[key]) for key in ("hidden", "named", "too_small")}
     alternatives = {name: tuple(others) for name, others in content["alternatives"].items()}
     return Outcome(**content | lists | {"alternatives": alternatives})

@@ -23,6 +23,7 @@ from dynssm_ros.vehicle.effects import EFFECTS
 
 _KNOWN = 2.0  # standard errors that the nominal values must be spared, where left-out units tell nothing
 _ROUNDS = 4  # of linearising anew, from the fit of all
+_HARDLY = 3.0  # logarithm of a likelihood ratio that is no strong evidence yet (Kass and Raftery 1995)
 
 
 class _Predicted(NamedTuple):
@@ -76,8 +77,8 @@ class Confirmation:
 
     @property
     def alike(self) -> bool:
-        """Whether the two cannot be told apart: the gain is within its standard error."""
-        return self.total < self.std
+        """Whether the two cannot be told apart: the gain is within its standard error, or too little to tell anything."""
+        return self.total < max(self.std, _HARDLY)
 
 
 class LeaveOneOut:

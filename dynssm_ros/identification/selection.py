@@ -79,6 +79,11 @@ class Refined:
         return bool(self.candidate.only_in) or not about.DIRECTIONS or float(side) in about.DIRECTIONS
 
     @property
+    def strangeness(self) -> tuple[bool, bool, bool]:
+        """Whether it is at a bound, is of single recordings, is on the side on which no car has it: in that order."""
+        return bool(self.bounded), bool(self.candidate.only_in), not self.is_met
+
+    @property
     def gain(self) -> float:
         """Logarithm of the predictive likelihood that it gains, nothing where it is not confirmed."""
         return self.confirmation.total if self.confirmation is not None and self.confirmation.holds else 0.0
@@ -230,6 +235,7 @@ class Search:
             chosen.append(best.candidate)
             self._exchange(chosen)
             self._temper(tuple(chosen))
+        self._prefer_ordinary(chosen)
         return self.eliminated(tuple(chosen))
 
     def reject(self, effect: str) -> Selection:
@@ -306,7 +312,7 @@ class Search:
         """
         found = sorted(self._confirmed(before), key=lambda r: -r.gain)
         alike = [r for r in found if r is found[0] or self._left_out.compare(r.fit, found[0].fit).alike]
-        return min(alike, key=lambda r: (bool(r.bounded), bool(r.candidate.only_in), not r.is_met), default=None)
+        return min(alike, key=lambda r: r.strangeness, default=None)
 
     def _taken_over(self, start: Fit | None) -> list[Candidate]:
         """The candidates of another problem's fit, fitted here."""
@@ -401,6 +407,15 @@ class Search:
                 if here is None or ranked[0].delta_bic > here.delta_bic + AMBIGUITY_DELTA_BIC:
                     chosen[:] = [*rest, ranked[0].candidate]
                     return
+
+    def _prefer_ordinary(self, chosen: list[Candidate]) -> None:
+        """Replaces what is strange by what cannot be told from it beside the others and is less so."""
+        for k, one in enumerate(chosen):
+            rest, all_of_them = (*chosen[:k], *chosen[k + 1 :]), tuple(chosen)
+            here = self._confirm(self._without(all_of_them, one), self._against(all_of_them, one))
+            best = self._best(rest) if any(here.strangeness) else None
+            if best is not None and best.strangeness < here.strangeness:
+                chosen[k] = best.candidate
 
     def _alternatives(self, chosen: tuple[Candidate, ...], one: Candidate) -> list[str]:
         rest = tuple(c for c in chosen if c != one)

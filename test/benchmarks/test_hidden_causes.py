@@ -119,6 +119,16 @@ def test_an_alternative_does_not_count_strictly() -> None:
     assert {tuple(one.hidden) for one in cases(0, 26, healthy=True)} == {()}
 
 
+def test_what_is_missed_may_be_smaller_than_what_would_be_named() -> None:
+    case = Case({"mass": {"factor": 1.2}, "drag": {"coefficient": 0.4}}, 0)
+    assert judge(case, [cause("drag", {"coefficient": 0.4})], {"mass": 0.25}).too_small == ("mass",)
+    assert judge(case, [cause("drag", {"coefficient": 0.4})], {"mass": 0.15}).too_small == ()
+    assert judge(case, [cause("drag", {"coefficient": 0.4}, "mass")], {"mass": 0.25}).too_small == ()
+    found = judge(case, [], {"mass": 0.25, "drag": 0.1})
+    assert (found.missed, found.too_small) == (("mass", "drag"), ("mass",))
+    assert rates([found])["too_small"]["count"] == 1
+
+
 def test_none_and_two_are_judged_by_all_that_is_named() -> None:
     assert judge(Case({}, 0), []).first
     assert not judge(Case({}, 0), [cause("mass", {"factor": 1.1})]).first
@@ -146,6 +156,7 @@ def test_rates_and_confusion_count_what_happened() -> None:
         "false_alarms": (1, 1.0),
         "right_size": (2, 0.5),
         "more_named": (2, 0.0),
+        "too_small": (1, 0.0),
     }
     # Wilson 1927: (p + z^2 / 2n +- z sqrt(p q / n + z^2 / 4n^2)) / (1 + z^2 / n)
     n, z = 2, 1.959964

@@ -40,6 +40,18 @@ def test_it_coasts_against_the_air_alone() -> None:
     assert rolling == pytest.approx(-0.04 * GRAVITY, rel=0.06)  # wheels that spin are heavier
 
 
+@pytest.mark.parametrize("throttle", [0.2, 1.0, -0.3])
+def test_a_heavier_car_has_the_same_engine_and_brakes(throttle: float) -> None:
+    def gained(**hidden: dict[str, float]) -> float:
+        car = driven(0, **hidden)
+        car.advance(Applied(throttle, 0.0))
+        before = car.state.v_x
+        car.advance(Applied(throttle, 0.0))
+        return car.state.v_x - before
+
+    assert gained(mass={"factor": 1.25}) == pytest.approx(gained() / 1.25, rel=0.02)
+
+
 def test_in_a_bend_it_turns_as_its_wheels_point() -> None:
     turning = driven(steering=0.02).state.omega
     assert 0.5 < turning / (SPEED * 0.02 / (CAR.constants.l_f + CAR.constants.l_r)) < 1.1

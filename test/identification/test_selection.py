@@ -110,6 +110,35 @@ def test_what_was_known_decides_where_left_out_parts_tell_nothing() -> None:
     assert not replace(level, gain=np.array([-1.0, -1.0, -0.5, -0.5])).holds
 
 
+def test_a_gain_that_is_hardly_evidence_tells_nothing_apart() -> None:
+    little = Confirmation(np.array([0.5, 0.4, 0.6, 0.5]), 0.1, 0.5, np.zeros(3))
+    assert little.alike
+    assert not replace(little, known=1.5).alike
+    assert replace(little, known=1.5, std=4.0).alike
+
+
+def test_what_no_car_has_gives_way_to_what_cannot_be_told_from_it() -> None:
+    """Without downforce, tyres that gain less force than load are like a centre of gravity that is lower than measured."""
+    av21 = load_vehicle("av21")
+    car = av21.with_effect("load_sensitivity", {"exponent": 0.5})
+    run = simulate(car, load_track("road_course"), duration=60.0, plant="rk4", noise=(0.005, 0.005, 0.001))
+    recording = as_recording(run)
+    data = recorded_rows(recording, recording_context(recording))
+    given = fit_windows(recording, data, 0.5, 0.0).with_integrator("rk4", av21)
+    known = CarEstimate.of(av21.with_nominal(av21.nominal, 0.001 * (av21.upper - av21.lower)))
+    lower, sensitive = Candidate("load_transfer", ("height",)), Candidate("load_sensitivity", ("exponent",))
+    searching = Search(IdentificationProblem(given, known), known, [lower, sensitive], quarters(given))
+    strange = searching.eliminated((next(r.candidate for r in searching.ranked(()) if r.candidate == lower),))
+    assert [one.is_met for one in strange.chosen] == [False]
+    assert strange.alternatives == {"load_transfer": ["load_sensitivity"]}
+    found = searching.run()
+    assert [one.candidate for one in found.chosen] == [sensitive]
+    assert found.alternatives == {"load_sensitivity": ["load_transfer"]}
+    chosen = [lower]
+    searching._prefer_ordinary(chosen)
+    assert chosen == [sensitive]
+
+
 def test_left_out_parts_are_predicted_by_the_others() -> None:
     given = windows(steering_offset={"offset": 0.03}).with_integrator("euler", ORCA)
     problem = IdentificationProblem(given, CarEstimate.of(ORCA))

@@ -155,6 +155,19 @@ def test_load_transfer_of_a_car_without_any_begins_at_the_ground() -> None:
     assert constants.F_z0 - q.F_zf == pytest.approx(0.1 * q.F_rx)
 
 
+def test_load_sensitivity_leaves_the_axles_as_they_are_at_rest() -> None:
+    effects = (build_effect("load_sensitivity", {"exponent": 0.7}),)
+    flat = CONSTANTS.model_copy(update={"h_cg": 0.0, "F_z0": CONSTANTS.m * GRAVITY / 2})
+    state, applied = State(30.0, 0.5, 0.2), Applied(0.5, 0.03)
+    plain, sensitive = (motion(np, state, applied, THETA, flat, these) for these in ((), effects))
+    assert (sensitive.F_fy, sensitive.F_ry) == pytest.approx((plain.F_fy, plain.F_ry), rel=1e-12)
+    high = flat.model_copy(update={"h_cg": 0.3})
+    plain, sensitive = (motion(np, state, applied, THETA, high, these) for these in ((), effects))
+    rest = flat.m * GRAVITY * flat.l_r / (flat.l_f + flat.l_r)
+    assert plain.F_zf < 0.99 * rest
+    assert sensitive.F_fy / plain.F_fy == pytest.approx((plain.F_zf / rest) ** -0.3, rel=1e-12)
+
+
 def test_load_sensitivity_of_a_car_without_load_transfer_is_one_clear_line() -> None:
     expected = "effect load_sensitivity cannot act: load_transfer false; expected axle loads that change"
     with pytest.raises(ConfigurationError, match=expected):

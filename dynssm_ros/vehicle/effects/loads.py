@@ -37,7 +37,10 @@ class Downforce(Effect):
 
 @dataclass(frozen=True)
 class LoadSensitivity(Effect):
-    """``F_y (F_z / F_z0)^(exponent - 1)``: with 1 the lateral force is in proportion to the axle load."""
+    """``F_y (F_z / F_z,rest)^(exponent - 1)``: with 1 the lateral force is in proportion to the axle load.
+
+    ``F_z,rest`` is the axle's share of ``2 F_z0`` at rest. There the coefficients hold as they are, whatever the exponent.
+    """
 
     NAME = "load_sensitivity"
     SUMMARY = "The tyres do not gain lateral force in proportion to their load."
@@ -55,8 +58,10 @@ class LoadSensitivity(Effect):
 
     def tyres(self, xp: Any, q: Motion) -> None:
         """Scales the lateral forces."""
-        q.F_fy = q.F_fy * at_least(q.F_zf / q.F_z0, _LEAST_LOAD) ** (self.exponent - 1.0)
-        q.F_ry = q.F_ry * at_least(q.F_zr / q.F_z0, _LEAST_LOAD) ** (self.exponent - 1.0)
+        both, wheelbase = 2.0 * q.F_z0, q.l_f + q.l_r
+        front, rear = both * q.l_r / wheelbase, both * q.l_f / wheelbase
+        q.F_fy = q.F_fy * at_least(q.F_zf / front, _LEAST_LOAD) ** (self.exponent - 1.0)
+        q.F_ry = q.F_ry * at_least(q.F_zr / rear, _LEAST_LOAD) ** (self.exponent - 1.0)
 
 
 @dataclass(frozen=True)
