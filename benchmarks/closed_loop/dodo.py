@@ -3,8 +3,8 @@
 Variables: ``out`` (folder), ``trained`` (folder of the generalisation matrix: models are taken from there, and trained there
 if they are missing), ``page`` (folder of the page and its figure), ``only`` (words that names of cells must begin with,
 separated by commas), ``part`` (``development``, the default, or ``all``: test cells too), ``sets`` (as of the generalisation
-matrix; with ``rivals`` the page is ``closed_loop_rivals.md``). What is done is kept; a kill costs the task under way. The
-tasks ``learn`` and ``learning_page`` run if they are named.
+matrix; with ``rivals`` the page is ``closed_loop_rivals.md``, or ``closed_loop_rivals_orca.md`` with ``only=orca``). What is
+done is kept; a kill costs the task under way. The tasks ``learn`` and ``learning_page`` run if they are named.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ ARGUMENTS = [f"{name}={value}" for name, value in VALUES.items() if value != USU
 # ridge has no physics to plan with
 MODELS = tuple(name for name in models_of(VALUES["sets"].split(",")) if name != "ridge")
 LEARNS = "dynssm"
-PAGE = "closed_loop_rivals" if set(RIVALS) & set(MODELS) else "closed_loop"
+PAGE = "closed_loop"
+if set(RIVALS) & set(MODELS):
+    PAGE = "_".join(["closed_loop_rivals", *filter(None, VALUES["only"].split(","))])
 DOIT_CONFIG = doit_config(OUT / "doit.json") | {"default_tasks": ["page"]}
 CELLS = [
     cell

@@ -17,6 +17,7 @@ from dynssm_ros.reporting.evaluation_figures import model_colours
 
 LEARNING_PAGE = "lap_learning.md"
 _GOAL = 1.015
+_CARS = {"orca": "the 1:43 car", "racer": "the 1:10 car", "av21": "the AV-21"}
 
 Known = Mapping[Cell, Mapping[str, Any]]
 
@@ -110,7 +111,8 @@ def page(known: Known, arguments: Sequence[str], figure: str) -> str:
 
 def _lines(known: Known, arguments: Sequence[str], figure: str) -> Iterator[str]:
     rivals = [name for name in RIVALS if name in next(iter(known.values()))]
-    yield "# Closed loop with rivals" if rivals else "# Closed loop"
+    cars = ", ".join(_CARS[name] for name in dict.fromkeys(cell.car for cell in known))
+    yield f"# Closed loop with rivals: {cars}" if rivals else "# Closed loop"
     yield ""
     command = " ".join(["python -m doit -n 2 -f benchmarks/closed_loop/dodo.py", *arguments])
     tracking, progress = (f"{PACE[objective]:g}" for objective in OBJECTIVES)

@@ -17,6 +17,7 @@ from dynssm_ros.arrays import Vector
 Floats = float | Vector
 
 _NEWTON_STEPS = 12
+_FOUND = 1e-8  # of the length: after so small a step of Newton's the foot is exact
 _BEND_POINTS = 1000
 _SMOOTHED = 0.01  # of the lap: standard deviation
 _SHARPEST = 0.95  # quantile of the curvature
@@ -97,10 +98,11 @@ class ClosedLine:
             slope = np.maximum(square - _dot(away, bend), 0.2 * square)
             move = np.minimum(np.maximum(_dot(away, tangent) / slope, -5 * longest), 5 * longest)
             s = s + move
-            if np.abs(move).max(initial=0.0) < 1e-11 * self.length:
+            if np.abs(move).max(initial=0.0) < _FOUND * self.length:
                 break
-        position, tangent, _ = self._derivatives(s)
-        away = p - position
+        else:
+            position, tangent, _ = self._derivatives(s)
+            away = p - position
         cross = tangent[..., 0] * away[..., 1] - tangent[..., 1] * away[..., 0]
         return np.asarray(s % self.length), np.asarray(cross / np.hypot(tangent[..., 0], tangent[..., 1]))
 
@@ -128,8 +130,8 @@ class ClosedLine:
 
     @cached_property
     def _pieces(self) -> Vector:
-        """Coefficients of the spline's pieces, ``(N, 4, 2)``."""
-        return np.ascontiguousarray(self._spline.c.transpose(1, 0, 2))
+        """Coefficients of the spline's pieces, ``(4, N, 2)``."""
+        return np.ascontiguousarray(self._spline.c)
 
     def _derivatives(self, s: Floats) -> tuple[Vector, Vector, Vector]:
         """Position and its first two derivatives by arc length at ``s`` (m, periodic), each ``(..., 2)``.
@@ -139,7 +141,7 @@ class ClosedLine:
         at = np.asarray(s, dtype=np.float64) % self.length
         knots = self._spline.x
         piece = knots[1:-1].searchsorted(at, "right")
-        a, b, c, d = np.moveaxis(self._pieces[piece], -2, 0)
+        a, b, c, d = self._pieces[:, piece]
         h = (at - knots[piece])[..., None]
         return ((a * h + b) * h + c) * h + d, (3 * a * h + 2 * b) * h + c, 6 * a * h + 2 * b
 
