@@ -156,11 +156,15 @@ def _fitted(X: Vector, y: Vector, order: Sequence[int]) -> Vector:
 
 
 def _library(signals: Vector) -> tuple[list[str], Vector]:
-    """Products of up to :data:`_DEGREE` signals: names, and values ``(M, P)``."""
+    """Products of up to :data:`_DEGREE` signals, time once at most: names, and values ``(M, P)``."""
     from sklearn.preprocessing import PolynomialFeatures
 
     products = PolynomialFeatures(_DEGREE).fit(signals)
-    return list(products.get_feature_names_out(_SIGNALS)), np.asarray(products.transform(signals))
+    steady = (
+        products.powers_[:, _SIGNALS.index("t")] <= 1
+    )  # of what changes over the drive a trend is all that carries over
+    names = products.get_feature_names_out(_SIGNALS)[steady]
+    return list(names), np.asarray(products.transform(signals))[:, steady]
 
 
 def _pursued(X: Vector, y: Vector) -> Vector:

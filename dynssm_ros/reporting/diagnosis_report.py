@@ -109,9 +109,11 @@ def formula_in_words(formula: Formula) -> str:
         for name, c in formula.terms.items()
     )
     parts = int((formula.gain > 0).sum())
+    time = "; t since the start of the recording" if any("t" in name.split() for name in formula.terms) else ""
     return (
-        f"d{formula.channel}/dt may lack{terms} (SI units; throttle and steering as applied): on parts of the drive that "
-        f"were left out that takes {percent(formula.share)} of the squared error, in {parts} of {len(formula.gain)} parts."
+        f"d{formula.channel}/dt may lack{terms} (SI units; throttle and steering as applied{time}): on parts of the drive "
+        f"that were left out that takes {percent(formula.share)} of the squared error, in {parts} of {len(formula.gain)} "
+        "parts."
     )
 
 

@@ -62,3 +62,17 @@ def test_units_of_a_signal_do_not_matter() -> None:
     assert one is not None
     assert other is not None
     assert other.terms["v_x^2 v_y"] == pytest.approx(one.terms["v_x^2 v_y"] * 1e-3, rel=1e-6)
+
+
+def test_of_time_there_is_a_trend_at_most() -> None:
+    data = missing(5)
+    omega, t = data.signals[:, 2], data.signals[:, 5]
+    drifting = data.acceleration.copy()
+    drifting[:, 1] += 0.05 * omega * t
+    found = _formula(data._replace(acceleration=drifting), 1)
+    assert found is not None
+    assert next(iter(found.terms)) == "omega t"
+    assert found.terms["omega t"] == pytest.approx(0.05, rel=0.1)
+    drifting[:, 1] = data.acceleration[:, 1] + 1e-6 * t**3
+    cubic = _formula(data._replace(acceleration=drifting), 1)
+    assert cubic is None or not any("t^" in name for name in cubic.terms)
