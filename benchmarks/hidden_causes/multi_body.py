@@ -64,11 +64,12 @@ class MultiBody:
         self._changed = changed = _Changes(vehicle.effects)
         self._line, self._T_s = line, vehicle.sampling_time
         self._car = car = setup_vehicle_parameters(_CAR)
-        more = car.m * (changed("mass", "factor") - 1.0)
+        heavier = changed("mass", "factor")
+        more = car.m * (heavier - 1.0)
         car.m, car.m_s = car.m + more, car.m_s + more
         # the library is asked for accelerations; engine and brakes of a heavier car are the same
-        self._full_throttle = _FULL_THROTTLE / changed("mass", "factor")
-        car.longitudinal.a_max /= changed("mass", "factor")
+        self._full_throttle = _FULL_THROTTLE / heavier
+        car.longitudinal.a_max /= heavier
         car.I_z *= changed("yaw_inertia", "factor")
         self._tyres = _gripping(car.tire, changed("grip", "factor"))
         self._on_patch = _gripping(self._tyres, changed("grip_patch", "factor"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -91,8 +91,7 @@ def judge(case: Case, causes: Sequence[Cause], noticeable: Mapping[str, float] |
     first = bool(reach and reach[0] & hidden) if hidden else not causes
     complete = all(any(name in names for names in reach) for name in hidden) if hidden else not causes
     right = [_right_size(cause, case.hidden[cause.effect]) for cause in causes if cause.effect in hidden]
-    least = noticeable or {}
-    return Outcome(
+    outcome = Outcome(
         case.name,
         tuple(case.hidden),
         tuple(cause.effect for cause in causes),
@@ -104,12 +103,10 @@ def judge(case: Case, causes: Sequence[Cause], noticeable: Mapping[str, float] |
         {cause.effect: tuple(cause.alternatives) for cause in causes},
         {cause.effect: cause.delta_bic for cause in causes},
         {cause.effect: dict(cause.std) for cause in causes},
-        tuple(
-            name
-            for name, values in case.hidden.items()
-            if not any(name in names for names in reach) and EFFECTS[name].amount(values) < least.get(name, 0.0)
-        ),
     )
+    least = noticeable or {}
+    amount = {name: EFFECTS[name].amount(case.hidden[name]) for name in outcome.missed}
+    return replace(outcome, too_small=tuple(name for name, size in amount.items() if size < least.get(name, 0.0)))
 
 
 def _right_size(cause: Cause, true: dict[str, float]) -> bool:

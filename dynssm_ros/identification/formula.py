@@ -160,11 +160,9 @@ def _library(signals: Vector) -> tuple[list[str], Vector]:
     from sklearn.preprocessing import PolynomialFeatures
 
     products = PolynomialFeatures(_DEGREE).fit(signals)
-    steady = (
-        products.powers_[:, _SIGNALS.index("t")] <= 1
-    )  # of what changes over the drive a trend is all that carries over
-    names = products.get_feature_names_out(_SIGNALS)[steady]
-    return list(names), np.asarray(products.transform(signals))[:, steady]
+    # of what changes over the drive a trend is all that carries over
+    kept = products.powers_[:, _SIGNALS.index("t")] <= 1
+    return list(products.get_feature_names_out(_SIGNALS)[kept]), np.asarray(products.transform(signals))[:, kept]
 
 
 def _pursued(X: Vector, y: Vector) -> Vector:

@@ -17,7 +17,6 @@ from dynssm_ros.arrays import Vector
 Floats = float | Vector
 
 _NEWTON_STEPS = 12
-_FOUND = 1e-8  # of the length: after so small a step of Newton's the foot is exact
 _BEND_POINTS = 1000
 _SMOOTHED = 0.01  # of the lap: standard deviation
 _SHARPEST = 0.95  # quantile of the curvature
@@ -98,7 +97,7 @@ class ClosedLine:
             slope = np.maximum(square - _dot(away, bend), 0.2 * square)
             move = np.minimum(np.maximum(_dot(away, tangent) / slope, -5 * longest), 5 * longest)
             s = s + move
-            if np.abs(move).max(initial=0.0) < _FOUND * self.length:
+            if np.abs(move).max(initial=0.0) < 1e-11 * self.length:
                 break
         else:
             position, tangent, _ = self._derivatives(s)
