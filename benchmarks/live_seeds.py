@@ -83,6 +83,7 @@ def drive_seeded(car: str, seed: int, laps: int, model: Path | None = None) -> S
         command = controller.step(stamps[1], pose, seen)
         if isinstance(command, Applied):
             holder.receive(command)
+            controller.learn()
         if predictor is not None:
             _observe(predictor, stamps[0], "feedback", sample.feedback)
             predictions += _predict(predictor, controller, stamps[1], pose, seen)

@@ -46,7 +46,7 @@ class Decision(NamedTuple):
         adapted: what was planned with: what the model said as far as it has earned it, and what was found to be missing.
         caution: by which it stays away from the borders at the end of the horizon (m).
         weights: of :data:`~dynssm_ros.control.evidence.SOURCES` in that, ``(3,)``.
-        seconds: that it took, model and plan together, by the controller's clock.
+        seconds: that it took, model and plan together, by the controller's clock; see :meth:`Controller.learn`.
     """
 
     command: Applied
@@ -67,10 +67,23 @@ class Decision(NamedTuple):
         return self.adapted.first.correction
 
 
+class _Sent(NamedTuple):
+    """What was sent at a measurement."""
+
+    t: float
+    """Of the measurement (s)."""
+    increments: Vector
+    said: Sequence[Adapted]
+    """By each of :data:`~dynssm_ros.control.evidence.SOURCES`."""
+    is_sound: bool
+    """Whether the measurement is finite."""
+
+
 class Controller:
     """A model and the controller of one car on one track. It remembers the window that the model reads and its last plan.
 
-    It is to be asked once per T_s. A step without a plan in time is driven by the plan before, moved on, and counted.
+    It is to be asked once per T_s, and to :meth:`learn` once the command is out. A step without a plan in time is driven by
+    the plan before, moved on, and counted.
 
     Args:
         model: what is known of the car.
@@ -114,6 +127,7 @@ class Controller:
     def forget(self) -> None:
         """Begins anew, as after a gap in what was measured: without a window, a plan, or an error of the model."""
         self._history.clear()
+        self._model.interrupt()
         self._commands.clear()
         for disturbance in self._disturbances:
             disturbance.forget()
@@ -123,6 +137,7 @@ class Controller:
         self._age = 0
         self._past: Vector | None = None  # the estimated state at the last measurement
         self._expected: Vector | None = None  # by the model, at the next one
+        self._sent: _Sent | None = None  # at the last measurement, till it is learned from
 
     def follow(self, reference: Reference, theta: Callable[[Vector], Vector]) -> None:
         """From now on follows the same line at another speed, with other coefficients of the calibrated car.
@@ -141,6 +156,8 @@ class Controller:
 
     def interrupt(self) -> None:
         """What is measured next is not one T_s after what was measured last."""
+        self.learn()
+        self._model.interrupt()
         self._past = self._expected = None
         for disturbance in self._disturbances:
             disturbance.interrupted()
@@ -165,6 +182,7 @@ class Controller:
             What to send. It is safe whatever came in: what is not finite counts as measured as it was planned.
         """
         began = self._clock()
+        self.learn()
         previous = self._nmpc.previous
         self._commands.append(feedback)
         while len(self._commands) <= age < MOST_LATE:
@@ -192,28 +210,20 @@ class Controller:
         command = self._nmpc.command(plan)
         first = self._expect(at, plan, command, sent, adapted)
         if is_new:
-            self._gather(at, first, said, bool(np.all(np.isfinite([*pose, *seen, *feedback]))))
+            self._sent = _Sent(at, first, said, bool(np.all(np.isfinite([*pose, *seen, *feedback]))))
         self.counts[plan.status] += 1
         return Decision(command, plan, adapted, float(margins.lateral[-1]), weights, self._clock() - began)
 
-    def _calibrated(self, pose: Pose, previous: Plan | None) -> Adapted:
-        """The calibrated car, along the plan where its coefficients depend on the place."""
-        if self._theta is None:
-            return self._model.calibrated
-        ahead = np.array([pose[:2]]) if previous is None else previous.x[: self._nmpc.settings.N, :2]
-        if not np.all(np.isfinite(ahead)):
-            return self._model.calibrated
-        return Adapted(self._theta(self._track.project(ahead)[0]), self._model.calibrated.correction)
+    def learn(self) -> None:
+        """Takes what was sent at the last measurement as evidence, and hands it to the model.
 
-    def _gather(self, t: float, increments: Vector, said: Sequence[Adapted], is_sound: bool) -> None:
-        """Takes what was said at the last measurement (s), and what was sent from there on, as evidence.
-
-        Args:
-            t: of the measurement.
-            increments: that were sent.
-            said: by each source.
-            is_sound: whether the measurement is finite.
+        The command does not wait for it, as in the preparation phase of a real-time iteration: it is to be called once the
+        command is out. The next step does what is left of it, and counts the time.
         """
+        if self._sent is None:
+            return
+        (t, increments, said, is_sound), self._sent = self._sent, None
+        self._model.learn(np.array(self._history))
         if self._past is None or not is_sound:
             self._evidence.interrupt()
             return
@@ -225,6 +235,15 @@ class Controller:
             self._evidence.sent(self._past, increments, said, t)
         else:
             self._evidence.interrupt()
+
+    def _calibrated(self, pose: Pose, previous: Plan | None) -> Adapted:
+        """The calibrated car, along the plan where its coefficients depend on the place."""
+        if self._theta is None:
+            return self._model.calibrated
+        ahead = np.array([pose[:2]]) if previous is None else previous.x[: self._nmpc.settings.N, :2]
+        if not np.all(np.isfinite(ahead)):
+            return self._model.calibrated
+        return Adapted(self._theta(self._track.project(ahead)[0]), self._model.calibrated.correction)
 
     def _expect(self, t: float, plan: Plan, command: Applied, sent: Vector, adapted: Adapted) -> Vector:
         """Completes the window's last row, and predicts the next measurement.

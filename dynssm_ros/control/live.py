@@ -150,6 +150,7 @@ class LiveController:
         x, y = (float(value) for value in reference.line.position(0.0))
         start = Pose(x, y, float(reference.line.heading(0.0)))
         self.step(0, start, State(float(reference.speed_at(0.0)), 0.0, 0.0))
+        self.learn()
         self._reset()
 
     def _reset(self) -> None:
@@ -204,6 +205,10 @@ class LiveController:
             self.laps, self._first = Laps(self._track), stamp
         self._last = self._planned = stamp
         return self._answer(stamp, pose, seen, together)
+
+    def learn(self) -> None:
+        """Learns from the last step; to be called once its command is out, which does not wait for it."""
+        self._pilot.learn()
 
     def _answer(self, stamp: int, pose: Pose, seen: State, together: bool) -> Applied:
         t = (stamp - self._first) / 1e9

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from dynssm_ros.runtime.online import Seen
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import Coefficients, State, Vehicle, step
+from dynssm_ros.vehicle.kinematics import SCALAR
 
 _MEASURED = slice(STATES.index("v_x"), len(STATES))  # of the controller's state: what a window's row begins with
 
@@ -39,6 +40,16 @@ class PredictionModel(Protocol):
             previous: the last plan as it stands now; ``None`` at the start.
         """
 
+    def learn(self, rows: Vector) -> None:
+        """Takes the history once the command in its last row is the one that was sent; once for each row.
+
+        Args:
+            rows: as of :meth:`read`.
+        """
+
+    def interrupt(self) -> None:
+        """The next row is not one T_s after the last one."""
+
 
 class Fixed:
     """Coefficients that never change, and no correction."""
@@ -53,6 +64,12 @@ class Fixed:
     def read(self, rows: Vector, previous: Plan | None) -> Adapted:
         """The same, whatever happens."""
         return self.calibrated
+
+    def learn(self, rows: Vector) -> None:
+        """Nothing is learned."""
+
+    def interrupt(self) -> None:
+        """Nothing is remembered."""
 
 
 class Adaptive:
@@ -74,8 +91,7 @@ class Adaptive:
         self._online: _Online | None = None
         if isinstance(model, OnnxModel) and model.online is not None:
             self._online = _Online(OnlineLearner(model, model.online, judges=False))
-        # it learns from rows whose command is known: those before the present
-        self.H = model.H + (self._online is not None)
+        self.H = model.H
         self.car = SteppedCar.of(own) if card is None else SteppedCar.of(own, card.integrator, card.substeps)
         self._model = model
         self._along_horizon = along_horizon
@@ -84,18 +100,25 @@ class Adaptive:
     def read(self, rows: Vector, previous: Plan | None) -> Adapted:
         """See :class:`PredictionModel`. What is not finite is replaced by the nominal car."""
         if len(rows) < self.H:
-            if self._online is not None:
-                self._online.interrupt()
             return self.calibrated
-        H = self._model.H
-        windows = rows[None, -H:]
+        windows = rows[None, -self.H :]
         if self._along_horizon and previous is not None:
             ahead = np.concatenate([rows, _planned_rows(previous)])
-            N = len(previous.u)
-            windows = np.stack([ahead[k : k + H] for k in range(len(rows) - H, len(rows) - H + N)])
-        before = rows[None, -H - 1 : -1] if self._online is not None else windows[:0]
-        adapted = self._of(self._read_by(np.concatenate([before, windows])), len(before))
+            first = len(rows) - self.H
+            windows = np.stack([ahead[k : k + self.H] for k in range(first, first + len(previous.u))])
+        adapted = self._of(self._read_by(windows))
         return adapted if all(np.all(np.isfinite(part)) for part in adapted) else self.calibrated
+
+    def learn(self, rows: Vector) -> None:
+        """See :class:`PredictionModel`."""
+        if self._online is not None and len(rows) >= self.H:
+            window = self._read_by(rows[None, -self.H :])
+            self._online.learn(window[0], self._model.predict(window))
+
+    def interrupt(self) -> None:
+        """See :class:`PredictionModel`."""
+        if self._online is not None:
+            self._online.interrupt()
 
     def _read_by(self, windows: Vector) -> Vector:
         """Windows as the model was trained on them."""
@@ -105,12 +128,10 @@ class Adaptive:
         windows[..., 5:] = 0.0
         return windows
 
-    def _of(self, windows: Vector, known: int) -> Adapted:
-        """What the model says of windows ``(n, H, 7)``, of which the first ``known`` are learned from before."""
+    def _of(self, windows: Vector) -> Adapted:
+        """What the model says of windows ``(n, H, 7)``."""
         said = self._model.predict(windows)
         if self._online is not None:
-            self._online.learn(windows[0], said.part(slice(0, known)))
-            windows, said = windows[known:], said.part(slice(known, None))
             said = self._online.corrected(said, windows)
         theta = self.calibrated.theta if said.theta is None else said.theta
         physics = stepped(self.car, windows[:, -1], theta) if said.physics is None else said.physics
@@ -153,12 +174,16 @@ def stepped(car: SteppedCar, rows: Vector, theta: Vector) -> Vector:
         rows: with the columns ``WINDOW_COLUMNS``, shape ``(k, 7)``.
         theta: coefficients, shape ``(17,)`` or ``(k, 17)``.
     """
-    now = rows.T
+    library: Any = np
+    now: Any = rows.T
+    coefficients: Any = np.transpose(theta)
+    if len(rows) == 1:  # plain numbers are several times as fast as arrays of one
+        library, now, coefficients = SCALAR, rows[0].tolist(), np.ravel(theta).tolist()
     following = step(
-        np, State(*now[:3]), applied_inputs(now), Coefficients(*np.transpose(theta)), car.constants, car.T_s, car.effects,
+        library, State(*now[:3]), applied_inputs(now), Coefficients(*coefficients), car.constants, car.T_s, car.effects,
         car.integrator, car.substeps,
     )  # fmt: skip
-    return np.stack(following, axis=1)
+    return np.reshape(following, (len(following), -1)).T
 
 
 def _planned_rows(plan: Plan) -> Vector:

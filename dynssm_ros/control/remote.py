@@ -151,6 +151,12 @@ class RemoteModel:
         """What was chosen last; see :class:`~dynssm_ros.control.prediction_model.PredictionModel`."""
         return self.output.adapted
 
+    def learn(self, rows: Vector) -> None:
+        """Nothing: the predictor learns."""
+
+    def interrupt(self) -> None:
+        """Nothing: what was heard holds until it is too old."""
+
     def ahead(self, x: Vector, context: Context, adapted: Adapted, increments: Vector = _HELD) -> Vector:
         """The state one T_s after ``x``; see :meth:`measured`.
 

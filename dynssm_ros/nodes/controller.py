@@ -163,6 +163,7 @@ class ControllerNode(ManagedNode):
         self._newest = stamp
         if outcome is not None:
             self._publish_command(actuators(stamp + self._driver.answered_after, outcome))
+            self._driver.learn()
 
     def _watch(self) -> None:
         """Brakes while odometry is silent."""

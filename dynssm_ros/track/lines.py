@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -50,20 +52,17 @@ class ClosedLine:
     def position(self, s: Floats, lateral: Floats = 0.0) -> Vector:
         """Positions (m) at arc length ``s`` (m, periodic), ``lateral`` metres to the left; shape ``(..., 2)``."""
         position, tangent, _ = self._derivatives(s)
-        normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
-        normal /= np.hypot(normal[..., :1], normal[..., 1:])
-        return np.asarray(position + np.asarray(lateral)[..., None] * normal)
+        beside = np.asarray(position + lateral * 1j * tangent / np.abs(tangent))
+        return np.stack([beside.real, beside.imag], axis=-1)
 
     def heading(self, s: Floats) -> Vector:
         """Direction of driving (rad, counter-clockwise from x, in ``(-pi, pi]``) at ``s`` (m, periodic)."""
-        tangent = self._derivatives(s)[1]
-        return np.asarray(np.arctan2(tangent[..., 1], tangent[..., 0]))
+        return np.asarray(np.angle(self._derivatives(s)[1]))
 
     def curvature(self, s: Floats) -> Vector:
         """Curvature (1/m, positive to the left) at ``s`` (m, periodic)."""
         _, first, second = self._derivatives(s)
-        cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-        return np.asarray(cross / np.hypot(first[..., 0], first[..., 1]) ** 3)
+        return np.asarray((first.conjugate() * second).imag / np.abs(first) ** 3)
 
     def bend(self, s: Floats) -> Vector:
         """How sharply the line bends at ``s`` (m, periodic): its curvature over that of its sharpest places.
@@ -87,8 +86,11 @@ class ClosedLine:
         Returns:
             Arc length in ``[0, length)`` and signed distance (m, positive to the left), each of shape ``(...)``.
         """
-        p = np.asarray(points, dtype=np.float64)
-        s = self.s[self._tree.query(p)[1]] if near is None else np.asarray(near, dtype=np.float64)
+        points = np.asarray(points, dtype=np.float64)
+        p: Any = _as_complex(points)
+        s: Any = self.s[self._tree.query(points)[1]] if near is None else np.asarray(near, dtype=np.float64)
+        if p.ndim == s.ndim == 0:  # plain numbers are several times as fast as arrays of one
+            p, s = complex(p), float(s)
         longest = self.length / len(self.points)
         for _ in range(_NEWTON_STEPS):
             position, tangent, bend = self._derivatives(s)
@@ -102,8 +104,8 @@ class ClosedLine:
         else:
             position, tangent, _ = self._derivatives(s)
             away = p - position
-        cross = tangent[..., 0] * away[..., 1] - tangent[..., 1] * away[..., 0]
-        return np.asarray(s % self.length), np.asarray(cross / np.hypot(tangent[..., 0], tangent[..., 1]))
+        cross = (tangent.conjugate() * away).imag
+        return np.asarray(s % self.length), np.asarray(cross / np.abs(tangent))
 
     def counted_on(self, s: float, last: float) -> float:
         """Arc length ``s`` (m) counted on over the laps from ``last`` (m), which is less than half a lap away."""
@@ -128,20 +130,31 @@ class ClosedLine:
         return spline
 
     @cached_property
-    def _pieces(self) -> Vector:
-        """Coefficients of the spline's pieces, ``(4, N, 2)``."""
-        return np.ascontiguousarray(self._spline.c)
+    def _pieces(self) -> npt.NDArray[np.complex128]:
+        """Coefficients of the spline's pieces as complex numbers, ``(4, N)``."""
+        return _as_complex(self._spline.c)
 
-    def _derivatives(self, s: Floats) -> tuple[Vector, Vector, Vector]:
-        """Position and its first two derivatives by arc length at ``s`` (m, periodic), each ``(..., 2)``.
+    @cached_property
+    def _listed(self) -> tuple[list[float], list[list[complex]]]:
+        """Knots and :attr:`_pieces` as plain numbers, one piece after the other."""
+        return self._spline.x.tolist(), self._pieces.T.tolist()
 
-        A controller asks for few points, many times a step. There scipy's own evaluation costs several times as much.
+    def _derivatives(self, s: Floats) -> tuple[Any, Any, Any]:
+        """Position and its first two derivatives by arc length at ``s`` (m, periodic), each ``(...)``, complex: ``x + iy``.
+
+        They are plain numbers for a plain number. A controller asks for few points, many times a step. There scipy's own
+        evaluation costs several times as much.
         """
-        at = np.asarray(s, dtype=np.float64) % self.length
-        knots = self._spline.x
-        piece = knots[1:-1].searchsorted(at, "right")
-        a, b, c, d = self._pieces[:, piece]
-        h = (at - knots[piece])[..., None]
+        at: Any
+        if isinstance(s, float):
+            knots, pieces = self._listed
+            at = s % self.length
+            piece = bisect_right(knots, at, 1, len(pieces)) - 1
+            (a, b, c, d), h = pieces[piece], at - knots[piece]
+        else:
+            at = np.asarray(s, dtype=np.float64) % self.length
+            places = self._spline.x[1:-1].searchsorted(at, "right")
+            (a, b, c, d), h = self._pieces[:, places], at - self._spline.x[places]
         return ((a * h + b) * h + c) * h + d, (3 * a * h + 2 * b) * h + c, 6 * a * h + 2 * b
 
     @cached_property
@@ -158,6 +171,11 @@ class ClosedLine:
         return cKDTree(self.points)
 
 
-def _dot(a: Vector, b: Vector) -> Vector:
-    """Scalar products of vectors ``(..., 2)``."""
-    return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1])
+def _as_complex(points: Vector) -> npt.NDArray[np.complex128]:
+    """``x + iy`` of points ``(..., 2)``."""
+    return np.asarray(points[..., 0] + 1j * points[..., 1])
+
+
+def _dot(a: Any, b: Any) -> Any:
+    """Scalar products of vectors in the plane, given as complex numbers."""
+    return (a.conjugate() * b).real

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.control.controller import Controller
-from dynssm_ros.control.prediction_model import Adaptive
+from dynssm_ros.control.prediction_model import Adaptive, Fixed
 from dynssm_ros.control.race_models import true_model
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
@@ -125,6 +125,75 @@ def test_the_deadline_counts_the_model_too(orca, pilot, on_line):
     assert (first.plan.status, second.plan.status) == ("solved", "late")
     assert second.seconds > 0.5
     np.testing.assert_allclose(second.plan.u[0], first.plan.u[1], atol=1e-12)
+
+
+class Learning(Fixed):
+    """Keeps what it is told."""
+
+    def __init__(self, car, cost=lambda: None):
+        super().__init__("learning", true_model(car, "rk4").car, car.nominal)
+        self.H, self.told, self._cost = 3, [], cost
+
+    def learn(self, rows):
+        self._cost()
+        self.told.append(rows.copy())
+
+    def interrupt(self):
+        self.told.append("interrupted")
+
+
+def driven(orca, driver, pose, state, asked):
+    """The commands of a short drive, whose driver is asked to learn in between or not."""
+    car, feedback, commands = make_plant(orca, "rk4", pose, state), Applied(0.0, 0.0), []
+    for k in range(12):
+        feedback = driver.step(0.02 * k, car.pose, car.measured, feedback).command
+        if asked:
+            driver.learn()
+        car.advance(feedback)
+        commands.append(feedback)
+    return commands
+
+
+def test_what_is_learned_after_the_command_is_what_the_next_step_would_learn(orca, pilot, on_line):
+    """Left to the next step, it changes no command; each row is learned from once, with the command that was sent."""
+    left, asked = Learning(orca), Learning(orca)
+    commands = driven(orca, pilot(left), *on_line, False)
+    assert commands == driven(orca, pilot(asked), *on_line, True)
+    told = asked.told[1:]  # the first: it begins
+    assert (len(told), len(left.told)) == (12, 12)
+    np.testing.assert_array_equal(left.told[-1], asked.told[-2])
+    sent = np.diff([(0.0, 0.0), *commands], axis=0)
+    np.testing.assert_allclose([rows[-1, 5:] for rows in told], sent, atol=1e-12)
+
+
+def test_a_command_does_not_wait_for_what_is_learned(orca, pilot, on_line):
+    """Learning that takes 10 s: a driver that is asked for it after the command has its command as soon as before."""
+    now = itertools.count()
+
+    def build():
+        return pilot(Learning(orca, lambda: [next(now) for _ in range(1000)]), clock=lambda: next(now) / 100)
+
+    pose, state = on_line
+    asked, left = build(), build()
+    for driver in (asked, left):
+        driver.step(0.0, pose, state, Applied(0.0, 0.0))
+    asked.learn()
+    assert asked.step(0.02, pose, state, Applied(0.0, 0.0)).seconds < 1
+    assert left.step(0.02, pose, state, Applied(0.0, 0.0)).seconds > 9
+
+
+def test_a_model_is_told_of_gaps(orca, pilot, on_line):
+    """What was sent before a gap is learned from; what was forgotten is not."""
+    model, (pose, state) = Learning(orca), on_line
+    driver = pilot(model)
+    driver.step(0.0, pose, state, Applied(0.0, 0.0))
+    driver.interrupt()
+    driver.step(0.05, pose, state, Applied(0.0, 0.0))
+    driver.forget()
+    driver.learn()
+    assert [rows if isinstance(rows, str) else len(rows) for rows in model.told] == [
+        "interrupted", 1, "interrupted", "interrupted"
+    ]  # fmt: skip
 
 
 def test_a_model_that_needs_what_is_not_measured_is_refused(orca, pilot):
