@@ -1,7 +1,8 @@
 """Faster every lap: how fast the line is driven next follows from the laps that were driven.
 
 The line's speed has a share of the car's accelerations for each section of the lap. It begins at a safe share. After a lap a
-section is driven a step faster, if the car stayed away from the borders there and was not slower than before. One that came
+section is driven a step faster, if the car stayed away from the borders there and was not slower than before: two steps
+below the safe share, where a car that was not known well had to begin. One that came
 too close to a border, and the one before it, go back below what they were driven with, and stay there. One that was slower
 than it has been goes back to what was fastest.
 
@@ -206,7 +207,8 @@ class LapLearner:
         self._best_share = np.where(better, driven, self._best_share)
         lower = np.minimum(self._ceiling, driven - _STEP / 2)
         self._ceiling = np.where(close & ~is_new, lower, self._ceiling)
-        faster = np.minimum(np.where(close, driven, driven + _STEP), self._ceiling)
+        step = np.where(driven < self._line.share, 2 * _STEP, _STEP)
+        faster = np.minimum(np.where(close, driven, driven + step), self._ceiling)
         self._shares = np.where(slower, np.minimum(self._best_share, self._ceiling), faster)
         self._logs = [*self._logs, lap][-_REMEMBERED:]
         self._known = self._calibrated()

@@ -95,6 +95,11 @@ def test_a_car_that_nobody_measured_begins_slower_still(orca, club):
     reference = load_reference("racing", orca, club, SAFE)
     learner = LapLearner(unknown, club, reference, Settings.of(orca), SteppedCar.of(orca), orca.nominal)
     assert learner.reference.lap_time > 1.05 * reference.lap_time
+    learner._calibrated = lambda: orca
+    for _ in range(3):
+        before = np.minimum(learner._shares, learner._allowed)
+        learner.learn(lap(learner))
+        np.testing.assert_allclose(learner._shares - before, np.where(before < SAFE, 2 * STEP, STEP))
 
 
 def test_a_line_with_a_speed_of_its_own_is_refused(orca, club):
