@@ -1,8 +1,8 @@
 """Which steps the simulation makes: Runge-Kutta with inputs that are held, unless the data clearly say otherwise.
 
 Euler steps of the sampling time, as some simulators make them, act about half a step late. Inputs that went on changing
-between their samples act half a sample early, as a line from sample to sample does. Steering that lags hides that, so the
-steps are compared with a lag fitted beside. Before the causes are known a car that errs may be closer to the data with either
+between their samples act half a sample early, as a line from sample to sample does. Steering that lags hides that, and so does
+another yaw inertia, so the steps are compared with both fitted beside. Before the causes are known a car that errs may be closer to the data with either
 by chance, so that the choice is made anew with the causes that were found.
 """
 
@@ -23,6 +23,7 @@ from dynssm_ros.identification.windows import SimulationWindows
 from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.vehicle.effects.actuators import SteeringLag
+from dynssm_ros.vehicle.effects.inertia import YawInertia
 from dynssm_ros.vehicle.single_track import Integrator
 
 _TRIED = 300  # windows with which the integrator is chosen at first
@@ -121,16 +122,17 @@ def _stepped(
 
 
 def _closest(fits: Mapping[Stepping, tuple[IdentificationProblem, Fit]]) -> Stepping:
-    """The steps in which the car, with steering that may lag, is closest to the data; those alone if there are no others."""
+    """The steps in which the car, with what hides them, is closest to the data; those alone if there are no others."""
     if len(fits) == 1:
         return next(iter(fits))
-    return closest({one: _with_lag(problem, fit) for one, (problem, fit) in fits.items()})
+    return closest({one: _with_what_hides(problem, fit) for one, (problem, fit) in fits.items()})
 
 
-def _with_lag(problem: IdentificationProblem, fit: Fit) -> Fit:
-    """The same with steering that lags, unless it has it already."""
-    effect, parameter = SteeringLag.NAME, "time_constant"
-    if effect in fit.car.effects or any(entry.name == effect for entry in fit.car.vehicle.effects):
-        return fit
-    lagging = fit.car.with_effect(effect, {parameter: problem.windows.data.T_s})
-    return problem.fit(lagging, (*fit.free, (effect, parameter)), fit)
+def _with_what_hides(problem: IdentificationProblem, fit: Fit) -> Fit:
+    """The same with steering that lags and a yaw inertia of its own, as far as it has not got them already."""
+    hides = (SteeringLag.NAME, "time_constant", problem.windows.data.T_s), (YawInertia.NAME, "factor", 1.0)
+    car, free = fit.car, fit.free
+    for effect, parameter, value in hides:
+        if effect not in car.effects and all(entry.name != effect for entry in car.vehicle.effects):
+            car, free = car.with_effect(effect, {parameter: value}), (*free, (effect, parameter))
+    return problem.fit(car, free, fit)

@@ -167,6 +167,21 @@ def test_the_integrator_is_that_of_the_data(plant: str) -> None:
     assert np.isfinite(found.selection.fit.objective)
 
 
+def test_another_yaw_inertia_is_not_taken_for_euler_steps() -> None:
+    """Steps of 40 ms that act half a step late are to a car of this yaw inertia what it is to one of less."""
+    av21 = load_vehicle("av21")
+    known = CarEstimate.of(av21.with_nominal(av21.nominal, 0.01 * np.abs(av21.nominal) + 1e-6))
+    car = av21.with_effect("yaw_inertia", {"factor": 0.65})
+    recording = as_recording(
+        simulate(car, load_track("road_course"), duration=60.0, plant="rk4", noise=(0.01, 0.01, 0.002))
+    )
+    given = fit_windows(recording, recorded_rows(recording, recording_context(recording)), 0.5, 0.0)
+    found = search_causes(given, known, quarters(given), None, lambda words: None, ("tire_relaxation", "yaw_rate_lag"))
+    assert found.problem.windows.integrator == "rk4"
+    assert [one.candidate.effect for one in found.selection.chosen] == ["yaw_inertia"]
+    assert found.selection.fit.car.effects["yaw_inertia"]["factor"] == pytest.approx(0.65, abs=0.05)
+
+
 def test_inputs_that_changed_between_the_rows_go_on_a_line() -> None:
     fast = ORCA.model_copy(update={"sampling_time": ORCA.sampling_time / 4})
     recording = as_recording(
