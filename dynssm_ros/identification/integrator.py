@@ -1,9 +1,9 @@
 """Which steps the simulation makes: Runge-Kutta with inputs that are held, unless the data clearly say otherwise.
 
 Euler steps of the sampling time, as some simulators make them, act about half a step late. Inputs that went on changing
-between their samples act half a sample early, as a line from sample to sample does. Steering that lags hides that, and so does
-another yaw inertia, so the steps are compared with both fitted beside. Before the causes are known a car that errs may be closer to the data with either
-by chance, so that the choice is made anew with the causes that were found.
+between their samples act half a sample early, as a line from sample to sample does. Steering that lags hides that, and so
+does another yaw inertia, so the steps are compared with both fitted beside. Before the causes are known a car that errs may
+be closer to the data with either by chance, so that the choice is made anew with the causes that were found.
 """
 
 from __future__ import annotations
