@@ -227,8 +227,8 @@ class LapLearner:
         own = self._path_error(lambda s: self._theta, lap)
         same = self._path_error(lambda s: self._known.nominal, lap)
         local = self._path_error(lambda s: self._known_at(s, self._grip), lap)
-        self._is_local = local < _CLEARLY * same
-        self._planned = (local if self._is_local else same) < _CLEARLY * own
+        self._is_local = _better(local, same, self._is_local)
+        self._planned = _better(local if self._is_local else same, own, planned)
         return self._planned and not planned
 
     def _by_section(self, lap: LapLog) -> tuple[Vector, Vector]:
@@ -320,6 +320,11 @@ class LapLearner:
                 continue  # no car that drives
             found.append((limits.speed, limits.lateral))
         return found
+
+
+def _better(error: float, other: float, is_believed: bool) -> bool:
+    """Whether what errs by the first is believed: only if it is clearly better, and from then on till it is clearly worse."""
+    return _CLEARLY * error < other if is_believed else error < _CLEARLY * other
 
 
 def _moved(pose: Pose, before: Vector, after: Vector, T_s: float) -> Pose:

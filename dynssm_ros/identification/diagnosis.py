@@ -23,7 +23,7 @@ from dynssm_ros.vehicle.effects import EFFECTS
 
 Verdict = Literal["effects", "none", "unexplained"]
 
-_SMALL_SHARE = 0.06  # of the squared error of each channel, on left-out parts
+SMALL_SHARE = 0.06  # of the squared error of each channel, on left-out parts
 _SMALL_GAIN = 0.01  # of the error on held-out rows: what takes less of both off is within the structure of the model
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
@@ -65,7 +65,7 @@ class Cause:
         It takes little off the error of each channel, on parts that were left out and on held-out rows. What a recalibration
         would make up for is told by what was known, and by how far the coefficients would have to be off, not by the error.
         """
-        little = float(self.confirmation.share.max()) < _SMALL_SHARE and self.heldout_gain < _SMALL_GAIN
+        little = float(self.confirmation.share.max()) < SMALL_SHARE and self.heldout_gain < _SMALL_GAIN
         return little and not self.confirmation.rests_on_known
 
 

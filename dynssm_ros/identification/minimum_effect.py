@@ -1,21 +1,35 @@
-"""How small an effect would still be named: what the driving, the noise and badly known nominal values leave of it."""
+"""How small an effect would still be named: what the driving, the noise and badly known nominal values leave of it.
+
+It has to be sure, and it has to matter: an effect that takes little off the errors is listed as small and not named, unless
+what was known of the nominal values tells most of it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import groupby
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.candidates import Candidate
 from dynssm_ros.identification.car import Values
+from dynssm_ros.identification.diagnosis import SMALL_SHARE
 from dynssm_ros.identification.noise import weights
-from dynssm_ros.identification.problem import Fit, IdentificationProblem, unit
+from dynssm_ros.identification.problem import Fit, IdentificationProblem, limits, unit, with_values
 from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 
-_PLACES = np.linspace(0.0, 1.0, 8, endpoint=False)  # of the lap
-_NOTHING = 1e-9  # of a squared error in units of the noise
+_PLACES = np.linspace(0.0, 1.0, 4, endpoint=False)  # of the lap
+_TRIED = 100  # windows, which count for all
+_FIRST = 0.01  # of the unit of a parameter: so little that fitted values follow in proportion
+_ROUNDS = 12  # in which sizes are looked for
+_AT_ONCE = 10.0  # times, by which one changes in a round
+_SETTLED = 1.1  # times
+_FOLLOWED = 2  # rounds in which fitted values follow an effect
+_SHARES = (1.0, 0.3)  # of the way there that a round tries
+_NOTHING = 1e-9  # of what is needed
+_MATTERS = SMALL_SHARE / (1 - SMALL_SHARE)  # of the squared error of what is left
 
 
 def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable[Candidate]) -> dict[str, float]:
@@ -31,43 +45,141 @@ def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable
     Returns:
         By effect, in the unit of the parameter; infinite where it changes nothing that was measured.
     """
-    root = _root(problem, fit)[:, None]
-    J = (fit.noise.whiten(fit.jacobian) * root[..., None]).reshape(-1, fit.jacobian.shape[2])
-    H = J.T @ J + problem.prior_precision(fit.position)
-    needed = np.log(problem.windows.target.size) + DECISIVE_DELTA_BIC
     taken = {effect for effect, _ in fit.free}
-    out: dict[str, float] = {}
-    for candidate in found:
-        effect = candidate.effect
-        if effect in taken or effect in out:
-            continue
-        about, parameter = EFFECTS[effect].PARAMETERS, candidate.amplitudes[0]
-        form = {name: about[name].neutral for name in candidate.shapes}
-        places = [{LOCATION[0]: float(place)} for place in _PLACES] if candidate.local else [{}]
-        left = np.median([_left(root * _column(problem, fit, effect, parameter, form | at), J, H) for at in places])
-        least = EFFECTS[effect].least(fit.car.vehicle.constants)
-        size = float(np.sqrt(needed / left) * unit(effect, parameter)) if left > _NOTHING else float("inf")
-        out[effect] = max(size, least)
-    return out
+    first = {one.effect: one for one in reversed(list(found)) if one.effect not in taken}
+    sizes = {effect: [_Size(one, at) for at in _where(one)] for effect, one in sorted(first.items())}
+    nearby = _Nearby(problem, fit)
+    for _ in range(_ROUNDS):
+        left = [one for each in sizes.values() for one in each if not one.settled]
+        for one, worth in zip(left, nearby.worth(left), strict=True):
+            one.change(float(worth))
+    constants = fit.car.vehicle.constants
+    return {
+        effect: max(float(np.median([one.size for one in each])), EFFECTS[effect].least(constants))
+        for effect, each in sizes.items()
+    }
 
 
-def _column(problem: IdentificationProblem, fit: Fit, effect: str, parameter: str, form: Values) -> Vector:
-    """What a unit of a parameter does to the whitened errors, shape ``(W, 3 K)``."""
-    about = EFFECTS[effect].PARAMETERS[parameter]
-    moved = about.neutral + about.direction * unit(effect, parameter)
-    values = dict(fit.car.effects.get(effect, {})) | form | {parameter: moved}
-    change = problem.errors(fit.car.with_effect(effect, values)) - fit.errors
-    return fit.noise.whiten(change)
+def _where(candidate: Candidate) -> list[Values]:
+    """Where on the lap it is tried."""
+    return [{LOCATION[0]: float(place)} for place in _PLACES] if candidate.local else [{}]
 
 
-def _root(problem: IdentificationProblem, fit: Fit) -> Vector:
-    """What each window counts, ``(W,)``."""
-    told = weights(fit.noise.whiten(fit.errors)) / problem.counted_once(fit)
-    return np.asarray(np.sqrt(told))
+class _Size:
+    """How far off neutral an effect has to be, looked for from little on.
+
+    Args:
+        candidate: the effect; its shape is neutral.
+        at: parameters of the place.
+    """
+
+    def __init__(self, candidate: Candidate, at: Values) -> None:
+        self.effect = candidate.effect
+        self._parameter = candidate.amplitudes[0]
+        about = EFFECTS[self.effect].PARAMETERS
+        self._about = about[self._parameter]
+        self._form = {name: about[name].neutral for name in candidate.shapes} | dict(at)
+        bound = self._about.upper if self._about.direction > 0 else self._about.lower
+        self._most = abs(bound - self._about.neutral)
+        self.size = min(_FIRST * unit(self.effect, self._parameter), self._most)
+        self.follows: float | Vector = 0.0
+        """What the fitted values do for each unit of it."""
+        self.settled = False
+        self._less, self._enough = 0.0, np.inf
+
+    @property
+    def values(self) -> Values:
+        """Its parameters."""
+        return self._form | {self._parameter: self._about.neutral + self._about.direction * self.size}
+
+    def change(self, worth: float) -> None:
+        """Takes what an effect of :attr:`values` is worth: it is to be 1, and grows like the size squared, or faster."""
+        if worth < 1.0:
+            self._less = self.size
+        else:
+            self._enough = self.size
+        change = worth**-0.5 if worth > _NOTHING else np.inf
+        close, beyond = 1 / _SETTLED < change < _SETTLED, worth < 1.0 and self.size >= self._most
+        self.settled = bool(close or beyond or self._enough < _SETTLED * self._less)
+        if close or beyond:
+            self.size *= change
+        elif self._less > 0.0 and np.isfinite(self._enough):
+            self.size = float(np.sqrt(self._less * self._enough))
+        else:
+            self.size = min(self.size * float(np.clip(change, 1 / _AT_ONCE, _AT_ONCE)), self._most)
 
 
-def _left(response: Vector, J: Vector, H: Vector) -> float:
-    """Squared length of what fitted values cannot take up of a response."""
-    column = response.ravel()
-    across = J.T @ column
-    return float(column @ column - across @ np.linalg.solve(H, across))
+class _Nearby:
+    """Cars that are like that of a fit but for an effect, as the data see them.
+
+    Args:
+        problem: the windows.
+        fit: the fit.
+    """
+
+    def __init__(self, problem: IdentificationProblem, fit: Fit) -> None:
+        some, near = problem.part(fit, -(-len(problem.windows) // _TRIED))
+        self._problem, self._fit = some, near
+        counts = len(problem.windows) / (len(some.windows) * problem.counted_once(fit))
+        self._root = np.sqrt(weights(near.noise.whiten(near.errors)) * counts)[:, None]
+        self._J = (near.noise.whiten(near.jacobian) * self._root[..., None]).reshape(-1, near.jacobian.shape[2])
+        self._prior = problem.prior_precision(fit.position)
+        self._H = self._J.T @ self._J + self._prior
+        self._error = np.maximum((near.errors[:, -3:] ** 2).sum(axis=0), 1e-300)
+        self._limits = limits(near.car, near.free)
+        self._needed = np.log(problem.windows.target.size) + DECISIVE_DELTA_BIC
+
+    def worth(self, sizes: Sequence[_Size]) -> Vector:
+        """How far each exceeds what makes it a cause, once all fitted values have followed it as far as they can, ``(n,)``.
+
+        It is the lesser of two ratios: twice the logarithm of the likelihood that it is worth, over what is needed; and its
+        share of the squared error of a channel at the end of the simulations, over what matters, where the first does not
+        rest on what was known beforehand.
+        """
+        if not sizes:
+            return np.empty(0)
+        present = np.concatenate([self._with_effect(name, list(one)) for name, one in groupby(sizes, _name)])
+        followed = np.zeros((len(sizes), len(self._H)))
+        rest = present - self._fit.errors
+        told = self._told(rest, followed)
+        move = np.stack(
+            [np.broadcast_to(one.size * one.follows, len(self._H)) for one in sizes]
+        )  # as for the size before
+        for shares in (_SHARES[:1], *[_SHARES] * _FOLLOWED):
+            for share in shares:
+                tried = np.clip(self._fit.position + followed + share * move, *self._limits) - self._fit.position
+                other = present - self._errors(tried)
+                less = self._told(other, tried)
+                better = less < told
+                rest[better], followed[better], told[better] = other[better], tried[better], less[better]
+            pull = self._seen(rest).reshape(len(sizes), -1) @ self._J - followed @ self._prior
+            move = np.linalg.solve(self._H, pull.T).T
+        for one, each in zip(sizes, followed, strict=True):
+            one.follows = each / one.size
+        seen = told - np.einsum("np,pq,nq->n", followed, self._prior, followed)
+        matters = np.max((rest[..., -3:] ** 2).sum(axis=1) / self._error, axis=1) / _MATTERS
+        return np.asarray(np.minimum(told / self._needed, np.where(2 * seen < told, np.inf, matters)))
+
+    def _errors(self, followed: Vector) -> Vector:
+        """Errors of the car of the fit with its values moved by ``(n, P)``: ``(n, W, 3 K)``."""
+        fit = self._fit
+        return self._problem.errors_of([with_values(fit.car, fit.free, fit.position + each) for each in followed])
+
+    def _told(self, rest: Vector, followed: Vector) -> Vector:
+        """Twice the logarithm of the likelihood of what is left and of how far the fitted values moved, ``(n,)``."""
+        known = np.einsum("np,pq,nq->n", followed, self._prior, followed)
+        return np.asarray(known + np.sum(self._seen(rest) ** 2, axis=(1, 2)))
+
+    def _with_effect(self, name: str, sizes: Sequence[_Size]) -> Vector:
+        """Errors of the car with an effect of several sizes, ``(n, W, 3 K)``."""
+        own = dict(self._fit.car.effects.get(name, {}))
+        return self._problem.errors_of([self._fit.car.with_effect(name, own | dict(one.values)) for one in sizes])
+
+    def _seen(self, change: Vector) -> Vector:
+        """Changes ``(n, W, 3 K)`` of the errors in units of the noise, as far as they count; outliers count less."""
+        white = [self._fit.noise.whiten(one) for one in change]
+        return np.stack([self._root * np.sqrt(weights(one))[:, None] * one for one in white])
+
+
+def _name(size: _Size) -> str:
+    return size.effect

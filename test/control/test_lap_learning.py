@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.control.horizon_model import SteppedCar
-from dynssm_ros.control.lap_learning import SAFE, LapLearner, LapLog
+from dynssm_ros.control.lap_learning import SAFE, LapLearner, LapLog, _better
 from dynssm_ros.control.prediction_model import Fixed
 from dynssm_ros.control.race import Course, race
 from dynssm_ros.control.reference import load_reference
@@ -100,6 +100,12 @@ def test_a_car_that_nobody_measured_begins_slower_still(orca, club):
         before = np.minimum(learner._shares, learner._allowed)
         learner.learn(lap(learner))
         np.testing.assert_allclose(learner._shares - before, np.where(before < SAFE, 2 * STEP, STEP))
+
+
+def test_what_is_believed_stays_till_it_is_clearly_worse():
+    """Errors of two that are about as good, lap by lap: nothing goes to and fro."""
+    assert [_better(error, 1.0, False) for error in (0.85, 0.95, 1.05)] == [True, False, False]
+    assert [_better(error, 1.0, True) for error in (0.95, 1.05, 1.2)] == [True, True, False]
 
 
 def test_a_line_with_a_speed_of_its_own_is_refused(orca, club):
