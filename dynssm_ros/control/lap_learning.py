@@ -2,9 +2,10 @@
 
 The line's speed has a share of the car's accelerations for each section of the lap. It begins at a safe share. After a lap a
 section is driven a step faster, if the car stayed away from the borders there and was not slower than before: two steps
-below the safe share, where a car that was not known well had to begin. One that came
-too close to a border, and the one before it, go back below what they were driven with, and stay there. One that was slower
-than it has been goes back to what was fastest.
+below the safe share, where a car that was not known well had to begin. One that came too close to a border, and the one
+before it, go back below what they were driven with, and stay there. So does one where an axle slipped nearly as far as it
+may, if the controller follows the line's speed: one that goes as far as it can does so at any speed of the line. A section
+that was slower than it has been goes back to what was fastest.
 
 After each lap the coefficients are calibrated on the last ones, and the grip of each section beside them. No share goes
 beyond what they allow with what is not known of them: the cornering limit that most cars within their covariance reach,
@@ -48,6 +49,7 @@ SAFE = 0.7
 _STEP = 0.06
 _MOST = 1.2  # of what the coefficients allow: racing lines ask for less than the borders do
 _CLOSE = 0.75  # half the car's width over the distance from its centre to the border, from which on it is too close
+_NEARLY = 0.95  # of the bound on its slip, from which on an axle slips too far
 _SLOWER = 0.01  # share of a section's best time
 _SECTION_HORIZONS = 1.5  # length of a section, in horizons at the line's mean speed
 _FEWEST_SECTIONS, _MOST_SECTIONS = 4, 40
@@ -67,6 +69,7 @@ class LapLog:
         s: along the centre line, counted on (m), ``(n,)``.
         room: from the car's centre to the nearer border (m), ``(n,)``.
         caution: standard deviation of where the car is at the end of a horizon (m), ``(n,)``.
+        believed: ``v_x, v_y, omega, r, delta`` as the controller knew them, ``(n, 5)``.
         rows: with the columns ``WINDOW_COLUMNS``, ``(n, 7)``.
     """
 
@@ -74,6 +77,7 @@ class LapLog:
     s: Vector
     room: Vector
     caution: Vector
+    believed: Vector
     rows: Vector
 
 
@@ -146,6 +150,7 @@ class LapLearner:
         self._known = vehicle
         self._planned = False
         self._half_width = settings.margin
+        self._most_slip = _NEARLY * np.array(settings.slip) if settings.objective == "tracking" else np.full(2, np.inf)
         horizon = HORIZON * settings.scale.time * track.length / reference.lap_time
         sections = int(np.clip(track.length / (_SECTION_HORIZONS * horizon), _FEWEST_SECTIONS, _MOST_SECTIONS))
         self._edges = np.linspace(0.0, track.length, sections + 1)
@@ -201,6 +206,7 @@ class LapLearner:
         if is_new:
             self._ceiling[:] = np.inf  # what was too close was planned with other coefficients
         close |= np.roll(close, -1)  # what leads there
+        close |= self._slips(lap)
         slower = ~close & (times > (1 + _SLOWER) * self._best_time)
         better = ~close & (times < self._best_time)
         self._best_time = np.where(better, times, self._best_time)
@@ -230,6 +236,15 @@ class LapLearner:
         self._is_local = _better(local, same, self._is_local)
         self._planned = _better(local if self._is_local else same, own, planned)
         return self._planned and not planned
+
+    def _slips(self, lap: LapLog) -> npt.NDArray[np.bool_]:
+        """In which sections an axle slipped nearly as far as it may."""
+        v_x, v_y, omega, _, delta = lap.believed.T
+        constants = self._vehicle.constants
+        front = delta - np.arctan2(v_y + constants.l_f * omega, v_x)
+        rear = np.arctan2(v_y - constants.l_r * omega, v_x)
+        far = np.abs(np.column_stack([front, rear])) > self._most_slip
+        return np.isin(np.arange(len(self._shares)), self._section(lap.s[far.any(axis=1)]))
 
     def _by_section(self, lap: LapLog) -> tuple[Vector, Vector]:
         """Time in each section (s), and the margin used there at most."""

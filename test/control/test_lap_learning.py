@@ -27,8 +27,11 @@ def learner(orca, club):
     return built
 
 
-def lap(learner, seconds=None, close=()):
-    """A lap that takes ``seconds`` in each section, with the car's side on the border in the sections ``close``."""
+def lap(learner, seconds=None, close=(), slipping=()):
+    """A lap that takes ``seconds`` in each section, with the car's side on the border in the sections ``close``.
+
+    In the sections ``slipping`` the rear axle moves sideways nearly as much as it may.
+    """
     edges = learner._edges
     count = len(edges) - 1
     seconds = np.ones(count) if seconds is None else np.asarray(seconds)
@@ -36,7 +39,10 @@ def lap(learner, seconds=None, close=()):
     section = np.clip(np.searchsorted(edges, s, "right") - 1, 0, count - 1)
     time = np.interp(s, edges, np.concatenate([[0.0], np.cumsum(seconds)]))
     room = np.where(np.isin(section, close), 1.0, 5.0) * learner._half_width
-    return LapLog(time, s, room, np.zeros(len(s)), np.zeros((len(s), 7)))
+    believed = np.zeros((len(s), 5))
+    believed[:, 0] = 2.0
+    believed[:, 1] = np.where(np.isin(section, slipping), 2.0 * np.tan(1.02 * learner._most_slip[1]), 0.0)
+    return LapLog(time, s, room, np.zeros(len(s)), believed, np.zeros((len(s), 7)))
 
 
 def test_the_first_lap_is_safe_and_each_section_is_driven_faster_by_a_step(learner, club, orca):
@@ -58,6 +64,21 @@ def test_where_it_was_close_it_goes_back_and_stays_there(learner):
         learner.learn(lap(learner))
     others = np.delete(learner._shares, [1, 2])
     np.testing.assert_allclose(others, SAFE + 6 * STEP)
+
+
+def test_where_an_axle_slipped_nearly_as_far_as_it_may_it_goes_back_and_stays_there(learner, orca, club):
+    """The section alone: what leads there is not to blame. A car that goes as far as it can does so at any speed."""
+    learner.learn(lap(learner))
+    learner.learn(lap(learner, slipping=[2]))
+    for _ in range(3):
+        assert learner._shares[2] == pytest.approx(SAFE + STEP / 2)
+        learner.learn(lap(learner))
+    np.testing.assert_allclose(np.delete(learner._shares, 2), SAFE + 5 * STEP)
+    fast = LapLearner(
+        orca, club, learner._line, Settings.of(orca, "progress"), SteppedCar.of(orca), orca.nominal
+    )  # fmt: skip
+    assert not fast._slips(lap(learner, slipping=[2])).any()
+    assert learner._slips(lap(learner, slipping=[2])).tolist().index(True) == 2
 
 
 def test_a_section_that_was_slower_returns_to_its_best(learner):
