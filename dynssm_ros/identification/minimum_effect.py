@@ -94,6 +94,7 @@ class _Size:
 
     def change(self, worth: float) -> None:
         """Takes what an effect of :attr:`values` is worth: it is to be 1, and grows like the size squared, or faster."""
+        worth = worth if np.isfinite(worth) else np.inf  # the simulation runs away
         if worth < 1.0:
             self._less = self.size
         else:
