@@ -26,14 +26,15 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.cli.console import console
 from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.horizon_model import HorizonModel
-from dynssm_ros.control.nmpc import DELTA, V_X, Adapted, Nmpc, R
+from dynssm_ros.control.nmpc import DELTA, V_X, Adapted, Nmpc, R, _directions
+from dynssm_ros.control.race import Course
 from dynssm_ros.control.race_models import true_model
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.reporting.tables import Column, Table, Value
 from dynssm_ros.simulation.plant import make_plant
+from dynssm_ros.simulation.sensing import Sensors
 from dynssm_ros.vehicle import Applied, State, load_vehicle
-from dynssm_ros.vehicle.kinematics import Pose
 
 _SPEED_SCALE = 0.9
 _EASE = 4  # of the increments and slacks of a stage: two and two
@@ -91,15 +92,14 @@ class Recorder(Nmpc):
         z_low, z_high = np.full(n, -np.inf), np.full(n, np.inf)
         z_low[:size] = z_high[:size] = x[0]
         at = self._reference_points(x)
-        point, heading = self._reference.line.position(at), self._reference.line.heading(at)
+        point, tangents, normals = self._reference.line.position(at), *_directions(self._reference.line.heading(at))
         reach, span = self._limits.steering_rate * self.model.car.T_s, np.ptp(self._limits.throttle)
         for k in range(N):
             first, after = k * wide + size, (k + 1) * wide
             inputs, slack, ending = slice(first, first + 2), first + 2, first + 3
             place, actuators = slice(after, after + 2), after + np.array([R, DELTA])
-            tangent = np.array([np.cos(heading[k]), np.sin(heading[k])])
-            normal = np.array([-tangent[1], tangent[0]])
-            W = 2 * h * (w.along * np.outer(tangent, tangent) + w.across * np.outer(normal, normal)) / length**2
+            along, across = (np.outer(each[k], each[k]) for each in (tangents, normals))
+            W = 2 * h * (w.along * along + w.across * across) / length**2
             H[place, place], g[place] = W, -W @ point[k]
             H[inputs, inputs] = 2 * np.diag([w.throttle, w.steering]) / h
             H[slack, slack], g[slack] = 2 * h * w.border, h * w.border
@@ -107,7 +107,7 @@ class Recorder(Nmpc):
             z_low[inputs], z_high[inputs] = (-span, -reach), (span, reach)
             z_low[[slack, ending]] = 0.0
             z_low[actuators], z_high[actuators] = zip(self._limits.throttle, self._limits.steering, strict=True)
-        g[N * wide : N * wide + 2] -= w.progress * tangent / length
+        g[N * wide : N * wide + 2] -= w.progress * tangents[-1] / length
         g[(N - 1) * wide + size + 3] = w.ending
         gaps = following - np.einsum("kij,kj->ki", by_x, x[:-1]) - np.einsum("kij,kj->ki", by_u, u)
         A, low, high = self._rows_by_stages(by_x, by_u, gaps, self._soft_rows(x, p, margins, float(at[-1])))
@@ -174,19 +174,16 @@ def recorded(car: str, objective: Any, seconds: float) -> dict[str, list[Problem
     reference, model = load_reference("racing", vehicle, road, _SPEED_SCALE), true_model(vehicle, "rk4")
     horizon = HorizonModel(model.car, settings.N, settings.travel, settings.scale.length / settings.scale.time)
     nmpc = Recorder(horizon, vehicle.inputs, reference, road, settings)
-    x, y = (float(value) for value in reference.line.position(0.0))
-    start = State(float(reference.speed_at(0.0)), 0.0, 0.0)
-    plant = make_plant(vehicle, "rk4", Pose(x, y, float(reference.line.heading(0.0))), start)
-    noise, rng, feedback = np.array(sensing(car, 1.0, False).noise), np.random.default_rng(0), Applied(0.0, 0.0)
+    course = Course(vehicle, road, "rk4", reference, settings, sensing=sensing(car, 1.0, False))
+    plant, feedback = make_plant(vehicle, course.plant, *course.starting()), Applied(0.0, 0.0)
+    sensors = Sensors(course.sensing, vehicle.sampling_time)
     for _ in range(round(seconds / vehicle.sampling_time)):
-        seen = np.array(plant.measured) + noise * rng.standard_normal(3)
-        plan = nmpc.plan(np.array([*plant.pose, *seen, *feedback]), model.calibrated)
+        sensors.measure(plant.pose, State(*plant.measured))
+        pose, seen = sensors.newest
+        plan = nmpc.plan(np.array([*pose, *seen, *feedback]), model.calibrated)
         feedback = nmpc.command(plan)
         plant.advance(feedback)
     return {form: problems[_SETTLED:] for form, problems in nmpc.problems.items()}
-
-
-_H, _A = operator.attrgetter("H"), operator.attrgetter("A")
 
 
 class Solutions(NamedTuple):
@@ -199,7 +196,8 @@ class Solutions(NamedTuple):
 
 def solved(problems: Sequence[Problem], solver: str) -> Solutions:
     """Solves programs of one form."""
-    h, a = (reduce(operator.add, (of(one).sparsity() for one in problems)) for of in (_H, _A))  # what is ever not zero
+    h = reduce(operator.add, (one.H.sparsity() for one in problems))  # what is ever not zero
+    a = reduce(operator.add, (one.A.sparsity() for one in problems))
     solve = ca.conic("program", solver, {"h": h, "a": a}, {"error_on_fail": False, **_OPTIONS[solver]})
     seconds, first = [], []
     for one in problems:

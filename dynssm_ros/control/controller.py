@@ -16,7 +16,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.disturbance import Disturbance
 from dynssm_ros.control.evidence import SOURCES, Evidence, sources, together
-from dynssm_ros.control.horizon_model import CONTEXT, STATES, VELOCITIES, HorizonModel
+from dynssm_ros.control.horizon_model import CONTEXT, MOVING, STATES, VELOCITIES, HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Nmpc, Plan, Status
 from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
@@ -33,7 +33,6 @@ from dynssm_ros.vehicle.single_track import settled_effect_states
 LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
 _AS_IT_IS = np.array([float(source == "model") for source in SOURCES])
 _ACTUATORS = slice(STATES.index("r"), STATES.index("delta") + 1)
-_MEASURED = slice(3, len(STATES))  # what a window's row begins with
 _KNOWN = (*STATES[:3], *CONTEXT)  # what effects may read
 
 
@@ -263,7 +262,7 @@ class Controller:
             past = np.where(np.isfinite(self._past), self._past, past)
         first = sent[0] if len(sent) else np.subtract(command, plan.x[0, _ACTUATORS])
         row = self._history[-1]
-        row[:5] = np.where(np.isfinite(row[:5]), row[:5], past[_MEASURED])
+        row[:5] = np.where(np.isfinite(row[:5]), row[:5], past[MOVING])
         row[5:] = first
         self._past = past
         self._expected = self._nmpc.following(past, first, adapted, t)

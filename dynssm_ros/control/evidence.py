@@ -23,7 +23,7 @@ from dynssm_ros.control.caution import Caution, Margins
 from dynssm_ros.control.horizon_model import VELOCITIES
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.vehicle import State
-from dynssm_ros.vehicle.kinematics import Pose, advance_pose
+from dynssm_ros.vehicle.kinematics import Pose, advance_pose, axle_direction
 
 Source = Literal["calibrated", "coefficients", "model"]
 SOURCES: tuple[Source, ...] = ("calibrated", "coefficients", "model")
@@ -173,10 +173,8 @@ class Evidence:
         rows = np.arange(len(left))
         step = np.asarray(self._steps - left, dtype=np.intp)
         lateral = np.cos(heading) * away[:, 1] - np.sin(heading) * away[:, 0]
-        v_x, v_y, omega = measured[VELOCITIES]
-        gone = states[:, VELOCITIES]
-        slips = np.arctan2(gone[:, 1:2] + self._axles * gone[:, 2:], gone[:, :1])
-        slip = slips - np.arctan2(v_y + self._axles * omega, v_x)
+        gone = states[:, VELOCITIES].T[..., None]
+        slip = axle_direction(np, self._axles, *gone) - axle_direction(np, self._axles, *measured[VELOCITIES])
         self._caution.update(rows % len(SOURCES), step, lateral, slip)
 
     def _moved(self, poses: Vector, before: Vector, after: Vector) -> Vector:

@@ -28,6 +28,8 @@ from dynssm_ros.vehicle.single_track import (
 STATES = ("x", "y", "theta", "v_x", "v_y", "omega", "r", "delta")
 """Pose (m, m, rad), velocities (m/s, m/s, rad/s), what the actuators do (fraction, rad). The effects' own follow."""
 VELOCITIES = slice(STATES.index("v_x"), STATES.index("omega") + 1)
+MOVING = slice(STATES.index("v_x"), len(STATES))
+"""Velocities and actuators: what a window's row begins with."""
 INPUTS = ("increment of r", "increment of delta")
 Travel = Literal["start", "middle"]
 """Which velocity and heading carry a car over a step: those at its start, as forward Euler does in the published data, or

@@ -41,7 +41,7 @@ from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import COEFFICIENTS, State, Vehicle
-from dynssm_ros.vehicle.kinematics import Pose, advance_pose
+from dynssm_ros.vehicle.kinematics import Pose, advance_pose, axle_direction
 from dynssm_ros.vehicle.limits import vehicle_limits
 
 SAFE = 0.7
@@ -239,11 +239,10 @@ class LapLearner:
 
     def _slips(self, lap: LapLog) -> npt.NDArray[np.bool_]:
         """In which sections an axle slipped nearly as far as it may."""
-        v_x, v_y, omega, _, delta = lap.believed.T
+        *velocities, _, delta = lap.believed.T[..., None]
         constants = self._vehicle.constants
-        front = delta - np.arctan2(v_y + constants.l_f * omega, v_x)
-        rear = np.arctan2(v_y - constants.l_r * omega, v_x)
-        far = np.abs(np.column_stack([front, rear])) > self._most_slip
+        moves = axle_direction(np, np.array([constants.l_f, -constants.l_r]), *velocities)
+        far = np.abs(moves - delta * [1.0, 0.0]) > self._most_slip
         return np.isin(np.arange(len(self._shares)), self._section(lap.s[far.any(axis=1)]))
 
     def _by_section(self, lap: LapLog) -> tuple[Vector, Vector]:

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.control.horizon_model import INPUTS, STATES, SteppedCar
+from dynssm_ros.control.horizon_model import INPUTS, MOVING, STATES, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Plan
 from dynssm_ros.runtime.learner import OnlineLearner
 from dynssm_ros.runtime.models import OnnxModel, WindowModel, WindowPrediction, corrected
@@ -16,8 +16,6 @@ from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import Coefficients, State, Vehicle, step
 from dynssm_ros.vehicle.kinematics import SCALAR
-
-_MEASURED = slice(STATES.index("v_x"), len(STATES))  # of the controller's state: what a window's row begins with
 
 
 class PredictionModel(Protocol):
@@ -188,7 +186,7 @@ def stepped(car: SteppedCar, rows: Vector, theta: Vector) -> Vector:
 
 def _planned_rows(plan: Plan) -> Vector:
     """Window rows of the plan's steps after the first, shape ``(N - 1, 7)``."""
-    return np.concatenate([plan.x[1:-1, _MEASURED], plan.u[1:]], axis=1)
+    return np.concatenate([plan.x[1:-1, MOVING], plan.u[1:]], axis=1)
 
 
 assert WINDOW_COLUMNS[:5] == (*STATES[3:6], "r_fb", "delta_fb"), "a window's row begins like the controller's state"

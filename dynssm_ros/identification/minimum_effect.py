@@ -46,8 +46,10 @@ def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable
         By effect, in the unit of the parameter; infinite where it changes nothing that was measured.
     """
     taken = {effect for effect, _ in fit.free}
-    first = {one.effect: one for one in reversed(list(found)) if one.effect not in taken}
-    sizes = {effect: [_Size(one, at) for at in _where(one)] for effect, one in sorted(first.items())}
+    sizes: dict[str, list[_Size]] = {}
+    for candidate in found:
+        if candidate.effect not in taken and candidate.effect not in sizes:
+            sizes[candidate.effect] = [_Size(candidate, at, len(fit.position)) for at in _where(candidate)]
     nearby = _Nearby(problem, fit)
     for _ in range(_ROUNDS):
         left = [one for each in sizes.values() for one in each if not one.settled]
@@ -71,9 +73,10 @@ class _Size:
     Args:
         candidate: the effect; its shape is neutral.
         at: parameters of the place.
+        fitted: how many values were fitted.
     """
 
-    def __init__(self, candidate: Candidate, at: Values) -> None:
+    def __init__(self, candidate: Candidate, at: Values, fitted: int) -> None:
         self.effect = candidate.effect
         self._parameter = candidate.amplitudes[0]
         about = EFFECTS[self.effect].PARAMETERS
@@ -82,7 +85,7 @@ class _Size:
         bound = self._about.upper if self._about.direction > 0 else self._about.lower
         self._most = abs(bound - self._about.neutral)
         self.size = min(_FIRST * unit(self.effect, self._parameter), self._most)
-        self.follows: float | Vector = 0.0
+        self.follows: Vector = np.zeros(fitted)
         """What the fitted values do for each unit of it."""
         self.settled = False
         self._less, self._enough = 0.0, np.inf
@@ -143,21 +146,18 @@ class _Nearby:
         followed = np.zeros((len(sizes), len(self._H)))
         rest = present - self._fit.errors
         told = self._told(rest, followed)
-        move = np.stack(
-            [np.broadcast_to(one.size * one.follows, len(self._H)) for one in sizes]
-        )  # as for the size before
-        for shares in (_SHARES[:1], *[_SHARES] * _FOLLOWED):
-            for share in shares:
+        for k in range(1 + _FOLLOWED):
+            # at first as for the size before
+            move = self._move(rest, followed) if k else np.stack([one.size * one.follows for one in sizes])
+            for share in _SHARES if k else (1.0,):
                 tried = np.clip(self._fit.position + followed + share * move, *self._limits) - self._fit.position
                 other = present - self._errors(tried)
                 less = self._told(other, tried)
                 better = less < told
                 rest[better], followed[better], told[better] = other[better], tried[better], less[better]
-            pull = self._seen(rest).reshape(len(sizes), -1) @ self._J - followed @ self._prior
-            move = np.linalg.solve(self._H, pull.T).T
         for one, each in zip(sizes, followed, strict=True):
             one.follows = each / one.size
-        seen = told - np.einsum("np,pq,nq->n", followed, self._prior, followed)
+        seen = told - self._surprise(followed)
         matters = np.max((rest[..., -3:] ** 2).sum(axis=1) / self._error, axis=1) / _MATTERS
         return np.asarray(np.minimum(told / self._needed, np.where(2 * seen < told, np.inf, matters)))
 
@@ -166,10 +166,18 @@ class _Nearby:
         fit = self._fit
         return self._problem.errors_of([with_values(fit.car, fit.free, fit.position + each) for each in followed])
 
+    def _move(self, rest: Vector, followed: Vector) -> Vector:
+        """How the fitted values would take up what is left, if errors were linear in them, ``(n, P)``."""
+        pull = self._seen(rest).reshape(len(rest), -1) @ self._J - followed @ self._prior
+        return np.asarray(np.linalg.solve(self._H, pull.T).T)
+
     def _told(self, rest: Vector, followed: Vector) -> Vector:
         """Twice the logarithm of the likelihood of what is left and of how far the fitted values moved, ``(n,)``."""
-        known = np.einsum("np,pq,nq->n", followed, self._prior, followed)
-        return np.asarray(known + np.sum(self._seen(rest) ** 2, axis=(1, 2)))
+        return np.asarray(self._surprise(followed) + np.sum(self._seen(rest) ** 2, axis=(1, 2)))
+
+    def _surprise(self, followed: Vector) -> Vector:
+        """How far the fitted values moved: squared, in standard deviations of what was known, ``(n,)``."""
+        return np.asarray(np.einsum("np,pq,nq->n", followed, self._prior, followed))
 
     def _with_effect(self, name: str, sizes: Sequence[_Size]) -> Vector:
         """Errors of the car with an effect of several sizes, ``(n, W, 3 K)``."""

@@ -35,6 +35,11 @@ def world_velocity(xp: Any, heading: Array, v_x: Array, v_y: Array) -> tuple[Arr
     return v_x * c - v_y * s, v_x * s + v_y * c
 
 
+def axle_direction(xp: Any, axle: Array, v_x: Array, v_y: Array, omega: Array) -> Array:
+    """Where an axle moves to against where the car heads (rad), ``axle`` metres before the centre of gravity."""
+    return xp.arctan2(v_y + axle * omega, v_x)
+
+
 def advance_pose(xp: Any, pose: Pose, before: State, after: State, T_s: float, share: float = 0.5) -> Pose:
     """The pose after a step of ``T_s`` (s) in which the velocities change from ``before`` to ``after``.
 

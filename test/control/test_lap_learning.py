@@ -74,11 +74,9 @@ def test_where_an_axle_slipped_nearly_as_far_as_it_may_it_goes_back_and_stays_th
         assert learner._shares[2] == pytest.approx(SAFE + STEP / 2)
         learner.learn(lap(learner))
     np.testing.assert_allclose(np.delete(learner._shares, 2), SAFE + 5 * STEP)
-    fast = LapLearner(
-        orca, club, learner._line, Settings.of(orca, "progress"), SteppedCar.of(orca), orca.nominal
-    )  # fmt: skip
+    fast = LapLearner(orca, club, learner._line, Settings.of(orca, "progress"), SteppedCar.of(orca), orca.nominal)
     assert not fast._slips(lap(learner, slipping=[2])).any()
-    assert learner._slips(lap(learner, slipping=[2])).tolist().index(True) == 2
+    assert np.flatnonzero(learner._slips(lap(learner, slipping=[2]))).tolist() == [2]
 
 
 def test_a_section_that_was_slower_returns_to_its_best(learner):
