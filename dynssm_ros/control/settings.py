@@ -24,9 +24,9 @@ Follows = Literal["chosen", "always", "never"]
 """How what the model mispredicts is followed."""
 
 HORIZON = 3.5  # in units of the car's time: 15 steps of 20 ms for the 1:43 car, 40 of 40 ms for an Indy car
-# shares of what the tyres can give up to which an axle is used: beyond its peak the front gives less for more steering, and
-# from a slide of the rear there is no way back
-_FRONT_USED, _REAR_USED = 1.0, 0.95
+# shares of what the tyres can give up to which an axle is used: at its peak the front gives the same for more and for less
+# steering, so that a program that is linearised there knows no way back; from a slide of the rear there is none
+_FRONT_USED, _REAR_USED = 0.98, 0.95
 _LAG_BOUND_WHEELBASES = (
     0.3  # wheelbases that a car may be behind the line's own time and still be asked to make up for it
 )

@@ -48,11 +48,11 @@ def test_every_car_sees_as_far_in_its_own_time(name, steps):
 
 
 def test_no_axle_is_to_be_used_beyond_what_its_tyres_give():
-    """The Indy car's B, C, E are 10, 1.5 and -0.5 on both axles: the front up to its peak, the rear up to 95 % of that."""
+    """The Indy car's B, C, E are 10, 1.5 and -0.5 on both axles: the front to 98 % of its peak, the rear to 95 %."""
     slip = np.linspace(0, 0.3, 30001)
     force = np.sin(1.5 * np.arctan(10 * slip + 0.5 * (10 * slip - np.arctan(10 * slip))))
     front, rear = Settings.of(load_vehicle("av21")).slip
-    assert front == pytest.approx(slip[np.argmax(force)], abs=1e-3)
+    assert front == pytest.approx(slip[np.argmax(force >= 0.98)], abs=1e-3)
     assert rear == pytest.approx(slip[np.argmax(force >= 0.95)], abs=1e-3)
 
 
