@@ -7,6 +7,10 @@ shooting: its gaps are closed by the program). The states are then eliminated, s
 Actuator limits are hard; the borders, the slip of both axles, and the speed at the end of the horizon where the objective
 asks for it are soft with a linear penalty, so that a program is feasible wherever the car is.
 
+A plan that steers to the stop may be a local optimum that a car should not stay in. Then it is improved by a second program,
+and beside it a few other manoeuvres are driven ahead by the model (:mod:`dynssm_ros.control.manoeuvres`). The best of them
+is the plan if the model, driven and not linearised, says that it is clearly better.
+
 Tracking follows a reference time: the place where a car that keeps the line's own time would be now. One that is behind is
 asked to catch up, one that is ahead to wait. The reference is at most ``lag_bound`` away (MPCC: a bound on the lag error),
 so that time that cannot be made up for is given up.
@@ -27,6 +31,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.control.buffered import QuadraticProgram
 from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, PARAMETERS, STATES, HorizonModel
+from dynssm_ros.control.manoeuvres import manoeuvres
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.track.tracks import Track
@@ -38,6 +43,8 @@ Status = Literal["solved", "infeasible", "late"]
 V_X, R, DELTA = (STATES.index(name) for name in ("v_x", "r", "delta"))
 _ROAD_LEFT, _SLIP_LEFT = 0.5, 0.5  # shares of the road and of the slip's bound that no caution takes
 _FIRST_ROUNDS = 10  # programs that the first plan takes to settle
+_AT_STOP = 0.01  # rad
+_CLEARLY = 0.2  # share of its cost by which a plan is to be undercut
 
 
 class Adapted(NamedTuple):
@@ -167,6 +174,8 @@ class Nmpc:
             plan = None if plan is None else self._improved(now, plan, adapted, t, margins)
         if plan is None:
             plan = self._held(now, guess, adapted, t, "infeasible")
+        elif self._may_be_caught(plan):
+            plan = self._elsewhere(now, plan, adapted, t, margins)
         self._plan = plan if sound or not first else None
         if not first and self._clock() - began > self.settings.deadline:
             return self._held(now, guess, adapted, t, "late")
@@ -246,6 +255,70 @@ class Nmpc:
             return None
         return Plan(states, u.reshape(-1, len(INPUTS)))
 
+    def _may_be_caught(self, plan: Plan) -> bool:
+        """Whether a plan steers to the stop."""
+        right, left = self._limits.steering
+        steering = plan.x[1:, DELTA]
+        return bool(np.any((steering < right + _AT_STOP) | (steering > left - _AT_STOP)))
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def _elsewhere(self, now: Vector, plan: Plan, adapted: Adapted, t: float, margins: Margins) -> Plan:
+        """``plan``, the same after another program, or another manoeuvre that is clearly better."""
+        p = self._parameters(adapted, t)
+        again = self._improved(now, plan, adapted, t, margins) or plan
+        others = manoeuvres(Applied(now[R], now[DELTA]), self._limits, self.settings.N, self.model.car.T_s)
+        u = np.concatenate([[plan.u, again.u], others])
+        x = self._driven(now, u, p)
+        costs = self._costs(x, u, p, margins)
+        own, best = int(np.argmin(costs[:2])), 2 + int(np.argmin(costs[2:]))
+        if costs[own] - costs[best] > _CLEARLY * abs(costs[own]):
+            return Plan(x[best], u[best])
+        return (plan, again)[own]
+
+    def _driven(self, now: Vector, u: Vector, p: Vector) -> Vector:
+        """Where increments lead by the model, not linearised: states ``(M, N + 1, size)``.
+
+        Args:
+            now: the present state, ``(size,)``.
+            u: sequences of increments, ``(M, N, 2)``.
+            p: parameters of the steps, ``(N, PARAMETERS)``.
+        """
+        x = np.empty((len(u), len(p) + 1, len(now)))
+        x[:, 0] = now
+        for k, parameters in enumerate(p):
+            x[:, k + 1] = self.model.step(x[:, k], u[:, k], parameters)
+        return x
+
+    def _costs(self, x: Vector, u: Vector, p: Vector, margins: Margins) -> Vector:
+        """What the program minimises, ``(M,)``; infinite where a state is not finite.
+
+        Args:
+            x: states, not linearised, ``(M, N + 1, size)``.
+            u: increments that led there, ``(M, N, 2)``.
+            p: parameters of the steps, ``(N, PARAMETERS)``.
+            margins: as of :meth:`plan`.
+        """
+        finite = np.all(np.isfinite(x), axis=(1, 2))
+        x = np.where(finite[:, None, None], x, x[:, :1])
+        w, length, h = self.settings.weights, self.settings.scale.length, self.model.car.T_s / self.settings.scale.time
+        at = self._reference_points(x)
+        tangent, normal = _directions(self._reference.line.heading(at))
+        errors = (x[:, 1:, :2] - self._reference.line.position(at)) / length
+        along, across = np.sum(tangent * errors, axis=-1), np.sum(normal * errors, axis=-1)
+        s, lateral = self._track.project(x[:, 1:, :2], _along(x[..., :2], self._on_track))
+        right, left = self._room(s, margins.lateral)
+        outside = np.maximum(lateral - left, -right - lateral) / length
+        slips = np.array([self.model.slip_angles(each[1:], p)[0] for each in x])
+        slipping = np.max(np.abs(slips) - self._slip_bounds(margins.slip), axis=-1)
+        each_step = w.along * along**2 + w.across * across**2 + w.border * _soft(np.maximum(outside, slipping))
+        costs = np.sum(h * each_step + u**2 @ [w.throttle, w.steering] / h, axis=-1)
+        if w.progress > 0:
+            costs -= w.progress * (along[:, -1] + (at[..., -1] - self._on_line) / length)
+        if w.ending > 0:
+            too_fast = (x[:, -1, V_X] - self._reference.speed_at(at[..., -1])) * self.settings.scale.time / length
+            costs += w.ending * _soft(too_fast)
+        return np.where(finite, costs, np.inf)
+
     def _program(
         self, now: Vector, guess: Vector, offset: Vector, slope: Vector, p: Vector, margins: Margins
     ) -> _Program:
@@ -299,19 +372,27 @@ class Nmpc:
         N = self.settings.N
         slips, by_x = self.model.slip_angles(guess, p)
         slips = slips + np.einsum("kas,ks->ka", by_x, offset - guess)
-        for axle, most in enumerate(self.settings.slip):
-            bound = most - np.minimum(margin[:, axle], (1.0 - _SLIP_LEFT) * most)
+        for axle, bound in enumerate(self._slip_bounds(margin).T):
             by_u = np.einsum("ks,ksj->kj", by_x[:, axle], slope)
             rows = slice(2 * axle * N, 2 * (axle + 1) * N)
             A[rows, : 2 * N] = np.concatenate([by_u, -by_u])
             A[rows, 2 * N : 3 * N] = -np.tile(np.eye(N), (2, 1))
             high[rows] = np.concatenate([bound - slips[:, axle], bound + slips[:, axle]])
 
+    def _slip_bounds(self, margin: Vector) -> Vector:
+        """Of front and rear axle after each step (rad), ``(N, 2)``, less ``margin`` ``(N, 2)`` where that leaves enough."""
+        most = np.array(self.settings.slip)
+        return most - np.minimum(margin, (1.0 - _SLIP_LEFT) * most)
+
     def _reference_points(self, guess: Vector) -> Vector:
-        """Where on the line the steps of the horizon are compared with it (m), shape ``(N,)``."""
+        """Where on the line the steps of the horizon are compared with it (m).
+
+        They are ``(..., N)`` for guesses ``(..., N + 1, size)``, or ``(N,)`` where all guesses are of the same present.
+        """
         if self.settings.objective == "tracking":
-            return self._reference.within_reach(self._on_line, self._times(1), float(guess[0, V_X]), self._scheduled)
-        return self._reference.project(guess[1:, :2], _along(guess[:, :2], self._on_line))
+            v = float(guess[..., 0, V_X].flat[0])
+            return self._reference.within_reach(self._on_line, self._times(1), v, self._scheduled)
+        return self._reference.project(guess[..., 1:, :2], _along(guess[..., :2], self._on_line))
 
     def _add_borders(
         self, A: Vector, low: Vector, high: Vector, guess: Vector, positions: Vector, moves: Vector, margin: Vector
@@ -324,14 +405,22 @@ class Nmpc:
         s = self._track.project(guess[1:, :2], _along(guess[:, :2], self._on_track))[0]
         foot = self._track.centre.position(s)
         normal = _directions(self._track.centre.heading(s))[1]
-        right, left = (width - self.settings.margin for width in self._track.widths(s))
-        margin = np.minimum(margin, (1.0 - _ROAD_LEFT) * np.maximum(right + left, 0.0) / 2)
+        right, left = self._room(s, margin)
         lateral = np.einsum("ki,ki->k", normal, positions - foot)
         by_u = np.einsum("ki,kij->kj", normal, moves)
         A[:, : 2 * N] = np.concatenate([by_u, by_u])
         into_slack = self.settings.scale.length * np.eye(N)
         A[:N, 2 * N : 3 * N], A[N:, 2 * N : 3 * N] = -into_slack, into_slack
-        high[:N], low[N:] = left - margin - lateral, margin - right - lateral
+        high[:N], low[N:] = left - lateral, -right - lateral
+
+    def _room(self, s: Vector, margin: Vector) -> tuple[Vector, Vector]:
+        """From the centre line at ``s`` (m) to where the car's centre may be, to the right and to the left (m).
+
+        Both are ``margin`` ``(N,)`` less, where the road is wide enough.
+        """
+        right, left = (width - self.settings.margin for width in self._track.widths(s))
+        margin = np.minimum(margin, (1.0 - _ROAD_LEFT) * np.maximum(right + left, 0.0) / 2)
+        return right - margin, left - margin
 
     def _held(self, now: Vector, guess: Plan, adapted: Adapted, t: float, status: Status) -> Plan:
         """The inputs of ``guess`` from ``now`` on, within the limits, and where they lead."""
@@ -361,11 +450,18 @@ def _condensed(x: Vector, u: Vector, following: Vector, by_x: Vector, by_u: Vect
 
 
 def _along(positions: Vector, s: float) -> Vector:
-    """About where positions after the first lie on a line (m), the first being at ``s``; shape ``(N,)``."""
-    return np.asarray(s + np.cumsum(np.hypot(*np.diff(positions, axis=0).T)))
+    """About where positions ``(..., N + 1, 2)`` after the first lie on a line (m), the first being at ``s``: ``(..., N)``."""
+    steps = np.diff(positions, axis=-2)
+    return np.asarray(s + np.cumsum(np.hypot(steps[..., 0], steps[..., 1]), axis=-1))
+
+
+def _soft(beyond: Vector) -> Vector:
+    """What going beyond a bound costs, in units of its price."""
+    slack = np.maximum(0.0, beyond)
+    return np.asarray(slack + slack**2)
 
 
 def _directions(heading: Vector) -> tuple[Vector, Vector]:
-    """Unit vectors along and to the left of ``heading``, each ``(N, 2)``."""
+    """Unit vectors along and to the left of ``heading`` ``(...)``, each ``(..., 2)``."""
     c, s = np.cos(heading), np.sin(heading)
-    return np.stack([c, s], axis=1), np.stack([-s, c], axis=1)
+    return np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)
