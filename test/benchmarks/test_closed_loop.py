@@ -12,14 +12,15 @@ from benchmarks.closed_loop.run import AS_IS, race_model, read_cell
 from benchmarks.generalisation.cells import CARS, NOISE_LEVELS
 from benchmarks.generalisation.run import model_folder
 from dynssm_ros.control.horizon_model import HorizonModel
-from dynssm_ros.control.nmpc import Adapted, Nmpc
+from dynssm_ros.control.nmpc import Nmpc
+from dynssm_ros.control.race import Course, Start
 from dynssm_ros.control.race_models import true_model
 from dynssm_ros.control.reference import load_reference
-from dynssm_ros.control.settings import Settings
-from dynssm_ros.simulation.plant import Pose, make_plant
+from dynssm_ros.control.settings import Settings, _slip
+from dynssm_ros.simulation.plant import make_plant
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import Applied, State, load_vehicle
-from dynssm_ros.vehicle.single_track import lateral_force
+from dynssm_ros.vehicle import Applied, load_vehicle
+from dynssm_ros.vehicle.kinematics import axle_direction
 
 
 def outcome(lap, violation=False, completed=True):
@@ -95,26 +96,23 @@ def test_a_cell_is_driven_with_each_model(small_model, tmp_path):
 def test_a_car_that_came_fast_into_a_bend_finds_out_of_it_with_a_front_that_grips_less():
     """The true model on a development cell. At the front tyre's peak the program sees no use in steering less."""
     cell, car = Cell("av21", ("club_b", 22), "front_grip"), load_vehicle("av21")
-    driven, road = car.with_effects(cell.effects.items()), cell.road
-    reference, settings = load_reference("racing", car, road, PACE["tracking"]), Settings.of(car)
+    driven, road, settings = (
+        car.with_effects(cell.effects.items()),
+        cell.road,
+        replace(Settings.of(car), deadline=np.inf),
+    )
+    reference, model = load_reference("racing", car, road, PACE["tracking"]), true_model(driven, "double_track")
+    horizon = HorizonModel(model.car, settings.N)
+    start = Start(float(road.project(reference.line.position(380.0))[0]), speed=1.04 * float(reference.speed_at(380.0)))
+    course = Course(driven, road, "double_track", reference, settings, start=start)
     B, C, _, E, *_ = car.nominal
-    slip = np.linspace(0.0, 0.3, 3001)
-    peak = float(slip[np.argmax(lateral_force(np, B, C, 1.0, E, 0.0, slip))])
-    model = HorizonModel(true_model(driven, "double_track").car, settings.N)
-    (x, y), heading = reference.line.position(380.0), float(reference.line.heading(380.0))
-    v_x = 1.04 * float(reference.speed_at(380.0))
-    most = {}
+    peak, most = _slip(1.0, B, C, E), {}
     for front in (settings.slip[0], peak):
-        nmpc = Nmpc(
-            model, car.inputs, reference, road, replace(settings, slip=(front, settings.slip[1]), deadline=np.inf)
-        )
-        start = State(v_x, 0.0, v_x * float(reference.line.curvature(380.0)))
-        plant, command = make_plant(driven, "double_track", Pose(x, y, heading), start), Applied(0.0, 0.0)
-        slips = []
+        nmpc = Nmpc(horizon, car.inputs, reference, road, replace(settings, slip=(front, settings.slip[1])))
+        plant, command, slips = make_plant(driven, course.plant, *course.starting()), Applied(0.0, 0.0), []
         for _ in range(100):
-            now = np.array([*plant.pose, *plant.state, *command])
-            command = nmpc.command(nmpc.plan(now, Adapted(driven.nominal, np.zeros(3))))
+            command = nmpc.command(nmpc.plan(np.array([*plant.pose, *plant.state, *command]), model.calibrated))
             plant.advance(command)
-            slips.append(np.arctan2(plant.state.v_y - car.constants.l_r * plant.state.omega, plant.state.v_x))
-        most[front] = np.max(np.abs(slips)) / settings.slip[1]
+            slips.append(abs(axle_direction(np, -car.constants.l_r, *plant.state)))
+        most[front] = np.max(slips) / settings.slip[1]
     assert most[settings.slip[0]] < 1.0 < 1.5 < most[peak], "of the rear, in shares of its bound"
