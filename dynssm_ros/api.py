@@ -637,7 +637,7 @@ def diagnose(
         horizon: time that is simulated from a measured state on (s).
         holdout: share at the end that only measures the improvement; whole laps if there are three.
         min_speed: stretches below are left out (m/s); the vehicle file's if not given.
-        integrator: of the simulation; if not given, Runge-Kutta unless Euler is clearly closer to the data.
+        integrator: of the simulation; if not given, the vehicle's, else Runge-Kutta, unless others are clearly closer.
         track: from whose start positions on the lap are counted; if not given, the first full lap.
         commands: source of the command inputs; the recording's own if not given.
         on_progress: called with what is being done.

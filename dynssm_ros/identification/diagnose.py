@@ -62,7 +62,7 @@ def diagnose(
         horizon: time that is simulated from a measured state on (s).
         holdout: share of each recording, at its end, that neither fit nor selection sees; whole laps if there are three.
         min_speed: stretches below are left out (m/s); ``None``: the vehicle file's.
-        integrator: of the simulation; ``None``: Runge-Kutta, unless Euler steps are clearly closer to the data.
+        integrator: of the simulation; ``None``: the vehicle's, else Runge-Kutta, unless others are clearly closer.
         line: of the track, from which positions on the lap are counted; ``None``: the first full lap of the recording.
         on_progress: told what is being done.
         exclude: names of effects that are impossible there, such as wind in a hall.

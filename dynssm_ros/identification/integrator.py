@@ -1,4 +1,4 @@
-"""Which steps the simulation makes: Runge-Kutta with inputs that are held, unless the data clearly say otherwise.
+"""Which steps the simulation makes: the vehicle file's, else Runge-Kutta, unless the data clearly say otherwise.
 
 Euler steps of the sampling time, as some simulators make them, act about half a step late. Inputs that went on changing
 between their samples act half a sample early, as a line from sample to sample does. Steering that lags hides that, and so
@@ -88,6 +88,7 @@ def search_causes(
 
     on_progress("choosing how the model steps")
     options = [one for one in _OPTIONS if integrator in (None, one.integrator)]
+    options.sort(key=lambda one: car.vehicle.integrator not in (None, one.integrator))  # those of the file first
     stepped = {one: _stepped(windows, car, one) for one in options}
     first = _closest({one: (problem, fit) for one, (_, problem, fit) in stepped.items()})
     found = search(stepped[first][0])

@@ -55,9 +55,8 @@ def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable
         left = [one for each in sizes.values() for one in each if not one.settled]
         for one, worth in zip(left, nearby.worth(left), strict=True):
             one.change(float(worth))
-    constants = fit.car.vehicle.constants
     return {
-        effect: max(float(np.median([one.size for one in each])), EFFECTS[effect].least(constants))
+        effect: max(float(np.median([one.size for one in each])), fit.car.least(effect))
         for effect, each in sizes.items()
     }
 

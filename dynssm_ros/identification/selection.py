@@ -425,13 +425,13 @@ class Search:
 
 
 def _is_little(refined: Refined) -> bool:
-    """Whether a cause of the car is nearer to neutral than what any car shows, or one of another structure."""
+    """Whether a cause of the car is nearer to neutral than what any car shows, one of another structure, or its file."""
     candidate, car = refined.candidate, refined.fit.car
-    about = EFFECTS[candidate.effect]
-    least = about.least(car.vehicle.constants)
+    least = car.least(candidate.effect)
     if not least or candidate.only_in:
         return False
-    return about.amount({name: car.effects[candidate.effect][name] for name in candidate.amplitudes}) < least
+    values = {name: car.effects[candidate.effect][name] for name in candidate.amplitudes}
+    return EFFECTS[candidate.effect].amount(values) < least
 
 
 def _pays(refined: Refined) -> bool:

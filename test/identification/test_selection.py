@@ -19,7 +19,8 @@ from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle import Vehicle, load_vehicle
+from dynssm_ros.vehicle.effects import EFFECTS
 
 ORCA = load_vehicle("orca")
 FEW = [
@@ -30,17 +31,23 @@ FEW = [
 ]
 
 
-def windows(plant: str = "euler", **effects: dict[str, float]) -> SimulationWindows:
+NOISE = (0.005, 0.005, 0.02)
+
+
+def windows(
+    plant: str = "euler", noise: tuple[float, float, float] = NOISE, **effects: dict[str, float]
+) -> SimulationWindows:
     car = ORCA.with_effects(effects.items())
-    run = simulate(car, load_track("club"), duration=25.0, plant=plant, noise=(0.005, 0.005, 0.02))
+    run = simulate(car, load_track("club"), duration=25.0, plant=plant, noise=noise)
     recording = as_recording(run)
     data = recorded_rows(recording, recording_context(recording))
     return fit_windows(recording, data, 0.3, 0.0)
 
 
-def search(**effects: dict[str, float]) -> Search:
-    given = windows(**effects).with_integrator("euler", ORCA)
-    return Search(IdentificationProblem(given, CarEstimate.of(ORCA)), CarEstimate.of(ORCA), FEW, quarters(given))
+def search(vehicle: Vehicle = ORCA, **effects: dict[str, float]) -> Search:
+    given = windows(**effects).with_integrator("euler", vehicle)
+    car = CarEstimate.of(vehicle)
+    return Search(IdentificationProblem(given, car), car, FEW, quarters(given))
 
 
 def quarters(given: SimulationWindows) -> CrossValidation:
@@ -139,6 +146,19 @@ def test_what_no_car_has_gives_way_to_what_cannot_be_told_from_it() -> None:
     assert chosen == [sensitive]
 
 
+@pytest.mark.parametrize(("factor", "named"), [(0.93, []), (0.85, ["front_grip"])])
+def test_what_leaning_loads_take_from_a_front_axle_is_no_cause(factor: float, named: list[str]) -> None:
+    known = ORCA.with_nominal(ORCA.nominal, 0.01 * np.abs(ORCA.nominal) + 1e-6)
+    found = search(known, front_grip={"factor": factor}).run()
+    assert [one.candidate.effect for one in found.chosen] == named
+
+
+def test_what_the_file_has_already_must_change_noticeably_to_be_a_cause() -> None:
+    assert CarEstimate.of(ORCA).least("steering_lag") == 0.0
+    late = ORCA.with_effect("steering_lag", {"time_constant": 0.05})
+    assert CarEstimate.of(late).least("steering_lag") == EFFECTS["steering_lag"].TYPICAL[0]
+
+
 def test_left_out_parts_are_predicted_by_the_others() -> None:
     given = windows(steering_offset={"offset": 0.03}).with_integrator("euler", ORCA)
     problem = IdentificationProblem(given, CarEstimate.of(ORCA))
@@ -165,6 +185,14 @@ def test_the_integrator_is_that_of_the_data(plant: str) -> None:
     assert found.problem.windows.integrator == plant
     assert [one.candidate.effect for one in found.selection.chosen] == []
     assert np.isfinite(found.selection.fit.objective)
+
+
+@pytest.mark.parametrize("stated", [None, "rk4", "euler"])
+def test_the_integrator_is_that_of_the_file_where_the_data_do_not_say(stated: str | None) -> None:
+    given = windows("rk4", (0.2, 0.2, 1.0))
+    car = CarEstimate.of(ORCA.model_copy(update={"integrator": stated}))
+    found = search_causes(given, car, quarters(given), None, lambda words: None)
+    assert found.problem.windows.integrator == (stated or "rk4")
 
 
 def test_another_yaw_inertia_is_not_taken_for_euler_steps() -> None:

@@ -13,6 +13,7 @@ from dynssm_ros.vehicle.single_track import Array, Constants, Motion, at_least
 
 _LEAST_GRIP = 0.1  # of the nominal, however far a drift has gone
 _LEAST_SHARE = 0.05  # squared share of the lateral force that the longitudinal one leaves at least
+_LEANS = 0.1  # of the grip of an axle with two wheels, that the load takes which leans to one side
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,8 @@ class Grip(Effect):
 
     @classmethod
     def least(cls, constants: Constants) -> float:
-        """What the load that leans to one side takes from the grip of an axle with two wheels."""
-        return 0.1
+        """What axles with two wheels lose in bends."""
+        return _LEANS
 
     def slip(self, xp: Any, q: Motion) -> None:
         """Scales the slip angles at which the tyres are."""
@@ -62,6 +63,11 @@ class FrontGrip(Effect):
     PARAMETERS = {"factor": Parameter("1", 0.3, 1.7, 1.0)}
     TYPICAL = (0.1, 0.25)
     factor: Array = 1.0
+
+    @classmethod
+    def least(cls, constants: Constants) -> float:
+        """What an axle with two wheels loses in bends."""
+        return _LEANS
 
     def tyres(self, xp: Any, q: Motion) -> None:
         """Scales the front lateral force."""
