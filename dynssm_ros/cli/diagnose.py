@@ -51,7 +51,9 @@ def diagnose(
     min_speed: MinSpeedOption = None,
     integrator: Annotated[
         Integrator | None,
-        typer.Option(help="How the model steps.", show_default="rk4, unless euler is clearly closer to the data"),
+        typer.Option(
+            help="How the model steps.", show_default="the vehicle's, else rk4, unless others are clearly closer"
+        ),
     ] = None,
     track: Annotated[
         str | None,
