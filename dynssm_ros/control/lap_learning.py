@@ -3,9 +3,9 @@
 The line's speed has a share of the car's accelerations for each section of the lap. It begins at a safe share. After a lap a
 section is driven a step faster, if the car stayed away from the borders there and was not slower than before: two steps
 below the safe share, where a car that was not known well had to begin. One that came too close to a border, and the one
-before it, go back below what they were driven with, and stay there. So does one where an axle slipped nearly as far as it
-may, if the controller follows the line's speed: one that goes as far as it can does so at any speed of the line. A section
-that was slower than it has been goes back to what was fastest.
+before it, go back below what they were driven with, and stay there. So does one where the rear slipped nearly as far as it
+may, if the controller follows the line's speed: one that goes as far as it can does so at any speed of the line. A front
+axle that slips as far is well used. A section that was slower than it has been goes back to what was fastest.
 
 After each lap the coefficients are calibrated on the last ones, and the grip of each section beside them. No share goes
 beyond what they allow with what is not known of them: the cornering limit that most cars within their covariance reach,
@@ -49,7 +49,7 @@ SAFE = 0.7
 _STEP = 0.06
 _MOST = 1.2  # of what the coefficients allow: racing lines ask for less than the borders do
 _CLOSE = 0.75  # half the car's width over the distance from its centre to the border, from which on it is too close
-_NEARLY = 0.95  # of the bound on its slip, from which on an axle slips too far
+_NEARLY = 0.95  # of the bound on its slip, from which on the rear slips too far
 _SLOWER = 0.01  # share of a section's best time
 _SECTION_HORIZONS = 1.5  # length of a section, in horizons at the line's mean speed
 _FEWEST_SECTIONS, _MOST_SECTIONS = 4, 40
@@ -69,7 +69,7 @@ class LapLog:
         s: along the centre line, counted on (m), ``(n,)``.
         room: from the car's centre to the nearer border (m), ``(n,)``.
         caution: standard deviation of where the car is at the end of a horizon (m), ``(n,)``.
-        believed: ``v_x, v_y, omega, r, delta`` as the controller knew them, ``(n, 5)``.
+        velocities: ``v_x, v_y, omega`` as the controller knew them, ``(n, 3)``.
         rows: with the columns ``WINDOW_COLUMNS``, ``(n, 7)``.
     """
 
@@ -77,7 +77,7 @@ class LapLog:
     s: Vector
     room: Vector
     caution: Vector
-    believed: Vector
+    velocities: Vector
     rows: Vector
 
 
@@ -150,7 +150,7 @@ class LapLearner:
         self._known = vehicle
         self._planned = False
         self._half_width = settings.margin
-        self._most_slip = _NEARLY * np.array(settings.slip) if settings.objective == "tracking" else np.full(2, np.inf)
+        self._most_slip = _NEARLY * settings.slip[1] if settings.objective == "tracking" else np.inf
         horizon = HORIZON * settings.scale.time * track.length / reference.lap_time
         sections = int(np.clip(track.length / (_SECTION_HORIZONS * horizon), _FEWEST_SECTIONS, _MOST_SECTIONS))
         self._edges = np.linspace(0.0, track.length, sections + 1)
@@ -238,12 +238,9 @@ class LapLearner:
         return self._planned and not planned
 
     def _slips(self, lap: LapLog) -> npt.NDArray[np.bool_]:
-        """In which sections an axle slipped nearly as far as it may."""
-        *velocities, _, delta = lap.believed.T[..., None]
-        constants = self._vehicle.constants
-        moves = axle_direction(np, np.array([constants.l_f, -constants.l_r]), *velocities)
-        far = np.abs(moves - delta * [1.0, 0.0]) > self._most_slip
-        return np.isin(np.arange(len(self._shares)), self._section(lap.s[far.any(axis=1)]))
+        """In which sections the rear slipped nearly as far as it may."""
+        far = np.abs(axle_direction(np, -self._vehicle.constants.l_r, *lap.velocities.T)) > self._most_slip
+        return np.isin(np.arange(len(self._shares)), self._section(lap.s[far]))
 
     def _by_section(self, lap: LapLog) -> tuple[Vector, Vector]:
         """Time in each section (s), and the margin used there at most."""

@@ -21,7 +21,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.control.caution import QUANTILE
 from dynssm_ros.control.controller import LOST, Controller, Decision
 from dynssm_ros.control.evidence import SOURCES
-from dynssm_ros.control.horizon_model import MOVING
+from dynssm_ros.control.horizon_model import VELOCITIES
 from dynssm_ros.control.lap_learning import LapLearner, LapLog, LearnedLap
 from dynssm_ros.control.prediction_model import PredictionModel
 from dynssm_ros.control.reference import Reference
@@ -280,7 +280,7 @@ class _Drive:
         track, believed = self._course.track, decision.plan.x[0]
         room = float(track.room(*track.project(believed[:2], near=self.s)))
         row = (*self._sensors.newest[1], *self._feedback, *np.subtract(decision.command, self._feedback))
-        self._logged.append((t, self.s, room, decision.caution / QUANTILE, believed[MOVING], row))
+        self._logged.append((t, self.s, room, decision.caution / QUANTILE, believed[VELOCITIES], row))
         if self.s >= self.start + (1 + len(self._learner.laps)) * track.length:
             self._learner.learn(LapLog(*(np.array(column) for column in zip(*self._logged, strict=True))))
             self.pilot.follow(self._learner.reference, self._learner.theta)

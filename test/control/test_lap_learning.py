@@ -39,10 +39,10 @@ def lap(learner, seconds=None, close=(), slipping=()):
     section = np.clip(np.searchsorted(edges, s, "right") - 1, 0, count - 1)
     time = np.interp(s, edges, np.concatenate([[0.0], np.cumsum(seconds)]))
     room = np.where(np.isin(section, close), 1.0, 5.0) * learner._half_width
-    believed = np.zeros((len(s), 5))
-    believed[:, 0] = 2.0
-    believed[:, 1] = np.where(np.isin(section, slipping), 2.0 * np.tan(1.02 * learner._most_slip[1]), 0.0)
-    return LapLog(time, s, room, np.zeros(len(s)), believed, np.zeros((len(s), 7)))
+    velocities = np.zeros((len(s), 3))
+    velocities[:, 0] = 2.0
+    velocities[:, 1] = np.where(np.isin(section, slipping), 2.0 * np.tan(1.02 * learner._most_slip), 0.0)
+    return LapLog(time, s, room, np.zeros(len(s)), velocities, np.zeros((len(s), 7)))
 
 
 def test_the_first_lap_is_safe_and_each_section_is_driven_faster_by_a_step(learner, club, orca):
@@ -66,7 +66,7 @@ def test_where_it_was_close_it_goes_back_and_stays_there(learner):
     np.testing.assert_allclose(others, SAFE + 6 * STEP)
 
 
-def test_where_an_axle_slipped_nearly_as_far_as_it_may_it_goes_back_and_stays_there(learner, orca, club):
+def test_where_the_rear_slipped_nearly_as_far_as_it_may_it_goes_back_and_stays_there(learner, orca, club):
     """The section alone: what leads there is not to blame. A car that goes as far as it can does so at any speed."""
     learner.learn(lap(learner))
     learner.learn(lap(learner, slipping=[2]))
