@@ -116,7 +116,7 @@ def write_page() -> None:
     figure = f"{PAGE}.png"
     with replacing(PAGE_FOLDER / figure) as aside:
         lap_times(known).savefig(aside, format="png", dpi=130, metadata={"Software": None})
-    _write(f"{PAGE}.md", page(known, ARGUMENTS, figure))
+    _write(f"{PAGE}.md", page(known, ARGUMENTS, figure, CELLS))
 
 
 def _known(read: Callable[..., dict[str, Any] | None]) -> dict[Cell, dict[str, Any]]:

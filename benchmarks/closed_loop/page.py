@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -98,18 +99,19 @@ def lap_times(known: Known) -> Figure:
     return figure
 
 
-def page(known: Known, arguments: Sequence[str], figure: str) -> str:
+def page(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[Cell]) -> str:
     """The results as Markdown.
 
     Args:
         known: outcomes.
         arguments: of doit's command that differ from the default.
         figure: name of the figure's file.
+        asked: the cells that the command drives, whether or not it has come to them.
     """
-    return "\n".join(_lines(known, arguments, figure)) + "\n"
+    return "\n".join(_lines(known, arguments, figure, asked)) + "\n"
 
 
-def _lines(known: Known, arguments: Sequence[str], figure: str) -> Iterator[str]:
+def _lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[Cell]) -> Iterator[str]:
     rivals = [name for name in RIVALS if name in next(iter(known.values()))]
     cars = ", ".join(_CARS[name] for name in dict.fromkeys(cell.car for cell in known))
     yield f"# Closed loop with rivals: {cars}" if rivals else "# Closed loop"
@@ -158,10 +160,13 @@ def _lines(known: Known, arguments: Sequence[str], figure: str) -> Iterator[str]
                 f"| `{model}` | {entry['came_round']} of {content['possible']} | {over} | {entry['p99_ms']:.1f} | "
                 f"{entry['missing']} |"
             )
-        yield ""
-        for model, entry in content["models"].items():
-            if entry["lost"]:
-                yield f"- `{model}` is lost in {', '.join(entry['lost'])}."
+        if lost := {model: entry["lost"] for model, entry in content["models"].items() if entry["lost"]}:
+            yield ""
+            yield from (f"- `{model}` is lost in {', '.join(where)}." for model, where in lost.items())
+        missing = Counter(cell.car for cell in asked if cell.is_test == _PARTS[label] and cell not in known)
+        if missing:
+            yield ""
+            yield f"Not driven: {', '.join(f'{count} cells of {_CARS[car]}' for car, count in missing.items())}."
     yield ""
     yield f"![Last laps over the true model's]({figure})"
 

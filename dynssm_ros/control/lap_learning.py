@@ -3,9 +3,9 @@
 The line's speed has a share of the car's accelerations for each section of the lap. It begins at a safe share. After a lap a
 section is driven a step faster, if the car stayed away from the borders there and was not slower than before: two steps
 below the safe share, where a car that was not known well had to begin. One that came too close to a border, and the one
-before it, go back below what they were driven with, and stay there. So does one where the rear slipped nearly as far as it
-may, if the controller follows the line's speed: one that goes as far as it can does so at any speed of the line. A front
-axle that slips as far is well used. A section that was slower than it has been goes back to what was fastest.
+before it, go back below what they were driven with, and stay there. So does, once, one where the rear slipped nearly as far
+as it may, if the controller follows the line's speed: one that goes as far as it can does so at any speed of the line. A
+front axle that slips as far is well used. A section that was slower than it has been goes back to what was fastest.
 
 After each lap the coefficients are calibrated on the last ones, and the grip of each section beside them. No share goes
 beyond what they allow with what is not known of them: the cornering limit that most cars within their covariance reach,
@@ -206,7 +206,7 @@ class LapLearner:
         if is_new:
             self._ceiling[:] = np.inf  # what was too close was planned with other coefficients
         close |= np.roll(close, -1)  # what leads there
-        close |= self._slips(lap)
+        close |= self._slips(lap) & np.isinf(self._ceiling)  # once: the plan goes as far at a little less speed
         slower = ~close & (times > (1 + _SLOWER) * self._best_time)
         better = ~close & (times < self._best_time)
         self._best_time = np.where(better, times, self._best_time)

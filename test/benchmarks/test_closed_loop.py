@@ -68,10 +68,15 @@ def test_the_page_counts_those_that_come_round_and_compares_last_laps():
     models = [part["models"]["dynssm"] for part in parts if part["cells"]]
     assert sum(model["came_round"] for model in models) == 1
     assert [name for model in models for name in model["lost"]] == [every[1].name]
-    words = page(known, ["part=all"], "laps.png")
+    words = page(known, ["part=all"], "laps.png", every)
     assert "(laps.png)" in words
     assert "dodo.py part=all" in words
     assert every[1].name in words
+    assert "Not driven" not in words
+    same = [
+        cell for cell in cells() if cell.car == every[0].car and cell.is_test == every[0].is_test and cell not in every
+    ]
+    assert f"Not driven: {len(same)} cells of" in page(known, [], "laps.png", [*every, *same])
     assert len(lap_times(known).axes) == 1
 
 
