@@ -51,9 +51,7 @@ def diagnose(
     min_speed: MinSpeedOption = None,
     integrator: Annotated[
         Integrator | None,
-        typer.Option(
-            help="How the model steps.", show_default="the vehicle's, else rk4, unless others are clearly closer"
-        ),
+        typer.Option(help="How the model steps.", show_default="the file's, else rk4; others if clearly closer"),
     ] = None,
     track: Annotated[
         str | None,

@@ -1,4 +1,4 @@
-"""Which steps the simulation makes: the vehicle file's, else Runge-Kutta, unless the data clearly say otherwise.
+"""Which steps the simulation makes: the file's, else Runge-Kutta with inputs that are held, unless the data say otherwise.
 
 Euler steps of the sampling time, as some simulators make them, act about half a step late. Inputs that went on changing
 between their samples act half a sample early, as a line from sample to sample does. Steering that lags hides that, and so

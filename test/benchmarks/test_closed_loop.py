@@ -101,11 +101,8 @@ def test_a_cell_is_driven_with_each_model(small_model, tmp_path):
 def test_a_car_that_came_fast_into_a_bend_finds_out_of_it_with_a_front_that_grips_less():
     """The true model on a development cell. At the front tyre's peak the program sees no use in steering less."""
     cell, car = Cell("av21", ("club_b", 22), "front_grip"), load_vehicle("av21")
-    driven, road, settings = (
-        car.with_effects(cell.effects.items()),
-        cell.road,
-        replace(Settings.of(car), deadline=np.inf),
-    )
+    driven, road = car.with_effects(cell.effects.items()), cell.road
+    settings = replace(Settings.of(car), deadline=np.inf)
     reference, model = load_reference("racing", car, road, PACE["tracking"]), true_model(driven, "double_track")
     horizon = HorizonModel(model.car, settings.N)
     start = Start(float(road.project(reference.line.position(380.0))[0]), speed=1.04 * float(reference.speed_at(380.0)))

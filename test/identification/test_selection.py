@@ -22,16 +22,13 @@ from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 
-ORCA = load_vehicle("orca")
+ORCA, NOISE = load_vehicle("orca"), (0.005, 0.005, 0.02)
 FEW = [
     Candidate("steering_offset", ("offset",)),
     Candidate("drive_gain", ("factor",)),
     Candidate("front_grip", ("factor",)),
     Candidate("drag", ("coefficient",)),
 ]
-
-
-NOISE = (0.005, 0.005, 0.02)
 
 
 def windows(
