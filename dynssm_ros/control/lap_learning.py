@@ -169,7 +169,7 @@ class LapLearner:
     def reference(self) -> Reference:
         """The line with the speed for the next lap."""
         share = np.interp(self._at, self._centres, np.minimum(self._shares, self._allowed), period=self._edges[-1])
-        return replace(self._line, speed=speed_profile(self._line.line, self._limits, share), share=None)
+        return Reference.within(self._line.name, self._line.line, self._limits, share)
 
     def theta(self, s: Vector) -> Vector:
         """Coefficients of the calibrated car at places of the next lap (m), ``(N, 17)``."""

@@ -312,10 +312,13 @@ class Nmpc:
         slipping = np.max(np.abs(slips) - self._slip_bounds(margins.slip), axis=-1)
         each_step = w.along * along**2 + w.across * across**2 + w.border * _soft(np.maximum(outside, slipping))
         costs = np.sum(h * each_step + u**2 @ [w.throttle, w.steering] / h, axis=-1)
+        costs += w.at_end * across[:, -1] ** 2
         if w.progress > 0:
             costs -= w.progress * (along[:, -1] + (at[..., -1] - self._on_line) / length)
         if w.ending > 0:
-            too_fast = (x[:, -1, V_X] - self._reference.speed_at(at[..., -1])) * self.settings.scale.time / length
+            too_fast = (
+                (x[:, -1, V_X] - self._reference.terminal_speed_at(at[..., -1])) * self.settings.scale.time / length
+            )
             costs += w.ending * _soft(too_fast)
         return np.where(finite, costs, np.inf)
 
@@ -330,11 +333,14 @@ class Nmpc:
         tangent, normal = _directions(heading)
         H, g = np.zeros((self._variables,) * 2), np.zeros(self._variables)
         length, h = self.settings.scale.length, self.model.car.T_s / self.settings.scale.time
-        for direction, weight in ((tangent, w.along), (normal, w.across)):
-            errors = np.einsum("ki,ki->k", direction, positions - point) / length
-            by_u = np.einsum("ki,kij->kj", direction, moves) / length
-            H[: 2 * N, : 2 * N] += 2 * h * weight * by_u.T @ by_u
-            g[: 2 * N] += 2 * h * weight * by_u.T @ errors
+        along, across = np.full(N, h * w.along), np.full(N, h * w.across)
+        across[-1] += w.at_end
+        for direction, weights in ((tangent, along), (normal, across)):
+            scale = np.sqrt(2 * weights) / length
+            errors = scale * np.einsum("ki,ki->k", direction, positions - point)
+            by_u = scale[:, None] * np.einsum("ki,kij->kj", direction, moves)
+            H[: 2 * N, : 2 * N] += by_u.T @ by_u
+            g[: 2 * N] += by_u.T @ errors
         g[: 2 * N] -= w.progress * tangent[-1] @ moves[-1] / length
         rates = np.tile([w.throttle, w.steering], N) / h
         H[np.diag_indices(self._variables)] += 2 * np.concatenate(
@@ -354,7 +360,7 @@ class Nmpc:
         self._add_slip(A[slips], high[slips], guess[1:], offset[1:], slope[1:], p, margins.slip)
         if w.ending > 0:
             A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -length / self.settings.scale.time
-            high[-1] = float(self._reference.speed_at(at[-1])) - offset[-1, V_X]
+            high[-1] = float(self._reference.terminal_speed_at(at[-1])) - offset[-1, V_X]
 
         reach = self._limits.steering_rate * self.model.car.T_s
         span = self._limits.throttle[1] - self._limits.throttle[0]

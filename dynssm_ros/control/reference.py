@@ -12,7 +12,7 @@ import numpy.typing as npt
 from dynssm_ros.arrays import Vector
 from dynssm_ros.track.lines import ClosedLine, Floats
 from dynssm_ros.track.racing_line import line_of
-from dynssm_ros.track.speed_profile import speed_profile
+from dynssm_ros.track.speed_profile import speed_profile, terminal_speed_profile
 from dynssm_ros.track.tracks import Track, TrackError
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.limits import Limits, vehicle_limits
@@ -34,7 +34,8 @@ class Reference:
         line: where to drive.
         speed: at the points of the line (m/s), shape ``(N,)``.
         limits: of the car that follows it; ``None``: it can do anything.
-        share: of the limits' accelerations that the speed asks for; ``None``: the line has a speed of its own.
+        share: of the limits' accelerations that the speed asks for, everywhere; ``None``: there is no such share.
+        terminal_speed: at the points (m/s), the greatest from which the car can go on, shape ``(N,)``; ``None``: ``speed``.
     """
 
     name: str
@@ -42,6 +43,20 @@ class Reference:
     speed: Vector
     limits: Limits | None = None
     share: float | None = None
+    terminal_speed: Vector | None = None
+
+    @classmethod
+    def within(cls, name: str, line: ClosedLine, limits: Limits, share: float | Vector) -> Reference:
+        """A line as fast as a car can drive it.
+
+        Args:
+            name: of the reference.
+            line: where to drive.
+            limits: of the car.
+            share: of its accelerations that are used, for all points or ``(N,)``.
+        """
+        speed, terminal_speed = (each(line, limits, share) for each in (speed_profile, terminal_speed_profile))
+        return cls(name, line, speed, limits, None if isinstance(share, np.ndarray) else share, terminal_speed)
 
     @property
     def standing(self) -> bool:
@@ -84,7 +99,15 @@ class Reference:
 
     def speed_at(self, s: Floats) -> Vector:
         """Speed (m/s) at ``s`` (m)."""
-        return np.asarray(np.interp(s if self.standing else s % self.line.length, self._grid, self._grid_speed))
+        return self._at(s, self._grid_speed)
+
+    def terminal_speed_at(self, s: Floats) -> Vector:
+        """Greatest speed (m/s) at ``s`` (m) from which the car can go on."""
+        return self._at(s, self._grid_terminal_speed)
+
+    def _at(self, s: Floats, values: Vector) -> Vector:
+        """``values`` of the grid at ``s`` (m)."""
+        return np.asarray(np.interp(s if self.standing else s % self.line.length, self._grid, values))
 
     def within_reach(self, s: float, times: Vector, v: float, scheduled: float | None = None) -> Vector:
         """Places (m) that a car with speed ``v`` (m/s) at ``s`` (m) is to reach after ``times`` (s).
@@ -122,6 +145,12 @@ class Reference:
         return np.append(self.speed, self.speed[-1 if self.standing else 0])
 
     @cached_property
+    def _grid_terminal_speed(self) -> Vector:
+        if self.terminal_speed is None:
+            return self._grid_speed
+        return np.append(self.terminal_speed, self.terminal_speed[0])
+
+    @cached_property
     def _time(self) -> Vector:
         """Time at which each point of the grid is reached (s); the speed changes linearly in time between points."""
         speed = self._grid_speed
@@ -147,7 +176,7 @@ def load_reference(name_or_path: str, vehicle: Vehicle, track: Track, speed_scal
     if name_or_path not in ("centre", "racing"):
         raise TrackError(f"line '{name_or_path}' is neither centre, racing nor a file {','.join(COLUMNS)}")
     line = line_of("centre" if name_or_path == "centre" else "racing", vehicle, track)
-    return Reference(name_or_path, line, speed_profile(line, limits, speed_scale), limits, speed_scale)
+    return Reference.within(name_or_path, line, limits, speed_scale)
 
 
 def _read(path: Path, speed_scale: float, limits: Limits) -> Reference:

@@ -21,6 +21,19 @@ def speed_profile(line: ClosedLine, limits: Limits, share: float | Vector = 1.0)
         limits: of the car.
         share: of its accelerations that are used, for all points or ``(N,)``.
     """
+    return _profile(line, limits, share, limits.drive)
+
+
+def terminal_speed_profile(line: ClosedLine, limits: Limits, share: float | Vector = 1.0) -> Vector:
+    """Greatest speed (m/s) at the points of ``line`` from which the car can go on along it, shape ``(N,)``.
+
+    Cornering and brakes bound it; the drive need not reach it, unlike in :func:`speed_profile`, whose arguments it takes.
+    """
+    return _profile(line, limits, share, None)
+
+
+def _profile(line: ClosedLine, limits: Limits, share: float | Vector, drive: Vector | None) -> Vector:
+    """The speed that cornering, brakes and ``drive`` (over ``limits.speed``; ``None``: of any strength) allow."""
     share = np.broadcast_to(np.asarray(share, dtype=np.float64), line.s.shape)
     curvature = np.abs(line.curvature(line.s)) / share
     v = limits.cornering_speed(curvature)
@@ -28,7 +41,8 @@ def speed_profile(line: ClosedLine, limits: Limits, share: float | Vector = 1.0)
     # from the slowest corner around once, the end meets the start; then the same in reverse for the brakes
     start = int(np.argmin(v))
     order = np.asarray((start + np.arange(len(v) + 1)) % len(v), dtype=np.intp)
-    v = _forward(v, order, share * ds, curvature, limits, limits.drive)
+    if drive is not None:
+        v = _forward(v, order, share * ds, curvature, limits, drive)
     return _forward(v, order[::-1], share * np.roll(ds, 1), curvature, limits, limits.brake)
 
 

@@ -1,6 +1,7 @@
 """The controller, against closed forms and its limits."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.optimize import fsolve
 from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.control.reference import load_reference
+from dynssm_ros.control.settings import WEIGHTS
 from dynssm_ros.simulation.plant import Pose, make_plant
 from dynssm_ros.vehicle import Applied, Coefficients, State, motion
 
@@ -195,6 +197,30 @@ def test_progress_is_faster_than_the_line_and_ends_as_slow(orca, circle, control
         plan = nmpc.plan(now, nominal(orca))
     assert plan.x[-1, 3] == pytest.approx(1.5, abs=0.05)
     assert np.max(plan.x[:, 3]) > 1.5
+
+
+def test_progress_ends_as_fast_as_the_car_can_go_on_from(orca, circle, controller):
+    """On a line that is slower than that, as behind a bend, it is the speed from which it can go on that counts."""
+    track, reference = circle(speed=1.5)
+    nmpc = controller(track, replace(reference, terminal_speed=np.full(200, 1.6)), "progress")
+    now = state_vector((1.0, 0.0, np.pi / 2), (1.3, 0.0, 1.3), (0.2, 0.06))
+    for _ in range(5):
+        plan = nmpc.plan(now, nominal(orca))
+    assert plan.x[-1, 3] == pytest.approx(1.6, abs=0.05)
+
+
+def test_progress_ends_near_the_line(orca, circle, controller, monkeypatch):
+    """A car beside the line comes back by the end of its horizon, the more the end counts."""
+    track, reference = circle()
+    now, beside = state_vector((0.95, 0.0, np.pi / 2), (1.3, 0.0, 1.3), (0.2, 0.06)), {}
+    as_shipped = WEIGHTS["progress"].at_end
+    for weight in (0.0, as_shipped):
+        monkeypatch.setitem(WEIGHTS, "progress", replace(WEIGHTS["progress"], at_end=weight))
+        nmpc = controller(track, reference, "progress")
+        for _ in range(5):
+            plan = nmpc.plan(now, nominal(orca))
+        beside[weight] = abs(np.hypot(*plan.x[-1, :2]) - 1.0)
+    assert beside[as_shipped] < 0.75 * beside[0.0]
 
 
 @pytest.mark.parametrize("side", [1, -1])

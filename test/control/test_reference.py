@@ -56,6 +56,16 @@ def test_the_file_may_close_the_loop(orca, club, tmp_path, circle):
     assert load_reference(str(path), orca, club).lap_time == pytest.approx(reference.lap_time, rel=1e-9)
 
 
+def test_the_car_may_go_on_from_a_higher_speed_than_it_reaches(orca, club, standing):
+    racing = load_reference("racing", orca, club)
+    s = np.linspace(-1.0, 2 * racing.line.length, 300)
+    above = racing.terminal_speed_at(s) - racing.speed_at(s)
+    assert np.min(above) == pytest.approx(0.0, abs=1e-12)
+    assert np.max(above) > 0.5
+    # of a file nothing else is known
+    np.testing.assert_array_equal(standing.terminal_speed_at(s), standing.speed_at(s))
+
+
 def test_pace_slows_the_line(orca, club):
     assert load_reference("centre", orca, club, 0.8).lap_time > 1.05 * load_reference("centre", orca, club).lap_time
 

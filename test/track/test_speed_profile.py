@@ -1,11 +1,13 @@
 """Acceleration limits of a vehicle and the forward-backward speed profile."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.track.speed_profile import speed_profile
+from dynssm_ros.track.speed_profile import speed_profile, terminal_speed_profile
 from dynssm_ros.track.tracks import built_in_track
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
 from dynssm_ros.vehicle.limits import Limits, vehicle_limits
@@ -58,6 +60,21 @@ def test_straights_are_driven_at_full_throttle_or_full_brake():
     # on each straight one point lies between the two
     assert np.sum(straight & ~full) <= 12
     assert np.sum(straight & full) > 150
+
+
+@pytest.mark.parametrize("share", [1.0, 0.7])
+def test_terminal_speed_is_bounded_by_cornering_and_brakes_alone(share):
+    line = built_in_track("road_course").centre
+    terminal = terminal_speed_profile(line, CONSTANT, share)
+    used = np.abs(line.curvature(line.s)) * terminal**2 / (share * CONSTANT.lateral[0])
+    assert np.max(used) <= 1 + 1e-3
+    assert np.all(slopes(line, terminal) >= -share * CONSTANT.brake[0] - 1e-9)
+    weak = replace(CONSTANT, drive=0.5 * CONSTANT.drive)
+    np.testing.assert_array_equal(terminal_speed_profile(line, weak, share), terminal)
+    v = speed_profile(line, CONSTANT, share)
+    assert np.all(v <= terminal)
+    assert np.max(terminal - v) > 10  # at the end of a corner, before a straight
+    assert np.mean(terminal - v < 1e-9) > 0.2  # where it brakes
 
 
 def test_profile_does_not_depend_on_the_first_point():
