@@ -106,7 +106,7 @@ def task_learning_page() -> dict[str, Any]:
 
 def write_learning_page() -> None:
     """The page of the cells that were driven faster every lap."""
-    _write(LEARNING_PAGE, learning_page(_known(read_learning), ARGUMENTS))
+    _write(LEARNING_PAGE, learning_page(_known(read_learning), ARGUMENTS, CELLS))
 
 
 def write_page() -> None:

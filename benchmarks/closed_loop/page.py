@@ -142,9 +142,13 @@ def _lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[
             "which for the 1:43 car and the AV-21 is the car itself before the change."
         )
     for label, content in summary(known).items():
-        if not content["cells"]:
+        if not any(cell.is_test == _PARTS[label] for cell in [*known, *asked]):
             continue
         yield ""
+        if not content["cells"]:
+            yield f"## {label.capitalize()} cells"
+            yield from _not_driven(known, asked, label)
+            continue
         yield f"## {label.capitalize()} cells ({content['possible']} of {content['cells']})"
         yield ""
         yield "Those in which the true model comes round between the borders."
@@ -163,44 +167,78 @@ def _lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[
         if lost := {model: entry["lost"] for model, entry in content["models"].items() if entry["lost"]}:
             yield ""
             yield from (f"- `{model}` is lost in {', '.join(where)}." for model, where in lost.items())
-        missing = Counter(cell.car for cell in asked if cell.is_test == _PARTS[label] and cell not in known)
-        if missing:
-            yield ""
-            yield f"Not driven: {', '.join(f'{count} cells of {_CARS[car]}' for car, count in missing.items())}."
+        yield from _not_driven(known, asked, label)
     yield ""
     yield f"![Last laps over the true model's]({figure})"
+
+
+def _not_driven(known: Known, asked: Sequence[Cell], label: str) -> Iterator[str]:
+    """Of which cars cells of a part are still to be driven."""
+    missing = Counter(cell.car for cell in asked if cell.is_test == _PARTS[label] and cell not in known)
+    if missing:
+        yield ""
+        yield f"Not driven: {', '.join(f'{count} of {_CARS[car]}' for car, count in missing.items())}."
 
 
 def _both(values: Sequence[float] | None) -> str:
     return "–" if values is None else ", ".join(f"{value:.3f}" for value in values)
 
 
-def learning_page(known: Mapping[Cell, Mapping[str, Any]], arguments: Sequence[str]) -> str:
-    """What learned lap by lap, as Markdown."""
+def learning_page(known: Known, arguments: Sequence[str], asked: Sequence[Cell]) -> str:
+    """What learned lap by lap, as Markdown; see :func:`page`."""
+    return "\n".join(_learning_lines(known, arguments, asked)) + "\n"
+
+
+def _learning_lines(known: Known, arguments: Sequence[str], asked: Sequence[Cell]) -> Iterator[str]:
     command = " ".join(["python -m doit -n 2 -f benchmarks/closed_loop/dodo.py", *arguments, "learning_page"])
-    lines = [
-        "# Faster every lap",
-        "",
+    yield "# Faster every lap"
+    yield ""
+    yield (
         f"Made by `{command}`. Each cell is driven for {LEARNING_LAPS} laps with `dynssm`, beginning with {SAFE:g} of the "
         "car's limits ([how](race.md#faster-every-lap)). The cells are those of the [matrix](closed_loop.md). The last "
         f"lap is compared with the best of the true model, which knows the plant and the change, at "
-        f"{', '.join(f'{pace:g}' for pace in TRUE_PACES)} of the limits.",
-    ]
+        f"{', '.join(f'{pace:g}' for pace in TRUE_PACES)} of the limits."
+    )
     for label, test in _PARTS.items():
         part = {cell: outcome for cell, outcome in known.items() if cell.is_test == test}
-        if not part:
+        if not any(cell.is_test == test for cell in [*known, *asked]):
             continue
-        lines += ["", f"## {label.capitalize()} cells", ""]
-        lines += ["| change | cells | between the borders | first lap | last lap: median, worst | within 1.5 % |"]
-        lines += ["| --- | --- | --- | --- | --- | --- |"]
-        for change in [*dict.fromkeys(cell.change for cell in part), "all"]:
-            lines.append(_learning_row(change, [v for c, v in part.items() if change in (c.change, "all")]))
-    return "\n".join(lines) + "\n"
+        yield ""
+        yield f"## {label.capitalize()} cells"
+        if part:
+            yield ""
+            yield "| | cells | between the borders | first lap | last lap: median, worst | within 1.5 % |"
+            yield "| --- | --- | --- | --- | --- | --- |"
+            for name, row in _learning_rows(part):
+                yield _learning_row(name, list(row.values()))
+            if behind := [f"{cell.name} ({ratio:.3f})" for cell, ratio in _behind(part) if ratio > _GOAL]:
+                yield ""
+                yield f"More than 1.5 % behind: {', '.join(behind)}."
+        yield from _not_driven(known, asked, label)
 
 
-def _learning_row(change: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
+def _learning_rows(part: Known) -> Iterator[tuple[str, Known]]:
+    """Outcomes by what is hidden, by car, by objective, and all."""
+    for change in dict.fromkeys(cell.change for cell in part):
+        yield change, {cell: outcome for cell, outcome in part.items() if cell.change == change}
+    for car, name in _CARS.items():
+        if of_car := {cell: outcome for cell, outcome in part.items() if cell.car == car}:
+            yield name, of_car
+    for objective in OBJECTIVES:
+        yield objective, {cell: outcome for cell, outcome in part.items() if cell.objective == objective}
+    yield "all", part
+
+
+def _behind(part: Known) -> Iterator[tuple[Cell, float]]:
+    """Last laps over the true model's best, where there are both."""
+    for cell, outcome in part.items():
+        if came_round(outcome["learned"]) and outcome["true_best_s"] is not None:
+            yield cell, outcome["learned"]["lap_times_s"][-1] / outcome["true_best_s"]
+
+
+def _learning_row(name: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
     safe = [outcome for outcome in outcomes if came_round(outcome["learned"])]
     pairs = [(o["learned"]["lap_times_s"], o["true_best_s"]) for o in safe if o["true_best_s"] is not None]
     first, last = (np.array([laps[k] / best for laps, best in pairs]) for k in (0, -1))
     middle = f"{np.median(first):.3f} | {np.median(last):.3f}, {np.max(last):.3f}" if pairs else "– | –"
-    return f"| {change} | {len(outcomes)} | {len(safe)} | {middle} | {np.sum(last <= _GOAL)} of {len(pairs)} |"
+    return f"| {name} | {len(outcomes)} | {len(safe)} | {middle} | {np.sum(last <= _GOAL)} of {len(pairs)} |"

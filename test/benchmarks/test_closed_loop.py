@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.closed_loop.cells import CHANGES, OBJECTIVES, PACE, PLANTS, TRACKS, Cell, cells, variation
-from benchmarks.closed_loop.page import lap_times, page, summary
+from benchmarks.closed_loop.page import lap_times, learning_page, page, summary
 from benchmarks.closed_loop.run import AS_IS, race_model, read_cell
 from benchmarks.generalisation.cells import CARS, NOISE_LEVELS
 from benchmarks.generalisation.run import model_folder
@@ -76,8 +76,33 @@ def test_the_page_counts_those_that_come_round_and_compares_last_laps():
     same = [
         cell for cell in cells() if cell.car == every[0].car and cell.is_test == every[0].is_test and cell not in every
     ]
-    assert f"Not driven: {len(same)} cells of" in page(known, [], "laps.png", [*every, *same])
+    assert f"Not driven: {len(same)} of" in page(known, [], "laps.png", [*every, *same])
     assert len(lap_times(known).axes) == 1
+
+
+def test_a_part_of_which_nothing_was_driven_is_told():
+    test, development = (next(cell for cell in cells() if cell.is_test == part) for part in (True, False))
+    known = {test: {name: outcome(10.0) for name in ("true", "calibrated", "dynssm")}}
+    for words in (
+        page(known, [], "laps.png", [test, development]),
+        learning_page({test: {"true_best_s": 10.0, "learned": outcome(10.1)}}, [], [test, development]),
+    ):
+        assert "## Development cells" in words
+        assert "Not driven: 1 of" in words
+
+
+def test_the_page_of_learning_names_what_stays_behind():
+    near, far, off, slow = [cell for cell in cells() if cell.is_test and cell.car == "orca"][:4]
+    known = {
+        near: {"true_best_s": 10.0, "learned": outcome(10.1)},
+        far: {"true_best_s": 10.0, "learned": outcome(10.3)},
+        off: {"true_best_s": 10.0, "learned": outcome(9.9, violation=True)},
+        slow: {"true_best_s": None, "learned": outcome(12.0)},
+    }
+    words = learning_page(known, ["part=all"], list(known))
+    assert "dodo.py part=all learning_page" in words
+    assert "| all | 4 | 3 | 1.030 | 1.020, 1.030 | 1 of 2 |" in words
+    assert f"More than 1.5 % behind: {far.name} (1.030)." in words
 
 
 @pytest.mark.timeout(300)
