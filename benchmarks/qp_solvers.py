@@ -99,16 +99,17 @@ class Recorder(Nmpc):
             inputs, slack, ending = slice(first, first + 2), first + 2, first + 3
             place, actuators = slice(after, after + 2), after + np.array([R, DELTA])
             along, across = (np.outer(each[k], each[k]) for each in (tangents, normals))
-            W = 2 * h * (w.along * along + w.across * across) / length**2
+            at_end = w.terminal_across if k == N - 1 else 0.0
+            W = 2 * (h * w.along * along + (h * w.across + at_end) * across) / length**2
             H[place, place], g[place] = W, -W @ point[k]
             H[inputs, inputs] = 2 * np.diag([w.throttle, w.steering]) / h
             H[slack, slack], g[slack] = 2 * h * w.border, h * w.border
-            H[ending, ending] = 2 * max(w.ending, 1.0)
+            H[ending, ending] = 2 * max(w.terminal_speed, 1.0)
             z_low[inputs], z_high[inputs] = (-span, -reach), (span, reach)
             z_low[[slack, ending]] = 0.0
             z_low[actuators], z_high[actuators] = zip(self._limits.throttle, self._limits.steering, strict=True)
         g[N * wide : N * wide + 2] -= w.progress * tangents[-1] / length
-        g[(N - 1) * wide + size + 3] = w.ending
+        g[(N - 1) * wide + size + 3] = w.terminal_speed
         gaps = following - np.einsum("kij,kj->ki", by_x, x[:-1]) - np.einsum("kij,kj->ki", by_u, u)
         A, low, high = self._rows_by_stages(by_x, by_u, gaps, self._soft_rows(x, p, margins, float(at[-1])))
         return Problem(ca.sparsify(ca.DM(H)), g, ca.sparsify(ca.DM(A)), low, high, z_low, z_high, size)
@@ -152,7 +153,7 @@ class Recorder(Nmpc):
         least = np.concatenate([low, np.full(4 * N, -np.inf)]).reshape(6, N).T
         rows = np.concatenate([borders, slips])[:, :size].reshape(6, N, size).swapaxes(0, 1)
         here = np.einsum("kij,kj->ki", rows, x[1:])
-        too_fast = float(self._reference.speed_at(end)) if self.settings.weights.ending > 0 else np.inf
+        too_fast = float(self._reference.terminal_speed_at(end)) if self.settings.weights.terminal_speed > 0 else np.inf
         speed = np.tile(np.eye(size)[V_X], (N, 1, 1))
         return (
             np.concatenate([rows, speed], axis=1),

@@ -312,14 +312,14 @@ class Nmpc:
         slipping = np.max(np.abs(slips) - self._slip_bounds(margins.slip), axis=-1)
         each_step = w.along * along**2 + w.across * across**2 + w.border * _soft(np.maximum(outside, slipping))
         costs = np.sum(h * each_step + u**2 @ [w.throttle, w.steering] / h, axis=-1)
-        costs += w.at_end * across[:, -1] ** 2
+        costs += w.terminal_across * across[:, -1] ** 2
         if w.progress > 0:
             costs -= w.progress * (along[:, -1] + (at[..., -1] - self._on_line) / length)
-        if w.ending > 0:
+        if w.terminal_speed > 0:
             too_fast = (
                 (x[:, -1, V_X] - self._reference.terminal_speed_at(at[..., -1])) * self.settings.scale.time / length
             )
-            costs += w.ending * _soft(too_fast)
+            costs += w.terminal_speed * _soft(too_fast)
         return np.where(finite, costs, np.inf)
 
     def _program(
@@ -334,7 +334,7 @@ class Nmpc:
         H, g = np.zeros((self._variables,) * 2), np.zeros(self._variables)
         length, h = self.settings.scale.length, self.model.car.T_s / self.settings.scale.time
         along, across = np.full(N, h * w.along), np.full(N, h * w.across)
-        across[-1] += w.at_end
+        across[-1] += w.terminal_across
         for direction, weights in ((tangent, along), (normal, across)):
             scale = np.sqrt(2 * weights) / length
             errors = scale * np.einsum("ki,ki->k", direction, positions - point)
@@ -344,10 +344,10 @@ class Nmpc:
         g[: 2 * N] -= w.progress * tangent[-1] @ moves[-1] / length
         rates = np.tile([w.throttle, w.steering], N) / h
         H[np.diag_indices(self._variables)] += 2 * np.concatenate(
-            [rates, np.full(N, h * w.border), [max(w.ending, 1.0)]]
+            [rates, np.full(N, h * w.border), [max(w.terminal_speed, 1.0)]]
         )
         g[2 * N : 3 * N] = h * w.border
-        g[3 * N] = w.ending
+        g[3 * N] = w.terminal_speed
 
         A = np.zeros((self._rows, self._variables))
         low, high = np.full(self._rows, -np.inf), np.full(self._rows, np.inf)
@@ -358,7 +358,7 @@ class Nmpc:
         borders, slips = slice(2 * N, 4 * N), slice(4 * N, 8 * N)
         self._add_borders(A[borders], low[borders], high[borders], guess, positions, moves, margins.lateral)
         self._add_slip(A[slips], high[slips], guess[1:], offset[1:], slope[1:], p, margins.slip)
-        if w.ending > 0:
+        if w.terminal_speed > 0:
             A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -length / self.settings.scale.time
             high[-1] = float(self._reference.terminal_speed_at(at[-1])) - offset[-1, V_X]
 

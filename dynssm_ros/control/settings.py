@@ -67,10 +67,10 @@ class Weights:
         steering: of the squared rate of the steering (rad per time).
         border: price of the distance beyond a border or a slip angle beyond its bound (rad), whichever is larger, and of
             its square.
-        ending: price of speed at the end of the horizon above that from which the car can go on along the line, and of its
-            square; 0: it is not bounded.
-        at_end: of the squared distance across the line at the end of the horizon, not integrated: what is known of how to go
-            on from there, the speed, is true of the line.
+        terminal_speed: price of speed at the end of the horizon above that from which the car can go on along the line, and
+            of its square; 0: it is not bounded.
+        terminal_across: of the squared distance across the line at the end of the horizon, not integrated. The speed that is
+            allowed there is true of the line.
     """
 
     along: float
@@ -79,15 +79,17 @@ class Weights:
     throttle: float = 0.07
     steering: float = 15.0
     border: float = 160.0
-    ending: float = 0.0
-    at_end: float = 0.0
+    terminal_speed: float = 0.0
+    terminal_across: float = 0.0
 
 
 WEIGHTS: Mapping[Objective, Weights] = {
     # for the 1:43 car Q and R of the literature: bayesrace and Deep Dynamics
     "tracking": Weights(along=1.0, across=1.0, progress=0.0),
     # a point of the last plan draws as the reference does, so that no plan strays from where it was linearised
-    "progress": Weights(along=1.0, across=10.0, progress=0.6, throttle=0.01, steering=3.0, ending=500.0, at_end=3.0),
+    "progress": Weights(
+        along=1.0, across=10.0, progress=0.6, throttle=0.01, steering=3.0, terminal_speed=500.0, terminal_across=3.0
+    ),
 }
 
 

@@ -213,9 +213,9 @@ def test_progress_ends_near_the_line(orca, circle, controller, monkeypatch):
     """A car beside the line comes back by the end of its horizon, the more the end counts."""
     track, reference = circle()
     now, beside = state_vector((0.95, 0.0, np.pi / 2), (1.3, 0.0, 1.3), (0.2, 0.06)), {}
-    as_shipped = WEIGHTS["progress"].at_end
+    as_shipped = WEIGHTS["progress"].terminal_across
     for weight in (0.0, as_shipped):
-        monkeypatch.setitem(WEIGHTS, "progress", replace(WEIGHTS["progress"], at_end=weight))
+        monkeypatch.setitem(WEIGHTS, "progress", replace(WEIGHTS["progress"], terminal_across=weight))
         nmpc = controller(track, reference, "progress")
         for _ in range(5):
             plan = nmpc.plan(now, nominal(orca))
