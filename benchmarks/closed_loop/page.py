@@ -116,16 +116,14 @@ def _lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[
     cars = ", ".join(_CARS[name] for name in dict.fromkeys(cell.car for cell in known))
     yield f"# Closed loop with rivals: {cars}" if rivals else "# Closed loop"
     yield ""
-    command = " ".join(["python -m doit -n 2 -f benchmarks/closed_loop/dodo.py", *arguments])
     tracking, progress = (f"{PACE[objective]:g}" for objective in OBJECTIVES)
     yield (
-        f"Made by `{command}`. Each cell is {LAPS} laps of one car on a track that nothing was tuned on: a variation of a "
-        "built-in one by a seed. One change of the car is hidden from the models. It is 20 % less grip on a third of the "
-        "lap, 15 % less front grip, a steering offset of 0.02 rad, 10 % more mass, or half as much drag again. A hash of the "
-        "cell's name draws the rest. The plant has steps of 1 ms or four wheels, noise is none, usual or three times that, "
-        f"and delay none or a step. The car tracks at {tracking} of the limits or progresses at {progress}. Models were "
-        "trained on another track, of the "
-        "car without the change."
+        f"Made by `{_command(arguments)}`. Each cell is {LAPS} laps of one car on a track that nothing was tuned on: a "
+        "variation of a built-in one by a seed. One change of the car is hidden from the models. It is 20 % less grip on a "
+        "third of the lap, 15 % less front grip, a steering offset of 0.02 rad, 10 % more mass, or half as much drag again. "
+        "A hash of the cell's name draws the rest. The plant has steps of 1 ms or four wheels, noise is none, usual or three "
+        f"times that, and delay none or a step. The car tracks at {tracking} of the limits or progresses at {progress}. "
+        "Models were trained on another track, of the car without the change."
     )
     yield ""
     yield (
@@ -141,43 +139,53 @@ def _lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[
             "calibrated car. The others calibrate nothing; where they have earned nothing the vehicle file is planned with, "
             "which for the 1:43 car and the AV-21 is the car itself before the change."
         )
-    for label, content in summary(known).items():
-        if not any(cell.is_test == _PARTS[label] for cell in [*known, *asked]):
-            continue
+    for label, part, missing in _parts(known, asked):
         yield ""
-        if not content["cells"]:
+        if part:
+            content = _summary(part)
+            yield f"## {label.capitalize()} cells ({content['possible']} of {content['cells']})"
+            yield from _results(content)
+        else:
             yield f"## {label.capitalize()} cells"
-            yield from _not_driven(known, asked, label)
-            continue
-        yield f"## {label.capitalize()} cells ({content['possible']} of {content['cells']})"
-        yield ""
-        yield "Those in which the true model comes round between the borders."
-        yield ""
-        yield (
-            "| model | comes round | last lap over `true`: median, worst | over `calibrated`: median, worst | "
-            "changed cars, over `calibrated`: median, worst | worst p99 (ms) | plans missing |"
-        )
-        yield "| --- | --- | --- | --- | --- | --- | --- |"
-        for model, entry in content["models"].items():
-            over = " | ".join(_both(entry[key]) for key in ("over_true", "over_calibrated", "over_calibrated_changed"))
-            yield (
-                f"| `{model}` | {entry['came_round']} of {content['possible']} | {over} | {entry['p99_ms']:.1f} | "
-                f"{entry['missing']} |"
-            )
-        if lost := {model: entry["lost"] for model, entry in content["models"].items() if entry["lost"]}:
-            yield ""
-            yield from (f"- `{model}` is lost in {', '.join(where)}." for model, where in lost.items())
-        yield from _not_driven(known, asked, label)
+        yield from missing
     yield ""
     yield f"![Last laps over the true model's]({figure})"
 
 
-def _not_driven(known: Known, asked: Sequence[Cell], label: str) -> Iterator[str]:
-    """Of which cars cells of a part are still to be driven."""
-    missing = Counter(cell.car for cell in asked if cell.is_test == _PARTS[label] and cell not in known)
-    if missing:
+def _command(arguments: Sequence[str]) -> str:
+    """By which a page is made."""
+    return " ".join(["python -m doit -n 2 -f benchmarks/closed_loop/dodo.py", *arguments])
+
+
+def _parts(known: Known, asked: Sequence[Cell]) -> Iterator[tuple[str, Known, list[str]]]:
+    """The parts of which cells are asked for: what is known of each, and the lines that say what was not driven."""
+    for label, test in _PARTS.items():
+        part = {cell: outcome for cell, outcome in known.items() if cell.is_test == test}
+        missing = Counter(cell.car for cell in asked if cell.is_test == test and cell not in known)
+        words = ", ".join(f"{count} of {_CARS[car]}" for car, count in missing.items())
+        if part or missing:
+            yield label, part, ["", f"Not driven: {words}."] if missing else []
+
+
+def _results(content: Mapping[str, Any]) -> Iterator[str]:
+    """How each model did in the cells that the true model can drive."""
+    yield ""
+    yield "Those in which the true model comes round between the borders."
+    yield ""
+    yield (
+        "| model | comes round | last lap over `true`: median, worst | over `calibrated`: median, worst | "
+        "changed cars, over `calibrated`: median, worst | worst p99 (ms) | plans missing |"
+    )
+    yield "| --- | --- | --- | --- | --- | --- | --- |"
+    for model, entry in content["models"].items():
+        over = " | ".join(_both(entry[key]) for key in ("over_true", "over_calibrated", "over_calibrated_changed"))
+        yield (
+            f"| `{model}` | {entry['came_round']} of {content['possible']} | {over} | {entry['p99_ms']:.1f} | "
+            f"{entry['missing']} |"
+        )
+    if lost := {model: entry["lost"] for model, entry in content["models"].items() if entry["lost"]}:
         yield ""
-        yield f"Not driven: {', '.join(f'{count} of {_CARS[car]}' for car, count in missing.items())}."
+        yield from (f"- `{model}` is lost in {', '.join(where)}." for model, where in lost.items())
 
 
 def _both(values: Sequence[float] | None) -> str:
@@ -190,31 +198,28 @@ def learning_page(known: Known, arguments: Sequence[str], asked: Sequence[Cell])
 
 
 def _learning_lines(known: Known, arguments: Sequence[str], asked: Sequence[Cell]) -> Iterator[str]:
-    command = " ".join(["python -m doit -n 2 -f benchmarks/closed_loop/dodo.py", *arguments, "learning_page"])
     yield "# Faster every lap"
     yield ""
     yield (
-        f"Made by `{command}`. Each cell is driven for {LEARNING_LAPS} laps with `dynssm`, beginning with {SAFE:g} of the "
-        "car's limits ([how](race.md#faster-every-lap)). The cells are those of the [matrix](closed_loop.md). The last "
-        f"lap is compared with the best of the true model, which knows the plant and the change, at "
-        f"{', '.join(f'{pace:g}' for pace in TRUE_PACES)} of the limits."
+        f"Made by `{_command([*arguments, 'learning_page'])}`. Each cell is driven for {LEARNING_LAPS} laps with "
+        f"`dynssm`, beginning with {SAFE:g} of the car's limits ([how](race.md#faster-every-lap)). The cells are those of "
+        "the [matrix](closed_loop.md). The last lap is compared with the best of the true model, which knows the plant and "
+        f"the change, at {', '.join(f'{pace:g}' for pace in TRUE_PACES)} of the limits."
     )
-    for label, test in _PARTS.items():
-        part = {cell: outcome for cell, outcome in known.items() if cell.is_test == test}
-        if not any(cell.is_test == test for cell in [*known, *asked]):
-            continue
+    for label, part, missing in _parts(known, asked):
         yield ""
         yield f"## {label.capitalize()} cells"
         if part:
             yield ""
             yield "| | cells | between the borders | first lap | last lap: median, worst | within 1.5 % |"
             yield "| --- | --- | --- | --- | --- | --- |"
-            for name, row in _learning_rows(part):
-                yield _learning_row(name, list(row.values()))
-            if behind := [f"{cell.name} ({ratio:.3f})" for cell, ratio in _behind(part) if ratio > _GOAL]:
+            yield from (_learning_row(name, row) for name, row in _learning_rows(part))
+            if behind := [
+                f"{cell.name} ({laps[-1]:.3f})" for cell, laps in _over_best(part).items() if laps[-1] > _GOAL
+            ]:
                 yield ""
                 yield f"More than 1.5 % behind: {', '.join(behind)}."
-        yield from _not_driven(known, asked, label)
+        yield from missing
 
 
 def _learning_rows(part: Known) -> Iterator[tuple[str, Known]]:
@@ -229,16 +234,18 @@ def _learning_rows(part: Known) -> Iterator[tuple[str, Known]]:
     yield "all", part
 
 
-def _behind(part: Known) -> Iterator[tuple[Cell, float]]:
-    """Last laps over the true model's best, where there are both."""
-    for cell, outcome in part.items():
-        if came_round(outcome["learned"]) and outcome["true_best_s"] is not None:
-            yield cell, outcome["learned"]["lap_times_s"][-1] / outcome["true_best_s"]
+def _over_best(part: Known) -> dict[Cell, np.ndarray]:
+    """Laps over the true model's best, where the car came round and so did that."""
+    return {
+        cell: np.array(outcome["learned"]["lap_times_s"]) / outcome["true_best_s"]
+        for cell, outcome in part.items()
+        if came_round(outcome["learned"]) and outcome["true_best_s"] is not None
+    }
 
 
-def _learning_row(name: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
-    safe = [outcome for outcome in outcomes if came_round(outcome["learned"])]
-    pairs = [(o["learned"]["lap_times_s"], o["true_best_s"]) for o in safe if o["true_best_s"] is not None]
-    first, last = (np.array([laps[k] / best for laps, best in pairs]) for k in (0, -1))
-    middle = f"{np.median(first):.3f} | {np.median(last):.3f}, {np.max(last):.3f}" if pairs else "– | –"
-    return f"| {name} | {len(outcomes)} | {len(safe)} | {middle} | {np.sum(last <= _GOAL)} of {len(pairs)} |"
+def _learning_row(name: str, part: Known) -> str:
+    safe = sum(came_round(outcome["learned"]) for outcome in part.values())
+    over = _over_best(part).values()
+    first, last = (np.array([laps[k] for laps in over]) for k in (0, -1))
+    middle = f"{np.median(first):.3f} | {np.median(last):.3f}, {np.max(last):.3f}" if over else "– | –"
+    return f"| {name} | {len(part)} | {safe} | {middle} | {np.sum(last <= _GOAL)} of {len(over)} |"

@@ -316,10 +316,8 @@ class Nmpc:
         if w.progress > 0:
             costs -= w.progress * (along[:, -1] + (at[..., -1] - self._on_line) / length)
         if w.terminal_speed > 0:
-            too_fast = (
-                (x[:, -1, V_X] - self._reference.terminal_speed_at(at[..., -1])) * self.settings.scale.time / length
-            )
-            costs += w.terminal_speed * _soft(too_fast)
+            too_fast = x[:, -1, V_X] - self._reference.terminal_speed_at(at[..., -1])
+            costs += w.terminal_speed * _soft(too_fast * self.settings.scale.time / length)
         return np.where(finite, costs, np.inf)
 
     def _program(
