@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
@@ -33,6 +34,10 @@ from dynssm_ros.vehicle.single_track import Integrator
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
 _MOVED = 3.0  # standard deviations beyond which recalibration is a finding
+_TOGETHER = float(
+    stats.chi2.isf(2.0 * stats.norm.sf(_MOVED), len(COEFFICIENTS) + 1)
+)  # squared, as rare for all of them
+_NAMED = 4  # coefficients
 _NOTED = 0.1  # relative difference of what the vehicle file has
 _DRIVEN_ALIKE = 0.5  # of a recording, that others must have for causes of it alone
 _HELD = {"zero": "held", "first": "a line from sample to sample"}
@@ -113,6 +118,7 @@ def diagnose(
             *(f"{name} cannot be judged: {why}" for name, why in found.impossible.items()),
             *_steps_otherwise(vehicle, windows, fit.car, live),
             *_hidden(sizes),
+            *_moved_together(fit.car),
             *_not_live(extended),
             *_not_written(fit.car, extended),
         ),
@@ -157,6 +163,19 @@ def _moved(car: CarEstimate) -> dict[str, float]:
     """See :attr:`Diagnosis.moved`."""
     names = (*COEFFICIENTS, "m")
     return {name: float(by) for name, by in zip(names, car.moved, strict=True) if abs(by) > _MOVED}
+
+
+def _moved_together(car: CarEstimate) -> Iterator[str]:
+    """How far coefficients went as a whole, where none did alone: of correlated ones some combinations are known better."""
+    shares = car.moved * (car.prior_precision @ car.moved)
+    by = float(np.sqrt(shares.sum()))
+    if not _moved(car) and shares.sum() > _TOGETHER:
+        names = (*COEFFICIENTS, "m")
+        most = [names[k] for k in np.argsort(-shares)[:_NAMED] if shares[k] > 0.0]
+        yield (
+            f"together the coefficients moved by {by:.0f} standard deviations, though none by more than {_MOVED:g} alone: "
+            f"{', '.join(most)} most, in a combination that the vehicle file knows better than each of them"
+        )
 
 
 class _Prepared(NamedTuple):

@@ -43,6 +43,8 @@ _ONE_OF_MANY = 2.0  # standard errors that a cause must gain that one recording 
 _ALIKE = 0.1  # logarithm of a ratio of inflations
 _WARM_STARTS = 3  # times that nominal values make room for an effect before it is fitted
 _SHARES = (1.6, 1.0, 0.6, 0.3)  # of what linearised errors promise
+_KEPT_PROMISE = 0.5  # of that, short of which a candidate is fitted before it is dropped
+_TRIAL_ROUNDS = 10  # of that fit, at most
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ class _SizeSearch:
 
         What linearised errors promise is too much where an effect grows faster than its size, and too little where the
         nominal values have hidden it: so several sizes are tried, as they are and with the nominal values moved along, from
-        where they are and from where the vehicle file has them.
+        where they are and from where the vehicle file has them. Where none of these keeps the promise, a short fit follows.
         """
         some, near, candidate, cars = self.some, self.near, scored.candidate, []
         for share in _SHARES:
@@ -163,8 +165,14 @@ class _SizeSearch:
             some.objective(errors, position(car, free), near.noise)
             for car, errors in zip(cars, some.errors_of(cars), strict=True)
         ]
-        expected_delta_bic = near.objective - min(reached) - self.price * len(candidate.parameters)
-        return _CandidateStart(candidate, cars[int(np.argmin(reached))], expected_delta_bic)
+        best, objective = cars[int(np.argmin(reached))], min(reached)
+        promised, paid = scored.improvement / some.tempering, self.price * len(candidate.parameters)
+        if promised > paid and near.objective - objective < _KEPT_PROMISE * promised:
+            neutral = {name: EFFECTS[candidate.effect].PARAMETERS[name].neutral for name in candidate.amplitudes}
+            car = near.car.with_effect(candidate.effect, scored.values | neutral, candidate.only_in)
+            fit = some.fit(car, free, near, _TRIAL_ROUNDS, rough=True)
+            best, objective = min((best, objective), (fit.car, fit.objective), key=lambda each: each[1])
+        return _CandidateStart(candidate, best, near.objective - objective - paid)
 
     def _from_the_file(self, candidate: Candidate, values: Values) -> list[CarEstimate]:
         """Cars with the nominal values of the file, and the effect in all sizes."""

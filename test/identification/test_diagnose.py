@@ -12,12 +12,13 @@ import pytest
 from benchmarks.hidden_causes.cases import Case, record, size
 from benchmarks.hidden_causes.outcomes import judge
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.identification.diagnose import diagnose
+from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.diagnose import _moved_together, diagnose
 from dynssm_ros.identification.diagnosis import Cause, Diagnosis
 from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report, headline
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import Vehicle, load_vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 
 Laps = Callable[..., tuple[Recording, Vehicle]]
@@ -162,6 +163,22 @@ def test_an_impossible_option_is_one_clear_line(
     recording, vehicle, _ = lagging
     with pytest.raises((ConfigurationError, RecordingError), match=words):
         diagnose(recording, vehicle, **options)  # type: ignore[arg-type]
+
+
+def test_coefficients_that_move_together_where_the_file_forbids_it_are_a_finding() -> None:
+    B, D = COEFFICIENTS.index("B_r"), COEFFICIENTS.index("D_r")
+    covariance = np.eye(len(COEFFICIENTS) + 1)
+    covariance[B, D] = covariance[D, B] = -0.99  # the product is known well
+    car = CarEstimate.of(CarEstimate.of(load_vehicle("orca")).known(covariance))
+    moved = np.zeros(len(covariance))
+    moved[[B, D]] = 0.5, -0.5
+    assert list(_moved_together(replace(car, moved=moved))) == []
+    moved[[B, D]] = 0.5, 0.5
+    (note,) = _moved_together(replace(car, moved=moved))
+    assert note.startswith("together the coefficients moved by 7 standard deviations")
+    assert "B_r, D_r most" in note or "D_r, B_r most" in note
+    moved[[B, D]] = 4.0, -4.0
+    assert list(_moved_together(replace(car, moved=moved))) == [], "they are told one by one"
 
 
 def test_what_is_excluded_is_not_named(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:

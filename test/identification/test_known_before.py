@@ -67,9 +67,25 @@ def test_parts_of_the_laps_are_known_again_and_others_are_not(recording: Recordi
     assert ORCA.known_before(recording.fingerprints) is ORCA
 
 
-def test_where_nothing_was_known_the_calibration_counts(recording: Recording, calibrated: Vehicle) -> None:
+def test_where_nothing_was_known_the_bounds_are(recording: Recording, calibrated: Vehicle) -> None:
     found = calibrated.calibrated_on(recording.fingerprints, ORCA.unmeasured())
-    assert found.known_before(recording.fingerprints) is found
+    before = found.known_before(recording.fingerprints)
+    np.testing.assert_array_equal(before.nominal, found.nominal)
+    assert {c.std for c in before.coefficients.values()} == {None}
+    assert before.correlation is None
+
+
+def test_what_took_up_a_cause_goes_back_where_the_cause_is_found() -> None:
+    car, cause = load_vehicle("av21"), {"exponent": 0.6}
+    I_z = car.coefficients["I_z"].nominal
+    other = car.with_effect("load_sensitivity", cause)
+    drive = simulate(other, load_track("road_course"), 60.0, plant="rk4", seed=3, noise=(0.02, 0.02, 0.003))
+    recording = as_recording(drive)
+    calibrated = calibrate(recording, car.unmeasured(), integrator="rk4", starts=2).vehicle
+    assert calibrated.coefficients["I_z"].nominal > 1.2 * I_z, "without the cause another yaw inertia is the closest"
+    found = diagnose(recording, calibrated, integrator="rk4")
+    assert {one.effect: one.values for one in found.causes} == {"load_sensitivity": pytest.approx(cause, abs=0.02)}
+    assert found.vehicle.coefficients["I_z"].nominal == pytest.approx(I_z, rel=0.05)
 
 
 def test_a_vehicle_file_keeps_it(calibrated: Vehicle, tmp_path: Path) -> None:

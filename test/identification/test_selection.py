@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.candidates import Candidate
+from dynssm_ros.identification.candidates import Candidate, ScoredCandidate
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.problem import IdentificationProblem
 from dynssm_ros.identification.recordings import CrossValidation, Folds
-from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
+from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays, _SizeSearch
 from dynssm_ros.identification.windows import SimulationWindows, fit_windows, recorded_rows
 from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
@@ -76,6 +76,19 @@ def test_leaving_one_out_is_a_fit_without_it() -> None:
     without = searching.leave_out(found, one)
     assert "steering_offset" not in without.car.effects
     assert without.objective - found.fit.objective == pytest.approx(one.improvement, rel=0.5)
+
+
+def test_a_candidate_is_fitted_before_it_is_dropped_for_a_promise_that_no_size_keeps() -> None:
+    known = ORCA.with_nominal(ORCA.nominal, 0.01 * np.abs(ORCA.nominal) + 1e-6)
+    given, car = windows(odometry_lever_arm={"x": 0.02}).with_integrator("euler", known), CarEstimate.of(known)
+    problem = IdentificationProblem(given, car)
+    near = problem.fit(car, ())
+    trial = _SizeSearch(problem, near, car, 8.0)
+    wrong = ScoredCandidate(Candidate("odometry_lever_arm", ("x", "y")), {"x": -3.0, "y": 2.0}, 1e5)
+    start = trial.start(wrong)
+    assert start.car.effects["odometry_lever_arm"]["x"] == pytest.approx(0.02, rel=0.1)
+    assert start.expected_delta_bic > 100.0
+    assert trial.start(replace(wrong, improvement=10.0)).expected_delta_bic < 0.0, "it would not pay"
 
 
 def test_evidence_that_does_not_repeat_does_not_pay() -> None:
