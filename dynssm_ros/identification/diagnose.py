@@ -118,6 +118,7 @@ def diagnose(
             *(f"{name} cannot be judged: {why}" for name, why in found.impossible.items()),
             *_steps_otherwise(vehicle, windows, fit.car, live),
             *_hidden(sizes),
+            *_not_confirmed(selection.unconfirmed),
             *_moved_together(fit.car),
             *_not_live(extended),
             *_not_written(fit.car, extended),
@@ -163,6 +164,18 @@ def _moved(car: CarEstimate) -> dict[str, float]:
     """See :attr:`Diagnosis.moved`."""
     names = (*COEFFICIENTS, "m")
     return {name: float(by) for name, by in zip(names, car.moved, strict=True) if abs(by) > _MOVED}
+
+
+def _not_confirmed(doubtful: Refined | None) -> Iterator[str]:
+    """What would explain most of what is left, if left-out parts of the drive agreed."""
+    if doubtful is not None and doubtful.confirmation is not None:
+        effect, gain = doubtful.candidate.effect, doubtful.confirmation.gain
+        values = ", ".join(f"{name} {value:.3g}" for name, value in doubtful.fit.car.effects[effect].items())
+        yield (
+            f"{effect} ({values}) would explain most of what is left (information criterion {doubtful.delta_bic:.0f}), but "
+            f"not where parts of the drive are left out: there the logarithm of the likelihood changes by "
+            f"{', '.join(f'{one:+.0f}' for one in gain)}. Nothing of it is kept. What would tell: {EFFECTS[effect].MANOEUVRE}"
+        )
 
 
 def _moved_together(car: CarEstimate) -> Iterator[str]:

@@ -102,6 +102,7 @@ class Selection:
         alternatives: for each of them, other effects that explain the data as well.
         tried: the best improvement of each effect on the first score test, by name.
         inflation: of the variance, by errors that hang together.
+        unconfirmed: what would explain most of what is left and does not hold on parts that were left out; ``None``: nothing.
     """
 
     base: Fit
@@ -110,6 +111,7 @@ class Selection:
     alternatives: dict[str, list[str]] = field(default_factory=dict)
     tried: dict[str, float] = field(default_factory=dict)
     inflation: float = 1.0
+    unconfirmed: Refined | None = None
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -264,7 +266,17 @@ class Search:
         fit = self.fit(chosen) if chosen else self.base
         found = sorted(found, key=lambda r: -r.gain)
         others = {r.candidate.effect: self._alternatives(chosen, r.candidate) for r in found}
-        return Selection(self.base, fit, found, others, self.tried, self._study.inflation(fit))
+        doubtful = self._unconfirmed(chosen, fit)
+        return Selection(self.base, fit, found, others, self.tried, self._study.inflation(fit), doubtful)
+
+    def _unconfirmed(self, chosen: tuple[Candidate, ...], fit: Fit) -> Refined | None:
+        """The best by the criterion of those that were tried beside ``chosen``, if it is large, sure, and not confirmed."""
+        best = next(iter(self._ranked.get(frozenset(chosen), [])), None)
+        if best is None or best.delta_bic <= DECISIVE_DELTA_BIC or _is_little(best):
+            return None
+        tried = self._confirm(fit, best)
+        assert tried.confirmation is not None
+        return tried if tried.sure > _SURE and not tried.confirmation.holds else None
 
     def leave_out(self, selection: Selection, one: Refined) -> Fit:
         """The fit of everything chosen but ``one``."""

@@ -10,6 +10,7 @@ import pytest
 from dynssm_ros.identification.candidates import Candidate, ScoredCandidate
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
+from dynssm_ros.identification.diagnose import _not_confirmed
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.problem import IdentificationProblem
 from dynssm_ros.identification.recordings import CrossValidation, Folds
@@ -118,6 +119,21 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     one_day = replace(strong, candidate=replace(FEW[0], only_in=(1,)))
     assert _pays(one_day)
     assert not _pays(replace(one_day, confirmation=replace(everywhere, std=6.0)))
+
+
+def test_what_is_not_confirmed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    searching = search(steering_offset={"offset": 0.03})
+    (best, *_) = searching.ranked(())
+    assert searching.eliminated(()).unconfirmed is None, "it would be"
+    once = Confirmation(np.array([24.0, 24.0, -240.0, 24.0]), 100.0, 0.0, np.zeros(3))
+    monkeypatch.setattr(searching._left_out, "compare", lambda without, fit: once)
+    doubtful = searching.eliminated(()).unconfirmed
+    assert doubtful is not None
+    assert doubtful.candidate == best.candidate
+    (note,) = _not_confirmed(doubtful)
+    assert note.startswith("steering_offset (offset 0.0")
+    assert "+24, +24, -240, +24. Nothing of it is kept. What would tell: driving straight" in note
+    assert list(_not_confirmed(None)) == []
 
 
 def test_what_was_known_decides_where_left_out_parts_tell_nothing() -> None:
