@@ -9,22 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
-from dynssm_ros.identification.candidates import (
-    BOTH_SIDES_UNITS,
-    Candidate,
-    Responses,
-    ScoredCandidate,
-    ScoreTest,
-    steps_off,
-)
-from dynssm_ros.identification.car import CarEstimate, Values
+from dynssm_ros.identification.candidates import Candidate, Responses, ScoredCandidate, ScoreTest
+from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
-from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
+from dynssm_ros.identification.problem import Fit, IdentificationProblem
 from dynssm_ros.identification.recordings import CrossValidation
+from dynssm_ros.identification.size_search import CandidateStart, SizeSearch
 from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS
@@ -41,10 +34,6 @@ _WORTH_A_LOOK = 0.3  # of the best by the criterion, that another must reach to 
 _SURE = 3.0  # standard deviations that a cause must be off neutral
 _ONE_OF_MANY = 2.0  # standard errors that a cause must gain that one recording alone has: more of them are tried
 _ALIKE = 0.1  # logarithm of a ratio of inflations
-_WARM_STARTS = 3  # times that nominal values make room for an effect before it is fitted
-_SHARES = (1.6, 1.0, 0.6, 0.3)  # of what linearised errors promise
-_KEPT_PROMISE = 0.5  # of that, short of which a candidate is fitted before it is dropped
-_TRIAL_ROUNDS = 10  # of that fit, at most
 
 
 @dataclass(frozen=True)
@@ -119,75 +108,7 @@ class Selection:
         return tuple(one.candidate for one in self.chosen)
 
 
-class _CandidateStart(NamedTuple):
-    """Where to fit a candidate from, and roughly what it is worth."""
-
-    candidate: Candidate
-    car: CarEstimate
-    expected_delta_bic: float
-
-
-@dataclass(frozen=True)
-class _SizeSearch:
-    """Candidates in several sizes, on some of the windows.
-
-    Attributes:
-        some: those windows.
-        near: the fit without the candidate, there.
-        given: the car as it was known.
-        price: of a parameter.
-    """
-
-    some: IdentificationProblem
-    near: Fit
-    given: CarEstimate
-    price: float
-
-    def start(self, scored: ScoredCandidate) -> _CandidateStart:
-        """Where to fit from, and what is reached there.
-
-        What linearised errors promise is too much where an effect grows faster than its size, and too little where the
-        nominal values have hidden it: so several sizes are tried, as they are and with the nominal values moved along, from
-        where they are and from where the vehicle file has them. Where none of these keeps the promise, a short fit follows.
-        """
-        some, near, candidate, cars = self.some, self.near, scored.candidate, []
-        for share in _SHARES:
-            values = dict(scored.values)
-            for name in candidate.amplitudes:
-                about = EFFECTS[candidate.effect].PARAMETERS[name]
-                wanted = about.neutral + share * (values[name] - about.neutral)
-                values[name] = float(np.clip(wanted, about.lower, about.upper))
-            cars.append(near.car.with_effect(candidate.effect, values, candidate.only_in))
-        cars += self._from_the_file(candidate, scored.values)
-        warm_started = cars
-        for _ in range(_WARM_STARTS):
-            warm_started = some.warm_started(warm_started, near)
-        cars, free = cars + warm_started, (*near.free, *candidate.free)
-        reached = [
-            some.objective(errors, position(car, free), near.noise)
-            for car, errors in zip(cars, some.errors_of(cars), strict=True)
-        ]
-        best, objective = cars[int(np.argmin(reached))], min(reached)
-        promised, paid = scored.improvement / some.tempering, self.price * len(candidate.parameters)
-        if promised > paid and near.objective - objective < _KEPT_PROMISE * promised:
-            neutral = {name: EFFECTS[candidate.effect].PARAMETERS[name].neutral for name in candidate.amplitudes}
-            car = near.car.with_effect(candidate.effect, scored.values | neutral, candidate.only_in)
-            fit = some.fit(car, free, near, _TRIAL_ROUNDS, rough=True)
-            best, objective = min((best, objective), (fit.car, fit.objective), key=lambda each: each[1])
-        return _CandidateStart(candidate, best, near.objective - objective - paid)
-
-    def _from_the_file(self, candidate: Candidate, values: Values) -> list[CarEstimate]:
-        """Cars with the nominal values of the file, and the effect in all sizes."""
-        if candidate.local or len(candidate.amplitudes) > 1:
-            return []
-        (name,), effect = candidate.amplitudes, candidate.effect
-        neutral = EFFECTS[effect].PARAMETERS[name].neutral
-        given = replace(self.near.car, moved=self.given.moved)
-        steps = steps_off(effect, name, BOTH_SIDES_UNITS)
-        return [given.with_effect(effect, values | {name: neutral + step}, candidate.only_in) for step in steps]
-
-
-def _fitted_roughly(problem: IdentificationProblem, near: Fit, start: _CandidateStart) -> Fit:
+def _fitted_roughly(problem: IdentificationProblem, near: Fit, start: CandidateStart) -> Fit:
     """A candidate fitted together with all that ``near`` has."""
     return problem.fit(start.car, (*near.free, *start.candidate.free), near, rough=True)
 
@@ -308,7 +229,7 @@ class Search:
             self.tried = {name: p.improvement for name, p in best.items()}
         shortlist = [p for p in best.values() if self._expected_delta_bic(p) >= -self._price][:_SHORTLIST]
         some, near = self._study.part(fit, max(1, len(self._study.windows) // _SHORTLIST_WINDOWS))
-        trial = _SizeSearch(some, near, self._known, self._price)
+        trial = SizeSearch(some, near, self._known, self._price)
         starts = sorted(
             self._pool.map(trial.start, shortlist), key=lambda start: start.expected_delta_bic, reverse=True
         )
@@ -389,7 +310,7 @@ class Search:
     def _expected_delta_bic(self, scored: ScoredCandidate) -> float:
         return float(scored.improvement / self._study.tempering - self._price * len(scored.candidate.parameters))
 
-    def _refined(self, fit: Fit, starts: Sequence[_CandidateStart]) -> list[Refined]:
+    def _refined(self, fit: Fit, starts: Sequence[CandidateStart]) -> list[Refined]:
         if starts:
             self._report(f"fitting {', '.join(start.candidate.effect for start in starts)}")
         fits = self._pool.map(partial(_fitted_roughly, self._study, fit), starts)

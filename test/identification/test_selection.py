@@ -14,7 +14,8 @@ from dynssm_ros.identification.diagnose import _not_confirmed
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.problem import IdentificationProblem
 from dynssm_ros.identification.recordings import CrossValidation, Folds
-from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays, _SizeSearch
+from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
+from dynssm_ros.identification.size_search import SizeSearch
 from dynssm_ros.identification.windows import SimulationWindows, fit_windows, recorded_rows
 from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
@@ -84,7 +85,7 @@ def test_a_candidate_is_fitted_before_it_is_dropped_for_a_promise_that_no_size_k
     given, car = windows(odometry_lever_arm={"x": 0.02}).with_integrator("euler", known), CarEstimate.of(known)
     problem = IdentificationProblem(given, car)
     near = problem.fit(car, ())
-    trial = _SizeSearch(problem, near, car, 8.0)
+    trial = SizeSearch(problem, near, car, 8.0)
     wrong = ScoredCandidate(Candidate("odometry_lever_arm", ("x", "y")), {"x": -3.0, "y": 2.0}, 1e5)
     start = trial.start(wrong)
     assert start.car.effects["odometry_lever_arm"]["x"] == pytest.approx(0.02, rel=0.1)

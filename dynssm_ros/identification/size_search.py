@@ -1,0 +1,86 @@
+"""Where to fit a candidate from: several sizes on some of the windows, and a short fit where none keeps what was promised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from dynssm_ros.identification.candidates import BOTH_SIDES_UNITS, Candidate, ScoredCandidate, steps_off
+from dynssm_ros.identification.car import CarEstimate, Values
+from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
+from dynssm_ros.vehicle.effects import EFFECTS
+
+_WARM_STARTS = 3  # times that nominal values make room for an effect before it is fitted
+_SHARES = (1.6, 1.0, 0.6, 0.3)  # of what linearised errors promise
+_KEPT_PROMISE = 0.5  # of that, short of which a candidate is fitted before it is dropped
+_TRIAL_ROUNDS = 10  # of that fit, at most
+
+
+class CandidateStart(NamedTuple):
+    """Where to fit a candidate from, and roughly what it is worth."""
+
+    candidate: Candidate
+    car: CarEstimate
+    expected_delta_bic: float
+
+
+@dataclass(frozen=True)
+class SizeSearch:
+    """Candidates in several sizes, on some of the windows.
+
+    Attributes:
+        some: those windows.
+        near: the fit without the candidate, there.
+        given: the car as it was known.
+        price: of a parameter.
+    """
+
+    some: IdentificationProblem
+    near: Fit
+    given: CarEstimate
+    price: float
+
+    def start(self, scored: ScoredCandidate) -> CandidateStart:
+        """Where to fit from, and what is reached there.
+
+        What linearised errors promise is too much where an effect grows faster than its size, and too little where the
+        nominal values have hidden it: so several sizes are tried, as they are and with the nominal values moved along, from
+        where they are and from where the vehicle file has them. Where none of these keeps the promise, a short fit follows.
+        """
+        some, near, candidate, cars = self.some, self.near, scored.candidate, []
+        for share in _SHARES:
+            values = dict(scored.values)
+            for name in candidate.amplitudes:
+                about = EFFECTS[candidate.effect].PARAMETERS[name]
+                wanted = about.neutral + share * (values[name] - about.neutral)
+                values[name] = float(np.clip(wanted, about.lower, about.upper))
+            cars.append(near.car.with_effect(candidate.effect, values, candidate.only_in))
+        cars += self._from_the_file(candidate, scored.values)
+        warm_started = cars
+        for _ in range(_WARM_STARTS):
+            warm_started = some.warm_started(warm_started, near)
+        cars, free = cars + warm_started, (*near.free, *candidate.free)
+        reached = [
+            some.objective(errors, position(car, free), near.noise)
+            for car, errors in zip(cars, some.errors_of(cars), strict=True)
+        ]
+        best, objective = cars[int(np.argmin(reached))], min(reached)
+        promised, paid = scored.improvement / some.tempering, self.price * len(candidate.parameters)
+        if promised > paid and near.objective - objective < _KEPT_PROMISE * promised:
+            neutral = {name: EFFECTS[candidate.effect].PARAMETERS[name].neutral for name in candidate.amplitudes}
+            car = near.car.with_effect(candidate.effect, scored.values | neutral, candidate.only_in)
+            fit = some.fit(car, free, near, _TRIAL_ROUNDS, rough=True)
+            best, objective = min((best, objective), (fit.car, fit.objective), key=lambda each: each[1])
+        return CandidateStart(candidate, best, near.objective - objective - paid)
+
+    def _from_the_file(self, candidate: Candidate, values: Values) -> list[CarEstimate]:
+        """Cars with the nominal values of the file, and the effect in all sizes."""
+        if candidate.local or len(candidate.amplitudes) > 1:
+            return []
+        (name,), effect = candidate.amplitudes, candidate.effect
+        neutral = EFFECTS[effect].PARAMETERS[name].neutral
+        given = replace(self.near.car, moved=self.given.moved)
+        steps = steps_off(effect, name, BOTH_SIDES_UNITS)
+        return [given.with_effect(effect, values | {name: neutral + step}, candidate.only_in) for step in steps]
