@@ -241,17 +241,13 @@ class Vehicle(StrictModel):
     def known_before(self, laps: Collection[str]) -> Vehicle:
         """The car as it was known before it was calibrated on ``laps`` (fingerprints).
 
-        Itself if it was not. If nothing but bounds was known, they are, around the calibrated values. A third of the laps is
-        enough, as the rest may have been held out.
+        Itself if it was not. A third of the laps is enough, as the rest may have been held out.
         """
         before = self.before
         if before is None or 3 * len({*before.laps} & {*laps}) < len(laps):
             return self
-        is_known = any(std is not None for std in before.std.values())
         coefficients = {
-            name: c.model_copy(
-                update={"nominal": before.nominal[name] if is_known else c.nominal, "std": before.std[name]}
-            )
+            name: c.model_copy(update={"nominal": before.nominal[name], "std": before.std[name]})
             for name, c in self.coefficients.items()
         }
         return self.model_copy(update={"coefficients": coefficients, "correlation": before.correlation, "before": None})
