@@ -33,11 +33,11 @@ from dynssm_ros.vehicle.single_track import Integrator
 
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25
+_NAMES = (*COEFFICIENTS, "m")  # of what is recalibrated
 _MOVED = 3.0  # standard deviations beyond which recalibration is a finding
-_TOGETHER = float(
-    stats.chi2.isf(2.0 * stats.norm.sf(_MOVED), len(COEFFICIENTS) + 1)
-)  # squared, as rare for all of them
-_NAMED = 4  # coefficients
+# the same of all of them together: as rare, squared
+_TOGETHER = float(stats.chi2.isf(2.0 * stats.norm.sf(_MOVED), len(_NAMES)))
+_NAMED = 4  # of them, in a note
 _NOTED = 0.1  # relative difference of what the vehicle file has
 _DRIVEN_ALIKE = 0.5  # of a recording, that others must have for causes of it alone
 _HELD = {"zero": "held", "first": "a line from sample to sample"}
@@ -162,8 +162,7 @@ def _groups(at: _Prepared, suspects: tuple[int, ...]) -> list[tuple[int, ...]]:
 
 def _moved(car: CarEstimate) -> dict[str, float]:
     """See :attr:`Diagnosis.moved`."""
-    names = (*COEFFICIENTS, "m")
-    return {name: float(by) for name, by in zip(names, car.moved, strict=True) if abs(by) > _MOVED}
+    return {name: float(by) for name, by in zip(_NAMES, car.moved, strict=True) if abs(by) > _MOVED}
 
 
 def _not_confirmed(doubtful: Refined | None) -> Iterator[str]:
@@ -181,12 +180,12 @@ def _not_confirmed(doubtful: Refined | None) -> Iterator[str]:
 def _moved_together(car: CarEstimate) -> Iterator[str]:
     """How far coefficients went as a whole, where none did alone: of correlated ones some combinations are known better."""
     shares = car.moved * (car.prior_precision @ car.moved)
-    by = float(np.sqrt(shares.sum()))
-    if not _moved(car) and shares.sum() > _TOGETHER:
-        names = (*COEFFICIENTS, "m")
-        most = [names[k] for k in np.argsort(-shares)[:_NAMED] if shares[k] > 0.0]
+    squared = float(shares.sum())
+    if not _moved(car) and squared > _TOGETHER:
+        most = [_NAMES[k] for k in np.argsort(-shares)[:_NAMED] if shares[k] > 0.0]
         yield (
-            f"together the coefficients moved by {by:.0f} standard deviations, though none by more than {_MOVED:g} alone: "
+            f"together the coefficients moved by {np.sqrt(squared):.0f} standard deviations, though none by more than "
+            f"{_MOVED:g} alone: "
             f"{', '.join(most)} most, in a combination that the vehicle file knows better than each of them"
         )
 

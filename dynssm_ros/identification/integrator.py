@@ -136,5 +136,4 @@ def _with_what_hides(problem: IdentificationProblem, fit: Fit) -> Fit:
     for effect, parameter, value in hides:
         if effect not in car.effects and all(entry.name != effect for entry in car.vehicle.effects):
             car, free = car.with_effect(effect, {parameter: value}), (*free, (effect, parameter))
-    hidden = problem.fit(car, free, fit) if free != fit.free else fit
-    return min(fit, hidden, key=lambda one: one.objective)
+    return fit if free == fit.free else min(fit, problem.fit(car, free, fit), key=lambda one: one.objective)

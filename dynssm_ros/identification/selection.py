@@ -75,9 +75,14 @@ class Refined:
         return bool(self.bounded), bool(self.candidate.only_in), not self.is_met
 
     @property
+    def is_confirmed(self) -> bool:
+        """Whether it holds on parts of the drive that were left out."""
+        return self.confirmation is not None and self.confirmation.holds
+
+    @property
     def gain(self) -> float:
         """Logarithm of the predictive likelihood that it gains, nothing where it is not confirmed."""
-        return self.confirmation.total if self.confirmation is not None and self.confirmation.holds else 0.0
+        return self.confirmation.total if self.confirmation is not None and self.is_confirmed else 0.0
 
 
 @dataclass
@@ -193,11 +198,10 @@ class Search:
     def _unconfirmed(self, chosen: tuple[Candidate, ...], fit: Fit) -> Refined | None:
         """The best by the criterion of those that were tried beside ``chosen``, if it is large, sure, and not confirmed."""
         best = next(iter(self._ranked.get(frozenset(chosen), [])), None)
-        if best is None or best.delta_bic <= DECISIVE_DELTA_BIC or _is_little(best):
+        if best is None or best.delta_bic <= DECISIVE_DELTA_BIC:
             return None
         tried = self._confirm(fit, best)
-        assert tried.confirmation is not None
-        return tried if tried.sure > _SURE and not tried.confirmation.holds else None
+        return tried if _is_asked_for(tried) and not tried.is_confirmed else None
 
     def leave_out(self, selection: Selection, one: Refined) -> Fit:
         """The fit of everything chosen but ``one``."""
@@ -229,7 +233,7 @@ class Search:
             self.tried = {name: p.improvement for name, p in best.items()}
         shortlist = [p for p in best.values() if self._expected_delta_bic(p) >= -self._price][:_SHORTLIST]
         some, near = self._study.part(fit, max(1, len(self._study.windows) // _SHORTLIST_WINDOWS))
-        trial = SizeSearch(some, near, self._known, self._price)
+        trial = SizeSearch(some, near, self._known, self._price, self._study.tempering)
         starts = sorted(
             self._pool.map(trial.start, shortlist), key=lambda start: start.expected_delta_bic, reverse=True
         )
@@ -375,11 +379,14 @@ def _is_little(refined: Refined) -> bool:
     return EFFECTS[candidate.effect].amount(values) < least
 
 
+def _is_asked_for(refined: Refined) -> bool:
+    """Whether the fitted laps ask for a cause: it is worth its parameters, sure, and large enough."""
+    return refined.delta_bic > DECISIVE_DELTA_BIC and refined.sure > _SURE and not _is_little(refined)
+
+
 def _pays(refined: Refined) -> bool:
-    """Whether a cause is worth its parameters, large enough, and holds where it was not fitted."""
+    """Whether a cause is asked for, and holds where it was not fitted."""
     confirmation = refined.confirmation
-    if confirmation is None or not confirmation.holds or refined.sure <= _SURE or _is_little(refined):
+    if confirmation is None or not refined.is_confirmed or not _is_asked_for(refined):
         return False
-    if refined.candidate.only_in and confirmation.total <= _ONE_OF_MANY * confirmation.std:
-        return False
-    return refined.delta_bic > DECISIVE_DELTA_BIC
+    return not refined.candidate.only_in or confirmation.total > _ONE_OF_MANY * confirmation.std

@@ -35,12 +35,14 @@ class SizeSearch:
         near: the fit without the candidate, there.
         given: the car as it was known.
         price: of a parameter.
+        tempering: with all windows, of which a promise is made.
     """
 
     some: IdentificationProblem
     near: Fit
     given: CarEstimate
     price: float
+    tempering: float
 
     def start(self, scored: ScoredCandidate) -> CandidateStart:
         """Where to fit from, and what is reached there.
@@ -49,14 +51,8 @@ class SizeSearch:
         nominal values have hidden it: so several sizes are tried, as they are and with the nominal values moved along, from
         where they are and from where the vehicle file has them. Where none of these keeps the promise, a short fit follows.
         """
-        some, near, candidate, cars = self.some, self.near, scored.candidate, []
-        for share in _SHARES:
-            values = dict(scored.values)
-            for name in candidate.amplitudes:
-                about = EFFECTS[candidate.effect].PARAMETERS[name]
-                wanted = about.neutral + share * (values[name] - about.neutral)
-                values[name] = float(np.clip(wanted, about.lower, about.upper))
-            cars.append(near.car.with_effect(candidate.effect, values, candidate.only_in))
+        some, near, candidate = self.some, self.near, scored.candidate
+        cars = [self._sized(scored, share) for share in _SHARES]
         cars += self._from_the_file(candidate, scored.values)
         warm_started = cars
         for _ in range(_WARM_STARTS):
@@ -67,13 +63,21 @@ class SizeSearch:
             for car, errors in zip(cars, some.errors_of(cars), strict=True)
         ]
         best, objective = cars[int(np.argmin(reached))], min(reached)
-        promised, paid = scored.improvement / some.tempering, self.price * len(candidate.parameters)
+        promised, paid = scored.improvement / self.tempering, self.price * len(candidate.parameters)
         if promised > paid and near.objective - objective < _KEPT_PROMISE * promised:
-            neutral = {name: EFFECTS[candidate.effect].PARAMETERS[name].neutral for name in candidate.amplitudes}
-            car = near.car.with_effect(candidate.effect, scored.values | neutral, candidate.only_in)
-            fit = some.fit(car, free, near, _TRIAL_ROUNDS, rough=True)
-            best, objective = min((best, objective), (fit.car, fit.objective), key=lambda each: each[1])
+            fit = some.fit(self._sized(scored, 0.0), free, near, _TRIAL_ROUNDS, rough=True)
+            if fit.objective < objective:
+                best, objective = fit.car, fit.objective
         return CandidateStart(candidate, best, near.objective - objective - paid)
+
+    def _sized(self, scored: ScoredCandidate, share: float) -> CarEstimate:
+        """The car with a share of what is promised of the effect."""
+        candidate, values = scored.candidate, dict(scored.values)
+        for name in candidate.amplitudes:
+            about = EFFECTS[candidate.effect].PARAMETERS[name]
+            wanted = about.neutral + share * (values[name] - about.neutral)
+            values[name] = float(np.clip(wanted, about.lower, about.upper))
+        return self.near.car.with_effect(candidate.effect, values, candidate.only_in)
 
     def _from_the_file(self, candidate: Candidate, values: Values) -> list[CarEstimate]:
         """Cars with the nominal values of the file, and the effect in all sizes."""

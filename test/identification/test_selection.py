@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.candidates import Candidate, ScoredCandidate
+from dynssm_ros.identification.candidates import Candidate, Responses, ScoredCandidate, ScoreTest
 from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.diagnose import _not_confirmed
-from dynssm_ros.identification.integrator import search_causes
+from dynssm_ros.identification.integrator import _with_what_hides, search_causes
 from dynssm_ros.identification.problem import IdentificationProblem
 from dynssm_ros.identification.recordings import CrossValidation, Folds
 from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
@@ -85,12 +85,25 @@ def test_a_candidate_is_fitted_before_it_is_dropped_for_a_promise_that_no_size_k
     given, car = windows(odometry_lever_arm={"x": 0.02}).with_integrator("euler", known), CarEstimate.of(known)
     problem = IdentificationProblem(given, car)
     near = problem.fit(car, ())
-    trial = SizeSearch(problem, near, car, 8.0)
+    trial = SizeSearch(problem, near, car, 8.0, problem.tempering)
     wrong = ScoredCandidate(Candidate("odometry_lever_arm", ("x", "y")), {"x": -3.0, "y": 2.0}, 1e5)
     start = trial.start(wrong)
     assert start.car.effects["odometry_lever_arm"]["x"] == pytest.approx(0.02, rel=0.1)
     assert start.expected_delta_bic > 100.0
     assert trial.start(replace(wrong, improvement=10.0)).expected_delta_bic < 0.0, "it would not pay"
+
+
+def test_a_promise_is_measured_on_as_many_windows_as_it_was_made_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = ORCA.with_nominal(ORCA.nominal, 0.01 * np.abs(ORCA.nominal) + 1e-6)
+    given, car = windows(odometry_lever_arm={"x": 0.02}).with_integrator("euler", known), CarEstimate.of(known)
+    problem = IdentificationProblem(given, car)
+    near = problem.fit(car, ())
+    candidate = Candidate("odometry_lever_arm", ("x",))
+    (kept,) = ScoreTest(problem, near, Responses(problem, car, near.errors)).try_all([candidate])
+    some, there = problem.part(near, 4)
+    monkeypatch.setattr(some, "fit", None)  # the tried sizes do
+    start = SizeSearch(some, there, car, 8.0, problem.tempering).start(kept)
+    assert start.expected_delta_bic == pytest.approx(kept.improvement - 8.0, rel=0.4)
 
 
 def test_evidence_that_does_not_repeat_does_not_pay() -> None:
@@ -220,6 +233,17 @@ def test_the_integrator_is_that_of_the_file_where_the_data_do_not_say(stated: st
     car = CarEstimate.of(ORCA.model_copy(update={"integrator": stated}))
     found = search_causes(given, car, quarters(given), None, lambda words: None)
     assert found.problem.windows.integrator == (stated or "rk4")
+
+
+def test_what_hides_the_steps_never_makes_a_fit_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    given, car = windows().with_integrator("euler", ORCA), CarEstimate.of(ORCA)
+    problem = IdentificationProblem(given, car)
+    fit = problem.fit(car, ())
+    closer, worse = (replace(fit, objective=fit.objective + change) for change in (-1.0, 1.0))
+    monkeypatch.setattr(problem, "fit", lambda *_: closer)
+    assert _with_what_hides(problem, fit) is closer
+    monkeypatch.setattr(problem, "fit", lambda *_: worse)
+    assert _with_what_hides(problem, fit) is fit
 
 
 def test_another_yaw_inertia_is_not_taken_for_euler_steps() -> None:
