@@ -44,6 +44,7 @@ V_X, R, DELTA = (STATES.index(name) for name in ("v_x", "r", "delta"))
 _ROAD_LEFT, _SLIP_LEFT = 0.5, 0.5  # shares of the road and of the slip's bound that no caution takes
 _FIRST_ROUNDS = 10  # programs that the first plan takes to settle
 _AT_STOP = 0.01  # rad
+_BEYOND = 1e-3  # wheelbases or rad: less is the solver's tolerance
 _CLEARLY = 0.2  # share of its cost by which a plan is to be undercut
 
 
@@ -69,11 +70,13 @@ class Plan:
         x: states in the order of ``STATES`` and the car's effect states, shape ``(N + 1, size)``.
         u: increments of throttle (fraction) and steering (rad), shape ``(N, 2)``.
         status: whether it was solved, or why it is the plan of the step before, moved on.
+        beyond: how far a step goes at most beyond a border (wheelbases) or a bound on the slip (rad).
     """
 
     x: Vector
     u: Vector
     status: Status = "solved"
+    beyond: float = 0.0
 
     def shifted(self) -> Plan:
         """The same plan one step later; the last step is repeated with the inputs held."""
@@ -249,14 +252,16 @@ class Nmpc:
         program = self._program(now, x, offset, slope, p, margins)
         if not all(np.all(np.isfinite(each)) for each in program[:3]):
             return None
-        u = self._solver.solve(*program)[: 2 * self.settings.N]
+        u, slack, _ = np.split(self._solver.solve(*program), [2 * self.settings.N, 3 * self.settings.N])
         states = offset + slope @ u
         if not (np.all(np.isfinite(u)) and np.all(np.isfinite(states))):
             return None
-        return Plan(states, u.reshape(-1, len(INPUTS)))
+        return Plan(states, u.reshape(-1, len(INPUTS)), beyond=float(np.max(slack)))
 
     def _may_be_caught(self, plan: Plan) -> bool:
-        """Whether a plan steers to the stop."""
+        """Whether a plan goes beyond a soft bound although it steers to the stop."""
+        if plan.beyond < _BEYOND:
+            return False
         right, left = self._limits.steering
         steering = plan.x[1:, DELTA]
         return bool(np.any((steering < right + _AT_STOP) | (steering > left - _AT_STOP)))

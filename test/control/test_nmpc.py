@@ -243,6 +243,18 @@ def test_a_turn_that_has_become_too_tight_is_ended_by_steering_to_the_other_side
     assert most[True] < 0.18 < 0.2 < most[False], "the borders are at 0.2 m"
 
 
+def test_a_plan_at_the_stop_that_stays_within_all_bounds_is_driven_at_once(
+    orca, club, club_line, controller, monkeypatch
+):
+    """Looking for another way out would more than double its time."""
+    (x, y), heading = club.centre.position(1.0, -0.1), float(club.centre.heading(1.0)) - 0.5
+    nmpc = controller(club, club_line)
+    monkeypatch.setattr(nmpc, "_elsewhere", None)
+    plan = [nmpc.plan(state_vector((x, y, heading), (0.7, 0.0, 0.0), (0.3, 0.0)), nominal(orca)) for _ in range(2)][-1]
+    assert plan.x[:, -1].max() == pytest.approx(orca.inputs.steering[1], abs=1e-6)
+    assert plan.beyond == pytest.approx(0.0, abs=1e-6)
+
+
 @pytest.mark.parametrize(("objective", "slack"), [("tracking", 0.0), ("progress", 3e-3)])
 def test_no_small_change_of_a_settled_plan_costs_less(orca, club, club_line, controller, objective, slack):
     """What plans are compared by is what the program minimises; at progress its reference points are those of its guess."""
