@@ -1,7 +1,8 @@
 """What a cause is worth where it was not fitted: every unit of the drive is left out in turn, and the car fitted again.
 
 A unit is a recording, a lap, or a quarter of the time. Its windows are predicted by a car that was fitted to all others.
-What acts in one recording alone is judged by parts of that recording.
+What acts in one recording alone is judged by parts of that recording, and what acts at places that were passed once by
+stretches of a few seconds.
 The logarithm of their predictive likelihood with a cause, less that without it, is what the cause gains there (Vehtari,
 Gelman and Gabry 2017). A cause that follows the accidents of one stretch gains nothing elsewhere.
 """
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -19,11 +20,15 @@ from dynssm_ros.identification.noise import Noise
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
 from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.parallel import IN_TURN, Pool
-from dynssm_ros.vehicle.effects import EFFECTS
+from dynssm_ros.vehicle.effects import EFFECTS, LAP
 
 _KNOWN = 2.0  # standard errors that the nominal values must be spared, where left-out units tell nothing
+_ONE_OF_MANY = 2.0  # standard errors to be gained by what one recording has, or a place passed once: many are tried
 _ROUNDS = 4  # of linearising anew, from the fit of all
 _HARDLY = 3.0  # logarithm of a likelihood ratio that is no strong evidence yet (Kass and Raftery 1995)
+
+
+_By = Literal["recordings", "parts", "places"]  # as in CrossValidation
 
 
 class _Predicted(NamedTuple):
@@ -45,12 +50,14 @@ class Confirmation:
         std: standard error of their sum.
         known: the same of the nominal values under what was known of them: what it spares them to be moved.
         share: of the squared error at the end of the simulations that is gone, by channel, ``(3,)``.
+        least: standard errors that the gain must be more than.
     """
 
     gain: Vector
     std: float
     known: float
     share: Vector
+    least: float = 1.0
 
     @property
     def total(self) -> float:
@@ -64,12 +71,12 @@ class Confirmation:
 
     @property
     def holds(self) -> bool:
-        """Whether the gain is more than its standard error, and there in half of the units or more.
+        """Whether the gain is more than :attr:`least` standard errors, and there in half of the units or more.
 
         More mass, say, predicts no better than less drive and less drag. What tells them apart is that the car was weighed:
         then it is enough that nothing speaks against the cause elsewhere.
         """
-        if self.total <= self.std:
+        if self.total <= self.least * self.std:
             return False
         if not self.rests_on_known:
             return 2 * int((self.gain > 0).sum()) >= len(self.gain)
@@ -92,31 +99,41 @@ class LeaveOneOut:
 
     def __init__(self, problem: IdentificationProblem, left_out: CrossValidation, pool: Pool = IN_TURN) -> None:
         self._problem, self._left_out, self._pool = problem, left_out, pool
-        self._known: dict[tuple[int, bool], tuple[Fit, _Predicted]] = {}
+        self._known: dict[tuple[int, str], tuple[Fit, _Predicted]] = {}
 
     def compare(self, without: Fit, fit: Fit) -> Confirmation:
         """What ``fit`` gains over ``without``."""
         only_in = _differ_only_in(without, fit)
-        by_recordings = not only_in and self._left_out.recordings is not self._left_out.parts
-        before, after = self._predicted(without, by_recordings), self._predicted(fit, by_recordings)
-        unit = (self._left_out.recordings if by_recordings else self._left_out.parts).unit
+        by = self._by(without, fit, only_in)
+        before, after = self._predicted(without, by), self._predicted(fit, by)
+        unit = getattr(self._left_out, by).unit
         number = self._problem.windows.number
         told = np.isin(number, only_in) if only_in else np.ones(len(number), dtype=bool)
         by_window = ((after.likelihood - before.likelihood) / self._problem.tempering)[told]
         gain, by_block = (sums_of(by_window, n[told]) for n in (unit, self._problem.block))
         known = (self._problem.surprise(without) - self._problem.surprise(fit)) / 2.0
         left = after.error[told].sum(axis=0) / np.maximum(before.error[told].sum(axis=0), 1e-300)
-        return Confirmation(gain, max(standard_error(gain), standard_error(by_block)), known, 1.0 - left)
+        least = _ONE_OF_MANY if only_in or by == "places" else 1.0
+        return Confirmation(gain, max(standard_error(gain), standard_error(by_block)), known, 1.0 - left, least)
 
-    def _predicted(self, fit: Fit, by_recordings: bool) -> _Predicted:
+    def _by(self, without: Fit, fit: Fit, only_in: tuple[int, ...]) -> _By:
+        """What is left out in turn to tell two fits apart."""
+        parts = self._left_out.parts
+        if not only_in and self._left_out.recordings is not parts:
+            return "recordings"
+        if self._left_out.places is not parts and _differ_by_place(without, fit):
+            return "places"
+        return "parts"
+
+    def _predicted(self, fit: Fit, by: _By) -> _Predicted:
         """Of each window by the fit without its fold; noise and the place of a local effect stay as they were found.
 
         So do effects of single recordings where whole recordings are left out, which tell nothing of them.
         """
-        fold = (self._left_out.recordings if by_recordings else self._left_out.parts).fold
-        key = id(fit), by_recordings
+        fold = getattr(self._left_out, by).fold
+        key = id(fit), by
         if key not in self._known:
-            near = _held(fit, by_recordings)
+            near = _held(fit, by == "recordings")
             likelihood, error = np.empty(len(fold)), np.empty((len(fold), 3))
             out = [fold == number for number in range(int(fold.max()) + 1)]
             for these, found in zip(out, self._pool.map(partial(_without, self._problem, near), out), strict=True):
@@ -139,6 +156,11 @@ def _differ_only_in(one: Fit, other: Fit) -> tuple[int, ...]:
     acts = [{name: fit.car.only_in.get(name, ()) for name in fit.car.effects} for fit in (one, other)]
     differ = set(acts[0].items()) ^ set(acts[1].items())
     return () if not all(where for _, where in differ) else tuple({k for _, where in differ for k in where})
+
+
+def _differ_by_place(one: Fit, other: Fit) -> bool:
+    """Whether what one fit has free and the other has not acts at places of the lap."""
+    return any(LAP[0] in EFFECTS[effect].signals((name,)) for effect, name in set(one.free) ^ set(other.free))
 
 
 def _held(fit: Fit, recordings: bool) -> Fit:

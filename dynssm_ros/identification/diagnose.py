@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,13 +12,14 @@ from scipy import stats
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.extras import missing_libraries
+from dynssm_ros.identification.candidates import Candidate
 from dynssm_ros.identification.car import CarEstimate, Values
 from dynssm_ros.identification.diagnosis import Cause, Diagnosis
 from dynssm_ros.identification.formula import Formula, formulas
 from dynssm_ros.identification.gate import HeldOut, Without, gated
 from dynssm_ros.identification.integrator import search_causes
 from dynssm_ros.identification.minimum_effect import minimum_detectable
-from dynssm_ros.identification.problem import Fit, IdentificationProblem, per_unit
+from dynssm_ros.identification.problem import BLOCK, Fit, IdentificationProblem, per_unit
 from dynssm_ros.identification.recordings import CrossValidation, RecordingSet, driven_alike
 from dynssm_ros.identification.selection import Refined, Selection
 from dynssm_ros.identification.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
@@ -28,7 +29,7 @@ from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
-from dynssm_ros.vehicle.effects import EFFECTS, require_context
+from dynssm_ros.vehicle.effects import EFFECTS, LAP, require_context
 from dynssm_ros.vehicle.single_track import Integrator
 
 _HORIZON = 0.5  # s
@@ -118,6 +119,7 @@ def diagnose(
             *(f"{name} cannot be judged: {why}" for name, why in found.impossible.items()),
             *_steps_otherwise(vehicle, windows, fit.car, live),
             *_hidden(sizes),
+            *_passed_once(at.left_out, selection.candidates),
             *_not_confirmed(selection.unconfirmed),
             *_moved_together(fit.car),
             *_not_live(extended),
@@ -163,6 +165,17 @@ def _groups(at: _Prepared, suspects: tuple[int, ...]) -> list[tuple[int, ...]]:
 def _moved(car: CarEstimate) -> dict[str, float]:
     """See :attr:`Diagnosis.moved`."""
     return {name: float(by) for name, by in zip(_NAMES, car.moved, strict=True) if abs(by) > _MOVED}
+
+
+def _passed_once(left_out: CrossValidation, chosen: Iterable[Candidate]) -> Iterator[str]:
+    """What acts at places that were passed once in these laps: nothing tells the place from the moment."""
+    if left_out.recordings is left_out.parts is not left_out.places:
+        for candidate in chosen:
+            if LAP[0] in EFFECTS[candidate.effect].signals(candidate.parameters):
+                yield (
+                    f"{candidate.effect} was seen in one pass of most places and is confirmed by stretches of {BLOCK:g} s "
+                    f"that were left out in turn; it may be of the moment and not of the place, which another lap tells"
+                )
 
 
 def _not_confirmed(doubtful: Refined | None) -> Iterator[str]:

@@ -14,12 +14,14 @@ from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.identification.problem import BLOCK
 from dynssm_ros.identification.windows import RecordedRows, SimulationWindows, rows_per_sample
 from dynssm_ros.signals.recording import Recording, concatenate
-from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number
+from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number, track_position
 from dynssm_ros.track.lines import ClosedLine
 
 LEAST_LAPS = 3  # with which whole laps are held out, and left out in turn
 _LEAST_RECORDINGS = 3  # with which whole recordings are left out in turn
 _QUARTERS = 4  # parts of a recording that are left out in turn where there are no laps
+_PLACES = 32  # of a lap, of which is told in which parts of the drive they are
+_NEARLY_ALL = 0.9  # of the simulations, whose place another part has as well
 _LIKE = 0.5  # spreads of speed, steering and throttle within which two simulations are driven alike
 _MOST_PARTS = 8  # of a single recording, so that many short laps do not take long
 
@@ -37,10 +39,18 @@ class Folds(NamedTuple):
 
 
 class CrossValidation(NamedTuple):
-    """How simulations are left out in turn; with fewer than three recordings both are the same."""
+    """How simulations are left out in turn.
+
+    Attributes:
+        recordings: whole recordings; with fewer than three of them their parts.
+        parts: laps, or quarters of the time where there are fewer than three.
+        places: the same; where the laps are so few that one part alone has most places, every fourth stretch of
+            :data:`BLOCK`, so that what acts at a place is predicted by what was driven there before and after.
+    """
 
     recordings: Folds
     parts: Folds
+    places: Folds
 
 
 @dataclass(frozen=True)
@@ -100,10 +110,7 @@ class RecordingSet:
         return self.names[self.number[row]], float(self.clock[row])
 
     def left_out(self, starts: Indices, line: ClosedLine | None) -> CrossValidation:
-        """How simulations from the rows ``starts`` are left out: recordings in turn, and parts of each of them in turn.
-
-        Parts are laps, or quarters of the time where there are fewer than three.
-        """
+        """How simulations from the rows ``starts`` are left out: recordings in turn, and parts of each of them in turn."""
         lap, whose, several = lap_number(self.recording, line), self.number[starts], len(self.names) > 1
         part = np.empty(len(starts), dtype=np.intp)
         for k in np.unique(whose):
@@ -114,10 +121,23 @@ class RecordingSet:
                 t = self.clock[own] - self.clock[own[0]]
                 part[whose == k] = np.floor(_QUARTERS * t / (np.ptp(t) + 1e-9))
         parts = Folds(*(np.unique(n, return_inverse=True)[1] for n in (part, whose * (part.max() + 1) + part)))
+        places = parts if line is None or self._passed_again(starts, line, parts) else self._stretches(starts)
         if len(np.unique(whose)) < _LEAST_RECORDINGS:
-            return CrossValidation(parts, parts)
+            return CrossValidation(parts, parts, places)
         number = np.unique(whose, return_inverse=True)[1]
-        return CrossValidation(Folds(number, number), parts)
+        return CrossValidation(Folds(number, number), parts, places)
+
+    def _passed_again(self, starts: Indices, line: ClosedLine, parts: Folds) -> bool:
+        """Whether nearly all places of each part of the drive are in another part as well."""
+        place = np.floor(_PLACES * track_position(line, self.recording)[starts] / line.length).astype(np.intp) % _PLACES
+        there = np.zeros((_PLACES, int(parts.fold.max()) + 1), dtype=bool)
+        there[place, parts.fold] = True
+        return bool(np.mean(there.sum(axis=1)[place] > 1) >= _NEARLY_ALL)
+
+    def _stretches(self, starts: Indices) -> Folds:
+        """Stretches of :data:`BLOCK` one after the other, of which every fourth is left out together."""
+        fold = np.unique((self.time[starts] // BLOCK).astype(np.intp) % _QUARTERS, return_inverse=True)[1]
+        return Folds(fold, fold)
 
 
 def driven_alike(windows: SimulationWindows, recordings: Collection[int]) -> float:

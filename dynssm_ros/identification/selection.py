@@ -32,7 +32,6 @@ _NEAR_BEST_SHARE = 0.9  # of the best evidence, near which others are fitted to 
 _MAX_CAUSES = 4  # effects
 _WORTH_A_LOOK = 0.3  # of the best by the criterion, that another must reach to be tried on parts that are left out
 _SURE = 3.0  # standard deviations that a cause must be off neutral
-_ONE_OF_MANY = 2.0  # standard errors that a cause must gain that one recording alone has: more of them are tried
 _ALIKE = 0.1  # logarithm of a ratio of inflations
 
 
@@ -386,7 +385,4 @@ def _is_asked_for(refined: Refined) -> bool:
 
 def _pays(refined: Refined) -> bool:
     """Whether a cause is asked for, and holds where it was not fitted."""
-    confirmation = refined.confirmation
-    if confirmation is None or not refined.is_confirmed or not _is_asked_for(refined):
-        return False
-    return not refined.candidate.only_in or confirmation.total > _ONE_OF_MANY * confirmation.std
+    return refined.is_confirmed and _is_asked_for(refined)

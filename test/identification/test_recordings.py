@@ -73,7 +73,8 @@ def test_a_short_recording_is_not_drowned_by_a_long_one() -> None:
 def test_three_recordings_are_left_out_in_turn_and_their_parts_too(days: list[Recording]) -> None:
     together = RecordingSet.of(days, 0.25)
     starts = np.flatnonzero(~together.held_out)[::20]
-    whole, parts = together.left_out(starts, None)
+    whole, parts, places = together.left_out(starts, None)
+    assert places is parts
     number = together.number[starts]
     np.testing.assert_array_equal(whole.unit, number)
     np.testing.assert_array_equal(whole.fold, number)
@@ -86,17 +87,29 @@ def test_three_recordings_are_left_out_in_turn_and_their_parts_too(days: list[Re
 
 def test_two_recordings_are_left_out_by_parts(days: list[Recording]) -> None:
     together = RecordingSet.of(days[:2], 0.25)
-    whole, parts = together.left_out(np.flatnonzero(~together.held_out)[::20], together.fitted_lap())
+    whole, parts, _ = together.left_out(np.flatnonzero(~together.held_out)[::20], together.fitted_lap())
     assert whole is parts
     assert len(set(parts.unit)) == 8
 
 
 def test_many_short_laps_are_left_out_in_groups() -> None:
     together = RecordingSet.of([recorded(200.0, 4)], 0.25)
-    whole, parts = together.left_out(np.flatnonzero(~together.held_out)[::20], CLUB.centre)
+    whole, parts, _ = together.left_out(np.flatnonzero(~together.held_out)[::20], CLUB.centre)
     assert whole is parts
     assert len(set(whole.fold)) == 8
     assert (np.diff(whole.fold) >= 0).all()
+
+
+@pytest.mark.parametrize(("duration", "again"), [(8.0, False), (16.0, True), (60.0, True)])
+def test_places_that_one_part_alone_has_are_left_out_by_stretches(duration: float, again: bool) -> None:
+    together = RecordingSet.of([recorded(duration, 5)], 0.01)
+    starts = np.flatnonzero(~together.held_out)[::5]
+    _, parts, places = together.left_out(starts, CLUB.centre)
+    assert (places is parts) == again
+    if not again:
+        block = together.time[starts] // BLOCK
+        assert all(len(set(places.fold[block == k])) == 1 for k in set(block))
+        assert len(set(places.fold)) == 3
 
 
 def test_recordings_of_the_same_driving_are_alike_and_others_are_not(days: list[Recording]) -> None:
@@ -142,6 +155,20 @@ Drive = Callable[[dict[str, dict[str, float]], int], Recording]
 @pytest.fixture(scope="module")
 def driven() -> Drive:
     return lambda hidden, seed: drive(Case(hidden, seed, "rk4", 60.0))
+
+
+def test_a_place_that_was_passed_once_is_found_where_all_of_it_agrees() -> None:
+    """A quarter of the time has all of the patch, so that the fit without it knows nothing of it."""
+    patch = {"factor": 0.85, "centre": 0.35, "length": 0.15}
+    case = Case({"grip_patch": patch}, 9412, "rk4", 90.0)
+    found = diagnose(drive(case), vehicle_file(Case({}, 9400)), integrator="rk4", line=case.road.centre)
+    (cause,) = found.causes
+    assert cause.effect == "grip_patch"
+    assert cause.values["factor"] == pytest.approx(0.85, abs=max(0.005, 3 * cause.std["factor"]))
+    assert cause.values["centre"] == pytest.approx(0.35, abs=0.02)
+    assert len(cause.confirmation.gain) == 4
+    assert cause.confirmation.least > 1.0
+    assert any(note.startswith("grip_patch was seen in one pass of most places") for note in found.notes)
 
 
 def test_what_changed_since_the_reference_is_told_from_what_was_there(driven: Drive) -> None:

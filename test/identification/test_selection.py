@@ -51,7 +51,7 @@ def search(vehicle: Vehicle = ORCA, **effects: dict[str, float]) -> Search:
 
 def quarters(given: SimulationWindows) -> CrossValidation:
     quarter = np.arange(len(given)) * 4 // len(given)
-    return CrossValidation(Folds(quarter, quarter), Folds(quarter, quarter))
+    return CrossValidation(*3 * (Folds(quarter, quarter),))
 
 
 def test_a_pair_is_found_the_stronger_first_and_with_its_sizes() -> None:
@@ -130,9 +130,9 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     ):
         sized = replace(strong, candidate=Candidate(effect, tuple(values)))
         assert _pays(replace(sized, fit=replace(fit, car=fit.car.with_effect(effect, values)))) == pays
-    one_day = replace(strong, candidate=replace(FEW[0], only_in=(1,)))
-    assert _pays(one_day)
-    assert not _pays(replace(one_day, confirmation=replace(everywhere, std=6.0)))
+    once_alone = replace(everywhere, least=2.0)
+    assert _pays(replace(strong, confirmation=once_alone))
+    assert not _pays(replace(strong, confirmation=replace(once_alone, std=6.0)))
 
 
 def test_what_is_not_confirmed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
