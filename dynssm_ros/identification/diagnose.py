@@ -242,7 +242,10 @@ def _prepare(
     speed = vehicle.minimum_speed if min_speed is None else min_speed
     line = together.fitted_lap() if line is None else line
     if line is None:
-        notes.append("no full lap with positions: effects that live at a place of the track cannot be judged")
+        notes.append(
+            "no full lap with positions among the fitted rows: effects that live at a place of the track cannot be judged "
+            "unless the track is given"
+        )
     data = together.rows(line)
     source = ", ".join(recording.info.source)
     require_context(vehicle.active_effects, data.context, f"recording {source}")
