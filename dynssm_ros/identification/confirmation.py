@@ -76,11 +76,13 @@ class Confirmation:
         More mass, say, predicts no better than less drive and less drag. What tells them apart is that the car was weighed:
         then it is enough that nothing speaks against the cause elsewhere.
         """
-        if self.total <= self.least * self.std:
+        elsewhere, least = float(self.gain.sum()), self.least * self.std
+        if self.total <= least:
             return False
-        if not self.rests_on_known:
-            return 2 * int((self.gain > 0).sum()) >= len(self.gain)
-        return float(self.gain.sum()) > -self.std and self.known > _KNOWN * self.std
+        repeats = 2 * int((self.gain > 0).sum()) >= len(self.gain)
+        if repeats and (elsewhere > least or not self.rests_on_known):
+            return True
+        return self.rests_on_known and elsewhere > -self.std and self.known > _KNOWN * self.std
 
     @property
     def alike(self) -> bool:

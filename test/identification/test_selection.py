@@ -157,6 +157,15 @@ def test_what_was_known_decides_where_left_out_parts_tell_nothing() -> None:
     assert not replace(level, gain=np.array([-1.0, -1.0, -0.5, -0.5])).holds
 
 
+def test_what_was_known_takes_nothing_from_what_left_out_parts_tell() -> None:
+    """Where one quarter of the drive goes to the limit, its gain makes the standard error large."""
+    confirmed = Confirmation(np.array([44.0, 1.0, 3.0, 3.0]), 41.0, 0.0, np.zeros(3))
+    assert confirmed.holds
+    assert replace(confirmed, known=61.0).holds
+    assert not replace(confirmed, known=61.0, gain=np.array([24.0, 1.0, 3.0, 3.0])).holds
+    assert not replace(confirmed, known=61.0, gain=np.array([54.0, -1.0, -1.0, -1.0])).holds
+
+
 def test_a_gain_that_is_hardly_evidence_tells_nothing_apart() -> None:
     little = Confirmation(np.array([0.5, 0.4, 0.6, 0.5]), 0.1, 0.5, np.zeros(3))
     assert little.alike
