@@ -272,7 +272,7 @@ def test_no_small_change_of_a_settled_plan_costs_less(orca, club, club_line, con
         changed = np.diff(inputs, axis=1, prepend=np.broadcast_to(now[6:8], (50, 1, 2)))
         p = nmpc._parameters(nominal(orca), 0.0)
         u = np.concatenate([plan.u[None], changed])
-        costs = nmpc._costs(nmpc._driven(now, u, p), u, p, margins)
+        costs = nmpc._program.costs(nmpc._driven(now, u, p), u, p, margins)
         assert np.all(costs[1:] > costs[0] - slack * abs(costs[0])), s
 
 
