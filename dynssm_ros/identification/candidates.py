@@ -60,6 +60,11 @@ class Candidate:
         return any(EFFECTS[self.effect].PARAMETERS[p].local for p in self.parameters)
 
     @property
+    def by_place(self) -> bool:
+        """Whether it depends on the place on the lap."""
+        return LAP[0] in EFFECTS[self.effect].signals(self.parameters)
+
+    @property
     def free(self) -> tuple[tuple[str, str], ...]:
         """For a fit."""
         return tuple((self.effect, p) for p in self.parameters)

@@ -29,7 +29,7 @@ from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
-from dynssm_ros.vehicle.effects import EFFECTS, LAP, require_context
+from dynssm_ros.vehicle.effects import EFFECTS, require_context
 from dynssm_ros.vehicle.single_track import Integrator
 
 _HORIZON = 0.5  # s
@@ -171,7 +171,7 @@ def _passed_once(left_out: CrossValidation, chosen: Iterable[Candidate]) -> Iter
     """What acts at places that were passed once in these laps: nothing tells the place from the moment."""
     if left_out.recordings is left_out.parts is not left_out.places:
         for candidate in chosen:
-            if LAP[0] in EFFECTS[candidate.effect].signals(candidate.parameters):
+            if candidate.by_place:
                 yield (
                     f"{candidate.effect} was seen in one pass of most places and is confirmed by stretches of {BLOCK:g} s "
                     f"that were left out in turn; it may be of the moment and not of the place, which another lap tells"

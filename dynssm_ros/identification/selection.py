@@ -20,7 +20,7 @@ from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.identification.size_search import CandidateStart, SizeSearch
 from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.progress import OnProgress
-from dynssm_ros.vehicle.effects import EFFECTS
+from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 
 DECISIVE_DELTA_BIC = 10.0  # difference in the information criterion that counts as very strong (Kass and Raftery 1995)
 AMBIGUITY_DELTA_BIC = 6.0  # candidates within this delta BIC are reported as alternatives
@@ -69,9 +69,18 @@ class Refined:
         return bool(self.candidate.only_in) or not about.DIRECTIONS or float(side) in about.DIRECTIONS
 
     @property
-    def strangeness(self) -> tuple[bool, bool, bool]:
-        """Whether it is at a bound, is of single recordings, is on the side on which no car has it: in that order."""
-        return bool(self.bounded), bool(self.candidate.only_in), not self.is_met
+    def strangeness(self) -> tuple[bool, bool, bool, bool]:
+        """Whether it is at a bound, of single recordings, of places, on the side on which no car has it: in that order."""
+        return bool(self.bounded), bool(self.candidate.only_in), self.candidate.by_place, not self.is_met
+
+    @property
+    def is_everywhere(self) -> bool:
+        """Whether it is to act on a section of the lap and the section is as long as can be."""
+        if not self.candidate.local:
+            return False
+        length, effect = LOCATION[1], self.candidate.effect
+        about, value = EFFECTS[effect].PARAMETERS[length], self.fit.car.effects[effect][length]
+        return about.at_bound(value) and value > about.neutral
 
     @property
     def is_confirmed(self) -> bool:
@@ -252,7 +261,8 @@ class Search:
     def _best(self, before: tuple[Candidate, ...]) -> Refined | None:
         """The candidate that gains most; of those that cannot be told from it the most ordinary one.
 
-        That is one within its bounds, then one that all recordings have, then one as it is met in real cars.
+        That is one within its bounds, then one that all recordings have, then one that acts at all places, then one as it is
+        met in real cars.
         """
         found = sorted(self._confirmed(before), key=lambda r: -r.gain)
         alike = [r for r in found if r is found[0] or self._left_out.compare(r.fit, found[0].fit).alike]
@@ -379,8 +389,9 @@ def _is_little(refined: Refined) -> bool:
 
 
 def _is_asked_for(refined: Refined) -> bool:
-    """Whether the fitted laps ask for a cause: it is worth its parameters, sure, and large enough."""
-    return refined.delta_bic > DECISIVE_DELTA_BIC and refined.sure > _SURE and not _is_little(refined)
+    """Whether the fitted laps ask for a cause: it is worth its parameters, sure, large enough, and of a part of the lap."""
+    asked = refined.delta_bic > DECISIVE_DELTA_BIC and refined.sure > _SURE
+    return asked and not _is_little(refined) and not refined.is_everywhere
 
 
 def _pays(refined: Refined) -> bool:

@@ -130,6 +130,12 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     ):
         sized = replace(strong, candidate=Candidate(effect, tuple(values)))
         assert _pays(replace(sized, fit=replace(fit, car=fit.car.with_effect(effect, values)))) == pays
+    for length, pays in ((0.5, True), (0.8, False)):
+        values = {"factor": 0.8, "centre": 0.3, "length": length}
+        sized = replace(strong, candidate=Candidate("grip_patch", tuple(values)))
+        sized = replace(sized, fit=replace(fit, car=fit.car.with_effect("grip_patch", values)))
+        assert _pays(sized) == pays, "a patch as long as can be is everywhere"
+        assert sized.strangeness == (False, False, True, False)
     once_alone = replace(everywhere, least=2.0)
     assert _pays(replace(strong, confirmation=once_alone))
     assert not _pays(replace(strong, confirmation=replace(once_alone, std=6.0)))
