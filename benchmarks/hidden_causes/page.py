@@ -28,33 +28,39 @@ _PLANTS = {
     "rk4": "one track, steps of 1 ms", "double_track": "four wheels", foreign.NAME: "another make",
     multi_body.NAME: "multi-body",
 }  # fmt: skip
+_MULTI_BODY = (
+    " The multi-body car is CommonRoad's: a body on springs, wheels that spin, PAC2002 tyres with camber and combined slip, "
+    "brakes on all wheels, an engine with a greatest power. Its first drives gave the library the effect `power_limit`; "
+    "nothing else was tuned to it."
+)
 
 
-def page(outcomes: Sequence[tuple[Case, Outcome | None]], seed: int) -> str:
+def page(outcomes: Sequence[tuple[Case, Outcome | None]], asked: str) -> str:
     """The results as Markdown.
 
     Args:
         outcomes: of the cases; ``None``: the car could not be driven.
-        seed: of the first case; the others' count on from it.
+        asked: the variables that the cases were asked for with.
     """
-    return "\n".join(_lines(outcomes, seed)) + "\n"
+    return "\n".join(_lines(outcomes, asked)) + "\n"
 
 
-def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str]:
+def _lines(of: Sequence[tuple[Case, Outcome | None]], asked: str) -> Iterator[str]:
     outcomes = [outcome for _, outcome in of if outcome is not None]
-    undriven = len(of) - len(outcomes)
+    undriven, seeds = len(of) - len(outcomes), [case.seed for case, _ in of]
+    plants = {plant: words for plant, words in _PLANTS.items() if any(case.plant == plant for case, _ in of)}
     yield "# Hidden causes"
     yield ""
     yield (
-        f"Made by `python -m doit -f benchmarks/hidden_causes/dodo.py seed={seed} count={len(of)}`: {len(outcomes)} "
-        f"simulated drives with hidden effects, seeds {seed} to {seed + len(of) - 1}"
+        f"Made by `python -m doit -f benchmarks/hidden_causes/dodo.py {asked}`: {len(outcomes)} simulated drives with hidden "
+        f"effects, seeds {min(seeds)} to {max(seeds)}"
         + (f", without {undriven} whose car could not be driven" if undriven else "")
         + ". How they are drawn and what counts as just noticeable: `benchmarks/hidden_causes/cases.py`."
     )
     yield ""
-    yield f"| rate | cases | share | 95 % interval | goal | {' | '.join(_PLANTS.values())} |"
-    yield f"| --- | --- | --- | --- | --- |{' --- |' * len(_PLANTS)}"
-    by_plant = [rates([o for case, o in of if o is not None and case.plant == plant]) for plant in _PLANTS]
+    yield f"| rate | cases | share | 95 % interval | goal | {' | '.join(plants.values())} |"
+    yield f"| --- | --- | --- | --- | --- |{' --- |' * len(plants)}"
+    by_plant = [rates([o for case, o in of if o is not None and case.plant == plant]) for plant in plants]
     overall = rates(outcomes)
     for name, words in _IN_WORDS.items():
         rate = overall[name]
@@ -70,10 +76,8 @@ def _lines(of: Sequence[tuple[Case, Outcome | None]], seed: int) -> Iterator[str
     yield (
         "Four wheels are a car that the equations do not have: an axle loses grip as load moves from one wheel to the other, "
         "and unequal forces at the steered wheels turn the car. An effect that is named there and not hidden may stand for "
-        "this. The car of another make has brush tyres, forces that grow less than the load, and steering that gives way. "
-        "The multi-body car is CommonRoad's: a body on springs, wheels that spin, PAC2002 tyres with camber and combined "
-        "slip, brakes on all wheels, an engine with a greatest power. Its first drives gave the library the effect "
-        "`power_limit`; nothing else was tuned to it."
+        "this. The car of another make has brush tyres, forces that grow less than the load, and steering that gives way."
+        + (_MULTI_BODY if multi_body.NAME in plants else "")
     )
     yield ""
     yield f"![What was hidden and what was named first]({FIGURE})"
@@ -115,8 +119,8 @@ def _conditions(outcomes: Sequence[Outcome]) -> Iterator[str]:
     yield ""
     yield (
         f"The vehicle file tells mass and geometry as they are. Its coefficients are off by {100 * OFF:g} % (standard "
-        "deviation), and it says so. Those of the car of another make and of the multi-body car were calibrated on two "
-        "minutes of a healthy drive, the former from nothing but the bounds, and then diagnosed."
+        "deviation), and it says so. Those of the car of another make (and of the multi-body car) were calibrated on "
+        "two minutes of a healthy drive, the former from nothing but the bounds, and then diagnosed."
     )
 
 
