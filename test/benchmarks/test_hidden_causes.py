@@ -171,7 +171,8 @@ def test_rates_and_confusion_count_what_happened() -> None:
 def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
     text = page(OF, "seed=7 count=9 cars=rk4,double_track")
     assert "/dodo.py seed=7 count=9 cars=rk4,double_track`: 4 simulated drives" in text
-    assert f"seeds {min(c.seed for c, _ in OF)} to {max(c.seed for c, _ in OF)}, without 1 whose car could not be driven" in text
+    seeds = [case.seed for case, _ in OF]
+    assert f"seeds {min(seeds)} to {max(seeds)}, without 1 whose car could not be driven" in text
     assert (
         "| the hidden effect, or an alternative reported with it, is named first | 2 | 50 % | 9 to 91 % |  "
         "| 1 of 1 | 0 of 1 |" in text
