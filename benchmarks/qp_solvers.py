@@ -24,10 +24,11 @@ from benchmarks.generalisation.cells import CARS
 from benchmarks.live_laps import ROAD
 from dynssm_ros.arrays import Vector
 from dynssm_ros.cli.console import console
+from dynssm_ros.control.buffered import QuadraticProgram
 from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.horizon_model import HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Nmpc
-from dynssm_ros.control.program import DELTA, V_X, Program, R, directions
+from dynssm_ros.control.program import DELTA, V_X, R, directions
 from dynssm_ros.control.race import Course
 from dynssm_ros.control.race_models import true_model
 from dynssm_ros.control.reference import load_reference
@@ -64,22 +65,34 @@ class Problem(NamedTuple):
     """Where in ``z`` the increments of the first step stand."""
 
 
+class RecordingSolver(QuadraticProgram):
+    """Keeps the programs that it solves."""
+
+    def __init__(self, variables: int, rows: int) -> None:
+        super().__init__(variables, rows)
+        self.problems: list[Problem] = []
+
+    def solve(
+        self, H: Vector, g: Vector, A: Vector, low: Vector, high: Vector, z_low: Vector, z_high: Vector
+    ) -> Vector:
+        """See :meth:`QuadraticProgram.solve`."""
+        self.problems.append(Problem(ca.DM(H), g, ca.DM(A), low, high, z_low, z_high, 0))
+        return super().solve(H, g, A, low, high, z_low, z_high)
+
+
 class Recorder(Nmpc):
     """Keeps the programs that it solves, in both forms."""
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
-        self.problems: dict[str, list[Problem]] = {"condensed": [], "by stages": []}
+        self._solver = RecordingSolver(self._program.variables, self._program.rows)
+        self.problems: dict[str, list[Problem]] = {"condensed": self._solver.problems, "by stages": []}
 
     def _improved(self, now: Vector, guess: Any, adapted: Adapted, t: float, margins: Margins) -> Any:
         x, p = np.concatenate([now[None], guess.x[1:]]), self._parameters(adapted, t)
         steps = self.model.linearised(x[:-1], guess.u, p)
         self.problems["by stages"].append(self._by_stages(x, guess.u, *steps, p, margins))
         return super()._improved(now, guess, adapted, t, margins)
-
-    def _solved(self, program: Program) -> Vector:
-        self.problems["condensed"].append(Problem(ca.DM(program.H), program.g, ca.DM(program.A), *program[3:], 0))
-        return super()._solved(program)
 
     def _by_stages(
         self, x: Vector, u: Vector, following: Vector, by_x: Vector, by_u: Vector, p: Vector, margins: Margins
@@ -91,12 +104,9 @@ class Recorder(Nmpc):
         H, g = np.zeros((n, n)), np.zeros(n)
         z_low, z_high = np.full(n, -np.inf), np.full(n, np.inf)
         z_low[:size] = z_high[:size] = x[0]
-        at = self._program.reference_points(x)
-        point, tangents, normals = (
-            self._program.reference.line.position(at),
-            *directions(self._program.reference.line.heading(at)),
-        )
-        reach, span = self._program.limits.steering_rate * self.model.car.T_s, np.ptp(self._program.limits.throttle)
+        at, line, limits = self._program.reference_points(x), self._program.reference.line, self._program.limits
+        point, tangents, normals = line.position(at), *directions(line.heading(at))
+        reach, span = limits.steering_rate * self.model.car.T_s, np.ptp(limits.throttle)
         for k in range(N):
             first, after = k * wide + size, (k + 1) * wide
             inputs, slack, ending = slice(first, first + 2), first + 2, first + 3
@@ -110,9 +120,7 @@ class Recorder(Nmpc):
             H[ending, ending] = 2 * max(w.terminal_speed, 1.0)
             z_low[inputs], z_high[inputs] = (-span, -reach), (span, reach)
             z_low[[slack, ending]] = 0.0
-            z_low[actuators], z_high[actuators] = zip(
-                self._program.limits.throttle, self._program.limits.steering, strict=True
-            )
+            z_low[actuators], z_high[actuators] = zip(limits.throttle, limits.steering, strict=True)
         g[N * wide : N * wide + 2] -= w.progress * tangents[-1] / length
         g[(N - 1) * wide + size + 3] = w.terminal_speed
         gaps = following - np.einsum("kij,kj->ki", by_x, x[:-1]) - np.einsum("kij,kj->ki", by_u, u)
@@ -149,20 +157,18 @@ class Recorder(Nmpc):
         N, size = self.settings.N, x.shape[1]
         unit = np.zeros((N, size, 2 * N))
         unit[:, :, :size] = np.eye(size)
-        borders, slips = np.zeros((2 * N, self._program.variables)), np.zeros((4 * N, self._program.variables))
+        program = self._program
+        borders, slips = np.zeros((2 * N, program.variables)), np.zeros((4 * N, program.variables))
         low, high = np.full(2 * N, -np.inf), np.full(2 * N, np.inf)
-        self._program.add_borders(borders, low, high, x, x[1:, :2], unit[:, :2], margins.lateral)
+        program.add_borders(borders, low, high, x, x[1:, :2], unit[:, :2], margins.lateral)
         bound = np.full(4 * N, np.inf)
-        self._program.add_slip(slips, bound, x[1:], x[1:], unit, p, margins.slip)
+        program.add_slip(slips, bound, x[1:], x[1:], unit, p, margins.slip)
         most = np.concatenate([high, bound]).reshape(6, N).T
         least = np.concatenate([low, np.full(4 * N, -np.inf)]).reshape(6, N).T
         rows = np.concatenate([borders, slips])[:, :size].reshape(6, N, size).swapaxes(0, 1)
         here = np.einsum("kij,kj->ki", rows, x[1:])
-        too_fast = (
-            float(self._program.reference.terminal_speed_at(end))
-            if self.settings.weights.terminal_speed > 0
-            else np.inf
-        )
+        bounds_end = self.settings.weights.terminal_speed > 0
+        too_fast = float(program.reference.terminal_speed_at(end)) if bounds_end else np.inf
         speed = np.tile(np.eye(size)[V_X], (N, 1, 1))
         return (
             np.concatenate([rows, speed], axis=1),

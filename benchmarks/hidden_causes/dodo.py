@@ -29,12 +29,15 @@ SEED, COUNT = int(get_var("seed", "0")), int(get_var("count", "130"))
 OUT = Path(get_var("out", "out/hidden_causes"))
 PAGE_FOLDER = Path(get_var("page", str(OUT)))
 HEALTHY = get_var("healthy", "0") == "1"
-CARS = get_var("cars", ",".join(TRUTHS))
-if unknown := set(CARS.split(",")) - set(TRUTHS):
-    raise UserError(f"cars={CARS}: {', '.join(sorted(unknown))} is none of {', '.join(TRUTHS)}")
-CASES = [case for case in cases(SEED, COUNT, healthy=HEALTHY) if case.plant in CARS.split(",")]
-_ALL = CARS.split(",") == list(TRUTHS)
-ASKED = f"seed={SEED} count={COUNT}" + " healthy=1" * HEALTHY + ("" if _ALL else f" cars={CARS}")
+CARS = get_var("cars", ",".join(TRUTHS)).split(",")
+if unknown := set(CARS) - set(TRUTHS):
+    raise UserError(f"cars={','.join(CARS)}: {', '.join(sorted(unknown))} is none of {', '.join(TRUTHS)}")
+CASES = [case for case in cases(SEED, COUNT, healthy=HEALTHY) if case.plant in CARS]
+ASKED = (
+    f"seed={SEED} count={COUNT}"
+    + " healthy=1" * HEALTHY
+    + (f" cars={','.join(CARS)}" if set(CARS) < set(TRUTHS) else "")
+)
 DOIT_CONFIG = doit_config(OUT / "doit.json")
 _DPI = 130
 

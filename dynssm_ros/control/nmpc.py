@@ -28,7 +28,7 @@ from dynssm_ros.control.buffered import QuadraticProgram
 from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, PARAMETERS, HorizonModel
 from dynssm_ros.control.manoeuvres import manoeuvres
-from dynssm_ros.control.program import DELTA, V_X, HorizonProgram, Program, R, Whereabouts
+from dynssm_ros.control.program import DELTA, V_X, HorizonProgram, R, Whereabouts
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.track.tracks import Track
@@ -224,14 +224,11 @@ class Nmpc:
         program = self._program.of(x, offset, slope, p, margins)
         if not all(np.all(np.isfinite(each)) for each in program[:3]):
             return None
-        u, slack = self._program.parts(self._solved(program))
+        u, slack = self._program.parts(self._solver.solve(*program))
         states = offset + slope @ u
         if not (np.all(np.isfinite(u)) and np.all(np.isfinite(states))):
             return None
         return Plan(states, u.reshape(-1, len(INPUTS)), beyond=float(np.max(slack)))
-
-    def _solved(self, program: Program) -> Vector:
-        return self._solver.solve(*program)
 
     def _may_be_caught(self, plan: Plan) -> bool:
         """Whether a plan goes beyond a soft bound although it steers to the stop."""

@@ -62,7 +62,7 @@ class Candidate:
     @property
     def by_place(self) -> bool:
         """Whether it depends on the place on the lap."""
-        return LAP[0] in EFFECTS[self.effect].signals(self.parameters)
+        return EFFECTS[self.effect].acts_by_place(self.parameters)
 
     @property
     def free(self) -> tuple[tuple[str, str], ...]:

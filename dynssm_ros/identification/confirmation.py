@@ -11,24 +11,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.identification.noise import Noise
 from dynssm_ros.identification.problem import Fit, IdentificationProblem
-from dynssm_ros.identification.recordings import CrossValidation
+from dynssm_ros.identification.recordings import CrossValidation, Folds
 from dynssm_ros.parallel import IN_TURN, Pool
-from dynssm_ros.vehicle.effects import EFFECTS, LAP
+from dynssm_ros.vehicle.effects import EFFECTS
 
 _KNOWN = 2.0  # standard errors that the nominal values must be spared, where left-out units tell nothing
 _ONE_OF_MANY = 2.0  # standard errors to be gained by what one recording has, or a place passed once: many are tried
 _ROUNDS = 4  # of linearising anew, from the fit of all
 _HARDLY = 3.0  # logarithm of a likelihood ratio that is no strong evidence yet (Kass and Raftery 1995)
-
-
-_By = Literal["recordings", "parts", "places"]  # as in CrossValidation
 
 
 class _Predicted(NamedTuple):
@@ -101,41 +98,37 @@ class LeaveOneOut:
 
     def __init__(self, problem: IdentificationProblem, left_out: CrossValidation, pool: Pool = IN_TURN) -> None:
         self._problem, self._left_out, self._pool = problem, left_out, pool
-        self._known: dict[tuple[int, str], tuple[Fit, _Predicted]] = {}
+        self._known: dict[tuple[int, int], tuple[Fit, _Predicted]] = {}
 
     def compare(self, without: Fit, fit: Fit) -> Confirmation:
         """What ``fit`` gains over ``without``."""
         only_in = _differ_only_in(without, fit)
-        by = self._by(without, fit, only_in)
-        before, after = self._predicted(without, by), self._predicted(fit, by)
-        unit = getattr(self._left_out, by).unit
+        folds = self._folds(without, fit, only_in)
+        before, after = self._predicted(without, folds), self._predicted(fit, folds)
         number = self._problem.windows.number
         told = np.isin(number, only_in) if only_in else np.ones(len(number), dtype=bool)
         by_window = ((after.likelihood - before.likelihood) / self._problem.tempering)[told]
-        gain, by_block = (sums_of(by_window, n[told]) for n in (unit, self._problem.block))
+        gain, by_block = (sums_of(by_window, n[told]) for n in (folds.unit, self._problem.block))
         known = (self._problem.surprise(without) - self._problem.surprise(fit)) / 2.0
         left = after.error[told].sum(axis=0) / np.maximum(before.error[told].sum(axis=0), 1e-300)
-        least = _ONE_OF_MANY if only_in or by == "places" else 1.0
+        passed_once = self._left_out.has_places_once and folds is self._left_out.places
+        least = _ONE_OF_MANY if only_in or passed_once else 1.0
         return Confirmation(gain, max(standard_error(gain), standard_error(by_block)), known, 1.0 - left, least)
 
-    def _by(self, without: Fit, fit: Fit, only_in: tuple[int, ...]) -> _By:
+    def _folds(self, without: Fit, fit: Fit, only_in: tuple[int, ...]) -> Folds:
         """What is left out in turn to tell two fits apart."""
-        parts = self._left_out.parts
-        if not only_in and self._left_out.recordings is not parts:
-            return "recordings"
-        if self._left_out.places is not parts and _differ_by_place(without, fit):
-            return "places"
-        return "parts"
+        if not only_in and self._left_out.has_recordings:
+            return self._left_out.recordings
+        return self._left_out.places if _differ_by_place(without, fit) else self._left_out.parts
 
-    def _predicted(self, fit: Fit, by: _By) -> _Predicted:
+    def _predicted(self, fit: Fit, folds: Folds) -> _Predicted:
         """Of each window by the fit without its fold; noise and the place of a local effect stay as they were found.
 
         So do effects of single recordings where whole recordings are left out, which tell nothing of them.
         """
-        fold = getattr(self._left_out, by).fold
-        key = id(fit), by
+        fold, key = folds.fold, (id(fit), id(folds))
         if key not in self._known:
-            near = _held(fit, by == "recordings")
+            near = _held(fit, self._left_out.has_recordings and folds is self._left_out.recordings)
             likelihood, error = np.empty(len(fold)), np.empty((len(fold), 3))
             out = [fold == number for number in range(int(fold.max()) + 1)]
             for these, found in zip(out, self._pool.map(partial(_without, self._problem, near), out), strict=True):
@@ -162,7 +155,7 @@ def _differ_only_in(one: Fit, other: Fit) -> tuple[int, ...]:
 
 def _differ_by_place(one: Fit, other: Fit) -> bool:
     """Whether what one fit has free and the other has not acts at places of the lap."""
-    return any(LAP[0] in EFFECTS[effect].signals((name,)) for effect, name in set(one.free) ^ set(other.free))
+    return any(EFFECTS[effect].acts_by_place((name,)) for effect, name in set(one.free) ^ set(other.free))
 
 
 def _held(fit: Fit, recordings: bool) -> Fit:

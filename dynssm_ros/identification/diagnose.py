@@ -169,7 +169,7 @@ def _moved(car: CarEstimate) -> dict[str, float]:
 
 def _passed_once(left_out: CrossValidation, chosen: Iterable[Candidate]) -> Iterator[str]:
     """What acts at places that were passed once in these laps: nothing tells the place from the moment."""
-    if left_out.recordings is left_out.parts is not left_out.places:
+    if left_out.has_places_once and not left_out.has_recordings:
         for candidate in chosen:
             if candidate.by_place:
                 yield (

@@ -52,6 +52,16 @@ class CrossValidation(NamedTuple):
     parts: Folds
     places: Folds
 
+    @property
+    def has_recordings(self) -> bool:
+        """Whether whole recordings are left out: there are enough of them."""
+        return self.recordings is not self.parts
+
+    @property
+    def has_places_once(self) -> bool:
+        """Whether one part alone has most places."""
+        return self.places is not self.parts
+
 
 @dataclass(frozen=True)
 class RecordingSet:
@@ -129,7 +139,8 @@ class RecordingSet:
 
     def _passed_again(self, starts: Indices, line: ClosedLine, parts: Folds) -> bool:
         """Whether nearly all places of each part of the drive are in another part as well."""
-        place = np.floor(_PLACES * track_position(line, self.recording)[starts] / line.length).astype(np.intp) % _PLACES
+        s = track_position(line, self.recording.select(starts))
+        place = np.floor(_PLACES * s / line.length).astype(np.intp) % _PLACES
         there = np.zeros((_PLACES, int(parts.fold.max()) + 1), dtype=bool)
         there[place, parts.fold] = True
         return bool(np.mean(there.sum(axis=1)[place] > 1) >= _NEARLY_ALL)

@@ -21,7 +21,6 @@ from dynssm_ros.vehicle.effects.actuators import (
 )
 from dynssm_ros.vehicle.effects.base import (
     CONTEXT_UNITS,
-    LAP,
     LOCATION,
     PLACE,
     Effect,
@@ -55,7 +54,6 @@ from dynssm_ros.vehicle.single_track import StageEffect
 __all__ = [
     "CONTEXT_UNITS",
     "EFFECTS",
-    "LAP",
     "LOCATION",
     "PLACE",
     "Effect",

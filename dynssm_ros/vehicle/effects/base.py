@@ -138,6 +138,11 @@ class Effect(StageEffect):
         return tuple(dict.fromkeys(signal for name in names for signal in cls.PARAMETERS[name].context))
 
     @classmethod
+    def acts_by_place(cls, parameters: Iterable[str]) -> bool:
+        """Whether these parameters act differently from place to place on the lap."""
+        return LAP[0] in cls.signals(parameters)
+
+    @classmethod
     def magnitude(cls) -> Parameter:
         """The first parameter that says how much."""
         return next(about for about in cls.PARAMETERS.values() if not about.shape)
