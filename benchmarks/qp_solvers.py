@@ -28,7 +28,7 @@ from dynssm_ros.control.buffered import QuadraticProgram
 from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.horizon_model import HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Nmpc
-from dynssm_ros.control.program import DELTA, V_X, R, directions
+from dynssm_ros.control.program import DELTA, V_X, R
 from dynssm_ros.control.race import Course
 from dynssm_ros.control.race_models import true_model
 from dynssm_ros.control.reference import load_reference
@@ -105,7 +105,7 @@ class Recorder(Nmpc):
         z_low, z_high = np.full(n, -np.inf), np.full(n, np.inf)
         z_low[:size] = z_high[:size] = x[0]
         at, line, limits = self._program.reference_points(x), self._program.reference.line, self._program.limits
-        point, tangents, normals = line.position(at), *directions(line.heading(at))
+        point, tangents, normals = line.frame(at)
         reach, span = limits.steering_rate * self.model.car.T_s, np.ptp(limits.throttle)
         for k in range(N):
             first, after = k * wide + size, (k + 1) * wide

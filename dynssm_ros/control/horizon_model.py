@@ -121,7 +121,8 @@ class HorizonModel:
         outputs = [following, ca.jacobian(following, x), ca.jacobian(following, u)]
         self._step = ca.Function("step", [x, u, p], [ca.densify(following)])
         self._steps: dict[int, BufferedRows] = {}  # by how many states are stepped at once
-        self._stages = BufferedRows(ca.Function("stage", [x, u, p], [ca.densify(each) for each in outputs]), N)
+        stages = ca.Function("stage", [x, u, p], [ca.densify(each) for each in outputs], {"cse": True})
+        self._stages = BufferedRows(stages, N)
         slips = self._slip_angles(x, p, slowest)
         self._slips = BufferedRows(
             ca.Function("slip", [x, p], [ca.densify(slips), ca.densify(ca.jacobian(slips, x))]), N

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.control.buffered import BufferedRows
 from dynssm_ros.control.horizon_model import INPUTS, MOVING, STATES, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Plan
 from dynssm_ros.runtime.learner import OnlineLearner
@@ -14,8 +15,7 @@ from dynssm_ros.runtime.models import OnnxModel, WindowModel, WindowPrediction, 
 from dynssm_ros.runtime.online import Seen
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
-from dynssm_ros.vehicle import Coefficients, State, Vehicle, step
-from dynssm_ros.vehicle.kinematics import SCALAR
+from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle, step
 
 
 class PredictionModel(Protocol):
@@ -91,6 +91,7 @@ class Adaptive:
             self._online = _Online(OnlineLearner(model, model.online, judges=False))
         self.H = model.H
         self.car = SteppedCar.of(own) if card is None else SteppedCar.of(own, card.integrator, card.substeps)
+        self._step = _compiled_step(self.car)
         self._model = model
         self._along_horizon = along_horizon
         self.calibrated = Adapted(own.nominal, np.zeros(3))
@@ -132,7 +133,12 @@ class Adaptive:
         if self._online is not None:
             said = self._online.corrected(said, windows)
         theta = self.calibrated.theta if said.theta is None else said.theta
-        physics = stepped(self.car, windows[:, -1], theta) if said.physics is None else said.physics
+        if said.physics is not None:
+            physics = said.physics
+        elif len(windows) == 1:
+            physics = self._step(windows[0, -1], np.ravel(theta))[0]
+        else:
+            physics = stepped(self.car, windows[:, -1], theta)
         correction = said.state - physics
         if len(windows) == 1:
             return Adapted(np.atleast_2d(theta)[0], correction[0])
@@ -172,16 +178,24 @@ def stepped(car: SteppedCar, rows: Vector, theta: Vector) -> Vector:
         rows: with the columns ``WINDOW_COLUMNS``, shape ``(k, 7)``.
         theta: coefficients, shape ``(17,)`` or ``(k, 17)``.
     """
-    library: Any = np
-    now: Any = rows.T
-    coefficients: Any = np.transpose(theta)
-    if len(rows) == 1:  # plain numbers are several times as fast as arrays of one
-        library, now, coefficients = SCALAR, rows[0].tolist(), np.ravel(theta).tolist()
-    following = step(
-        library, State(*now[:3]), applied_inputs(now), Coefficients(*coefficients), car.constants, car.T_s, car.effects,
+    return np.reshape(_step(np, car, rows.T, np.transpose(theta)), (3, -1)).T
+
+
+def _compiled_step(car: SteppedCar) -> BufferedRows:
+    """:func:`stepped` of one row ``(7,)`` and its coefficients ``(17,)``: each control step asks for it."""
+    import casadi as ca  # takes a while, and most of the command line does without
+
+    row, theta = ca.SX.sym("row", len(WINDOW_COLUMNS)), ca.SX.sym("theta", len(COEFFICIENTS))
+    following = _step(ca, car, ca.vertsplit(row), ca.vertsplit(theta))
+    return BufferedRows(ca.Function("step", [row, theta], [ca.densify(ca.vertcat(*following))]), 1)
+
+
+def _step(library: Any, car: SteppedCar, now: Any, theta: Any) -> State:
+    """The next state, from the columns of rows and of their coefficients, with ``library``'s numbers."""
+    return step(
+        library, State(*now[:3]), applied_inputs(now), Coefficients(*theta), car.constants, car.T_s, car.effects,
         car.integrator, car.substeps,
     )  # fmt: skip
-    return np.reshape(following, (len(following), -1)).T
 
 
 def _planned_rows(plan: Plan) -> Vector:

@@ -105,8 +105,7 @@ class HorizonProgram:
         N, w = self.settings.N, self.settings.weights
         positions, moves = offset[1:, :2], slope[1:, :2]
         points = self.reference_points(guess)
-        point, heading = self.reference.line.position(points), self.reference.line.heading(points)
-        tangent, normal = directions(heading)
+        point, tangent, normal = self.reference.line.frame(points)
         H, g = np.zeros((self.variables,) * 2), np.zeros(self.variables)
         length, h = self.settings.scale.length, self.model.car.T_s / self.settings.scale.time
         along, across = np.full(N, h * w.along), np.full(N, h * w.across)
@@ -159,8 +158,8 @@ class HorizonProgram:
         x = np.where(finite[:, None, None], x, x[:, :1])
         w, length, h = self.settings.weights, self.settings.scale.length, self.model.car.T_s / self.settings.scale.time
         points = self.reference_points(x)
-        tangent, normal = directions(self.reference.line.heading(points))
-        errors = (x[:, 1:, :2] - self.reference.line.position(points)) / length
+        point, tangent, normal = self.reference.line.frame(points)
+        errors = (x[:, 1:, :2] - point) / length
         along, across = np.sum(tangent * errors, axis=-1), np.sum(normal * errors, axis=-1)
         s, lateral = self.track.project(x[:, 1:, :2], _along(x[..., :2], self.at.on_track))
         right, left = self._room(s, margins.lateral)
@@ -196,8 +195,7 @@ class HorizonProgram:
         """
         N = self.settings.N
         s = self.track.project(guess[1:, :2], _along(guess[:, :2], self.at.on_track))[0]
-        foot = self.track.centre.position(s)
-        normal = directions(self.track.centre.heading(s))[1]
+        foot, _, normal = self.track.centre.frame(s)
         right, left = self._room(s, margin)
         lateral = np.einsum("ki,ki->k", normal, positions - foot)
         by_u = np.einsum("ki,kij->kj", normal, moves)
@@ -248,9 +246,3 @@ def _soft(beyond: Vector) -> Vector:
     """What going beyond a bound costs, in units of its price."""
     slack = np.maximum(0.0, beyond)
     return np.asarray(slack + slack**2)
-
-
-def directions(heading: Vector) -> tuple[Vector, Vector]:
-    """Unit vectors along and to the left of ``heading`` ``(...)``, each ``(..., 2)``."""
-    c, s = np.cos(heading), np.sin(heading)
-    return np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)

@@ -42,22 +42,27 @@ class ClosedLine:
     @cached_property
     def s(self) -> Vector:
         """Arc length of the points (m), shape ``(N,)``, 0 at the first."""
-        return np.asarray(self._spline.x[:-1])
+        return self._knots[:-1]
 
     @cached_property
     def length(self) -> float:
         """Length of one lap (m)."""
-        return float(self._spline.x[-1])
+        return float(self._knots[-1])
 
     def position(self, s: Floats, lateral: Floats = 0.0) -> Vector:
         """Positions (m) at arc length ``s`` (m, periodic), ``lateral`` metres to the left; shape ``(..., 2)``."""
         position, tangent, _ = self._derivatives(s)
-        beside = np.asarray(position + lateral * 1j * tangent / np.abs(tangent))
-        return np.stack([beside.real, beside.imag], axis=-1)
+        return _as_points(position + lateral * 1j * tangent / np.abs(tangent))
 
     def heading(self, s: Floats) -> Vector:
         """Direction of driving (rad, counter-clockwise from x, in ``(-pi, pi]``) at ``s`` (m, periodic)."""
         return np.asarray(np.angle(self._derivatives(s)[1]))
+
+    def frame(self, s: Floats) -> tuple[Vector, Vector, Vector]:
+        """Positions (m), unit vectors along the line and to its left at ``s`` (m, periodic), each ``(..., 2)``."""
+        position, tangent, _ = self._derivatives(s)
+        along = tangent / np.abs(tangent)
+        return _as_points(position), _as_points(along), _as_points(1j * along)
 
     def curvature(self, s: Floats) -> Vector:
         """Curvature (1/m, positive to the left) at ``s`` (m, periodic)."""
@@ -135,9 +140,14 @@ class ClosedLine:
         return _as_complex(self._spline.c)
 
     @cached_property
+    def _knots(self) -> Vector:
+        """Arc length at which the spline's pieces begin, and the end of the last one (m), ``(N + 1,)``."""
+        return np.asarray(self._spline.x)
+
+    @cached_property
     def _listed(self) -> tuple[list[float], list[list[complex]]]:
         """Knots and :attr:`_pieces` as plain numbers, one piece after the other."""
-        return self._spline.x.tolist(), self._pieces.T.tolist()
+        return self._knots.tolist(), self._pieces.T.tolist()
 
     def _derivatives(self, s: Floats) -> tuple[Any, Any, Any]:
         """Position and its first two derivatives by arc length at ``s`` (m, periodic), each ``(...)``, complex: ``x + iy``.
@@ -153,8 +163,8 @@ class ClosedLine:
             (a, b, c, d), h = pieces[piece], at - knots[piece]
         else:
             at = np.asarray(s, dtype=np.float64) % self.length
-            places = self._spline.x[1:-1].searchsorted(at, "right")
-            (a, b, c, d), h = self._pieces[:, places], at - self._spline.x[places]
+            places = self._knots[1:-1].searchsorted(at, "right")
+            (a, b, c, d), h = self._pieces[:, places], at - self._knots[places]
         return ((a * h + b) * h + c) * h + d, (3 * a * h + 2 * b) * h + c, 6 * a * h + 2 * b
 
     @cached_property
@@ -174,6 +184,11 @@ class ClosedLine:
 def _as_complex(points: Vector) -> npt.NDArray[np.complex128]:
     """``x + iy`` of points ``(..., 2)``."""
     return np.asarray(points[..., 0] + 1j * points[..., 1])
+
+
+def _as_points(z: Any) -> Vector:
+    """Points ``(..., 2)`` of ``x + iy``."""
+    return np.stack([np.real(z), np.imag(z)], axis=-1)
 
 
 def _dot(a: Any, b: Any) -> Any:

@@ -68,11 +68,14 @@ class Track:
 
     def widths(self, s: Floats) -> tuple[Vector, Vector]:
         """Distances from the centre line to the right and to the left border (m) at ``s`` (m, periodic)."""
-        at, period = np.asarray(s, dtype=np.float64), self.length
-        return (
-            np.interp(at, self.centre.s, self.width_right, period=period),
-            np.interp(at, self.centre.s, self.width_left, period=period),
-        )
+        at, (places, right, left) = np.asarray(s, dtype=np.float64) % self.length, self._lap
+        return np.interp(at, places, right), np.interp(at, places, left)
+
+    @cached_property
+    def _lap(self) -> tuple[Vector, Vector, Vector]:
+        """Places of the centre line's points (m) and widths there, the first point once more at the end of the lap."""
+        right, left = (np.append(width, width[0]) for width in (self.width_right, self.width_left))
+        return np.append(self.centre.s, self.length), right, left
 
     def project(self, points: npt.ArrayLike, near: npt.ArrayLike | None = None) -> tuple[Vector, Vector]:
         """Track position ``s`` (m) and lateral offset (m, positive left) of ``points``; see ``ClosedLine.project``."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.control.nmpc import Plan
-from dynssm_ros.control.prediction_model import Adaptive
+from dynssm_ros.control.prediction_model import Adaptive, stepped
 from dynssm_ros.control.race_models import load_prediction_model, true_model
 from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.runtime.models import Persistence, SingleTrack, WindowPrediction, load_model
@@ -68,9 +68,19 @@ def test_a_model_without_commands_sees_none(orca):
 def test_a_model_without_physics_corrects_the_nominal_car(orca):
     """Persistence says that nothing changes, so the correction takes off what the nominal step adds."""
     adapted = Adaptive(Persistence(), orca).read(ROWS, None)
-    stepped = SingleTrack(orca).predict(ROWS[None, -1:]).state[0]
-    np.testing.assert_allclose(stepped + adapted.correction, ROWS[-1, :3], atol=1e-12)
+    following = SingleTrack(orca).predict(ROWS[None, -1:]).state[0]
+    np.testing.assert_allclose(following + adapted.correction, ROWS[-1, :3], atol=1e-12)
     np.testing.assert_array_equal(adapted.theta, orca.nominal)
+
+
+def test_one_row_is_stepped_as_many_are(orca):
+    """Also standing still, where the wheels roll and slip angles have no derivative."""
+    model = Adaptive(Persistence(), orca)
+    rows = np.concatenate([ROWS, [[0.0, 0.0, 0.0, 0.4, 0.1, 0.0, 0.0], [0.5, 0.0, 0.3, 1.0, -0.2, 0.0, 0.0]]])
+    following = stepped(model.car, rows, orca.nominal)
+    for row, expected in zip(rows, following, strict=True):
+        correction = model.read(row[None], None).correction
+        np.testing.assert_allclose(correction, row[:3] - expected, atol=1e-12)
 
 
 def test_what_is_not_finite_is_not_used(orca):

@@ -51,6 +51,16 @@ def test_position_is_periodic_and_left_is_positive():
     assert np.hypot(*line.position(5.0, 2.0)) == pytest.approx(8.0, abs=1e-5)
 
 
+def test_the_frame_is_the_position_and_the_heading_and_left_of_it():
+    line = circle(10.0, direction=-1)
+    s = np.array([[1.0, 7.0], [line.length + 1.0, -3.0]])
+    position, along, left = line.frame(s)
+    heading = line.heading(s)
+    np.testing.assert_array_equal(position, line.position(s))
+    np.testing.assert_allclose(along, np.stack([np.cos(heading), np.sin(heading)], axis=-1), atol=1e-12)
+    np.testing.assert_allclose(position + 2 * left, line.position(s, 2.0), atol=1e-12)
+
+
 @settings(max_examples=60, deadline=None)
 @given(share=st.floats(0, 0.999999), lateral=st.floats(-0.19, 0.19))
 def test_projection_inverts_position(share, lateral):
