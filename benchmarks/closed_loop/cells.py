@@ -44,6 +44,7 @@ _HARMONICS = range(2, 7)
 _BENT = 0.2  # of the lap's length over 2 pi, by which the centre line is moved at most by a harmonic
 _TIGHTEST = 0.75  # of the least radius of the built-in track
 _TRIES = 500
+_SEEDS = 100  # of the noise, between drives of a cell
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,13 @@ class Cell:
         car: one of the generalisation matrix' cars.
         track: built-in track and seed of its variation.
         change: what is hidden from the models.
+        again: counts drives of the cell with other noise.
     """
 
     car: str
     track: tuple[str, int]
     change: str
+    again: int = 0
 
     @property
     def name(self) -> str:
@@ -96,7 +99,7 @@ class Cell:
     @property
     def sensing(self) -> Sensing:
         """What comes between the car and its controller."""
-        return sensing(self.car, NOISE_LEVELS[self.noise], self.late, self.track[1])
+        return sensing(self.car, NOISE_LEVELS[self.noise], self.late, self.track[1] + _SEEDS * self.again)
 
     @property
     def training(self) -> Training:

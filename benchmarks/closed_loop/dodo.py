@@ -3,8 +3,9 @@
 Variables: ``out`` (folder), ``trained`` (folder of the generalisation matrix: models are taken from there, and trained there
 if they are missing), ``page`` (folder of the page and its figure), ``only`` (words that names of cells must begin with,
 separated by commas), ``part`` (``development``, the default, or ``all``: test cells too), ``sets`` (as of the generalisation
-matrix; with ``rivals`` the page is ``closed_loop_rivals.md``, or ``closed_loop_rivals_orca.md`` with ``only=orca``). What is
-done is kept; a kill costs the task under way. The tasks ``learn`` and ``learning_page`` run if they are named.
+matrix; with ``rivals`` the page is ``closed_loop_rivals.md``, or ``closed_loop_rivals_orca.md`` with ``only=orca``),
+``models`` (those of the sets that are driven, separated by commas; all if not given). What is done is kept; a kill costs the
+task under way. The tasks ``learn`` and ``learning_page`` run if they are named.
 """
 
 from __future__ import annotations
@@ -40,11 +41,15 @@ OUT = Path(get_var("out", "out/closed_loop"))
 TRAINED = Path(get_var("trained", "out/generalisation"))
 PAGE_FOLDER = Path(get_var("page", str(OUT)))
 _DEVELOPMENT, _SHIPPED = "development", "shipped"
-VALUES = {"only": get_var("only", ""), "part": get_var("part", _DEVELOPMENT), "sets": get_var("sets", _SHIPPED)}
-USUAL = {"only": "", "part": _DEVELOPMENT, "sets": _SHIPPED}
+USUAL = {"only": "", "part": _DEVELOPMENT, "sets": _SHIPPED, "models": ""}
+VALUES = {name: get_var(name, usual) for name, usual in USUAL.items()}
 ARGUMENTS = [f"{name}={value}" for name, value in VALUES.items() if value != USUAL[name]]
 # ridge has no physics to plan with
-MODELS = tuple(name for name in models_of(VALUES["sets"].split(",")) if name != "ridge")
+OFFERED = tuple(name for name in models_of(VALUES["sets"].split(",")) if name != "ridge")
+ASKED = tuple(filter(None, VALUES["models"].split(",")))
+if unknown := set(ASKED) - set(OFFERED):
+    raise UserError(f"models={VALUES['models']}: {', '.join(sorted(unknown))} is none of {', '.join(OFFERED)}")
+MODELS = ASKED or OFFERED
 LEARNS = "dynssm"
 PAGE = "closed_loop"
 if set(RIVALS) & set(MODELS):
@@ -65,7 +70,7 @@ def task_drive() -> Iterator[dict[str, Any]]:
 
 def task_train() -> Iterator[dict[str, Any]]:
     """Trains each model on each training."""
-    yield from train_tasks(TRAININGS.values(), MODELS, TRAINED)
+    yield from train_tasks(TRAININGS.values(), dict.fromkeys((*MODELS, CALIBRATES)), TRAINED)
 
 
 def task_race() -> Iterator[dict[str, Any]]:

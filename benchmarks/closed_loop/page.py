@@ -135,8 +135,9 @@ def _lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[
         yield ""
         yield (
             f"Rivals are {', '.join(f'`{name}`' for name in rivals)} ([what they are](rivals.md)), trained with what their "
-            "authors chose for a car of about that size. Nothing of theirs was decided on these cells. `gp` corrects the "
-            "calibrated car. The others calibrate nothing; where they have earned nothing the vehicle file is planned with, "
+            "authors chose for a car of about that size. Nothing of theirs was decided on these cells. "
+            + ("`gp` corrects the calibrated car. " if "gp" in rivals else "")
+            + "DDM and FTHD calibrate nothing; where they have earned nothing the vehicle file is planned with, "
             "which for the 1:43 car and the AV-21 is the car itself before the change."
         )
     for label, part, missing in _parts(known, asked):

@@ -12,7 +12,7 @@ from benchmarks.generalisation.cells import simulated_car
 from benchmarks.generalisation.run import model_folder
 from dynssm_ros.control.lap_learning import SAFE
 from dynssm_ros.control.prediction_model import Adaptive, PredictionModel
-from dynssm_ros.control.race import Course, race
+from dynssm_ros.control.race import Course, Race, race
 from dynssm_ros.control.race_models import TRUE, true_model
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
@@ -23,7 +23,7 @@ CALIBRATED = "calibrated"
 BASELINES = (TRUE, CALIBRATED)
 CALIBRATES = "rls"
 """Whose folder has the calibrated car."""
-TRUE_PACES = (0.9, 1.0, 1.1, 1.2)
+TRUE_PACES = (0.9, 1.0, 1.1, 1.2, 1.3, 1.4)
 """Shares of the car's limits among which the true model's best is looked for."""
 LEARNING_LAPS = 10
 AS_IS = " as it is"
@@ -44,27 +44,27 @@ def race_model(cell: Cell, name: str, out: Path, trained: Path) -> None:
         out: folder of the outcomes.
         trained: folder of the generalisation matrix, which has the models.
     """
+    outcomes = {name: drive(cell, name, trained).to_json()}
+    if name not in BASELINES:
+        outcomes[name + AS_IS] = drive(cell, name, trained, evidence=False).to_json()
+    write_json(outcome_file(cell, name, out), {"models": outcomes})
+
+
+def drive(cell: Cell, name: str, trained: Path, evidence: bool = True) -> Race:
+    """Drives a cell with one of :data:`BASELINES` or with a trained model; arguments as of :func:`race_model`."""
     car, road = simulated_car(cell.car), cell.road
     driven = car.with_effects(cell.effects.items())
     reference = load_reference("racing", car, road, PACE[cell.objective])
-    outcomes: dict[str, Any] = {}
-
-    def drive(name: str, model: PredictionModel, evidence: bool = True) -> None:
-        settings = Settings.of(car, cell.objective, evidence=evidence)
-        course = Course(driven, road, cell.plant, reference, settings, LAPS, sensing=cell.sensing)
-        outcomes[name] = race(course, model).to_json()
-
+    settings = Settings.of(car, cell.objective, evidence=evidence)
     if name == TRUE:
-        drive(TRUE, true_model(driven, cell.plant))
+        model: PredictionModel = true_model(driven, cell.plant)
     elif name == CALIBRATED:
         calibrated = load_model(model_folder(cell.training, CALIBRATES, trained)).vehicle
         assert calibrated is not None
-        drive(CALIBRATED, Adaptive(SingleTrack(calibrated), car))
+        model = Adaptive(SingleTrack(calibrated), car)
     else:
-        for evidence in (True, False):
-            model = load_model(model_folder(cell.training, name, trained))
-            drive(name if evidence else name + AS_IS, Adaptive(model, car), evidence)
-    write_json(outcome_file(cell, name, out), {"models": outcomes})
+        model = Adaptive(load_model(model_folder(cell.training, name, trained)), car)
+    return race(Course(driven, road, cell.plant, reference, settings, LAPS, sensing=cell.sensing), model)
 
 
 def learning_file(cell: Cell, out: Path) -> Path:
@@ -81,23 +81,33 @@ def learn_cell(cell: Cell, out: Path, trained: Path, model: str) -> None:
         trained: folder of the generalisation matrix, which has the model.
         model: its name.
     """
+    best, learned = true_best(cell), learn(cell, trained, model)
+    write_json(learning_file(cell, out), {"true_best_s": best, "learned": learned.to_json()})
+
+
+def true_best(cell: Cell) -> float | None:
+    """Time of the true model's last lap (s) at the best of :data:`TRUE_PACES` that stays on the road, if one does."""
     car, road = simulated_car(cell.car), cell.road
-    driven = car.with_effects(cell.effects.items())
-    settings = Settings.of(car, cell.objective)
+    driven, settings = car.with_effects(cell.effects.items()), Settings.of(car, cell.objective)
     best = []
     for pace in TRUE_PACES:
-        course = Course(
-            driven, road, cell.plant, load_reference("racing", car, road, pace), settings, LAPS, sensing=cell.sensing
-        )
+        reference = load_reference("racing", car, road, pace)
+        course = Course(driven, road, cell.plant, reference, settings, LAPS, sensing=cell.sensing)
         outcome = race(course, true_model(driven, cell.plant))
         if outcome.completed and not outcome.outside:
             best.append(outcome.lap_times[-1])
+    return min(best, default=None)
+
+
+def learn(cell: Cell, trained: Path, model: str) -> Race:
+    """Drives a cell faster every lap; arguments as of :func:`learn_cell`."""
+    car, road = simulated_car(cell.car), cell.road
+    reference, settings = load_reference("racing", car, road, SAFE), Settings.of(car, cell.objective)
     course = Course(
-        driven, road, cell.plant, load_reference("racing", car, road, SAFE), settings, LEARNING_LAPS, sensing=cell.sensing,
-        learning=car,
+        car.with_effects(cell.effects.items()), road, cell.plant, reference, settings, LEARNING_LAPS,
+        sensing=cell.sensing, learning=car,
     )  # fmt: skip
-    learned = race(course, Adaptive(load_model(model_folder(cell.training, model, trained)), car))
-    write_json(learning_file(cell, out), {"true_best_s": min(best, default=None), "learned": learned.to_json()})
+    return race(course, Adaptive(load_model(model_folder(cell.training, model, trained)), car))
 
 
 def read_cell(cell: Cell, models: Iterable[str], out: Path) -> dict[str, Any] | None:

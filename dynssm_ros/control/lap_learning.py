@@ -47,7 +47,7 @@ from dynssm_ros.vehicle.limits import vehicle_limits
 SAFE = 0.7
 """Share of the car's accelerations to begin with."""
 _STEP = 0.06
-_MOST = 1.2  # of what the coefficients allow: racing lines ask for less than the borders do
+_MOST = 1.3  # of what the coefficients allow: racing lines ask for less than the borders do
 _CLOSE = 0.75  # half the car's width over the distance from its centre to the border, from which on it is too close
 _NEARLY = 0.95  # of the bound on its slip, from which on the rear slips too far
 _SLOWER = 0.01  # share of a section's best time

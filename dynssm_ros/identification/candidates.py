@@ -14,6 +14,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.car import CarEstimate, Values
+from dynssm_ros.identification.levels import ONE_RECORDING, Levels
 from dynssm_ros.identification.noise import weights
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, unit
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
@@ -89,7 +90,7 @@ def candidates(
     problem: IdentificationProblem,
     car: CarEstimate,
     excluded: Collection[str] = (),
-    groups: Sequence[tuple[int, ...]] = (),
+    levels: Levels = ONE_RECORDING,
 ) -> tuple[list[Candidate], dict[str, str]]:
     """The effects that can be tried, and for those that cannot, why.
 
@@ -97,7 +98,7 @@ def candidates(
         problem: the windows.
         car: as the vehicle file has it.
         excluded: effects that are not tried.
-        groups: of recordings, in each of which an effect may act that the others do not have.
+        levels: which recordings may have an effect that the others do not have. What acts at a place acts on one road alone.
     """
     found, left = [], {}
     have = set(problem.windows.data.context)
@@ -114,7 +115,8 @@ def candidates(
         usable = [v for v in effect.variants() if set(effect.signals(v)) <= have]
         if set(LAP) <= have:
             usable = [v for v in usable if v not in effect.OPEN_ROAD]
-        found += [Candidate(name, variant, group) for group in ((), *groups) for variant in usable]
+        tried = [Candidate(name, variant, group) for group in ((), *levels.groups) for variant in usable]
+        found += [one for one in tried if levels.has_one_road(one.only_in) or not one.by_place]
         if not usable:
             left[name] = f"the recording has no {', '.join(s for s in effect.signals() if s not in have)}"
     return found, left

@@ -18,6 +18,7 @@ from dynssm_ros.identification.diagnosis import Cause, Diagnosis
 from dynssm_ros.identification.formula import Formula, formulas
 from dynssm_ros.identification.gate import HeldOut, Without, gated
 from dynssm_ros.identification.integrator import search_causes
+from dynssm_ros.identification.levels import Group, Levels
 from dynssm_ros.identification.minimum_effect import minimum_detectable
 from dynssm_ros.identification.problem import BLOCK, Fit, IdentificationProblem, per_unit
 from dynssm_ros.identification.recordings import CrossValidation, RecordingSet, driven_alike
@@ -59,8 +60,8 @@ def diagnose(
 ) -> Diagnosis:
     """Finds out what a vehicle file gets wrong about recordings.
 
-    An effect acts in all recordings, or in one of several and not in the others. With ``suspect`` it acts in all or in
-    those: what has changed since the others.
+    An effect acts in all recordings, or in some and not in the others: in one alone, in those of one session, or in those of
+    one road (:mod:`~dynssm_ros.identification.levels`). With ``suspect`` it acts in all or in those: what has changed since.
 
     Args:
         recordings: measured laps of one car.
@@ -80,12 +81,12 @@ def diagnose(
         ConfigurationError: an effect of the vehicle needs a signal that the recording has not; options out of range.
     """
     first = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    at = _prepare([*first, *suspect], vehicle, horizon, holdout, min_speed, line)
     suspects = tuple(range(len(first), len(first) + len(suspect)))
+    at = _prepare([*first, *suspect], suspects, vehicle, horizon, holdout, min_speed, line)
     if unknown := sorted(set(exclude) - set(EFFECTS)):
         raise ConfigurationError(f"exclude {', '.join(unknown)}: no such effect; expected some of {', '.join(EFFECTS)}")
-    groups = _groups(at, suspects)
-    found = search_causes(at.fitted, at.car, at.left_out, integrator, on_progress, exclude, groups, pool)
+    levels = _driven_alike(at)
+    found = search_causes(at.fitted, at.car, at.left_out, integrator, on_progress, exclude, levels, pool)
     problem, windows = found.problem, found.problem.windows
     on_progress("measuring the improvement on held-out laps")
     selection, without, left, improvement = gated(
@@ -145,21 +146,20 @@ def _formulas(
     return formulas(windows, car, left_out)
 
 
-def _groups(at: _Prepared, suspects: tuple[int, ...]) -> list[tuple[int, ...]]:
-    """The groups of recordings that may differ from the others: the suspects, else each that was driven like others."""
-    names = at.recordings.names
-    single = [(k,) for k in np.unique(at.fitted.number).tolist()]
-    if len(single) == 1:
-        return []
-    alike = {group: driven_alike(at.fitted, group) for group in ([suspects] if suspects else single)}
+def _driven_alike(at: _Prepared) -> Levels:
+    """The levels with those groups that were driven like the other recordings: others show another side of the car."""
+    names, levels = at.recordings.names, at.recordings.levels
+    fitted = set(np.unique(at.fitted.number).tolist())
+    alike = {group: driven_alike(at.fitted, group) for group in levels.groups if fitted & set(group) < fitted}
     for group, share in alike.items():
         if share < _DRIVEN_ALIKE:
             at.notes.append(
                 f"{' and '.join(names[k] for k in group)}: {100 * share:.0f} % driven like the others (speed, steering, "
                 "throttle), so that what differs there can hardly be told from what its driving shows"
-                + ("" if suspects else "; causes of it alone are not tried")
+                + ("" if levels.suspects else "; causes of it alone are not tried")
             )
-    return [group for group, share in alike.items() if suspects or share >= _DRIVEN_ALIKE]
+    tried = (group for group, share in alike.items() if levels.suspects or share >= _DRIVEN_ALIKE)
+    return replace(levels, groups=tuple(tried))
 
 
 def _moved(car: CarEstimate) -> dict[str, float]:
@@ -218,6 +218,7 @@ class _Prepared(NamedTuple):
 
 def _prepare(
     recordings: Sequence[Recording],
+    suspects: Group,
     vehicle: Vehicle,
     horizon: float,
     holdout: float,
@@ -227,7 +228,7 @@ def _prepare(
     """Checks what was given, holds laps out and lays the simulations along the rest; see :func:`diagnose`."""
     if not 0.05 <= holdout <= 0.8:
         raise ConfigurationError(f"holdout {holdout:g}: expected a share between 0.05 and 0.8")
-    together = RecordingSet.of(recordings, holdout)
+    together = RecordingSet.of(recordings, holdout, line, suspects)
     recording = together.recording
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
     steps = int(np.ceil(horizon / recording.T_s - 1e-9))
@@ -240,13 +241,12 @@ def _prepare(
     steps = every * -(-steps // every)
     notes = _check_signals(recording)
     speed = vehicle.minimum_speed if min_speed is None else min_speed
-    line = together.fitted_lap() if line is None else line
-    if line is None:
+    if not together.has_places:
         notes.append(
             "no full lap with positions among the fitted rows: effects that live at a place of the track cannot be judged "
             "unless the track is given"
         )
-    data = together.rows(line)
+    data = together.rows()
     source = ", ".join(recording.info.source)
     require_context(vehicle.active_effects, data.context, f"recording {source}")
     fitted = fit_windows(recording, data, steps * recording.T_s, speed, together.held_out)
@@ -259,7 +259,7 @@ def _prepare(
         "Fit": f"{len(fitted)} simulations of {steps * recording.T_s:g} s, from {speed:g} m/s",
         "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * recording.T_s:g} s",
     }
-    left_out = together.left_out(fitted.starts, line)
+    left_out = together.left_out(fitted.starts)
     known = vehicle.known_before(recording.fingerprints)
     if known is not vehicle:
         notes.append(
@@ -289,6 +289,7 @@ def _cause(one: Refined, without: Without, selection: Selection, recordings: Rec
         one.bounded,
         tuple(selection.alternatives[effect]),
         tuple(recordings.names[k] for k in one.candidate.only_in),
+        recordings.levels.level(one.candidate.only_in),
         without.errors,
     )
 

@@ -13,6 +13,7 @@ from dynssm_ros.identification.car import CarEstimate
 from dynssm_ros.identification.confirmation import Confirmation
 from dynssm_ros.identification.formula import Formula
 from dynssm_ros.identification.improvement import Improvement
+from dynssm_ros.identification.levels import Level
 from dynssm_ros.identification.recordings import RecordingSet
 from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance
 from dynssm_ros.identification.selection import Selection
@@ -43,6 +44,7 @@ class Cause:
         on_bound: its parameters that the data push against a bound: they are at least that far off.
         alternatives: effects that explain the data as well.
         only_in: names of the recordings in which it acts; empty: in all.
+        level: what these recordings are.
         without: what the car with all other causes errs on the held-out rows, at the horizon, ``(W, 3)``.
     """
 
@@ -56,6 +58,7 @@ class Cause:
     on_bound: tuple[str, ...]
     alternatives: tuple[str, ...]
     only_in: tuple[str, ...] = ()
+    level: Level = "car"
     without: Vector = field(default_factory=lambda: np.empty((0, 3)), repr=False)
 
     @property
@@ -205,6 +208,7 @@ def _cause_to_json(cause: Cause) -> dict[str, Any]:
         "on_bound": list(cause.on_bound),
         "alternatives": list(cause.alternatives),
         "only_in": list(cause.only_in),
+        "level": cause.level,
         "small": cause.small,
     }
 

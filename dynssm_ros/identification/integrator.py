@@ -8,7 +8,7 @@ be closer to the data with either by chance, so that the choice is made anew wit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from dynssm_ros.identification.candidates import candidates
 from dynssm_ros.identification.car import CarEstimate
+from dynssm_ros.identification.levels import ONE_RECORDING, Levels
 from dynssm_ros.identification.problem import Fit, IdentificationProblem, closest
 from dynssm_ros.identification.recordings import CrossValidation
 from dynssm_ros.identification.selection import Search, Selection
@@ -62,7 +63,7 @@ def search_causes(
     integrator: Integrator | None,
     on_progress: Callable[[str], None],
     exclude: Collection[str] = (),
-    groups: Sequence[tuple[int, ...]] = (),
+    levels: Levels = ONE_RECORDING,
     pool: Pool = IN_TURN,
 ) -> SearchResult:
     """Searches for causes.
@@ -74,7 +75,7 @@ def search_causes(
         integrator: of the simulation; ``None``: chosen by the data.
         on_progress: told what is being done.
         exclude: effects that are not tried.
-        groups: of recordings, in each of which an effect may act that the others do not have.
+        levels: which recordings may have an effect that the others do not have.
         pool: where candidates are tried.
     """
     # noise is carried along as by the car that was known, so that a calibration on the same laps changes nothing
@@ -82,7 +83,7 @@ def search_causes(
 
     def search(windows: SimulationWindows, start: Fit | None = None) -> SearchResult:
         problem = IdentificationProblem(windows, known)
-        found, impossible = candidates(problem, known, exclude, groups)
+        found, impossible = candidates(problem, known, exclude, levels)
         searching = Search(problem, car, found, left_out, on_progress, pool)
         return SearchResult(problem, searching, searching.run(start), impossible)
 

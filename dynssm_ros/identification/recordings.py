@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dynssm_ros.arrays import Indices, Mask, Vector
+from dynssm_ros.identification.levels import Group, Levels
 from dynssm_ros.identification.problem import BLOCK
 from dynssm_ros.identification.windows import RecordedRows, SimulationWindows, rows_per_sample
 from dynssm_ros.signals.recording import Recording, concatenate
@@ -74,6 +75,8 @@ class RecordingSet:
         clock: time since the first row of its recording, of each row (s), ``(N,)``.
         held_out: the rows that neither fit nor selection sees, ``(N,)``.
         split: how they were chosen, in words.
+        levels: which of them belong together.
+        lines: along which places are counted, of each recording; those of one road have the same. ``None``: there is none.
     """
 
     recording: Recording = field(repr=False)
@@ -82,10 +85,20 @@ class RecordingSet:
     clock: Vector
     held_out: Mask
     split: str
+    levels: Levels
+    lines: tuple[ClosedLine | None, ...]
 
     @classmethod
-    def of(cls, recordings: Sequence[Recording], holdout: float) -> RecordingSet:
+    def of(
+        cls, recordings: Sequence[Recording], holdout: float, line: ClosedLine | None = None, suspects: Group = ()
+    ) -> RecordingSet:
         """Joins recordings and holds out the share ``holdout`` at the end of each; whole laps if there are three.
+
+        Args:
+            recordings: of one car.
+            holdout: share of each.
+            line: along which places are counted; ``None``: of each road the first full lap among the fitted rows.
+            suspects: numbers of the recordings in which something may have changed.
 
         Raises:
             RecordingError: sampling times or command protocols differ, or there is none.
@@ -95,7 +108,11 @@ class RecordingSet:
         clock = np.concatenate([(one.time - one.time[0]) / 1e9 for one in recordings])
         cuts = [_cut(one, holdout) for one in recordings]
         held = np.concatenate([np.arange(len(one)) >= cut for one, (cut, _) in zip(recordings, cuts, strict=True)])
-        return cls(joined, number, _names(recordings), clock, held, _in_words([words for _, words in cuts]))
+        levels = Levels.of(recordings, suspects)
+        fitted = [one.select(np.arange(len(one)) < cut) for one, (cut, _) in zip(recordings, cuts, strict=True)]
+        lines = _fitted_laps(fitted, levels.road) if line is None else (line,) * len(recordings)
+        words = _in_words([words for _, words in cuts])
+        return cls(joined, number, _names(recordings), clock, held, words, levels, lines)
 
     @cached_property
     def time(self) -> Vector:
@@ -104,44 +121,59 @@ class RecordingSet:
         begins = np.cumsum([0.0, *(BLOCK * (np.floor(t / BLOCK) + 1.0) for t in longest[:-1])])
         return np.asarray(begins[self.number] + self.clock)
 
-    def fitted_lap(self) -> ClosedLine | None:
-        """The first full lap among the rows that are fitted."""
-        return first_lap(self.recording.select(~self.held_out))
+    @property
+    def has_places(self) -> bool:
+        """Whether each recording's place on a lap is known."""
+        return all(line is not None for line in self.lines)
 
-    def rows(self, line: ClosedLine | None) -> RecordedRows:
-        """As simulations read them, with the place on the lap along ``line``; ``t`` is the recording's own clock."""
-        context = lap_context(self.recording, line) | {"t": self.clock}
+    def rows(self) -> RecordedRows:
+        """As simulations read them, with the place on the lap; ``t`` is the recording's own clock."""
+        lines = self.lines if self.has_places else (None,) * len(self.names)
+        parts = [lap_context(self._part(k), line) for k, line in enumerate(lines)]
+        context = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} | {"t": self.clock}
         samples = rows_per_sample(self.recording)
         return RecordedRows(self.recording.matrix.T, context, self.recording.T_s, self.time, self.number, samples)
+
+    def _part(self, k: int, rows: Indices | None = None) -> Recording:
+        """One of the recordings, or those of its rows that are among ``rows``."""
+        chosen = np.flatnonzero(self.number == k) if rows is None else rows[self.number[rows] == k]
+        return self.recording.select(chosen)
 
     def place(self, time: float) -> tuple[str, float]:
         """The recording that is at a :attr:`time`, and its own clock (s) there."""
         row = int(np.argmin(np.abs(self.time - time)))
         return self.names[self.number[row]], float(self.clock[row])
 
-    def left_out(self, starts: Indices, line: ClosedLine | None) -> CrossValidation:
+    def left_out(self, starts: Indices) -> CrossValidation:
         """How simulations from the rows ``starts`` are left out: recordings in turn, and parts of each of them in turn."""
-        lap, whose, several = lap_number(self.recording, line), self.number[starts], len(self.names) > 1
+        whose, several = self.number[starts], len(self.names) > 1
         part = np.empty(len(starts), dtype=np.intp)
         for k in np.unique(whose):
             own = starts[whose == k]
-            if lap is not None and np.ptp(lap[own]) + 1 >= LEAST_LAPS:
-                part[whose == k] = _grouped(lap[own], _QUARTERS if several else _MOST_PARTS)
+            lap = lap_number(self._part(k), self.lines[k])
+            passed = None if lap is None else lap[own - int(np.argmax(self.number == k))]
+            if passed is not None and np.ptp(passed) + 1 >= LEAST_LAPS:
+                part[whose == k] = _grouped(passed, _QUARTERS if several else _MOST_PARTS)
             else:
                 t = self.clock[own] - self.clock[own[0]]
                 part[whose == k] = np.floor(_QUARTERS * t / (np.ptp(t) + 1e-9))
         parts = Folds(*(np.unique(n, return_inverse=True)[1] for n in (part, whose * (part.max() + 1) + part)))
-        places = parts if line is None or self._passed_again(starts, line, parts) else self._stretches(starts)
+        again = not self.has_places or self._passed_again(starts, parts)
+        places = parts if again else self._stretches(starts)
         if len(np.unique(whose)) < _LEAST_RECORDINGS:
             return CrossValidation(parts, parts, places)
         number = np.unique(whose, return_inverse=True)[1]
         return CrossValidation(Folds(number, number), parts, places)
 
-    def _passed_again(self, starts: Indices, line: ClosedLine, parts: Folds) -> bool:
+    def _passed_again(self, starts: Indices, parts: Folds) -> bool:
         """Whether nearly all places of each part of the drive are in another part as well."""
-        s = track_position(line, self.recording.select(starts))
-        place = np.floor(_PLACES * s / line.length).astype(np.intp) % _PLACES
-        there = np.zeros((_PLACES, int(parts.fold.max()) + 1), dtype=bool)
+        whose, place = self.number[starts], np.empty(len(starts), dtype=np.intp)
+        for k, line in enumerate(self.lines):
+            if line is not None:
+                s = track_position(line, self._part(k, starts))
+                on_lap = np.floor(_PLACES * s / line.length).astype(np.intp) % _PLACES
+                place[whose == k] = _PLACES * self.levels.road[k] + on_lap
+        there = np.zeros((_PLACES * (1 + max(self.levels.road)), int(parts.fold.max()) + 1), dtype=bool)
         there[place, parts.fold] = True
         return bool(np.mean(there.sum(axis=1)[place] > 1) >= _NEARLY_ALL)
 
@@ -161,6 +193,15 @@ def driven_alike(windows: SimulationWindows, recordings: Collection[int]) -> flo
     driven /= np.maximum(driven.std(axis=0), 1e-9)
     own = np.isin(windows.number, list(recordings))
     return float(np.mean(cKDTree(driven[~own]).query(driven[own])[0] < _LIKE))
+
+
+def _fitted_laps(fitted: Sequence[Recording], road: Sequence[int]) -> tuple[ClosedLine | None, ...]:
+    """Of each recording the first full lap on its road."""
+    laps: dict[int, ClosedLine | None] = {}
+    for one, number in zip(fitted, road, strict=True):
+        if laps.get(number) is None:
+            laps[number] = first_lap(one)
+    return tuple(laps[number] for number in road)
 
 
 def _grouped(lap: Vector, most: int) -> Indices:

@@ -70,7 +70,8 @@ def _share_in_words(cause: Cause) -> str:
 
 def _where(cause: Cause) -> str:
     """The recordings that a cause is in, if not in all."""
-    return f" (only in {' and '.join(cause.only_in)})" if cause.only_in else ""
+    together = {"session": ", one session", "road": ", one road"}.get(cause.level, "")
+    return f" (only in {' and '.join(cause.only_in)}{together})" if cause.only_in else ""
 
 
 def pattern_in_words(left: ExplainedVariance) -> str:

@@ -99,7 +99,7 @@ def test_the_json_is_that_of_the_contract(lagging: tuple[Recording, Vehicle, Dia
     assert content["verdict"] == "effects"
     (cause,) = content["causes"]
     assert content["small_effects"] == []
-    assert set(cause) == {"effect", "parameters", "evidence", "on_bound", "alternatives", "only_in", "small"}
+    assert set(cause) == {"effect", "parameters", "evidence", "on_bound", "alternatives", "only_in", "level", "small"}
     assert set(cause["parameters"]["time_constant"]) == {"value", "std", "unit"}
     assert cause["parameters"]["time_constant"]["unit"] == "s"
     assert set(cause["evidence"]) == {"delta_bic", "heldout_gain", "left_out"}

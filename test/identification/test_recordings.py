@@ -51,7 +51,7 @@ def test_each_recording_has_its_own_clock_and_they_follow_each_other(days: list[
 
 def test_the_end_of_each_recording_is_held_out(days: list[Recording]) -> None:
     together = RecordingSet.of(days, 0.25)
-    data = together.rows(None)
+    data = together.rows()
     fitted = fit_windows(together.recording, data, 0.4, 0.0, together.held_out)
     for k in range(3):
         own = together.held_out[together.number == k]
@@ -65,7 +65,7 @@ def test_the_end_of_each_recording_is_held_out(days: list[Recording]) -> None:
 
 def test_a_short_recording_is_not_drowned_by_a_long_one() -> None:
     together = RecordingSet.of([recorded(300.0, 1), recorded(40.0, 2)], 0.25)
-    fitted = fit_windows(together.recording, together.rows(None), 0.4, 0.0, together.held_out)
+    fitted = fit_windows(together.recording, together.rows(), 0.4, 0.0, together.held_out)
     assert len(fitted) == 300
     assert (fitted.number == 1).sum() > 40
 
@@ -73,7 +73,7 @@ def test_a_short_recording_is_not_drowned_by_a_long_one() -> None:
 def test_three_recordings_are_left_out_in_turn_and_their_parts_too(days: list[Recording]) -> None:
     together = RecordingSet.of(days, 0.25)
     starts = np.flatnonzero(~together.held_out)[::20]
-    whole, parts, places = together.left_out(starts, None)
+    whole, parts, places = together.left_out(starts)
     assert places is parts
     number = together.number[starts]
     np.testing.assert_array_equal(whole.unit, number)
@@ -87,14 +87,34 @@ def test_three_recordings_are_left_out_in_turn_and_their_parts_too(days: list[Re
 
 def test_two_recordings_are_left_out_by_parts(days: list[Recording]) -> None:
     together = RecordingSet.of(days[:2], 0.25)
-    whole, parts, _ = together.left_out(np.flatnonzero(~together.held_out)[::20], together.fitted_lap())
+    whole, parts, _ = together.left_out(np.flatnonzero(~together.held_out)[::20])
     assert whole is parts
     assert len(set(parts.unit)) == 8
 
 
+def test_each_road_has_its_own_laps(days: list[Recording]) -> None:
+    """The lap of another road says nothing of where a car is on this one."""
+    elsewhere = as_recording(simulate(ORCA, load_track("club_b"), duration=60.0, seed=6))
+    together = RecordingSet.of([days[0], elsewhere, days[2]], 0.25)
+    assert together.levels.road == (0, 1, 0)
+    assert together.has_places
+    own, other, again = together.lines
+    assert own is again
+    assert own is not other
+    rows = together.rows()
+    for k, line in enumerate(together.lines):
+        assert line is not None
+        np.testing.assert_array_equal(rows.context["lap_length"][together.number == k], line.length)
+    alone = RecordingSet.of([elsewhere], 0.25).rows()
+    np.testing.assert_array_equal(rows.context["s"][together.number == 1], alone.context["s"])
+    starts = np.flatnonzero(~together.held_out)[::20]
+    _, parts, _ = together.left_out(starts)
+    assert len(set(parts.unit[together.number[starts] == 1])) == 4
+
+
 def test_many_short_laps_are_left_out_in_groups() -> None:
     together = RecordingSet.of([recorded(200.0, 4)], 0.25)
-    whole, parts, _ = together.left_out(np.flatnonzero(~together.held_out)[::20], CLUB.centre)
+    whole, parts, _ = together.left_out(np.flatnonzero(~together.held_out)[::20])
     assert whole is parts
     assert len(set(whole.fold)) == 8
     assert (np.diff(whole.fold) >= 0).all()
@@ -102,9 +122,9 @@ def test_many_short_laps_are_left_out_in_groups() -> None:
 
 @pytest.mark.parametrize(("duration", "again"), [(8.0, False), (16.0, True), (60.0, True)])
 def test_places_that_one_part_alone_has_are_left_out_by_stretches(duration: float, again: bool) -> None:
-    together = RecordingSet.of([recorded(duration, 5)], 0.01)
+    together = RecordingSet.of([recorded(duration, 5)], 0.01, CLUB.centre)
     starts = np.flatnonzero(~together.held_out)[::5]
-    _, parts, places = together.left_out(starts, CLUB.centre)
+    _, parts, places = together.left_out(starts)
     assert (places is parts) == again
     if not again:
         block = together.time[starts] // BLOCK
@@ -114,7 +134,7 @@ def test_places_that_one_part_alone_has_are_left_out_by_stretches(duration: floa
 
 def test_recordings_of_the_same_driving_are_alike_and_others_are_not(days: list[Recording]) -> None:
     together = RecordingSet.of(days[:2], 0.25)
-    windows = fit_windows(together.recording, together.rows(None), 0.4, 0.0)
+    windows = fit_windows(together.recording, together.rows(), 0.4, 0.0)
     assert driven_alike(windows, (1,)) > 0.8
     rows = windows.data.rows.copy()
     rows[3, windows.data.number == 1] -= 2.0
@@ -130,7 +150,7 @@ def test_recordings_of_different_rates_are_one_clear_line(days: list[Recording])
 
 def test_what_acts_in_one_recording_acts_in_no_other(days: list[Recording]) -> None:
     together = RecordingSet.of(days, 0.25)
-    windows: SimulationWindows = fit_windows(together.recording, together.rows(None), 0.4, 0.0)
+    windows: SimulationWindows = fit_windows(together.recording, together.rows(), 0.4, 0.0)
     plain = CarEstimate.of(ORCA)
     for name, values in (("grip", {"factor": 0.8}), ("steering_lag", {"time_constant": 0.1})):
         without, everywhere = windows.errors(plain), windows.errors(plain.with_effect(name, values))
@@ -202,6 +222,26 @@ def test_what_one_of_three_days_has_is_named_with_it_and_not_written(driven: Dri
     assert turning.values["angle"] == pytest.approx(-0.007, abs=5e-4)
     assert [effect.name for effect in found.vehicle.effects] == ["yaw_rate_lag"]
     assert any(note.startswith("odometry_misalignment: not in the vehicle file") for note in found.notes)
+
+
+def test_what_a_session_has_is_named_with_it(driven: Drive) -> None:
+    """A sensor that was turned between two days is in both drives of the second."""
+    turned = {"odometry_misalignment": {"angle": -0.007}}
+
+    def at(hour: float, hidden: dict[str, dict[str, float]], seed: int) -> Recording:
+        recording = driven(hidden, seed)
+        return replace(recording, time=recording.time + np.int64(hour * 3600e9))
+
+    found = diagnose(
+        [at(0.0, {}, 9410), at(1.0, {}, 9411), at(24.0, turned, 9413), at(25.0, turned, 9414)],
+        vehicle_file(Case({}, 9400)),
+        integrator="rk4",
+    )
+    (cause,) = found.causes
+    assert (cause.effect, cause.level) == ("odometry_misalignment", "session")
+    assert [name.split("/")[-1] for name in cause.only_in] == ["9413", "9414"]
+    assert cause.values["angle"] == pytest.approx(-0.007, abs=5e-4)
+    assert "9414, one session)" in as_text(found)
 
 
 def test_three_healthy_days_of_unlike_noise_are_right(driven: Drive) -> None:
