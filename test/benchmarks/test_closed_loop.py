@@ -2,10 +2,12 @@
 
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from benchmarks.closed_loop import seeds
 from benchmarks.closed_loop.cells import CHANGES, OBJECTIVES, PACE, PLANTS, TRACKS, Cell, cells, variation
 from benchmarks.closed_loop.page import lap_times, learning_page, page, summary
 from benchmarks.closed_loop.run import AS_IS, race_model, read_cell
@@ -17,6 +19,7 @@ from dynssm_ros.control.race import Course, Start
 from dynssm_ros.control.race_models import true_model
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings, _slip
+from dynssm_ros.errors import UserError
 from dynssm_ros.simulation.plant import make_plant
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, load_vehicle
@@ -106,6 +109,34 @@ def test_the_page_of_learning_names_what_stays_behind():
 
 
 @pytest.mark.timeout(300)
+def test_a_cell_is_driven_again_with_other_noise_alone():
+    cell = Cell("orca", ("club", 11), "mass")
+    again = replace(cell, again=1)
+    assert again.sensing.seed != cell.sensing.seed
+    assert replace(again.sensing, seed=cell.sensing.seed) == cell.sensing
+    drawn = ("name", "plant", "objective", "noise", "late", "is_test", "effects")
+    assert [getattr(again, each) for each in drawn] == [getattr(cell, each) for each in drawn]
+
+
+def test_seeds_tell_mean_spread_and_what_was_lost(monkeypatch, capsys):
+    laps = {"dynssm": [4.0, 4.2, 4.1], "true": [4.0, 4.0, 4.0], "calibrated": [4.0, 4.0, 4.1]}
+
+    def drive(cell, name, trained):
+        lost = name == "dynssm" and cell.again == 2
+        return SimpleNamespace(completed=not lost, outside=0.0, lap_times=[9.0, laps[name][cell.again]])
+
+    monkeypatch.setattr(seeds, "drive", drive)
+    seeds.main(["orca-club_11-mass", "--count", "3"])
+    last = capsys.readouterr().out.splitlines()[-2:]
+    assert last[0] == "orca-club_11-mass, over true: 1.0250 +- 0.0354 over 2 seeds, worst 1.0500, lost 1"
+    assert last[1] == "orca-club_11-mass, over calibrated: 1.0250 +- 0.0354 over 2 seeds, worst 1.0500, lost 1"
+
+
+def test_seeds_of_a_cell_that_there_is_not_are_refused():
+    with pytest.raises(UserError, match="orca-oval_1-mass is no cell of the matrix"):
+        seeds.main(["orca-oval_1-mass"])
+
+
 def test_a_cell_is_driven_with_each_model(small_model, tmp_path):
     (cell,) = [each for each in cells() if each.name == "orca-club_11-none"]
     folder = model_folder(cell.training, "small", tmp_path / "trained")
