@@ -18,7 +18,6 @@ from benchmarks.closed_loop.cells import Cell, cells
 from benchmarks.closed_loop.run import CALIBRATED, drive, learn, true_best
 from dynssm_ros.control.race import Race
 from dynssm_ros.control.race_models import TRUE
-from dynssm_ros.errors import UserError
 
 
 def last_lap(race: Race) -> float:
@@ -50,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     known = {cell.name: cell for cell in cells()}
     for name in options.cells:
         if name not in known:
-            raise UserError(f"{name} is no cell of the matrix; one is {next(iter(known))}")
+            parser.error(f"{name} is no cell of the matrix; one is {next(iter(known))}")
         found = []
         for again in range(options.count):
             cell = replace(known[name], again=again)
