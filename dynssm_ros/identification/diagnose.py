@@ -148,18 +148,23 @@ def _formulas(
 
 def _driven_alike(at: _Prepared) -> Levels:
     """The levels with those groups that were driven like the other recordings: others show another side of the car."""
-    names, levels = at.recordings.names, at.recordings.levels
-    fitted = set(np.unique(at.fitted.number).tolist())
+    levels, fitted = at.recordings.levels, set(np.unique(at.fitted.number).tolist())
     alike = {group: driven_alike(at.fitted, group) for group in levels.groups if fitted & set(group) < fitted}
+    tried = tuple(group for group, share in alike.items() if levels.suspects or share >= _DRIVEN_ALIKE)
+
+    def named(group: Iterable[int]) -> str:
+        return " and ".join(at.recordings.names[k] for k in group)
+
     for group, share in alike.items():
         if share < _DRIVEN_ALIKE:
+            others = tuple(k for k in range(len(at.recordings.names)) if k not in group)
             at.notes.append(
-                f"{' and '.join(names[k] for k in group)}: {100 * share:.0f} % driven like the others (speed, steering, "
-                "throttle), so that what differs there can hardly be told from what its driving shows"
+                f"{named(group)}: {100 * share:.0f} % driven like the others (speed, steering, throttle), so that what "
+                "differs there can hardly be told from what its driving shows"
                 + ("" if levels.suspects else "; causes of it alone are not tried")
+                + (f", and what is named of {named(others)} alone may be the opposite there" if others in tried else "")
             )
-    tried = (group for group, share in alike.items() if levels.suspects or share >= _DRIVEN_ALIKE)
-    return replace(levels, groups=tuple(tried))
+    return replace(levels, groups=tried)
 
 
 def _moved(car: CarEstimate) -> dict[str, float]:

@@ -26,7 +26,7 @@ class ExplainedVariance:
     Attributes:
         share: of the squared error, by channel, that the signals and the place predict where they were not fitted to,
             shape ``(3,)``.
-        by_place: the same from the place on the lap alone; NaN without laps.
+        by_place: the same from the place on the lap alone; NaN without laps, or with those of several roads.
         sure: by how many standard errors the whole is better than no explanation.
         pattern: the signals that the errors go with most, by channel, with their correlation.
         stretch: where on the lap the mean error is farthest from zero, by channel, from and to (m); empty without laps.
@@ -146,7 +146,7 @@ def _features(signals: Vector) -> Vector:
 
 
 def _places(windows: SimulationWindows) -> Vector | None:
-    if "s" not in windows.data.context:
+    if not windows.data.on_one_lap:
         return None
     here = windows.context(windows.steps // 2)
     bin_ = np.minimum((here["s"] / here["lap_length"] * _PLACES).astype(int), _PLACES - 1)

@@ -52,6 +52,11 @@ class RecordedRows:
     number: Indices
     rows_per_sample: tuple[int, int] = (1, 1)
 
+    @property
+    def on_one_lap(self) -> bool:
+        """Whether all places are those of one lap: recordings of another road have the same place elsewhere."""
+        return "s" in self.context and bool(np.ptp(self.context["lap_length"]) == 0.0)
+
     @cached_property
     def lines(self) -> Vector:
         """Applied throttle and steering if they move in lines from one sample to the next, shape ``(2, N)``.

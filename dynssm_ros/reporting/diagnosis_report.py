@@ -305,7 +305,7 @@ def _shown(diagnosis: Diagnosis) -> Iterator[Section]:
         "steering (rad)": rows[4, at] + rows[6, at],
         "throttle (negative: brake)": rows[3, at] + rows[5, at],
     }
-    if "s" in windows.data.context:
+    if windows.data.on_one_lap:
         against["position on the lap (m)"] = windows.data.context["s"][at]
     for label, values in against.items():
         yield Section(

@@ -106,6 +106,7 @@ def test_each_road_has_its_own_laps(days: list[Recording]) -> None:
         assert line is not None
         np.testing.assert_array_equal(rows.context["lap_length"][together.number == k], line.length)
     alone = RecordingSet.of([elsewhere], 0.25).rows()
+    assert (alone.on_one_lap, rows.on_one_lap) == (True, False)
     np.testing.assert_array_equal(rows.context["s"][together.number == 1], alone.context["s"])
     starts = np.flatnonzero(~together.held_out)[::20]
     _, parts, _ = together.left_out(starts)
