@@ -736,7 +736,7 @@ def race(
     for text in models:
         if list(models).count(text) > 1:
             raise ConfigurationError(f"--model {text}: given twice; expected different models")
-    opened = {text: load_prediction_model(text, car, driven, plant, along_horizon) for text in models}
+    opened = {text: load_prediction_model(text, car, driven, plant, along_horizon, as_is) for text in models}
     for name, model in disambiguated(opened, lambda model: model.name).items():
         model.name = name
     pace = (SAFE if learn else 1.0) if speed_scale is None else speed_scale

@@ -58,12 +58,12 @@ def drive(cell: Cell, name: str, trained: Path, evidence: bool = True) -> Race:
     settings = Settings.of(car, cell.objective, evidence=evidence)
     if name == TRUE:
         model: PredictionModel = true_model(driven, cell.plant)
-    elif name == CALIBRATED:
+    else:
         calibrated = load_model(model_folder(cell.training, CALIBRATES, trained)).vehicle
         assert calibrated is not None
-        model = Adaptive(SingleTrack(calibrated), car)
-    else:
-        model = Adaptive(load_model(model_folder(cell.training, name, trained)), car)
+        folder = model_folder(cell.training, name, trained)
+        known = SingleTrack(calibrated) if name == CALIBRATED else load_model(folder)
+        model = Adaptive(known, calibrated, as_is=not evidence)
     return race(Course(driven, road, cell.plant, reference, settings, LAPS, sensing=cell.sensing), model)
 
 

@@ -83,6 +83,6 @@ class DriveLaps(Step):
             if name == MID_RANGE:
                 given = str(Path(folder) / f"{MID_RANGE}.yaml")
                 save_vehicle(known.unmeasured(), Path(given), "The middle of all bounds.")
-            knowledge = load_prediction_model(given, known, driven, self.race.plant)
+            knowledge = load_prediction_model(given, known, driven, self.race.plant, as_is=True)
         knowledge.name = name
         return knowledge

@@ -78,19 +78,25 @@ class Adaptive:
 
     Args:
         model: the model. Its online layer, if it has one, learns from row to row.
-        vehicle: the nominal car of a model that has none of its own.
+        vehicle: the car as it is known.
         along_horizon: reads the model anew at each step of the last plan instead, as if that had been driven.
+        as_is: steps the model's own physics in any case. Else only if its training has calibrated that. A model of other
+            physics, such as one without load transfer, is stepped as the car is known, which then drives where the model has
+            earned nothing; what it says beyond that is added, as in the controller node.
     """
 
-    def __init__(self, model: WindowModel, vehicle: Vehicle, along_horizon: bool = False) -> None:
-        own = model.vehicle or vehicle
-        card = model.card
+    def __init__(self, model: WindowModel, vehicle: Vehicle, along_horizon: bool = False, as_is: bool = False) -> None:
+        card, own = model.card, model.vehicle or vehicle
+        self._is_own = as_is or card is None or own.integrator is not None
+        if not self._is_own:
+            own = vehicle
         self.name = model.name
         self._online: _Online | None = None
         if isinstance(model, OnnxModel) and model.online is not None:
             self._online = _Online(OnlineLearner(model, model.online, judges=False))
         self.H = model.H
-        self.car = SteppedCar.of(own) if card is None else SteppedCar.of(own, card.integrator, card.substeps)
+        stepping = (card.integrator, card.substeps) if card is not None and self._is_own else ()
+        self.car = SteppedCar.of(own, *stepping)
         self._step = _compiled_step(self.car)
         self._model = model
         self._along_horizon = along_horizon
@@ -133,7 +139,7 @@ class Adaptive:
         if self._online is not None:
             said = self._online.corrected(said, windows)
         theta = self.calibrated.theta if said.theta is None else said.theta
-        if said.physics is not None:
+        if self._is_own and said.physics is not None:
             physics = said.physics
         elif len(windows) == 1:
             physics = self._step(windows[0, -1], np.ravel(theta))[0]

@@ -22,7 +22,12 @@ def true_model(vehicle: Vehicle, plant: PlantKind) -> Fixed:
 
 
 def load_prediction_model(
-    name_or_path: str, known: Vehicle, driven: Vehicle, plant: PlantKind, along_horizon: bool = False
+    name_or_path: str,
+    known: Vehicle,
+    driven: Vehicle,
+    plant: PlantKind,
+    along_horizon: bool = False,
+    as_is: bool = False,
 ) -> PredictionModel:
     """What the controller is to know of the car.
 
@@ -33,6 +38,7 @@ def load_prediction_model(
         driven: the same with what the plant has beyond that.
         plant: how that is simulated.
         along_horizon: see :class:`Adaptive`.
+        as_is: likewise.
 
     Raises:
         ArtifactError: the model is damaged, or of another car or sampling time.
@@ -50,7 +56,7 @@ def load_prediction_model(
             f"model '{name_or_path}': neither a model folder nor one of {', '.join((TRUE, *UNTRAINED))} nor a vehicle file"
         )
     _check_car(name_or_path, model, known)
-    return Adaptive(model, known, along_horizon)
+    return Adaptive(model, known, along_horizon, as_is)
 
 
 def _check_car(given: str, model: WindowModel, vehicle: Vehicle) -> None:

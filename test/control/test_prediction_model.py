@@ -91,11 +91,30 @@ def test_what_is_not_finite_is_not_used(orca):
 
 
 def test_a_trained_model_says_here_what_it_says_elsewhere(orca, small_model):
-    knowledge = load_prediction_model(str(small_model), orca, orca, "rk4")
+    knowledge = load_prediction_model(str(small_model), orca, orca, "rk4", as_is=True)
     adapted = knowledge.read(ROWS, None)
     said = load_model(small_model).predict(ROWS[None, -knowledge.H :])
     np.testing.assert_array_equal(adapted.theta, said.theta[0])
     np.testing.assert_array_equal(adapted.correction, (said.state - said.physics)[0])
+
+
+def test_a_model_whose_physics_nobody_calibrated_is_stepped_as_the_car_is_known(orca, small_model):
+    """Its own nominal car may be no car that ever was; as it is, it is planned with nevertheless."""
+    known = orca.with_nominal(0.9 * orca.nominal + 0.1 * orca.lower).model_copy(update={"integrator": "rk4"})
+    model = load_model(small_model)
+    assert model.vehicle.integrator is None
+    judged, as_it_is = (
+        load_prediction_model(str(small_model), known, known, "rk4", as_is=each) for each in (False, True)
+    )
+    assert (judged.car.integrator, as_it_is.car.integrator) == ("rk4", "euler")
+    np.testing.assert_array_equal(judged.calibrated.theta, known.nominal)
+    np.testing.assert_array_equal(as_it_is.calibrated.theta, model.vehicle.nominal)
+    said, adapted = model.predict(ROWS[None, -model.H :]), judged.read(ROWS, None)
+    following = stepped(judged.car, ROWS[-1:], adapted.theta)
+    np.testing.assert_allclose(following + adapted.correction, said.state, atol=1e-12)
+    calibrated = model.vehicle.model_copy(update={"integrator": "rk4"})
+    model.vehicle = calibrated
+    np.testing.assert_array_equal(Adaptive(model, known).calibrated.theta, calibrated.nominal)
 
 
 def test_the_true_model_has_what_the_plant_has(orca):
