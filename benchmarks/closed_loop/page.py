@@ -138,7 +138,7 @@ def _lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[
             "authors chose for a car of about that size. Nothing of theirs was decided on these cells. "
             + ("`gp` corrects the calibrated car. " if "gp" in rivals else "")
             + "DDM and FTHD calibrate nothing. With evidence the calibrated car is stepped, and what they say beyond it is "
-            "added as far as they have earned it; as they are, their own physics is stepped, with the vehicle file's nominal "
+            "added as far as they have earned it. As they are, their own physics is stepped, with the vehicle file's nominal "
             "values, in Euler steps and without load transfer."
         )
     for label, part, missing in _parts(known, asked):

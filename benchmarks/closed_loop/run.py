@@ -52,19 +52,31 @@ def race_model(cell: Cell, name: str, out: Path, trained: Path) -> None:
 
 def drive(cell: Cell, name: str, trained: Path, evidence: bool = True) -> Race:
     """Drives a cell with one of :data:`BASELINES` or with a trained model; arguments as of :func:`race_model`."""
-    car, road = simulated_car(cell.car), cell.road
-    driven = car.with_effects(cell.effects.items())
-    reference = load_reference("racing", car, road, PACE[cell.objective])
-    settings = Settings.of(car, cell.objective, evidence=evidence)
+    course = _course(cell, PACE[cell.objective], evidence=evidence)
     if name == TRUE:
-        model: PredictionModel = true_model(driven, cell.plant)
+        model: PredictionModel = true_model(course.vehicle, cell.plant)
     else:
         calibrated = load_model(model_folder(cell.training, CALIBRATES, trained)).vehicle
         assert calibrated is not None
         folder = model_folder(cell.training, name, trained)
         known = SingleTrack(calibrated) if name == CALIBRATED else load_model(folder)
         model = Adaptive(known, calibrated, as_is=not evidence)
-    return race(Course(driven, road, cell.plant, reference, settings, LAPS, sensing=cell.sensing), model)
+    return race(course, model)
+
+
+def _course(cell: Cell, pace: float, laps: int = LAPS, evidence: bool = True, learns: bool = False) -> Course:
+    """What is driven in a cell, the line with the share ``pace`` of the car's limits."""
+    car, road = simulated_car(cell.car), cell.road
+    return Course(
+        car.with_effects(cell.effects.items()),
+        road,
+        cell.plant,
+        load_reference("racing", car, road, pace),
+        Settings.of(car, cell.objective, evidence=evidence),
+        laps,
+        sensing=cell.sensing,
+        learning=car if learns else None,
+    )
 
 
 def learning_file(cell: Cell, out: Path) -> Path:
@@ -87,13 +99,10 @@ def learn_cell(cell: Cell, out: Path, trained: Path, model: str) -> None:
 
 def true_best(cell: Cell) -> float | None:
     """Time of the true model's last lap (s) at the best of :data:`TRUE_PACES` that stays on the road, if one does."""
-    car, road = simulated_car(cell.car), cell.road
-    driven, settings = car.with_effects(cell.effects.items()), Settings.of(car, cell.objective)
     best = []
     for pace in TRUE_PACES:
-        reference = load_reference("racing", car, road, pace)
-        course = Course(driven, road, cell.plant, reference, settings, LAPS, sensing=cell.sensing)
-        outcome = race(course, true_model(driven, cell.plant))
+        course = _course(cell, pace)
+        outcome = race(course, true_model(course.vehicle, cell.plant))
         if outcome.completed and not outcome.outside:
             best.append(outcome.lap_times[-1])
     return min(best, default=None)
@@ -101,13 +110,8 @@ def true_best(cell: Cell) -> float | None:
 
 def learn(cell: Cell, trained: Path, model: str) -> Race:
     """Drives a cell faster every lap; arguments as of :func:`learn_cell`."""
-    car, road = simulated_car(cell.car), cell.road
-    reference, settings = load_reference("racing", car, road, SAFE), Settings.of(car, cell.objective)
-    course = Course(
-        car.with_effects(cell.effects.items()), road, cell.plant, reference, settings, LEARNING_LAPS,
-        sensing=cell.sensing, learning=car,
-    )  # fmt: skip
-    return race(course, Adaptive(load_model(model_folder(cell.training, model, trained)), car))
+    knowledge = Adaptive(load_model(model_folder(cell.training, model, trained)), simulated_car(cell.car))
+    return race(_course(cell, SAFE, LEARNING_LAPS, learns=True), knowledge)
 
 
 def read_cell(cell: Cell, models: Iterable[str], out: Path) -> dict[str, Any] | None:

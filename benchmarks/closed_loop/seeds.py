@@ -15,26 +15,21 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.closed_loop.cells import Cell, cells
+from benchmarks.closed_loop.page import last_lap
 from benchmarks.closed_loop.run import CALIBRATED, drive, learn, true_best
-from dynssm_ros.control.race import Race
 from dynssm_ros.control.race_models import TRUE
-
-
-def last_lap(race: Race) -> float:
-    """Time of the last lap (s); not a number if it was not driven, or the car left the road."""
-    return race.lap_times[-1] if race.completed and not race.outside else float("nan")
 
 
 def ratios(cell: Cell, model: str, trained: Path) -> dict[str, float]:
     """The model's last lap over the true model's and over the calibrated car's."""
-    lap, true, calibrated = (last_lap(drive(cell, name, trained)) for name in (model, TRUE, CALIBRATED))
+    lap, true, calibrated = (last_lap(drive(cell, name, trained).to_json()) for name in (model, TRUE, CALIBRATED))
     return {"over true": lap / true, "over calibrated": lap / calibrated}
 
 
 def learned_ratio(cell: Cell, model: str, trained: Path) -> dict[str, float]:
     """The last lap of a car that learns over the true model's best."""
     best = true_best(cell)
-    return {"over the true model's best": last_lap(learn(cell, trained, model)) / (best or float("nan"))}
+    return {"over the true model's best": last_lap(learn(cell, trained, model).to_json()) / (best or float("nan"))}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -47,9 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--learn", action="store_true", help="ten laps, faster every lap")
     options = parser.parse_args(arguments)
     known = {cell.name: cell for cell in cells()}
+    if unknown := [name for name in options.cells if name not in known]:
+        parser.error(f"{unknown[0]} is no cell of the matrix; one is {next(iter(known))}")
     for name in options.cells:
-        if name not in known:
-            parser.error(f"{name} is no cell of the matrix; one is {next(iter(known))}")
         found = []
         for again in range(options.count):
             cell = replace(known[name], again=again)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -78,8 +79,10 @@ def _members(numbers: Sequence[int], number: int) -> Group:
 
 def _clusters(recordings: Sequence[Recording], together: Callable[[Recording, Recording], bool]) -> tuple[int, ...]:
     """Numbers of clusters of recordings of which each has another one that it belongs together with."""
-    belong = [[together(one, other) for other in recordings] for one in recordings]
-    return tuple(connected_components(np.array(belong, dtype=float), directed=False)[1].tolist())
+    belong = np.eye(len(recordings))
+    for one, other in combinations(range(len(recordings)), 2):
+        belong[one, other] = together(recordings[one], recordings[other])
+    return tuple(connected_components(belong, directed=False)[1].tolist())
 
 
 def _of_one_session(one: Recording, other: Recording) -> bool:
@@ -92,7 +95,8 @@ def _of_one_road(one: Recording, other: Recording) -> bool:
     """Whether two paths cover each other, in the same direction; without positions nothing tells roads apart."""
     if not (one.has_pose and other.has_pose):
         return True
-    return min(_covered(_path(one), _path(other)), _covered(_path(other), _path(one))) >= _COVERED
+    path, another = _path(one), _path(other)
+    return min(_covered(path, another), _covered(another, path)) >= _COVERED
 
 
 def _path(recording: Recording) -> tuple[Vector, Vector]:

@@ -109,10 +109,9 @@ class RecordingSet:
         cuts = [_cut(one, holdout) for one in recordings]
         held = np.concatenate([np.arange(len(one)) >= cut for one, (cut, _) in zip(recordings, cuts, strict=True)])
         levels = Levels.of(recordings, suspects)
-        fitted = [one.select(np.arange(len(one)) < cut) for one, (cut, _) in zip(recordings, cuts, strict=True)]
-        lines = _fitted_laps(fitted, levels.road) if line is None else (line,) * len(recordings)
-        words = _in_words([words for _, words in cuts])
-        return cls(joined, number, _names(recordings), clock, held, words, levels, lines)
+        ends, splits = zip(*cuts, strict=True)
+        lines = _first_laps(recordings, ends, levels.road) if line is None else (line,) * len(recordings)
+        return cls(joined, number, _names(recordings), clock, held, _in_words(splits), levels, lines)
 
     @cached_property
     def time(self) -> Vector:
@@ -195,12 +194,14 @@ def driven_alike(windows: SimulationWindows, recordings: Collection[int]) -> flo
     return float(np.mean(cKDTree(driven[~own]).query(driven[own])[0] < _LIKE))
 
 
-def _fitted_laps(fitted: Sequence[Recording], road: Sequence[int]) -> tuple[ClosedLine | None, ...]:
-    """Of each recording the first full lap on its road."""
+def _first_laps(
+    recordings: Sequence[Recording], cuts: Sequence[int], road: Sequence[int]
+) -> tuple[ClosedLine | None, ...]:
+    """Of each recording the first full lap on its road before the rows that are held out."""
     laps: dict[int, ClosedLine | None] = {}
-    for one, number in zip(fitted, road, strict=True):
+    for one, cut, number in zip(recordings, cuts, road, strict=True):
         if laps.get(number) is None:
-            laps[number] = first_lap(one)
+            laps[number] = first_lap(one.select(np.arange(len(one)) < cut))
     return tuple(laps[number] for number in road)
 
 
