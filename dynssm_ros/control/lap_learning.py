@@ -1,11 +1,13 @@
 """Faster every lap: how fast the line is driven next follows from the laps that were driven.
 
-The line's speed has a share of the car's accelerations for each section of the lap. It begins at a safe share. After a lap a
-section is driven a step faster, if the car stayed away from the borders there and was not slower than before: two steps
-below the safe share, where a car that was not known well had to begin. One that came too close to a border, and the one
-before it, go back below what they were driven with, and stay there. So does, once, one where the rear slipped nearly as far
-as it may, if the controller follows the line's speed: one that goes as far as it can does so at any speed of the line. A
-front axle that slips as far is well used. A section that was slower than it has been goes back to what was fastest.
+The line's speed has a share of the car's accelerations for each section of the lap. It begins at a safe share. After a
+lap a section is driven a step faster, if the car stayed away from the borders there and was not slower than before. It is
+two steps below the safe share, where a car that was not known well had to begin. From the second lap on it is two steps,
+up to the limits of the file's car, where the car stayed far away. A section that came too close to a border, and the one
+before it, go back below what they were driven with, and stay there. So does, once, one where the rear slipped nearly as
+far as it may, if the controller follows the line's speed: one that goes as far as it can does so at any speed of the
+line. A front axle that slips as far is well used. A section that was slower than it has been goes back to what was
+fastest.
 
 After each lap the coefficients are calibrated on the last ones, and the grip of each section beside them. No share goes
 beyond what they allow with what is not known of them: the cornering limit that most cars within their covariance reach,
@@ -49,6 +51,7 @@ SAFE = 0.7
 _STEP = 0.06
 _MOST = 1.3  # of what the coefficients allow: racing lines ask for less than the borders do
 _CLOSE = 0.75  # half the car's width over the distance from its centre to the border, from which on it is too close
+_LITTLE = 0.5  # likewise, below which it is far: the racing line's own is 0.4 to 0.45
 _NEARLY = 0.95  # of the bound on its slip, from which on the rear slips too far
 _SLOWER = 0.01  # share of a section's best time
 _SECTION_HORIZONS = 1.5  # length of a section, in horizons at the line's mean speed
@@ -158,7 +161,8 @@ class LapLearner:
         self._at = track.project(reference.line.points)[0]  # of the line's points on the track
         self._grip, self._careful_grip = np.ones((2, sections))
         self._is_local = False
-        self._shares = np.full(sections, reference.share)
+        self._safe = reference.share
+        self._shares = np.full(sections, self._safe)
         self._ceiling = np.full(sections, np.inf)
         self._best_time, self._best_share = np.full(sections, np.inf), self._shares.copy()
         self._logs: list[LapLog] = []
@@ -213,8 +217,10 @@ class LapLearner:
         self._best_share = np.where(better, driven, self._best_share)
         lower = np.minimum(self._ceiling, driven - _STEP / 2)
         self._ceiling = np.where(close & ~is_new, lower, self._ceiling)
-        step = np.where(driven < self._line.share, 2 * _STEP, _STEP)
-        faster = np.minimum(np.where(close, driven, driven + step), self._ceiling)
+        far = (used < _LITTLE) & (len(self.laps) > 1)  # the first lap counts without caution
+        soon = np.where(far, 1.0, self._safe)
+        raised = np.clip(soon, driven + _STEP, driven + 2 * _STEP)
+        faster = np.minimum(np.where(close, driven, raised), self._ceiling)
         self._shares = np.where(slower, np.minimum(self._best_share, self._ceiling), faster)
         self._logs = [*self._logs, lap][-_REMEMBERED:]
         self._known = self._calibrated()

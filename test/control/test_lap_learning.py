@@ -27,10 +27,11 @@ def learner(orca, club):
     return built
 
 
-def lap(learner, seconds=None, close=(), slipping=()):
+def lap(learner, seconds=None, close=(), slipping=(), far=()):
     """A lap that takes ``seconds`` in each section, with the car's side on the border in the sections ``close``.
 
-    In the sections ``slipping`` the rear axle moves sideways nearly as much as it may.
+    In the sections ``far`` it is a width away from the borders, in the others half of one. In the sections ``slipping``
+    the rear axle moves sideways nearly as much as it may.
     """
     edges = learner._edges
     count = len(edges) - 1
@@ -38,7 +39,7 @@ def lap(learner, seconds=None, close=(), slipping=()):
     s = np.linspace(0.0, edges[-1], 50 * count + 1)
     section = np.clip(np.searchsorted(edges, s, "right") - 1, 0, count - 1)
     time = np.interp(s, edges, np.concatenate([[0.0], np.cumsum(seconds)]))
-    room = np.where(np.isin(section, close), 1.0, 5.0) * learner._half_width
+    room = np.select([np.isin(section, close), np.isin(section, far)], [1.0, 3.0], 2.0) * learner._half_width
     velocities = np.zeros((len(s), 3))
     velocities[:, 0] = 2.0
     velocities[:, 1] = np.where(np.isin(section, slipping), 2.0 * np.tan(1.02 * learner._most_slip), 0.0)
@@ -79,6 +80,16 @@ def test_where_the_rear_slipped_nearly_as_far_as_it_may_it_goes_back_and_stays_t
     assert np.flatnonzero(learner._slips(lap(learner, slipping=[2]))).tolist() == [2]
 
 
+def test_where_it_stayed_far_from_the_borders_two_steps_are_taken_from_the_second_lap_on_up_to_the_limits(learner):
+    expected = SAFE
+    for step in (1, 2, 2, 1, 1):
+        learner.learn(lap(learner, far=[2]))
+        expected += step * STEP
+        assert learner._shares[2] == pytest.approx(expected)
+    assert expected - STEP > 1.0
+    np.testing.assert_allclose(np.delete(learner._shares, 2), SAFE + 5 * STEP)
+
+
 def test_a_section_that_was_slower_returns_to_its_best(learner):
     learner.learn(lap(learner))
     best = learner._shares.copy()
@@ -89,7 +100,7 @@ def test_a_section_that_was_slower_returns_to_its_best(learner):
 
 
 def test_caution_counts_from_the_second_lap_on(learner):
-    unsure = replace(lap(learner), caution=np.full(50 * len(learner._shares) + 1, 4.0 * learner._half_width))
+    unsure = replace(lap(learner), caution=np.full(50 * len(learner._shares) + 1, learner._half_width))
     learner.learn(unsure)
     assert np.all(learner._shares > SAFE)
     learner.learn(unsure)
@@ -118,7 +129,7 @@ def test_a_car_that_nobody_measured_begins_slower_still(orca, club):
     for _ in range(3):
         before = np.minimum(learner._shares, learner._allowed)
         learner.learn(lap(learner))
-        np.testing.assert_allclose(learner._shares - before, np.where(before < SAFE, 2 * STEP, STEP))
+        np.testing.assert_allclose(learner._shares, np.clip(SAFE, before + STEP, before + 2 * STEP))
 
 
 def test_what_is_believed_stays_till_it_is_clearly_worse():
