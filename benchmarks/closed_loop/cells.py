@@ -7,6 +7,7 @@ meets all others in some cells. Another hash says which cells are for developmen
 from __future__ import annotations
 
 import hashlib
+from argparse import ArgumentTypeError
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -140,6 +141,18 @@ def cells() -> Iterator[Cell]:
         for track in TRACKS:
             for change in CHANGES:
                 yield Cell(car, track, change)
+
+
+def named(name: str) -> Cell:
+    """The cell of a name on the command line.
+
+    Raises:
+        ArgumentTypeError: there is none.
+    """
+    known = {cell.name: cell for cell in cells()}
+    if name not in known:
+        raise ArgumentTypeError(f"{name} is no cell of the matrix; one is {next(iter(known))}")
+    return known[name]
 
 
 def variation(track: Track, seed: int) -> Track:

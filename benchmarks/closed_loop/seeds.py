@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.closed_loop.cells import Cell, cells
+from benchmarks.closed_loop.cells import Cell, named
 from benchmarks.closed_loop.page import last_lap
 from benchmarks.closed_loop.run import CALIBRATED, drive, learn, true_best
 from dynssm_ros.control.race_models import TRUE
@@ -35,19 +35,16 @@ def learned_ratio(cell: Cell, model: str, trained: Path) -> dict[str, float]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Drives each cell with so many seeds and prints ratios of lap times."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.closed_loop.seeds", description=__doc__)
-    parser.add_argument("cells", nargs="+", metavar="CELL")
+    parser.add_argument("cells", nargs="+", metavar="CELL", type=named)
     parser.add_argument("--count", type=int, default=12, help="seeds; the first is the matrix' own")
     parser.add_argument("--model", default="dynssm")
     parser.add_argument("--trained", type=Path, default=Path("out/generalisation"))
     parser.add_argument("--learn", action="store_true", help="ten laps, faster every lap")
     options = parser.parse_args(arguments)
-    known = {cell.name: cell for cell in cells()}
-    if unknown := [name for name in options.cells if name not in known]:
-        parser.error(f"{unknown[0]} is no cell of the matrix; one is {next(iter(known))}")
-    for name in options.cells:
-        found = []
+    for first in options.cells:
+        name, found = first.name, []
         for again in range(options.count):
-            cell = replace(known[name], again=again)
+            cell = replace(first, again=again)
             found.append((learned_ratio if options.learn else ratios)(cell, options.model, options.trained))
             print(
                 f"{name}, seed {again}: " + ", ".join(f"{value:.4f} {of}" for of, value in found[-1].items()),

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.closed_loop import seeds
+from benchmarks.closed_loop import seeds, step_times
 from benchmarks.closed_loop.cells import CHANGES, OBJECTIVES, PACE, PLANTS, TRACKS, Cell, cells, variation
 from benchmarks.closed_loop.page import lap_times, learning_page, page, summary
 from benchmarks.closed_loop.run import AS_IS, race_model, read_cell
@@ -135,6 +135,18 @@ def test_seeds_of_a_cell_that_there_is_not_are_refused(capsys):
     with pytest.raises(SystemExit):
         seeds.main(["orca-oval_1-mass"])
     assert "orca-oval_1-mass is no cell of the matrix; one is orca-club_11-none" in capsys.readouterr().err
+
+
+def test_the_least_time_of_a_step_that_is_taken_again_leaves_the_machine_out(monkeypatch, capsys):
+    quiet, disturbed = np.full(200, 2e-3), np.where(np.arange(200) % 20, 2e-3, 5e-3)
+    drives = [SimpleNamespace(command=np.zeros((200, 2)), solve=each) for each in (disturbed, quiet)]
+    monkeypatch.setattr(step_times, "drive", lambda cell, name, trained: drives.pop(0))
+    step_times.main(["orca-club_11-mass", "--count", "2"])
+    said = "orca-club_11-mass, true: p50 2.00, p99 5.00 ms; least of 2: p50 2.00, p99 2.00 ms"
+    assert capsys.readouterr().out.splitlines() == [said]
+    drives += [SimpleNamespace(command=np.full((200, 2), k), solve=quiet) for k in range(2)]
+    step_times.main(["orca-club_11-mass", "--count", "2"])
+    assert "times cannot be compared" in capsys.readouterr().out
 
 
 @pytest.mark.timeout(300)
