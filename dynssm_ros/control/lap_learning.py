@@ -7,7 +7,7 @@ up to the limits of the file's car, where the car stayed far away. A section tha
 before it, go back below what they were driven with, and stay there. So does, once, one where the rear slipped nearly as
 far as it may, if the controller follows the line's speed: one that goes as far as it can does so at any speed of the
 line. A front axle that slips as far is well used. A section that was slower than it has been goes back to what was
-fastest.
+fastest, and that counts no longer if it is slower there as well.
 
 After each lap the coefficients are calibrated on the last ones, and the grip of each section beside them. No share goes
 beyond what they allow with what is not known of them: the cornering limit that most cars within their covariance reach,
@@ -211,8 +211,11 @@ class LapLearner:
             self._ceiling[:] = np.inf  # what was too close was planned with other coefficients
         close |= np.roll(close, -1)  # what leads there
         close |= self._slips(lap) & np.isinf(self._ceiling)  # once: the plan goes as far at a little less speed
-        slower = ~close & (times > (1 + _SLOWER) * self._best_time)
-        better = ~close & (times < self._best_time)
+        again = (
+            driven <= self._best_share
+        )  # and still slower: the best owed its time to something else, as to the start
+        slower = ~close & ~again & (times > (1 + _SLOWER) * self._best_time)
+        better = ~close & (again | (times < self._best_time))
         self._best_time = np.where(better, times, self._best_time)
         self._best_share = np.where(better, driven, self._best_share)
         lower = np.minimum(self._ceiling, driven - _STEP / 2)

@@ -99,6 +99,15 @@ def test_a_section_that_was_slower_returns_to_its_best(learner):
     assert learner._shares[0] > best[0]
 
 
+def test_a_best_that_the_same_share_does_not_reach_again_holds_nothing_back(learner):
+    """The first lap begins at the line's speed, so that a section may be faster in it than ever after."""
+    count = len(learner._shares)
+    learner.learn(lap(learner, np.where(np.arange(count) == 1, 0.8, 1.0)))
+    for expected in (SAFE, SAFE + STEP, SAFE + 2 * STEP):
+        learner.learn(lap(learner))
+        assert learner._shares[1] == pytest.approx(expected)
+
+
 def test_caution_counts_from_the_second_lap_on(learner):
     unsure = replace(lap(learner), caution=np.full(50 * len(learner._shares) + 1, learner._half_width))
     learner.learn(unsure)
