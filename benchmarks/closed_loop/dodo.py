@@ -17,9 +17,10 @@ from typing import Any
 
 from doit import get_var
 from doit.tools import config_changed
+from matplotlib.figure import Figure
 
 from benchmarks.closed_loop.cells import Cell, cells
-from benchmarks.closed_loop.page import LEARNING_PAGE, lap_times, learning_page, page, summary
+from benchmarks.closed_loop.page import LEARNING_PAGE, lap_times, learned_laps, learning_page, page, summary
 from benchmarks.closed_loop.run import (
     BASELINES,
     CALIBRATES,
@@ -110,8 +111,10 @@ def task_learning_page() -> dict[str, Any]:
 
 
 def write_learning_page() -> None:
-    """The page of the cells that were driven faster every lap."""
-    _write(LEARNING_PAGE, learning_page(_known(read_learning), ARGUMENTS, CELLS))
+    """The page of the cells that were driven faster every lap, with its figure."""
+    known, figure = _known(read_learning), Path(LEARNING_PAGE).with_suffix(".png").name
+    _save(figure, learned_laps(known))
+    _write(LEARNING_PAGE, learning_page(known, ARGUMENTS, figure, CELLS))
 
 
 def write_page() -> None:
@@ -119,8 +122,7 @@ def write_page() -> None:
     known = _known(partial(read_cell, models=MODELS))
     write_json(OUT / "summary.json", summary(known))
     figure = f"{PAGE}.png"
-    with replacing(PAGE_FOLDER / figure) as aside:
-        lap_times(known).savefig(aside, format="png", dpi=130, metadata={"Software": None})
+    _save(figure, lap_times(known))
     _write(f"{PAGE}.md", page(known, ARGUMENTS, figure, CELLS))
 
 
@@ -130,6 +132,12 @@ def _known(read: Callable[..., dict[str, Any] | None]) -> dict[Cell, dict[str, A
     if not known:
         raise UserError(f"only={VALUES['only']} part={VALUES['part']}: no cell was driven")
     return known
+
+
+def _save(name: str, figure: Figure) -> None:
+    """Writes a figure beside the page."""
+    with replacing(PAGE_FOLDER / name) as aside:
+        figure.savefig(aside, format="png", dpi=130, metadata={"Software": None})
 
 
 def _write(name: str, text: str) -> None:

@@ -194,12 +194,32 @@ def _both(values: Sequence[float] | None) -> str:
     return "–" if values is None else ", ".join(f"{value:.3f}" for value in values)
 
 
-def learning_page(known: Known, arguments: Sequence[str], asked: Sequence[Cell]) -> str:
+def learned_laps(known: Known) -> Figure:
+    """Each lap over the true model's best, a line for each cell and a panel for each car."""
+    cars = {car: over for car in _CARS if (over := _over_best({c: o for c, o in known.items() if c.car == car}))}
+    figure = Figure(figsize=(9.6, 3.4), layout="constrained")
+    panels = figure.subplots(1, max(len(cars), 1), sharey=True, squeeze=False)[0]
+    for axes, (car, over) in zip(panels, cars.items(), strict=False):
+        for laps in over.values():
+            axes.plot(range(1, len(laps) + 1), laps, color="C0", lw=0.7, alpha=0.5)
+        median = np.median(list(over.values()), axis=0)
+        axes.plot(range(1, len(median) + 1), median, color="black", lw=1.6, label="median")
+        axes.axhspan(0.0, _GOAL, color="C2", alpha=0.12, lw=0, label="within 1.5 %")
+        axes.set(
+            title=f"{_CARS[car]}, {len(over)} cells", xlabel="lap", xticks=range(1, len(median) + 1), ylim=(0.95, 1.3)
+        )
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("lap over the true model's best")
+    panels[-1].legend(loc="upper right", fontsize=8)
+    return figure
+
+
+def learning_page(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[Cell]) -> str:
     """What learned lap by lap, as Markdown; see :func:`page`."""
-    return "\n".join(_learning_lines(known, arguments, asked)) + "\n"
+    return "\n".join(_learning_lines(known, arguments, figure, asked)) + "\n"
 
 
-def _learning_lines(known: Known, arguments: Sequence[str], asked: Sequence[Cell]) -> Iterator[str]:
+def _learning_lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[Cell]) -> Iterator[str]:
     yield "# Faster every lap"
     yield ""
     yield (
@@ -222,6 +242,8 @@ def _learning_lines(known: Known, arguments: Sequence[str], asked: Sequence[Cell
                 yield ""
                 yield f"More than 1.5 % behind: {', '.join(behind)}."
         yield from missing
+    yield ""
+    yield f"![Laps over the true model's best]({figure})"
 
 
 def _learning_rows(part: Known) -> Iterator[tuple[str, Known]]:

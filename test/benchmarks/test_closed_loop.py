@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.closed_loop import seeds, step_times
 from benchmarks.closed_loop.cells import CHANGES, OBJECTIVES, PACE, PLANTS, TRACKS, Cell, cells, variation
-from benchmarks.closed_loop.page import lap_times, learning_page, page, summary
+from benchmarks.closed_loop.page import lap_times, learned_laps, learning_page, page, summary
 from benchmarks.closed_loop.run import AS_IS, race_model, read_cell
 from benchmarks.generalisation.cells import CARS, NOISE_LEVELS
 from benchmarks.generalisation.run import model_folder
@@ -87,7 +87,7 @@ def test_a_part_of_which_nothing_was_driven_is_told():
     known = {test: {name: outcome(10.0) for name in ("true", "calibrated", "dynssm")}}
     for words in (
         page(known, [], "laps.png", [test, development]),
-        learning_page({test: {"true_best_s": 10.0, "learned": outcome(10.1)}}, [], [test, development]),
+        learning_page({test: {"true_best_s": 10.0, "learned": outcome(10.1)}}, [], "laps.png", [test, development]),
     ):
         assert "## Development cells" in words
         assert "Not driven: 1 of" in words
@@ -101,10 +101,13 @@ def test_the_page_of_learning_names_what_stays_behind():
         off: {"true_best_s": 10.0, "learned": outcome(9.9, violation=True)},
         slow: {"true_best_s": None, "learned": outcome(12.0)},
     }
-    words = learning_page(known, ["part=all"], list(known))
+    words = learning_page(known, ["part=all"], "lap_learning.png", list(known))
     assert "dodo.py part=all learning_page" in words
     assert "| all | 4 | 3 | 1.030 | 1.020, 1.030 | 1 of 2 |" in words
     assert f"More than 1.5 % behind: {far.name} (1.030)." in words
+    (axes,) = learned_laps(known).axes
+    drawn = sorted(float(line.get_ydata()[-1]) for line in axes.get_lines())
+    assert drawn == pytest.approx([1.01, 1.02, 1.03])  # those that came round, and their median
 
 
 def test_a_cell_is_driven_again_with_other_noise_alone():
