@@ -17,7 +17,6 @@ from typing import Any
 
 from doit import get_var
 from doit.tools import config_changed
-from matplotlib.figure import Figure
 
 from benchmarks.closed_loop.cells import Cell, cells
 from benchmarks.closed_loop.page import LEARNING_PAGE, lap_times, learned_laps, learning_page, page, summary
@@ -33,7 +32,7 @@ from benchmarks.closed_loop.run import (
 )
 from benchmarks.generalisation.run import RIVALS, model_folder, models_of
 from benchmarks.generalisation.training_tasks import drive_tasks, train_tasks
-from benchmarks.tasks import doit_config
+from benchmarks.tasks import doit_config, save_figure
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import replacing, write_json
 from dynssm_ros.runtime.artifact import CARD
@@ -113,7 +112,7 @@ def task_learning_page() -> dict[str, Any]:
 def write_learning_page() -> None:
     """The page of the cells that were driven faster every lap, with its figure."""
     known, figure = _known(read_learning), Path(LEARNING_PAGE).with_suffix(".png").name
-    _save(figure, learned_laps(known))
+    save_figure(learned_laps(known), PAGE_FOLDER / figure)
     _write(LEARNING_PAGE, learning_page(known, ARGUMENTS, figure, CELLS))
 
 
@@ -122,7 +121,7 @@ def write_page() -> None:
     known = _known(partial(read_cell, models=MODELS))
     write_json(OUT / "summary.json", summary(known))
     figure = f"{PAGE}.png"
-    _save(figure, lap_times(known))
+    save_figure(lap_times(known), PAGE_FOLDER / figure)
     _write(f"{PAGE}.md", page(known, ARGUMENTS, figure, CELLS))
 
 
@@ -132,12 +131,6 @@ def _known(read: Callable[..., dict[str, Any] | None]) -> dict[Cell, dict[str, A
     if not known:
         raise UserError(f"only={VALUES['only']} part={VALUES['part']}: no cell was driven")
     return known
-
-
-def _save(name: str, figure: Figure) -> None:
-    """Writes a figure beside the page."""
-    with replacing(PAGE_FOLDER / name) as aside:
-        figure.savefig(aside, format="png", dpi=130, metadata={"Software": None})
 
 
 def _write(name: str, text: str) -> None:

@@ -21,7 +21,7 @@ from benchmarks.generalisation.cells import cells
 from benchmarks.generalisation.page import FIGURE, PAGE, heat_map, page, summary
 from benchmarks.generalisation.run import cell_file, model_folder, models_of, read_cell, score_cell
 from benchmarks.generalisation.training_tasks import drive_tasks, train_tasks
-from benchmarks.tasks import doit_config
+from benchmarks.tasks import doit_config, save_figure
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import replacing, write_json
 from dynssm_ros.runtime.artifact import CARD
@@ -77,8 +77,7 @@ def write_page() -> None:
     if not known:
         raise UserError(f"only={','.join(ONLY)} part={PART}: no cell was scored")
     write_json(OUT / "summary.json", summary(known))
-    with replacing(PAGE_FOLDER / FIGURE) as aside:
-        heat_map(known).savefig(aside, format="png", dpi=130, metadata={"Software": None})
+    save_figure(heat_map(known), PAGE_FOLDER / FIGURE)
     text = page(known, ARGUMENTS, len(CELLS) - len(known))
     with replacing(PAGE_FOLDER / PAGE) as aside:
         aside.write_text(text, encoding="utf-8")

@@ -20,7 +20,7 @@ from benchmarks.hidden_causes.cases import TRUTHS, cases
 from benchmarks.hidden_causes.outcomes import matrix, rates
 from benchmarks.hidden_causes.page import FIGURE, PAGE, page
 from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
-from benchmarks.tasks import doit_config
+from benchmarks.tasks import doit_config, save_figure
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import replacing, write_json
 from dynssm_ros.reporting.diagnosis_figures import confusion
@@ -39,7 +39,6 @@ ASKED = (
     + (f" cars={','.join(CARS)}" if set(CARS) < set(TRUTHS) else "")
 )
 DOIT_CONFIG = doit_config(OUT / "doit.json")
-_DPI = 130
 
 
 def task_case() -> Iterator[dict[str, Any]]:
@@ -66,8 +65,7 @@ def write_page() -> None:
         raise UserError(f"count={COUNT}: no case could be driven")
     about = {"seed": SEED, "undriven": len(of) - len(outcomes), **rates(outcomes)}
     write_json(OUT / "outcomes.json", about | {"outcomes": [asdict(outcome) for outcome in outcomes]})
-    with replacing(PAGE_FOLDER / FIGURE) as aside:
-        confusion(*matrix(outcomes)).savefig(aside, format="png", dpi=_DPI, metadata={"Software": None})
+    save_figure(confusion(*matrix(outcomes)), PAGE_FOLDER / FIGURE)
     with replacing(PAGE_FOLDER / PAGE) as aside:
         aside.write_text(page(of, ASKED), encoding="utf-8")
     for name, value in about.items():

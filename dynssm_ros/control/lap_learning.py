@@ -211,9 +211,7 @@ class LapLearner:
             self._ceiling[:] = np.inf  # what was too close was planned with other coefficients
         close |= np.roll(close, -1)  # what leads there
         close |= self._slips(lap) & np.isinf(self._ceiling)  # once: the plan goes as far at a little less speed
-        again = (
-            driven <= self._best_share
-        )  # and still slower: the best owed its time to something else, as to the start
+        again = driven <= self._best_share  # if still slower, the best owed its time to something else, as to the start
         slower = ~close & ~again & (times > (1 + _SLOWER) * self._best_time)
         better = ~close & (again | (times < self._best_time))
         self._best_time = np.where(better, times, self._best_time)
