@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.closed_loop.cells import LAPS, OBJECTIVES, PACE, Cell
+from benchmarks.closed_loop.cells import CHANGES, LAPS, OBJECTIVES, PACE, Cell
 from benchmarks.closed_loop.run import AS_IS, CALIBRATED, LEARNING_LAPS, TRUE_PACES
 from benchmarks.generalisation.run import RIVALS
 from dynssm_ros.control.lap_learning import SAFE
@@ -147,6 +147,7 @@ def _lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[
             content = _summary(part)
             yield f"## {label.capitalize()} cells ({content['possible']} of {content['cells']})"
             yield from _results(content)
+            yield from _grouped(part)
         else:
             yield f"## {label.capitalize()} cells"
         yield from missing
@@ -190,8 +191,32 @@ def _results(content: Mapping[str, Any]) -> Iterator[str]:
         yield from (f"- `{model}` is lost in {', '.join(where)}." for model, where in lost.items())
 
 
+def _grouped(part: Known) -> Iterator[str]:
+    """Last laps over the true model's by what is hidden, by car and by objective."""
+    models = [model for model in next(iter(part.values())) if model != TRUE and not model.endswith(AS_IS)]
+    yield ""
+    yield "Last lap over `true`, median and worst, of those that come round:"
+    yield ""
+    yield f"| | cells | {' | '.join(f'`{model}`' for model in models)} |"
+    yield f"| --- | --- | {' | '.join('---' for _ in models)} |"
+    for name, group in _groups(part):
+        over = (_both(_middle_and_worst(ratios(group, model, TRUE))) for model in models)
+        yield f"| {name} | {len(group)} | {' | '.join(over)} |"
+
+
 def _both(values: Sequence[float] | None) -> str:
     return "–" if values is None else ", ".join(f"{value:.3f}" for value in values)
+
+
+def _groups(part: Known) -> Iterator[tuple[str, Known]]:
+    """Outcomes by what is hidden, by car if there are several, by objective, and all."""
+    cars, keys = {cell.car for cell in part}, [(change, "change", change) for change in CHANGES]
+    keys += [(name, "car", car) for car, name in _CARS.items() if len(cars) > 1]
+    keys += [(objective, "objective", objective) for objective in OBJECTIVES]
+    for label, key, value in keys:
+        if group := {cell: outcome for cell, outcome in part.items() if getattr(cell, key) == value}:
+            yield label, group
+    yield "all", part
 
 
 def learned_laps(known: Known) -> Figure:
@@ -235,7 +260,7 @@ def _learning_lines(known: Known, arguments: Sequence[str], figure: str, asked: 
             yield ""
             yield "| | cells | between the borders | first lap | last lap: median, worst | within 1.5 % |"
             yield "| --- | --- | --- | --- | --- | --- |"
-            yield from (_learning_row(name, row) for name, row in _learning_rows(part))
+            yield from (_learning_row(name, row) for name, row in _groups(part))
             if behind := [
                 f"{cell.name} ({laps[-1]:.3f})" for cell, laps in _over_best(part).items() if laps[-1] > _GOAL
             ]:
@@ -244,18 +269,6 @@ def _learning_lines(known: Known, arguments: Sequence[str], figure: str, asked: 
         yield from missing
     yield ""
     yield f"![Laps over the true model's best]({figure})"
-
-
-def _learning_rows(part: Known) -> Iterator[tuple[str, Known]]:
-    """Outcomes by what is hidden, by car, by objective, and all."""
-    for change in dict.fromkeys(cell.change for cell in part):
-        yield change, {cell: outcome for cell, outcome in part.items() if cell.change == change}
-    for car, name in _CARS.items():
-        if of_car := {cell: outcome for cell, outcome in part.items() if cell.car == car}:
-            yield name, of_car
-    for objective in OBJECTIVES:
-        yield objective, {cell: outcome for cell, outcome in part.items() if cell.objective == objective}
-    yield "all", part
 
 
 def _over_best(part: Known) -> dict[Cell, np.ndarray]:

@@ -82,6 +82,27 @@ def test_the_page_counts_those_that_come_round_and_compares_last_laps():
     assert len(lap_times(known).axes) == 1
 
 
+def test_the_page_tells_what_each_change_costs_each_model():
+    cell = next(cell for cell in cells() if cell.change == "mass" and cell.objective == "progress")
+    lost = next(c for c in cells() if c.change == "drag" and c.is_test == cell.is_test and c.car == cell.car)
+    known = {
+        cell: {
+            "true": outcome(10.0),
+            "calibrated": outcome(10.4),
+            "dynssm": outcome(10.1),
+            "dynssm as it is": outcome(11.0),
+        },
+        lost: {
+            name: outcome(9.0, violation=name != "true") for name in ("true", "calibrated", "dynssm", "dynssm as it is")
+        },
+    }
+    words = page(known, [], "laps.png", list(known))
+    assert "| | cells | `calibrated` | `dynssm` |" in words
+    assert "| mass | 1 | 1.040, 1.040 | 1.010, 1.010 |" in words
+    assert "| drag | 1 | – | – |" in words
+    assert "| all | 2 | 1.040, 1.040 | 1.010, 1.010 |" in words
+
+
 def test_a_part_of_which_nothing_was_driven_is_told():
     test, development = (next(cell for cell in cells() if cell.is_test == part) for part in (True, False))
     known = {test: {name: outcome(10.0) for name in ("true", "calibrated", "dynssm")}}
