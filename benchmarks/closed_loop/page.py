@@ -40,10 +40,20 @@ def ratios(known: Known, model: str, to: str) -> np.ndarray:
 
 def summary(known: Known) -> dict[str, Any]:
     """For development and test cells: how often models came round, and laps over those of ``true`` and ``calibrated``."""
-    return {part: _summary({c: v for c, v in known.items() if c.is_test == test}) for part, test in _PARTS.items()}
+    return {part: _summary(_those(known, "is_test", test)) for part, test in _PARTS.items()}
 
 
 _PARTS = {"development": False, "test": True}
+
+
+def _those(known: Known, attribute: str, value: Any) -> Known:
+    """The outcomes of the cells that have this value."""
+    return {cell: outcome for cell, outcome in known.items() if getattr(cell, attribute) == value}
+
+
+def _with_evidence(known: Known) -> list[str]:
+    """What is compared with the true model: all but those that are planned with as they are."""
+    return [model for model in next(iter(known.values())) if model != TRUE and not model.endswith(AS_IS)]
 
 
 def _summary(known: Known) -> dict[str, Any]:
@@ -79,7 +89,7 @@ def lap_times(known: Known) -> Figure:
     """The last lap of each model over the true model's, a row for each cell."""
     possible = (cell for cell in known if came_round(known[cell][TRUE]))
     cells = sorted(possible, key=lambda cell: (cell.car, cell.change, cell.name))
-    names = [name for name in next(iter(known.values())) if name != TRUE and not name.endswith(AS_IS)]
+    names = _with_evidence(known)
     colours = model_colours([TRUE, *names])
     figure = Figure(figsize=(9.6, 1.4 + 0.2 * len(cells)), layout="constrained")
     axes = figure.subplots()
@@ -163,7 +173,7 @@ def _command(arguments: Sequence[str]) -> str:
 def _parts(known: Known, asked: Sequence[Cell]) -> Iterator[tuple[str, Known, list[str]]]:
     """The parts of which cells are asked for: what is known of each, and the lines that say what was not driven."""
     for label, test in _PARTS.items():
-        part = {cell: outcome for cell, outcome in known.items() if cell.is_test == test}
+        part = _those(known, "is_test", test)
         missing = Counter(cell.car for cell in asked if cell.is_test == test and cell not in known)
         words = ", ".join(f"{count} of {_CARS[car]}" for car, count in missing.items())
         if part or missing:
@@ -193,7 +203,7 @@ def _results(content: Mapping[str, Any]) -> Iterator[str]:
 
 def _grouped(part: Known) -> Iterator[str]:
     """Last laps over the true model's by what is hidden, by car and by objective."""
-    models = [model for model in next(iter(part.values())) if model != TRUE and not model.endswith(AS_IS)]
+    models = _with_evidence(part)
     yield ""
     yield "Last lap over `true`, median and worst, of those that come round:"
     yield ""
@@ -210,18 +220,20 @@ def _both(values: Sequence[float] | None) -> str:
 
 def _groups(part: Known) -> Iterator[tuple[str, Known]]:
     """Outcomes by what is hidden, by car if there are several, by objective, and all."""
-    cars, keys = {cell.car for cell in part}, [(change, "change", change) for change in CHANGES]
-    keys += [(name, "car", car) for car, name in _CARS.items() if len(cars) > 1]
-    keys += [(objective, "objective", objective) for objective in OBJECTIVES]
-    for label, key, value in keys:
-        if group := {cell: outcome for cell, outcome in part.items() if getattr(cell, key) == value}:
-            yield label, group
+    names = {"change": {change: change for change in CHANGES}}
+    if len({cell.car for cell in part}) > 1:
+        names["car"] = _CARS
+    names["objective"] = {objective: objective for objective in OBJECTIVES}
+    for attribute, values in names.items():
+        for value, name in values.items():
+            if group := _those(part, attribute, value):
+                yield name, group
     yield "all", part
 
 
 def learned_laps(known: Known) -> Figure:
     """Each lap over the true model's best, a line for each cell and a panel for each car."""
-    cars = {car: over for car in _CARS if (over := _over_best({c: o for c, o in known.items() if c.car == car}))}
+    cars = {car: over for car in _CARS if (over := _over_best(_those(known, "car", car)))}
     figure = Figure(figsize=(9.6, 3.4), layout="constrained")
     panels = figure.subplots(1, max(len(cars), 1), sharey=True, squeeze=False)[0]
     for axes, (car, over) in zip(panels, cars.items(), strict=False):
