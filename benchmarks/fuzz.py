@@ -23,7 +23,7 @@ import numpy as np
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.progress import Progress
 from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.plausibility import ranges
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals import messages

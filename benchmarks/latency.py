@@ -22,7 +22,7 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
 from dynssm_ros.reporting.tables import Column, Table
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Predictor
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, load_signal_map

@@ -29,7 +29,7 @@ from dynssm_ros.control.reference import load_reference
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
 from dynssm_ros.progress import Progress
-from dynssm_ros.runtime.models import load_model
+from dynssm_ros.runtime.registry import load_model
 from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.track.tracks import CSV_COLUMNS, Track
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle

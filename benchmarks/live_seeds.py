@@ -26,7 +26,7 @@ from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import UserError
 from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.simulation.external import CommandHolder, drive_by_commands

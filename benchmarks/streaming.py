@@ -21,7 +21,7 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.open_loop import evaluate
 from dynssm_ros.files import write_json
 from dynssm_ros.reporting.tables import Column, Table, Value
-from dynssm_ros.runtime.models import load_model
+from dynssm_ros.runtime.registry import load_model
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from dynssm_ros.learning.models.base import ModelConfig
     from dynssm_ros.learning.stages import Trained
     from dynssm_ros.runtime.artifact import Artifact
-    from dynssm_ros.runtime.models import WindowModel
+    from dynssm_ros.runtime.contract import WindowModel
     from dynssm_ros.signals.inspection import Inspection
     from dynssm_ros.signals.season import Session
     from dynssm_ros.simulation.laps import Run
@@ -62,7 +62,7 @@ def load_model(name_or_dir: PathLike, vehicle: Vehicle | PathLike | None = None)
         >>> model.H, model.T_s
         (1, 0.02)
     """
-    from dynssm_ros.runtime.models import load_model
+    from dynssm_ros.runtime.registry import load_model
 
     return load_model(name_or_dir, None if vehicle is None else _vehicle_in_windows(vehicle))
 
@@ -552,7 +552,7 @@ def open_models(
 
 def with_offline(models: Mapping[str, WindowModel]) -> dict[str, WindowModel]:
     """Models, each that has an online layer followed by itself without it."""
-    from dynssm_ros.runtime.models import without_online
+    from dynssm_ros.runtime.contract import without_online
 
     both: dict[str, WindowModel] = {}
     for label, model in models.items():
@@ -600,7 +600,7 @@ def replay(
         (995, Counter({<Refusal.FILLING: ...>: 5}), [])
     """
     from dynssm_ros.runtime.artifact import open_artifact
-    from dynssm_ros.runtime.models import OnnxModel
+    from dynssm_ros.runtime.onnx_model import OnnxModel
     from dynssm_ros.runtime.predictor import Predictor
     from dynssm_ros.runtime.replay import replay_to_bag
 

@@ -23,7 +23,7 @@ from benchmarks.paper.stale import marked
 from dynssm_ros.cli.main import app
 from dynssm_ros.extras import EXTRAS
 from dynssm_ros.learning.models.registry import load_model_config
-from dynssm_ros.runtime.models import UNTRAINED
+from dynssm_ros.runtime.registry import UNTRAINED
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.signal_map import SIGNALS, load_signal_map

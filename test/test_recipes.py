@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import dynssm_ros
 from dynssm_ros.extras import load_plugins
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.signals.bags import write_bag
 from dynssm_ros.simulation.plant import PLANTS
 from dynssm_ros.vehicle.effects import EFFECTS

@@ -17,7 +17,8 @@ from dynssm_ros.control.race_models import TRUE, true_model
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.files import write_json
-from dynssm_ros.runtime.models import SingleTrack, load_model
+from dynssm_ros.runtime.baselines import SingleTrack
+from dynssm_ros.runtime.registry import load_model
 
 CALIBRATED = "calibrated"
 BASELINES = (TRUE, CALIBRATED)

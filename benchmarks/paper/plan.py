@@ -16,7 +16,7 @@ from dynssm_ros.control.settings import Objective
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.registry import load_model_config, merge
-from dynssm_ros.runtime.models import UNTRAINED
+from dynssm_ros.runtime.registry import UNTRAINED
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.track.racing_line import LineKind

@@ -19,7 +19,7 @@ from benchmarks.paper.stale import signed
 from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.files import replacing
 from dynssm_ros.reporting.tables import Column, Table, Value
-from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma
+from dynssm_ros.runtime.baselines import Persistence, SingleTrack, SingleTrackEwma
 
 _NAMES = {
     TRUE: "the plant's own model",

@@ -19,7 +19,7 @@ from benchmarks.paper.steps import (
     Train,
     recording_key,
 )
-from dynssm_ros.runtime.models import UNTRAINED
+from dynssm_ros.runtime.registry import UNTRAINED
 from dynssm_ros.signals.signal_map import Commands
 
 

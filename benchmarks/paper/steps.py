@@ -25,7 +25,8 @@ from dynssm_ros.evaluation.open_loop import Evaluation, evaluate
 from dynssm_ros.files import digest, write_json
 from dynssm_ros.identification.calibration import calibrate
 from dynssm_ros.learning.models.base import ModelConfig
-from dynssm_ros.runtime.models import UNTRAINED, WindowModel, load_model
+from dynssm_ros.runtime.contract import WindowModel
+from dynssm_ros.runtime.registry import UNTRAINED, load_model
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.paper.results import Comparison, Results
 from dynssm_ros.reporting.tables import Column, Table, Value
-from dynssm_ros.runtime.models import UNTRAINED
+from dynssm_ros.runtime.registry import UNTRAINED
 
 _WITHOUT_A_NETWORK = ("ridge", "rls", "gp", "on_track")
 _ALIKE = 0.02  # errors that differ by less are called equal

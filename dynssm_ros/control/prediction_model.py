@@ -10,9 +10,11 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.control.buffered import BufferedRows
 from dynssm_ros.control.horizon_model import INPUTS, MOVING, STATES, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Plan
+from dynssm_ros.runtime.contract import WindowModel, WindowPrediction
 from dynssm_ros.runtime.learner import OnlineLearner
-from dynssm_ros.runtime.models import OnnxModel, WindowModel, WindowPrediction, corrected
 from dynssm_ros.runtime.online import Seen
+from dynssm_ros.runtime.onnx_model import OnnxModel
+from dynssm_ros.runtime.rollout import corrected
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle, step

@@ -7,7 +7,9 @@ from pathlib import Path
 from dynssm_ros.control.horizon_model import SteppedCar
 from dynssm_ros.control.prediction_model import Adaptive, Fixed, PredictionModel
 from dynssm_ros.errors import ArtifactError, ConfigurationError
-from dynssm_ros.runtime.models import UNTRAINED, SingleTrack, WindowModel, load_model
+from dynssm_ros.runtime.baselines import SingleTrack
+from dynssm_ros.runtime.contract import WindowModel
+from dynssm_ros.runtime.registry import UNTRAINED, load_model
 from dynssm_ros.simulation.plant import PlantKind, plant_type
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 
@@ -33,7 +35,7 @@ def load_prediction_model(
 
     Args:
         name_or_path: ``true``, the plant's own model; a vehicle file (``.yaml``), the single-track car with its
-            coefficients; else as :func:`~dynssm_ros.runtime.models.load_model`.
+            coefficients; else as :func:`~dynssm_ros.runtime.registry.load_model`.
         known: the vehicle as its file describes it.
         driven: the same with what the plant has beyond that.
         plant: how that is simulated.

@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.runtime.models import WindowModel, WindowPrediction, corrected, seen_by
+from dynssm_ros.runtime.contract import WindowModel, WindowPrediction, seen_by
 from dynssm_ros.runtime.online import Along, Learned
 from dynssm_ros.runtime.path_judge import PathJudge, trusted_along
+from dynssm_ros.runtime.rollout import corrected
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 

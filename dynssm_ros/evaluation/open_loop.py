@@ -30,7 +30,7 @@ from dynssm_ros.evaluation.regimes import Regime, driving_regimes, liveliest, re
 from dynssm_ros.evaluation.rollout import Rollout, score_rollouts
 from dynssm_ros.evaluation.score import Group, Score, grouped
 from dynssm_ros.parallel import HERE, Workers, each
-from dynssm_ros.runtime.models import WindowModel, WindowPrediction
+from dynssm_ros.runtime.contract import WindowModel, WindowPrediction
 from dynssm_ros.runtime.online import Learned
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Commands

@@ -17,8 +17,9 @@ import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.metrics import BATCH, DriveThrough, Tick, silent
-from dynssm_ros.runtime.models import WindowModel, corrected
+from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.online import Learned
+from dynssm_ros.runtime.rollout import corrected
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle.kinematics import path
 

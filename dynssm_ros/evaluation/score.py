@@ -15,7 +15,7 @@ from dynssm_ros.evaluation.metrics import by_channel, finite
 from dynssm_ros.evaluation.regimes import Regime
 from dynssm_ros.evaluation.rollout import Rollout
 from dynssm_ros.evaluation.spread import SeedSpread, mean_and_std, spreads
-from dynssm_ros.runtime.models import WindowModel
+from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.online import Learned
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 

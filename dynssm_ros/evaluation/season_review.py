@@ -23,7 +23,7 @@ from dynssm_ros.identification.calibration import calibrate
 from dynssm_ros.identification.diagnose import diagnose
 from dynssm_ros.identification.diagnosis import Cause
 from dynssm_ros.runtime.coefficients import SHIFTS, daily_change
-from dynssm_ros.runtime.models import WindowModel
+from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.season import Session
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle

@@ -36,8 +36,8 @@ from dynssm_ros.nodes.support import (
 )
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.health import Health
-from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.runtime.online import expert_weights
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.wiring import Wiring
 from dynssm_ros.signals.decoding import TopicDecoder, header_stamp_ns, live_decoders

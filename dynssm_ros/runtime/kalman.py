@@ -15,8 +15,9 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.runtime.artifact import ModelCard
+from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.coefficients import SPREAD
-from dynssm_ros.runtime.models import SingleTrack, WindowPrediction
+from dynssm_ros.runtime.contract import WindowPrediction
 from dynssm_ros.runtime.online import OnlineLayer
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.signal_map import Commands

@@ -8,9 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.runtime.models import OnnxModel, WindowPrediction, corrected, seen_by
+from dynssm_ros.runtime.contract import WindowPrediction, seen_by
 from dynssm_ros.runtime.online import CHANNELS, Learned, OnlineLayer, OnlineState, Seen
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.path_judge import PathJudge
+from dynssm_ros.runtime.rollout import corrected
 from dynssm_ros.signals.history import Refusal
 
 Cut = Callable[[int], Vector | Refusal]

@@ -16,8 +16,8 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.learner import OnlineLearner
-from dynssm_ros.runtime.models import OnnxModel
 from dynssm_ros.runtime.online import OnlineState
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.plausibility import Plausibility
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS

@@ -12,7 +12,7 @@ from dynssm_ros.control.prediction_model import Adaptive, Fixed
 from dynssm_ros.control.race_models import true_model
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.runtime.models import Persistence, SingleTrack
+from dynssm_ros.runtime.baselines import Persistence, SingleTrack
 from dynssm_ros.simulation.plant import Pose, make_plant
 from dynssm_ros.vehicle import Applied, State
 

@@ -7,7 +7,9 @@ from dynssm_ros.control.nmpc import Plan
 from dynssm_ros.control.prediction_model import Adaptive, stepped
 from dynssm_ros.control.race_models import load_prediction_model, true_model
 from dynssm_ros.errors import ArtifactError, ConfigurationError
-from dynssm_ros.runtime.models import Persistence, SingleTrack, WindowPrediction, load_model
+from dynssm_ros.runtime.baselines import Persistence, SingleTrack
+from dynssm_ros.runtime.contract import WindowPrediction
+from dynssm_ros.runtime.registry import load_model
 from dynssm_ros.simulation.double_track import DoubleTrack
 from dynssm_ros.vehicle import load_vehicle, save_vehicle
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dynssm_ros.evaluation import metrics
-from dynssm_ros.runtime.models import Persistence, WindowPrediction
+from dynssm_ros.runtime.baselines import Persistence
+from dynssm_ros.runtime.contract import WindowPrediction
 
 
 @pytest.fixture

@@ -9,7 +9,8 @@ import pytest
 
 from dynssm_ros.errors import ArtifactError, RecordingError
 from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
-from dynssm_ros.runtime.models import Persistence, SingleTrack, WindowPrediction
+from dynssm_ros.runtime.baselines import Persistence, SingleTrack
+from dynssm_ros.runtime.contract import WindowPrediction
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import load_vehicle

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dynssm_ros.evaluation.rollout import branches, roll_out, score_rollouts
-from dynssm_ros.runtime.models import Persistence, WindowPrediction
+from dynssm_ros.runtime.baselines import Persistence
+from dynssm_ros.runtime.contract import WindowPrediction
 from dynssm_ros.runtime.predictor import propagate_pose
 from dynssm_ros.vehicle.kinematics import path
 

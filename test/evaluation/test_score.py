@@ -11,7 +11,8 @@ import yaml
 from dynssm_ros.evaluation.open_loop import evaluate
 from dynssm_ros.evaluation.score import grouped
 from dynssm_ros.reporting.evaluation_report import coefficient_table, markdown, summary_table, verdict
-from dynssm_ros.runtime.models import Persistence, load_model
+from dynssm_ros.runtime.baselines import Persistence
+from dynssm_ros.runtime.registry import load_model
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map
 

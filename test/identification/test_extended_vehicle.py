@@ -17,7 +17,7 @@ from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.replay import replay
 from dynssm_ros.signals.bags import open_bag

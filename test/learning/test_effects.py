@@ -11,7 +11,7 @@ import torch
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.models.dynssm.network import PhysicsLayer
 from dynssm_ros.learning.models.physics import PhysicsConfig
-from dynssm_ros.runtime.models import SingleTrack
+from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 

@@ -24,7 +24,7 @@ from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import Trained, train
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 

@@ -16,7 +16,9 @@ from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.online import OnlineFeatures
 from dynssm_ros.learning.stages import train
-from dynssm_ros.runtime.models import OnnxModel, SingleTrack, without_online
+from dynssm_ros.runtime.baselines import SingleTrack
+from dynssm_ros.runtime.contract import without_online
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.recording import concatenate

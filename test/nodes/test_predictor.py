@@ -16,7 +16,7 @@ from nav_msgs.msg import Odometry
 from benchmarks.live_run import run_live
 from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.replay import replay
 from dynssm_ros.signals.bags import open_bag

@@ -22,7 +22,8 @@ from dynssm_ros.reporting.evaluation_report import (
 )
 from dynssm_ros.reporting.page import Report, Section, svg_uri
 from dynssm_ros.reporting.tables import Column, Table
-from dynssm_ros.runtime.models import Persistence, SingleTrack, WindowPrediction
+from dynssm_ros.runtime.baselines import Persistence, SingleTrack
+from dynssm_ros.runtime.contract import WindowPrediction
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.track.lines import ClosedLine

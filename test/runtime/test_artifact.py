@@ -17,7 +17,7 @@ from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import checksum
 from dynssm_ros.runtime.artifact import CARD, FORMAT_VERSION, METRICS, ONNX, WEIGHTS, open_artifact, read_card
 from dynssm_ros.runtime.artifact import write_card as write
-from dynssm_ros.runtime.models import OnnxModel
+from dynssm_ros.runtime.onnx_model import OnnxModel
 
 
 @pytest.fixture

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.runtime.baselines import Persistence, SingleTrack, SingleTrackEwma
 from dynssm_ros.runtime.kalman import SingleTrackEkf
-from dynssm_ros.runtime.models import Persistence, SingleTrack, SingleTrackEwma, count_operations, load_model
+from dynssm_ros.runtime.operations import count_operations
+from dynssm_ros.runtime.registry import load_model
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle, load_vehicle, step
 

@@ -12,7 +12,8 @@ import yaml
 
 from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.models import OnnxModel, WindowPrediction
+from dynssm_ros.runtime.contract import WindowPrediction
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor, propagate_pose
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.history import Refusal

@@ -9,7 +9,8 @@ import pytest
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.models import OnnxModel, WindowPrediction
+from dynssm_ros.runtime.contract import WindowPrediction
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.replay import replay, replay_to_bag
 from dynssm_ros.signals.bags import open_bag

@@ -16,7 +16,8 @@ from dynssm_ros.learning.models.ddm import DDM
 from dynssm_ros.learning.models.registry import MODELS, build_model, load_model_config, parse_model_config
 from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.artifact import Normalisation
-from dynssm_ros.runtime.models import OnnxModel, SingleTrack
+from dynssm_ros.runtime.baselines import SingleTrack
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 

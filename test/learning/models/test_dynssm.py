@@ -19,7 +19,7 @@ from dynssm_ros.learning.models.dynssm.network import DynSSM, GatedResidual
 from dynssm_ros.learning.models.physics import PhysicsLayer
 from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.runtime.artifact import Normalisation
-from dynssm_ros.runtime.models import SingleTrack
+from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle
 

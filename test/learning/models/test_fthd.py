@@ -18,7 +18,7 @@ from dynssm_ros.learning.models.fthd import consecutive, physics_loss
 from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import Trained, checkpoints, train
 from dynssm_ros.runtime.artifact import Normalisation
-from dynssm_ros.runtime.models import SingleTrack
+from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 

@@ -14,7 +14,8 @@ from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models import gp
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.stages import train
-from dynssm_ros.runtime.models import OnnxModel, SingleTrack
+from dynssm_ros.runtime.baselines import SingleTrack
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 

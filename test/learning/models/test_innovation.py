@@ -18,7 +18,7 @@ from dynssm_ros.learning.models.dynssm.network import DynSSM
 from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.artifact import Normalisation
-from dynssm_ros.runtime.models import SingleTrackEwma
+from dynssm_ros.runtime.baselines import SingleTrackEwma
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 

@@ -12,7 +12,8 @@ from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.on_track import TYRES, OnTrack
 from dynssm_ros.learning.stages import train
-from dynssm_ros.runtime.models import OnnxModel, SingleTrack
+from dynssm_ros.runtime.baselines import SingleTrack
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, Vehicle
 from dynssm_ros.vehicle.single_track import front_force, rear_force

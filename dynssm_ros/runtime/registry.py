@@ -1,0 +1,43 @@
+"""Models by name or folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.baselines import Persistence, SingleTrack, SingleTrackEwma
+from dynssm_ros.runtime.contract import WindowModel
+from dynssm_ros.runtime.kalman import SingleTrackEkf
+from dynssm_ros.runtime.onnx_model import OnnxModel
+from dynssm_ros.vehicle import Vehicle
+
+_PHYSICS: dict[str, Callable[[Vehicle], WindowModel]] = {
+    physics.name: physics for physics in (SingleTrack, SingleTrackEwma, SingleTrackEkf)
+}
+UNTRAINED = (Persistence.name, *_PHYSICS)
+"""Names of the models that need no training."""
+
+
+def load_model(name_or_dir: str | Path, vehicle: Vehicle | None = None) -> WindowModel:
+    """Opens a model folder, or one of the models that need no training.
+
+    Args:
+        name_or_dir: a model folder, or one of :data:`UNTRAINED`.
+        vehicle: needed for the single-track models.
+
+    Raises:
+        ArtifactError: the folder is not a usable model.
+        ConfigurationError: no such model, or the vehicle is missing.
+    """
+    if Path(name_or_dir).is_dir():
+        return OnnxModel(open_artifact(name_or_dir))
+    if name_or_dir == Persistence.name:
+        return Persistence()
+    physics = _PHYSICS.get(str(name_or_dir))
+    if physics is None:
+        raise ConfigurationError(f"model '{name_or_dir}': neither a model folder nor one of {', '.join(UNTRAINED)}")
+    if vehicle is None:
+        raise ConfigurationError(f"model {name_or_dir}: needs --vehicle")
+    return physics(vehicle)
