@@ -4,7 +4,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup demo paper docs test colcon-test clean
+.PHONY: help setup demo paper docs test test-all colcon-test clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -17,6 +17,8 @@ SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12)
 
 # the environment brings its own ROS 2; a sourced one, or another environment's libraries, would shadow it
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# tests start hundreds of processes, of which each would compile the package anew
+unexport PYTHONDONTWRITEBYTECODE
 ifdef ROS_DISTRO
 unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH
 endif
@@ -25,7 +27,7 @@ help: ## this list
 	@echo "make TARGET, where TARGET is one of"
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
 	@echo "Variables: OUT=$(OUT) (folder of the demo; of paper out/paper), JOBS=$(JOBS) (processes),"
-	@echo "  DYNSSM_DATA=$(DYNSSM_DATA) (measured logs and tracks), ARGS=... (variables of make paper: quick=1, test=NAME=R.parquet), PYTHON=... (interpreter, 3.10 to 3.12)"
+	@echo "  DYNSSM_DATA=$(DYNSSM_DATA) (measured logs and tracks), ARGS=... (of make paper: quick=1, test=NAME=R.parquet; of make test: pytest's options), PYTHON=... (interpreter, 3.10 to 3.12)"
 
 setup: $(STAMP) ## the virtual environment alone
 
@@ -41,15 +43,21 @@ paper: $(STAMP) ## docs/results.md and results_race.md measured anew, about two 
 docs: $(STAMP) ## the documentation as a site, out/site/index.html
 	@$(BIN)/sphinx-build -W --keep-going -q -b html docs out/site
 
-test: $(STAMP) ## style, types and all tests
+test: $(STAMP) ## style, types and tests, about ten minutes on two cores
+test-all: $(STAMP) ## the same with the slow tests, before a release
+test-all: SELECTED = -m ""
+
+test test-all:
 	@set -x
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	# the types of the newest numpy hold; Python 3.10 has an older one
-	if $(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then $(BIN)/mypy; fi
-	$(BIN)/pytest -n $(JOBS) -m "not live" --timeout 300
-	# real time needs the machine to itself
-	$(BIN)/pytest -m live --timeout 300
+	{ $(BIN)/python -c 'import sys; sys.exit(sys.version_info >= (3, 11))' || $(BIN)/mypy; } & types=$$!
+	tests=0
+	$(BIN)/pytest -n $(JOBS) --dist worksteal --timeout 300 $(SELECTED) $(ARGS) || tests=$$?
+	wait $$types
+	if [ $$tests = 0 ] && [ $@ = test-all ]; then test/colcon.sh; fi
+	exit $$tests
 
 colcon-test: $(STAMP) ## build and use the package in a fresh colcon workspace
 	@test/colcon.sh

@@ -6,6 +6,10 @@ import ast
 import io
 import os
 import sys
+
+# tests run side by side; libraries read these when they are loaded
+os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +23,6 @@ settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"  # a wrongly typed message field must fail, not corrupt
-os.environ["OPENBLAS_NUM_THREADS"] = "1"  # tests run side by side
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 

@@ -80,6 +80,7 @@ def test_what_is_there_is_not_asked_for() -> None:
     assert issubclass(MissingExtraError, Exception)
 
 
+@pytest.mark.slow
 @pytest.mark.live
 @pytest.mark.timeout(600)
 def test_an_environment_with_the_core_alone_predicts_live_on_dds(

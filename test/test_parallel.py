@@ -12,8 +12,8 @@ import pytest
 from dynssm_ros.errors import ConfigurationError, ProcessDiedError
 from dynssm_ros.parallel import HERE, Workers, each
 
-ALL = [HERE, Workers(2), Workers(2, "ray"), Workers(2, "dask")]
-SEVERAL = ALL[1:]
+CLUSTERS = [pytest.param(Workers(2, backend), marks=pytest.mark.slow) for backend in ("ray", "dask")]
+SEVERAL = [Workers(2), *CLUSTERS]
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def name(workers: Workers) -> str:
     return f"{workers.jobs}-{workers.backend}"
 
 
-@pytest.mark.parametrize("workers", ALL, ids=name)
+@pytest.mark.parametrize("workers", [HERE, *SEVERAL], ids=name)
 def test_every_item_has_its_result_and_an_error_is_the_one_that_was_raised(
     squared: Callable[[int], int], workers: Workers
 ) -> None:

@@ -65,6 +65,7 @@ def test_weighted_means_of_shares_are_the_mean_of_the_batch(rows: int) -> None:
     torch.testing.assert_close(torch.stack(means).mean(0), batch.mean(0), rtol=1e-14, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_gradients_of_two_processes_are_those_of_one(members: ModuleType) -> None:
     batch = torch.randn(7, 4, generator=torch.Generator().manual_seed(0))
     together, mean = run_in_processes(2, CPU, None, members.gradients, batch)
@@ -77,6 +78,7 @@ class StoppedError(Exception):
     """Of a training."""
 
 
+@pytest.mark.slow
 def test_two_processes_train_the_model_of_one_and_go_on_with_what_one_began(
     laps: Recording, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -101,6 +103,7 @@ def test_two_processes_train_the_model_of_one_and_go_on_with_what_one_began(
     assert names[0].keys() == names[1].keys()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("function", "words"), [("killed", "SIGKILL"), ("failed", "no such luck")])
 def test_a_process_that_ends_early_is_named(members: ModuleType, function: str, words: str) -> None:
     with pytest.raises(UserError, match=f"training in 2 processes: .*{words}"):

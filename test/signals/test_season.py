@@ -128,7 +128,10 @@ def test_what_is_done_stays_done_after_an_interrupt(bags: list[Path], tmp_path: 
     assert (len(new), len(season.sessions)) == (2, 4)
 
 
-@pytest.mark.parametrize("backend", get_args(Backend))
+@pytest.mark.parametrize(
+    "backend",
+    [pytest.param(name, marks=[] if name == "processes" else pytest.mark.slow) for name in get_args(Backend)],
+)
 def test_several_processes_give_the_same_though_one_is_killed(
     bags: list[Path], tmp_path: Path, backend: Backend
 ) -> None:
@@ -182,6 +185,7 @@ def cluster(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Workers]
             head.terminate()
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same(bags: list[Path], tmp_path: Path, cluster: Workers) -> None:
     one, _ = extract_season(logs(bags), tmp_path / "one")
     two, _ = extract_season(logs(bags), tmp_path / "two", cluster)
