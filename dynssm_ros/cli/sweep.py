@@ -33,7 +33,7 @@ def sweep(
     ],
     vehicle: VehicleOption,
     out: Annotated[
-        Path, typer.Option(help="Folder of the sweep: report.html, best.yaml, all models.", file_okay=False)
+        Path, typer.Option(help="Folder of the sweep: results.json, best.yaml, all models.", file_okay=False)
     ],
     model: Annotated[str, typer.Option(help="Model: name of a shipped one or a file.")] = "dynssm",
     space: Annotated[
@@ -58,7 +58,7 @@ def sweep(
     """Train a model with other settings again and again, and see which predict laps best that were left out."""
     require("sweep", "sweep", "train", "report")
     from dynssm_ros.learning.models.registry import load_model_config, overrides
-    from dynssm_ros.reporting.sweep_report import sweep_report, trial_table, verdict
+    from dynssm_ros.reporting.sweep_table import CAUTION, trial_table, verdict
 
     logs, left_out = recording_files(recordings, where), recording_files(validation or [])
     with progress_bar("trying") as progress:
@@ -69,14 +69,7 @@ def sweep(
     best = load_model_config(model, overrides(found.best.settings))
     with replacing(out / "best.yaml") as aside:
         aside.write_text(yaml.safe_dump(best.model_dump(mode="json"), sort_keys=False), encoding="utf-8")
-    names = ", ".join(path.name for path in recordings) + (f" where {where}" if where else "")
-    scored = ", ".join(path.name for path in validation or []) or f"last {100 * holdout:.3g} % of each recording"
-    protocol = {
-        "Recordings": names, "Scored on": scored, "Model": model, "Space": space, "Vehicle": vehicle, "Seed": str(seed),
-        "Choice": "tree-structured Parzen estimator (Optuna)",
-    }  # fmt: skip
-    sweep_report(found, protocol).save(out / "report.html")
     write_results(found.to_json(), out, json)
     console.print(trial_table(found).brief.rich())
-    console.print(verdict(found), markup=False, soft_wrap=True)
+    console.print(f"{verdict(found)} {CAUTION}", markup=False, soft_wrap=True)
     console.print(f"{out / 'best.yaml'}: its model file", markup=False, soft_wrap=True)
