@@ -1,7 +1,10 @@
 """Sphinx configuration: MyST pages, API from docstrings. `make docs` builds, rosdoc2 finds it here too."""
 
+import re
 import sys
 from pathlib import Path
+
+from sphinx.application import Sphinx
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -20,3 +23,12 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_type_aliases = {"PathLike": "str | Path", "Log": "Recording | str | Path", "Progress": "Callable"}
 exclude_patterns = ["README.md"]
+
+
+def link_repository_files(app: Sphinx, name: str, source: list[str]) -> None:
+    """Files of the repository outside docs/, as the measured results, are linked as they are: the site has a copy."""
+    source[0] = re.sub(r"\]\(((?:\.\./)+benchmarks/[^)#]+)(?:#[^)]*)?\)", r"](path:\1)", source[0])
+
+
+def setup(app: Sphinx) -> None:
+    app.connect("source-read", link_repository_files)

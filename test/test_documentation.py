@@ -33,7 +33,8 @@ from dynssm_ros.vehicle.effects import EFFECTS
 Declared = Callable[[str], dict[str, object]]
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]}
-MEASURED = ("results.md", "results_race.md")  # written by `make paper`, in the words of the version that measured
+RESULTS_FOLDER = ROOT / "benchmarks" / "results"  # in the words of the version that measured
+RESULTS = {path.name: path.read_text(encoding="utf-8") for path in RESULTS_FOLDER.glob("*.md")}
 README = PAGES["README.md"]
 
 
@@ -59,8 +60,6 @@ def test_every_command_is_described_and_every_described_one_exists() -> None:
 def code_lines() -> Iterator[tuple[str, str]]:
     """Page and line of all code in blocks, with continued lines joined."""
     for name, text in PAGES.items():
-        if name in MEASURED:
-            continue
         joined = re.sub(r"\\\n\s*", "", text)
         fenced = re.findall(r"^```(?:bash)?\n(.*?)^```", joined, flags=re.M | re.S)
         for line in [*re.findall(r"^(?: {4}|\t)(.*)", joined, flags=re.M), *"\n".join(fenced).splitlines()]:
@@ -95,9 +94,8 @@ def test_every_option_that_a_page_names_exists() -> None:
     elsewhere = {"--help", "--ros-args", "--symlink-install", "--system-site-packages", "--backend", "--cpus"}
     known = set().union(*options().values()) | elsewhere
     for page, text in PAGES.items():
-        if page not in MEASURED:
-            named = set(re.findall(r"`(--[a-z-]+)", text))
-            assert named <= known, f"{page}: {named - known}"
+        named = set(re.findall(r"`(--[a-z-]+)", text))
+        assert named <= known, f"{page}: {named - known}"
 
 
 def test_every_module_that_a_code_block_runs_exists() -> None:
@@ -124,8 +122,14 @@ def test_every_node_parameter_in_a_code_block_is_declared(declared_parameters: D
 def test_links_lead_somewhere() -> None:
     for page, text in PAGES.items():
         folder = ROOT if (ROOT / page).is_file() else ROOT / "docs"
-        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
-            assert "://" in target or (folder / target).exists(), f"{page}: {target}"
+        assert_links_lead_somewhere(page, text, folder)
+    for page, text in RESULTS.items():
+        assert_links_lead_somewhere(page, text, RESULTS_FOLDER)
+
+
+def assert_links_lead_somewhere(page: str, text: str, folder: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
+        assert "://" in target or (folder / target).exists(), f"{page}: {target}"
 
 
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
@@ -188,18 +192,18 @@ def test_every_block_of_the_papers_results_is_somewhere() -> None:
 
 @pytest.mark.parametrize("page", ["results.md", "results_race.md"])
 def test_results_of_other_settings_are_marked_stale(page: str) -> None:
-    """``python -m benchmarks.paper.stale docs/results.md docs/results_race.md`` mends it."""
-    assert PAGES[page] == marked(PAGES[page], load_plan())
+    """``python -m benchmarks.paper.stale benchmarks/results/results.md benchmarks/results/results_race.md`` mends it."""
+    assert RESULTS[page] == marked(RESULTS[page], load_plan())
 
 
 def test_the_rivals_settings_are_those_of_their_model_files() -> None:
-    rows = table("setting", PAGES["rivals.md"])
+    rows = table("setting", RESULTS["rivals.md"])
     assert {"ddm_av21", "ddm_orca", "fthd_av21", "fthd_orca"} <= {name.split(".")[0] for name in rows}
     for name, (published, ours, why) in rows.items():
         model, *path = name.split(".")
         assert float(ours) == reduce(getattr, path, load_model_config(model)), name
         assert published == ours or why, f"{name}: differs from what is published without a reason"
-    named = set(table("model", PAGES["rivals.md"]))
+    named = set(table("model", RESULTS["rivals.md"]))
     assert named == {*UNTRAINED, "ridge", "rls", "gp", "on_track"}
 
 

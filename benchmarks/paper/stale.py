@@ -1,7 +1,7 @@
 """A page of results says of which plan, models and cars it is, and is marked stale when they are others by now.
 
-``python -m benchmarks.paper.stale docs/results.md docs/results_race.md`` marks pages, or takes the mark off; a test of the
-documentation asks for it.
+``python -m benchmarks.paper.stale benchmarks/results/results.md benchmarks/results/results_race.md`` marks pages, or takes
+the mark off; a test of the documentation asks for it.
 """
 
 from __future__ import annotations
