@@ -23,6 +23,7 @@ from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC, PREDICTION_TOPIC
 
 PERIOD = 20_000_000  # ns
+LONG_AGO = 1000 * 10**9  # ns: farther than any test moves stamps
 
 
 def call(collector: Collector, service: Any, name: str, **request: Any) -> Any:
@@ -129,23 +130,49 @@ class Car:
 StartCar = Callable[..., Car]
 
 
+def _started(stack: ExitStack, model: Path, wait: bool = True, **parameters: object) -> Car:
+    os.environ.update(isolated_environment())
+    process = stack.enter_context(
+        predictor_process(model, {"diagnostics_period": 0.1, **parameters}, os.environ.copy())
+    )
+    run = LiveRun(PERIOD)
+    car = Car(stack.enter_context(collecting(run)), run, process)
+    if wait:
+        car.wait_for_match()
+    return car
+
+
 @pytest.fixture
 def start_car(small_model: Path) -> Iterator[StartCar]:
     """Starts predictors with the small model (or another) and hands out cars that talk to them."""
     with ExitStack() as stack:
 
         def start(model: Path = small_model, wait: bool = True, **parameters: object) -> Car:
-            os.environ.update(isolated_environment())
-            process = stack.enter_context(
-                predictor_process(model, {"diagnostics_period": 0.1, **parameters}, os.environ.copy())
-            )
-            run = LiveRun(PERIOD)
-            car = Car(stack.enter_context(collecting(run)), run, process)
-            if wait:
-                car.wait_for_match()
-            return car
+            return _started(stack, model, wait, **parameters)
 
         yield start
+
+
+@pytest.fixture(scope="module")
+def parked_car(small_model: Path) -> Iterator[Callable[[], Car]]:
+    """The one car of a module, which talks to one predictor; a new one where the last test has stopped it."""
+    with ExitStack() as stack:
+        cars: list[Car] = []
+
+        def fetch() -> Car:
+            if not cars or cars[-1].process.poll() is not None:
+                cars.append(_started(stack, small_model))
+            return cars[-1]
+
+        yield fetch
+
+
+@pytest.fixture
+def car(parked_car: Callable[[], Car]) -> Car:
+    """A car that other tests of the module have driven, long ago: for tests that leave the node's parameters alone."""
+    car = parked_car()
+    car.stamp += LONG_AGO
+    return car
 
 
 @pytest.fixture(scope="session")

@@ -169,9 +169,9 @@ FAULTS = (
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name.replace(" ", "_"))
 def test_a_fault_is_named_nothing_is_predicted_from_it_and_predictions_come_back(
-    start_car: Any, laps: list[Row], fault: Fault
+    car: Any, laps: list[Row], fault: Fault
 ) -> None:
-    car, rows = start_car(), iter(laps)
+    rows = iter(laps)
     good = [send_and_wait(car, row) for row in take(rows, BEFORE)]
     assert all(good[-10:]), "it does not predict to begin with"
     said = len(car.run.diagnostics)

@@ -109,8 +109,7 @@ def test_every_odometry_message_after_the_first_window_gets_a_prediction_as_repl
     assert len(run.parameters[some]) == len(COEFFICIENTS)
 
 
-def test_bad_samples_yield_no_prediction_and_the_node_recovers_by_itself(start_car) -> None:
-    car = start_car()
+def test_bad_samples_yield_no_prediction_and_the_node_recovers_by_itself(car) -> None:
     assert car.drive_until_answered() == H
     nan = car.step(v_x=float("nan"))
     good = car.step()
@@ -137,8 +136,7 @@ def test_outputs_are_reliable_unless_asked_otherwise(start_car, asked: str) -> N
 
 
 @pytest.mark.parametrize("off", [-1.0, 1.0, 10.0])
-def test_a_single_stamp_far_off_costs_its_message_alone(start_car, off: float) -> None:
-    car = start_car()
+def test_a_single_stamp_far_off_costs_its_message_alone(car, off: float) -> None:
     car.drive_until_answered()
     right = car.stamp
     car.stamp += round(off * 1e9)
@@ -148,8 +146,7 @@ def test_a_single_stamp_far_off_costs_its_message_alone(start_car, off: float) -
     assert wrong not in car.run.predicted
 
 
-def test_a_speed_that_no_car_has_is_refused_and_named(start_car) -> None:
-    car = start_car()
+def test_a_speed_that_no_car_has_is_refused_and_named(car) -> None:
     car.drive_until_answered()
     bad = [car.step(v_x=1e4) for _ in range(10)]
     assert car.diagnosed("a sample is beyond what the car can do")
@@ -158,12 +155,11 @@ def test_a_speed_that_no_car_has_is_refused_and_named(start_car) -> None:
     assert not any(stamp in car.run.predicted for stamp in bad)
 
 
-def test_more_than_one_publisher_of_an_input_is_named(start_car) -> None:
+def test_more_than_one_publisher_of_an_input_is_named(car) -> None:
     from nav_msgs.msg import Odometry
 
     from dynssm_ros.nodes.support import SENSOR_QOS
 
-    car = start_car()
     second = car.collector.create_publisher(Odometry, "/vehicle/odometry", SENSOR_QOS)
 
     def is_named() -> bool:
@@ -185,8 +181,7 @@ def test_a_refused_set_of_parameters_leaves_no_model_behind(start_car, small_mod
     assert car.run.diagnostics[-1][2]["model folder"] != str(other)
 
 
-def test_time_that_jumps_back_restarts_the_window(start_car) -> None:
-    car = start_car()
+def test_time_that_jumps_back_restarts_the_window(car) -> None:
     car.drive_until_answered()
     car.stamp -= 10_000_000_000
     first = car.stamp + car.run.T_s
@@ -195,8 +190,7 @@ def test_time_that_jumps_back_restarts_the_window(start_car) -> None:
 
 
 @pytest.mark.parametrize("how", [{"actuators": False}, {"commands": False}])
-def test_stale_actuators_stop_predictions_and_diagnostics_say_so_until_they_are_back(start_car, how) -> None:
-    car = start_car()
+def test_stale_actuators_stop_predictions_and_diagnostics_say_so_until_they_are_back(car, how) -> None:
     car.drive_until_answered()
     stale = [car.step(**how) for _ in range(30)]
     assert car.diagnosed("silent for")
@@ -205,15 +199,13 @@ def test_stale_actuators_stop_predictions_and_diagnostics_say_so_until_they_are_
     assert car.diagnosed("predicting") or car.answered(car.step())
 
 
-def test_odometry_that_stops_is_reported_as_silent(start_car) -> None:
-    car = start_car()
+def test_odometry_that_stops_is_reported_as_silent(car) -> None:
     car.drive_until_answered()
     assert car.diagnosed("/vehicle/odometry: silent for")
     assert car.run.diagnostics[-1][0] == 2, "an error, not a warning"
 
 
-def test_diagnostics_hold_rates_ages_latencies_and_refusals(start_car) -> None:
-    car = start_car()
+def test_diagnostics_hold_rates_ages_latencies_and_refusals(car) -> None:
     before = int(car.run.diagnostics[-1][2]["refused: filling"])
     car.drive_until_answered()
     assert car.diagnosed("")
@@ -307,12 +299,11 @@ def test_parameters_are_listed_described_and_read(start_car, small_model: Path, 
     assert (values[0].string_value, values[1].double_value, values[2].bool_value) == (str(small_model), 0.2, False)
 
 
-def test_the_pose_of_a_prediction_claims_no_certainty(start_car) -> None:
+def test_the_pose_of_a_prediction_claims_no_certainty(car) -> None:
     from nav_msgs.msg import Odometry
 
     from dynssm_ros.nodes.support import SENSOR_QOS
 
-    car = start_car()
     prediction = heard(car, Odometry, "/dynssm/prediction", SENSOR_QOS)
     np.testing.assert_array_equal(np.reshape(prediction.pose.covariance, (6, 6)), UNKNOWN * np.eye(6))
     stated = np.diag(np.reshape(prediction.twist.covariance, (6, 6)))
@@ -332,8 +323,7 @@ def test_models_are_taken_from_below_their_root_only(start_car, small_model: Pat
     assert car.set_parameter("model", str(shutil.copytree(small_model, root / "b"))) == (True, "")
 
 
-def test_the_process_holds_no_torch(start_car) -> None:
-    car = start_car()
+def test_the_process_holds_no_torch(car) -> None:
     car.drive_until_answered()
     mapped = Path(f"/proc/{car.process.pid}/maps").read_text()
     assert "onnxruntime" in mapped
