@@ -1,9 +1,9 @@
-"""Golden results: what the commands print and write for small fixed inputs, to hold behaviour still while code moves.
+"""Golden results: the main numbers of the commands for small fixed inputs, to hold behaviour still while code moves.
 
-``python benchmarks/golden.py record FILE`` runs the commands and writes their numbers to ``FILE`` (JSON);
-``python benchmarks/golden.py compare OLD NEW`` lists every number that differs by more than 1e-9 (relative to the larger
-of 1 and its size) and exits with 1 if there is one. Results of one machine are compared: another processor rounds
-otherwise. Times are left out.
+``python -m benchmarks.golden record FILE`` runs the commands and writes their numbers to ``FILE`` (JSON), in about three
+minutes of one core. ``python -m benchmarks.golden compare OLD NEW`` lists every number of ``OLD`` that differs in ``NEW``
+by more than 1e-9 (relative to the larger of 1 and its size) and exits with 1 if there is one. Results of one machine are
+compared: another processor rounds otherwise. Times are left out.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import argparse
 import json
 import math
 import re
+import resource
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -26,136 +26,128 @@ from pyarrow import parquet
 from rosbags.highlevel import AnyReader
 
 TOLERANCE = 1e-9
-TIMED = re.compile(r"latency|seconds|_us\b|_ms\b|late\b|step_time|control_step|milliseconds|compute")
-PAIR = ("--effect", "steering_offset:offset=0.02", "--effect", "rear_grip:factor=0.85")
-
-
-# the model files of 0.1.0, as changes of those that are shipped
-MODELS: dict[str, dict[str, Any]] = {
-    "dynssm_av21": {"base": "dynssm", "training": {"validation_block": 10.0}},
-    "dynssm_orca": {
-        "base": "dynssm_paper_orca", "physics": {"nominal": "calibrated"}, "residual": {"inputs": "normalised"},
-        "loss": {"scale": "increment"},
-    },
-    "rls_av21": {"base": "rls"},
-    "rls_orca": {"base": "rls"},
-    "ridge_av21": {"base": "ridge", "training": {"validation_block": 10.0}},
-    "ridge_orca": {"base": "ridge", "history": 0.3, "training": {"validation_block": 1.0}},
+SIGNALS = r"(v_x|v_y|omega|r_fb|delta_fb|r_cmd|delta_cmd|x|y|theta)/(mean|signature)$"
+ERRORS = r"models/\w+/(rmse/\w+|max_error/\w+|ade|fde|parameters|flops|coverage_90/\w+)$"
+LAPS = r"models/\w+/(lap_time_s|violation|mean_v_x|mean_abs_v_y|mean_abs_omega|steering_total_variation|steps)$"
+CAUSES = r"verdict|causes\[|gain/|improvement/|noticeable/|minimum_detectable|(nominal|value)$"
+MESSAGES = (
+    r"(prediction/(pose/pose/position/[xy]|twist/twist/(linear/[xy]|angular/z))|parameters.*\])/(mean|signature)$"
+)
+DYNSSM_ORCA = {
+    "base": "dynssm_paper_orca", "name": "dynssm_orca", "physics": {"nominal": "calibrated"},
+    "residual": {"inputs": "normalised"}, "loss": {"scale": "increment"},
 }  # fmt: skip
+"""The model file that is trained, as changes of a shipped one."""
 
 
-def commands(folder: Path) -> Iterator[tuple[str, list[str], list[Path]]]:
-    """Name, arguments and written files of every command, in the order in which they need each other."""
-    for car, track, rate, speed, plants in (
-        ("orca", "club", "50", "0", ("euler", "rk4", "double_track")),
-        ("av21", "road_course", "25", "5", ("euler", "rk4", "double_track")),
-    ):
-        noise = "0.01,0.01,0.03" if car == "orca" else "0.02,0.01,0.002"
-        seconds = "60" if car == "orca" else "150"
-        for plant in plants:
-            hidden = PAIR if plant == "rk4" else ()
-            bag, log = folder / f"{car}_{plant}_bag", folder / f"{car}_{plant}.parquet"
-            yield (
-                f"{car}/{plant}/simulate",
-                ["simulate", "--vehicle", car, "--track", track, "--duration", seconds, "--plant", plant, "--seed", "3",
-                 "--aggressiveness", "0.8", "--noise", noise, *hidden, "--out", f"{bag}", "--json", f"{bag}.json"],
-                [Path(f"{bag}.json")],
-            )  # fmt: skip
-            yield (
-                f"{car}/{plant}/extract",
-                ["extract", f"{bag}", "--signals", "default", "--rate", rate, "--out", f"{log}"],
-                [log],
-            )
-            vehicle, result = folder / f"{car}_{plant}.yaml", folder / f"{car}_{plant}_calibrate.json"
-            yield (
-                f"{car}/{plant}/calibrate",
-                ["calibrate", f"{log}", "--vehicle", car, "--min-speed", speed, "--starts", "2", "--out", f"{vehicle}",
-                 "--json", f"{result}"],
-                [vehicle, result],
-            )  # fmt: skip
-        log = folder / f"{car}_euler.parquet"
-        for model in (f"dynssm_{car}", f"ddm_{car}", f"ridge_{car}", f"rls_{car}"):
-            out = folder / model
-            yield (
-                f"{car}/train/{model}",
-                ["train", f"{log}", "--model", model_file(folder, model), "--vehicle",
-                 f"{folder / f'{car}_euler.yaml'}", "--epochs", "1",
-                 "--out", f"{out}"],
-                [out / "metrics.json"],
-            )  # fmt: skip
-        models = [f"{folder / name}" for name in (f"dynssm_{car}", f"ddm_{car}", f"ridge_{car}", f"rls_{car}")]
-        rivals = [*models, "persistence", "single_track", "single_track_ewma"]
-        out = folder / f"{car}_evaluate"
-        yield (
-            f"{car}/evaluate",
-            ["evaluate", f"{folder / f'{car}_rk4.parquet'}", *(a for m in rivals for a in ("--model", m)), "--vehicle",
-             f"{folder / f'{car}_euler.yaml'}", "--stride", "5", "--out", f"{out}"],
-            [out / "results.json"],
-        )  # fmt: skip
-        out = folder / f"{car}_replay"
-        yield (
-            f"{car}/replay",
-            ["replay", f"{folder / f'{car}_rk4_bag'}", "--model", f"{folder / f'dynssm_{car}'}", "--out", f"{out}"],
-            [out],
+class Golden(NamedTuple):
+    """A command whose results are kept."""
+
+    name: str
+    arguments: str
+    """With ``{folder}`` for where its inputs and outputs lie."""
+    written: tuple[str, ...]
+    """Files in that folder."""
+    kept: str
+    """Which places in these files, a regular expression."""
+
+
+def drives(car: str, plant: str, options: str, rate: int, min_speed: int) -> Iterator[Golden]:
+    """From a simulated drive to a calibrated car."""
+    name = f"{car}_{plant}"
+    yield Golden(
+        f"{car}/{plant}/simulate",
+        f"simulate --vehicle {car} --plant {plant} --seed 3 --aggressiveness 0.8 {options} "
+        f"--out {{folder}}/{name}_bag --json {{folder}}/{name}_bag.json",
+        (f"{name}_bag.json",),
+        "lap|speed",
+    )
+    yield Golden(
+        f"{car}/{plant}/extract",
+        f"extract {{folder}}/{name}_bag --signals default --rate {rate} --out {{folder}}/{name}.parquet",
+        (f"{name}.parquet",),
+        SIGNALS,
+    )
+    yield Golden(
+        f"{car}/{plant}/calibrate",
+        f"calibrate {{folder}}/{name}.parquet --vehicle {car} --min-speed {min_speed} --starts 2 "
+        f"--out {{folder}}/{name}.yaml --json {{folder}}/{name}_calibrate.json",
+        (f"{name}.yaml", f"{name}_calibrate.json"),
+        r"nominal$|std$|rmse|unidentified|rows",
+    )
+
+
+def commands() -> Iterator[Golden]:
+    """All commands, in the order in which they need each other."""
+    of_orca = "--track club --duration 60 --noise 0.01,0.01,0.03"
+    hidden = "--effect steering_offset:offset=0.02 --effect rear_grip:factor=0.85"
+    yield from drives("orca", "euler", of_orca, 50, 0)
+    yield from drives("orca", "rk4", f"{of_orca} {hidden}", 50, 0)
+    yield from drives("av21", "double_track", "--track road_course --duration 150 --noise 0.02,0.01,0.002", 25, 5)
+    for name, file in (("dynssm_orca", "{folder}/dynssm_orca.yaml"), ("ridge_orca", "ridge"), ("rls_orca", "rls")):
+        yield Golden(
+            f"orca/train/{name}",
+            f"train {{folder}}/orca_euler.parquet --model {file} --vehicle {{folder}}/orca_euler.yaml --epochs 1 "
+            f"--out {{folder}}/{name}",
+            (f"{name}/metrics.json",),
+            "validation_rmse|windows|best_epoch|history",
         )
-        for plant in ("rk4",) if car == "av21" else ("rk4", "double_track"):
-            out = folder / f"{car}_{plant}_diagnose"
-            yield (
-                f"{car}/{plant}/diagnose",
-                ["diagnose", f"{folder / f'{car}_{plant}.parquet'}", "--vehicle", car, "--out", f"{out}"],
-                [out / "results.json", out / "vehicle.yaml"],
-            )
-        for plant in plants if car == "orca" else ("rk4",):
-            out = folder / f"{car}_{plant}_race"
-            yield (
-                f"{car}/{plant}/race",
-                ["race", "--vehicle", car, "--track", "club" if car == "orca" else "oval", "--plant", plant,
-                 "--model", "true", "--model", f"{folder / f'dynssm_{car}'}", "--speed-scale", "0.8", "--out", f"{out}"],
-                [out / "results.json"],
-            )  # fmt: skip
-    out = folder / "orca_progress"
-    yield (
+    trained = [f"{{folder}}/{name}" for name in ("dynssm_orca", "ridge_orca", "rls_orca")]
+    models = " ".join(f"--model {name}" for name in (*trained, "persistence", "single_track", "single_track_ewma"))
+    yield Golden(
+        "orca/evaluate",
+        f"evaluate {{folder}}/orca_rk4.parquet {models} --vehicle {{folder}}/orca_euler.yaml --stride 5 "
+        "--out {folder}/orca_evaluate",
+        ("orca_evaluate/results.json",),
+        ERRORS,
+    )
+    yield Golden(
+        "orca/replay",
+        f"replay {{folder}}/orca_rk4_bag --model {trained[0]} --out {{folder}}/orca_replay",
+        ("orca_replay",),
+        MESSAGES,
+    )
+    yield Golden(
+        "orca/rk4/diagnose",
+        "diagnose {folder}/orca_rk4.parquet --vehicle orca --out {folder}/orca_rk4_diagnose",
+        ("orca_rk4_diagnose/results.json", "orca_rk4_diagnose/vehicle.yaml"),
+        CAUSES,
+    )
+    race = "race --vehicle orca --track club --model true"
+    yield Golden(
+        "orca/euler/race",
+        f"{race} --plant euler --model {trained[0]} --speed-scale 0.8 --out {{folder}}/orca_euler_race",
+        ("orca_euler_race/results.json",),
+        LAPS,
+    )
+    yield Golden(
         "orca/progress/race",
-        ["race", "--vehicle", "orca", "--track", "club", "--model", "true", "--model", f"{folder / 'orca_rk4.yaml'}",
-         "--objective", "progress", "--offset-free", "--speed-scale", "0.85", "--effect", "front_grip:factor=0.9", "--out",
-         f"{out}"],
-        [out / "results.json"],
-    )  # fmt: skip
-
-
-def model_file(folder: Path, model: str) -> str:
-    """The model file of that name: of ``MODELS``, or a shipped one."""
-    return f"{folder / model}.yaml" if model in MODELS else model
+        f"{race} --model {{folder}}/orca_rk4.yaml --objective progress --offset-free --speed-scale 0.85 "
+        "--effect front_grip:factor=0.9 --out {folder}/orca_progress",
+        ("orca_progress/results.json",),
+        LAPS,
+    )
 
 
 def numbers(path: Path) -> dict[str, float | str]:
     """All numbers (and words) of a JSON, YAML or Parquet file or of a bag, by their place in it."""
     if path.is_dir():
-        return bag_numbers(path)
+        return of_columns(bag_columns(path))
     if path.suffix == ".parquet":
         table = parquet.read_table(path)
-        columns = {name: table[name].to_numpy().astype(float) for name in table.column_names}
-        return {
-            f"{name}/{what}": float(value)
-            for name, column in columns.items()
-            for what, value in summary(column).items()
-        }
+        return of_columns({name: table[name].to_numpy().astype(float) for name in table.column_names})
     text = path.read_text(encoding="utf-8")
     return dict(flat(json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)))
 
 
-def bag_numbers(path: Path) -> dict[str, float | str]:
-    """Sums over the messages of a bag, topic by topic."""
-    found: dict[str, float | str] = {}
+def bag_columns(path: Path) -> dict[str, Any]:
+    """Each number of the messages of a bag over its messages."""
     values: dict[str, list[float]] = {}
     with AnyReader([path]) as reader:
         for connection, _, raw in reader.messages():
-            message = reader.deserialize(raw, connection.msgtype)
-            for name, value in attributes(message, connection.topic):
+            for name, value in attributes(reader.deserialize(raw, connection.msgtype), connection.topic):
                 values.setdefault(name, []).append(value)
-    for name, column in values.items():
-        found.update({f"{name}/{what}": value for what, value in summary(np.array(column)).items()})
-    return found
+    return {name: np.array(column) for name, column in values.items()}
 
 
 def attributes(message: Any, name: str) -> Iterator[tuple[str, float]]:
@@ -173,17 +165,14 @@ def attributes(message: Any, name: str) -> Iterator[tuple[str, float]]:
                 yield from attributes(getattr(message, field), f"{name}/{field}")
 
 
-def summary(column: np.ndarray) -> dict[str, float]:
-    """A column in five numbers that see a change of any row."""
-    whole = np.nan_to_num(column)
-    weight = np.cos(np.arange(len(whole)))
-    return {
-        "count": float(len(whole)),
-        "first": float(whole[0]),
-        "last": float(whole[-1]),
-        "mean": float(whole.mean()),
-        "signature": float((whole * weight).mean()),
-    }
+def of_columns(columns: dict[str, Any]) -> dict[str, float | str]:
+    """Mean of each column, and a weighted one that sees a change of the order too."""
+    found: dict[str, float | str] = {}
+    for name, column in columns.items():
+        whole = np.nan_to_num(column)
+        found[f"{name}/mean"] = float(whole.mean())
+        found[f"{name}/signature"] = float((whole * np.cos(np.arange(len(whole)))).mean())
+    return found
 
 
 def flat(content: Any, place: str = "") -> Iterator[tuple[str, float | str]]:
@@ -201,47 +190,50 @@ def flat(content: Any, place: str = "") -> Iterator[tuple[str, float | str]]:
 
 
 def record(file: Path) -> None:
-    """Runs all commands and writes what they printed and wrote."""
-    results: dict[str, Any] = {}
+    """Runs all commands and writes the numbers that are kept of each."""
+    results: dict[str, dict[str, float | str]] = {}
     with tempfile.TemporaryDirectory(prefix="dynssm-golden-") as name:
         folder = Path(name)
-        for model, content in MODELS.items():
-            (folder / f"{model}.yaml").write_text(yaml.safe_dump(content | {"name": model}), encoding="utf-8")
-        for case, arguments, written in commands(folder):
-            begin = time.monotonic()
+        (folder / "dynssm_orca.yaml").write_text(yaml.safe_dump(DYNSSM_ORCA), encoding="utf-8")
+        for golden in commands():
+            arguments = golden.arguments.format(folder=folder).split()
+            begin = _cpu_seconds()
             run = subprocess.run(  # noqa: S603 - our own command
                 [sys.executable, "-m", "dynssm_ros.cli.main", *arguments], capture_output=True, text=True, check=False
             )
             if run.returncode:
-                raise SystemExit(f"{case}: {run.stderr[-2000:]}")
-            found = {
-                f"{path.relative_to(folder)}{place}": value
-                for path in written
-                for place, value in numbers(path).items()
-                if not TIMED.search(place)
+                raise SystemExit(f"{golden.name}: {run.stderr[-2000:]}")
+            results[golden.name] = {
+                f"{path}{place}": value.replace(name, "DIR") if isinstance(value, str) else value
+                for path in golden.written
+                for place, value in numbers(folder / path).items()
+                if re.search(golden.kept, place)
             }
-            clean = {k: v.replace(name, "DIR") if isinstance(v, str) else v for k, v in found.items()}
-            results[case] = {"values": clean, "printed": run.stdout.replace(name, "DIR").splitlines()}
-            print(f"{case}: {len(clean)} values, {time.monotonic() - begin:.1f} s", flush=True)
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(json.dumps(results, indent=0), encoding="utf-8")
+            print(f"{golden.name}: {len(results[golden.name])} values, {_cpu_seconds() - begin:.1f} s", flush=True)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(results, indent=0) + "\n", encoding="utf-8")
+
+
+def _cpu_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def compare(old: Path, new: Path) -> int:
     """Prints every value that differs; returns how many do."""
     before, after = (json.loads(path.read_text(encoding="utf-8")) for path in (old, new))
     differences = 0
-    for case in before:
-        ours, theirs = before[case]["values"], after.get(case, {}).get("values", {})
-        rows = [row for place in {**ours, **theirs} if (row := difference(place, ours.get(place), theirs.get(place)))]
+    for name, ours in before.items():
+        theirs = after.get(name, {})
+        rows = [row for place, value in ours.items() if (row := difference(place, value, theirs.get(place)))]
         differences += len(rows)
-        print(f"{case}: {len(ours)} values, {len(rows)} differ")
+        print(f"{name}: {len(ours)} values, {len(rows)} differ")
         for row in rows[:20]:
             print(f"  {row}")
     return differences
 
 
-def difference(place: str, before: float | str | None, after: float | str | None) -> str | None:
+def difference(place: str, before: float | str, after: float | str | None) -> str | None:
     """A line about a value that changed; ``None`` if it is the same."""
     if isinstance(before, float) and isinstance(after, float):
         if math.isnan(before) and math.isnan(after):
