@@ -22,6 +22,7 @@ from dynssm_ros.arrays import Mask, Vector
 from dynssm_ros.control.caution import Caution, Margins
 from dynssm_ros.control.horizon_model import VELOCITIES
 from dynssm_ros.control.nmpc import Adapted
+from dynssm_ros.runtime.comparison import RunningComparison
 from dynssm_ros.vehicle import State
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose, axle_direction
 
@@ -30,12 +31,9 @@ SOURCES: tuple[Source, ...] = ("calibrated", "coefficients", "model")
 """The calibrated car; with the adapted coefficients; with all that the model says."""
 
 _AT_ONCE = 4  # horizons under way
-_REMEMBERED = 20  # horizons that the comparison is of
 _FEWEST = 6  # of them, before anything is believed
 _CLEARLY = 0.05  # logarithm of the distances' ratio
-_LARGEST = 2.0  # a single logarithm counts as at most that
 _SETTLING = 1.0  # horizons in which 63 % of a switch are made
-_NEAR = 1e-9  # m
 
 Following = Callable[[Vector, Vector, Adapted, float], Vector]
 """From states ``(n, size)``, increments of the inputs, what holds for each, and the time (s) to the states one T_s later."""
@@ -86,11 +84,9 @@ class Evidence:
 
     def forget(self) -> None:
         """Begins anew, with the calibrated car."""
-        self.advantage = np.zeros(len(SOURCES))
-        """Mean logarithm of the calibrated car's distance from the measured paths over that of each source."""
+        self._comparison = RunningComparison(len(SOURCES))
         self.weights = np.array([1.0, 0.0, 0.0])
         """Shares with which each source is planned with, ``(3,)``."""
-        self._horizons = 0
         self._caution.forget()
         self.interrupt()
 
@@ -103,8 +99,8 @@ class Evidence:
     @property
     def source(self) -> Source:
         """What is believed now."""
-        best = int(np.argmax(self.advantage))
-        return SOURCES[best if self._horizons >= _FEWEST and self.advantage[best] > _CLEARLY else 0]
+        advantage, best = self._comparison.advantage, int(np.argmax(self._comparison.advantage))
+        return SOURCES[best if self._comparison.paths >= _FEWEST and advantage[best] > _CLEARLY else 0]
 
     def earned(self, said: Sequence[Adapted]) -> Adapted:
         """What to plan with: a mixture of what each of :data:`SOURCES` says."""
@@ -165,7 +161,7 @@ class Evidence:
         )
         done = moved.left <= 0
         if done.any():
-            self._compare(moved.distances[done])
+            self._comparison.add(moved.distances[done][0], moved.distances[done])
         return moved.at(~done)
 
     def _watch(self, left: Vector, states: Vector, measured: Vector, away: Vector, heading: Vector) -> None:
@@ -182,15 +178,6 @@ class Evidence:
         first, second = (State(*states[:, VELOCITIES].T) for states in (before, after))
         moved = advance_pose(np, Pose(*poses.T), first, second, self._T_s)
         return np.stack(np.broadcast_arrays(*moved), axis=1)
-
-    def _compare(self, distances: Vector) -> None:
-        distances = np.nan_to_num(distances, nan=math.inf, posinf=math.inf) + _NEAR
-        if not math.isfinite(distances[0]):
-            return
-        with np.errstate(divide="ignore"):
-            ratios = np.clip(np.log(distances[0]) - np.log(distances), -_LARGEST, _LARGEST)
-        self._horizons += 1
-        self.advantage = self.advantage + (ratios - self.advantage) / min(self._horizons, _REMEMBERED)
 
 
 def sources(calibrated: Adapted, said: Adapted) -> tuple[Adapted, ...]:

@@ -10,12 +10,10 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.control.buffered import BufferedRows
 from dynssm_ros.control.horizon_model import INPUTS, MOVING, STATES, SteppedCar
 from dynssm_ros.control.nmpc import Adapted, Plan
-from dynssm_ros.runtime.contract import WindowModel, WindowPrediction
+from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.learner import OnlineLearner
-from dynssm_ros.runtime.online import Seen
 from dynssm_ros.runtime.onnx_model import OnnxModel
-from dynssm_ros.runtime.rollout import corrected
-from dynssm_ros.signals.history import Refusal
+from dynssm_ros.runtime.rollout import RolloutCorrection
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle, step
 
@@ -93,9 +91,9 @@ class Adaptive:
         if not self._is_own:
             own = vehicle
         self.name = model.name
-        self._online: _Online | None = None
+        self._learner: OnlineLearner | None = None
         if isinstance(model, OnnxModel) and model.online is not None:
-            self._online = _Online(OnlineLearner(model, model.online, judges=False))
+            self._learner = OnlineLearner(model, model.online, judges=False)
         self.H = model.H
         stepping = (card.integrator, card.substeps) if card is not None and self._is_own else ()
         self.car = SteppedCar.of(own, *stepping)
@@ -118,14 +116,14 @@ class Adaptive:
 
     def learn(self, rows: Vector) -> None:
         """See :class:`PredictionModel`."""
-        if self._online is not None and len(rows) >= self.H:
-            window = self._read_by(rows[None, -self.H :])
-            self._online.learn(window[0], self._model.predict(window))
+        if self._learner is not None and len(rows) >= self.H:
+            window = self._read_by(rows[None, -self.H :]).copy()
+            self._learner.learn(window[0], self._model.predict(window))
 
     def interrupt(self) -> None:
         """See :class:`PredictionModel`."""
-        if self._online is not None:
-            self._online.interrupt()
+        if self._learner is not None:
+            self._learner.interrupt()
 
     def _read_by(self, windows: Vector) -> Vector:
         """Windows as the model was trained on them."""
@@ -138,8 +136,10 @@ class Adaptive:
     def _of(self, windows: Vector) -> Adapted:
         """What the model says of windows ``(n, H, 7)``."""
         said = self._model.predict(windows)
-        if self._online is not None:
-            said = self._online.corrected(said, windows)
+        if self._learner is not None:
+            assert said.seen is not None
+            known = self._learner.learned(said.seen).at(np.zeros(len(windows), dtype=np.intp))
+            said = RolloutCorrection(self._learner.layer, known).corrected(said, windows)._replace(physics=None)
         theta = self.calibrated.theta if said.theta is None else said.theta
         if self._is_own and said.physics is not None:
             physics = said.physics
@@ -151,31 +151,6 @@ class Adaptive:
         if len(windows) == 1:
             return Adapted(np.atleast_2d(theta)[0], correction[0])
         return Adapted(theta, correction)
-
-
-class _Online:
-    """The online layer of a model that is read once per T_s."""
-
-    def __init__(self, learner: OnlineLearner) -> None:
-        self._learner = learner
-        self._period = round(learner.layer.T_s * 1e9)
-        self._stamp = 0
-
-    def learn(self, window: Vector, predicted: WindowPrediction) -> None:
-        """Takes the next window ``(H, 7)``, and what the model predicts from it."""
-        self._stamp += self._period
-        self._learner.corrected(self._stamp, window.copy(), predicted, lambda stamp: Refusal.FILLING)
-
-    def interrupt(self) -> None:
-        """The next window does not follow on the last one."""
-        self._stamp += 2 * self._period
-
-    def corrected(self, said: WindowPrediction, windows: Vector) -> WindowPrediction:
-        """A prediction from windows ``(N, H, 7)`` with what was learned so far; its physics is left out."""
-        assert said.seen is not None
-        learner, first = self._learner, np.zeros(len(windows), dtype=np.intp)
-        known = learner.learned(Seen(said.seen.features[:1], said.seen.physics[:1])).at(first)
-        return corrected(said, windows, learner.layer, known)._replace(physics=None)
 
 
 def stepped(car: SteppedCar, rows: Vector, theta: Vector) -> Vector:

@@ -14,8 +14,8 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.runtime.contract import WindowModel, WindowPrediction, seen_by
 from dynssm_ros.runtime.online import Along, Learned
-from dynssm_ros.runtime.path_judge import PathJudge, trusted_along
-from dynssm_ros.runtime.rollout import corrected
+from dynssm_ros.runtime.path_judge import PathJudge
+from dynssm_ros.runtime.rollout import RolloutCorrection
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
@@ -33,6 +33,7 @@ def predict_rows(
     model: WindowModel,
     recording: Recording,
     rows: Indices,
+    *,
     batch: int = BATCH,
     tick: Tick = silent,
     drive: DriveThrough | None = None,
@@ -52,7 +53,7 @@ def predict_rows(
         windows = recording.windows(chunk, model.H)
         predicted = model.predict(windows)
         if model.online is not None and drive is not None:
-            predicted = corrected(predicted, windows, model.online, drive.at(chunk))
+            predicted = RolloutCorrection(model.online, drive.at(chunk)).corrected(predicted, windows)
         yield predicted._replace(seen=None)
         tick(len(chunk))
 
@@ -90,7 +91,7 @@ def drive_through(
     if layer is None or len(ends := recording.window_ends(H, 0, layer.minimum_speed)) == 0:
         yield None, list(asked)
         return
-    along, judge, last = Along(layer), PathJudge(layer), None
+    along, judge = Along(layer), PathJudge(layer, partial(seen_by, model))
     blocks = [(np.searchsorted(ends, rows, side="right") - 1).clip(0) // batch for rows in asked]
     for start in range(0, len(ends), batch):
         chunk = ends[start : start + batch]
@@ -98,8 +99,7 @@ def drive_through(
         seen, rows = seen_by(model, windows), windows[:, -1]
         following = recording.states(np.minimum(chunk + 1, len(recording) - 1))
         learned = along.over(seen, rows, following - rows[:, :3], chunk)
-        trusted = trusted_along(judge, windows, chunk, learned, seen, partial(seen_by, model), last)
-        last = int(chunk[-1])
+        trusted = judge.along(windows, chunk, learned, seen)
         own = [rows[block == start // batch] for rows, block in zip(asked, blocks, strict=True)]
         yield DriveThrough(chunk, learned._replace(trusted=trusted)), own
 

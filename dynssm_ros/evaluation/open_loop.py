@@ -250,10 +250,12 @@ class _On:
         with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
             predicted, rollouts, knowledge = _OneStep(model.vehicle, measured, _coefficients_every(rows)), [], []
             for drive, (ends, starts, drawn) in drive_through(model, recording, (rows, self.starts, self.drawn), batch):
-                for prediction in predict_rows(model, recording, ends, batch, tick, drive):
+                for prediction in predict_rows(model, recording, ends, batch=batch, tick=tick, drive=drive):
                     predicted.add(prediction)
                 if len(starts):
-                    rollouts.append(score_rollouts(model, recording, starts, self.steps, batch, tick, drive))
+                    rollouts.append(
+                        score_rollouts(model, recording, starts, self.steps, batch=batch, tick=tick, drive=drive)
+                    )
                 if drive is not None:
                     knowledge.append(drive.at(drawn))
             errors = predicted.state - measured

@@ -19,7 +19,7 @@ from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.metrics import BATCH, DriveThrough, Tick, silent
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.online import Learned
-from dynssm_ros.runtime.rollout import corrected
+from dynssm_ros.runtime.rollout import RolloutCorrection, path_errors, roll_out, step_of
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle.kinematics import path
 
@@ -64,31 +64,24 @@ class Rollout:
         return cls(parts[0].T_s, sum(part.starts for part in parts), np.sqrt(square), displacement)
 
 
-def roll_out(model: WindowModel, stretches: Vector, steps: int, learned: Learned | None = None) -> Vector:
-    """Predicts ``steps`` states recursively.
+def predicted_states(
+    model: WindowModel, recording: Recording, starts: Indices, steps: int, learned: Learned | None = None
+) -> tuple[Vector, Vector]:
+    """States of rollouts, and those that were measured.
 
     Args:
         model: reads windows of ``model.H`` rows.
-        stretches: measured rows, shape ``(M, B + steps, 7)``; row ``B - 1`` is the start, ``B >= model.H``. The last
-            row's state is not used.
+        recording: measured rows.
+        starts: last measured row of each rollout, shape ``(M,)``.
         steps: length of the horizon.
         learned: what the model's online layer had learned at the starts, and keeps over the horizon.
 
     Returns:
-        Predicted states of the rows after the start, shape ``(M, steps, 3)``.
+        Predicted and measured states after the starts, each of shape ``(M, steps, 3)``.
     """
-    fed_back, mean_error = stretches.copy(), None
-    start = stretches.shape[1] - steps
-    for k in range(start, start + steps):
-        windows = fed_back[:, k - model.H : k]
-        predicted = model.predict(windows)
-        if model.online is not None and learned is not None:
-            predicted = corrected(predicted, windows, model.online, learned, mean_error, k - start)
-            if mean_error is None:
-                assert predicted.seen is not None
-                mean_error = model.online.mean_error(predicted.seen.features)
-        fed_back[:, k, :3] = predicted.state
-    return fed_back[:, start:, :3]
+    stretches, layer = recording.windows(starts, model.H, steps), model.online
+    correction = None if layer is None or learned is None else RolloutCorrection(layer, learned)
+    return roll_out(step_of(model, correction), stretches, model.H), stretches[:, model.H :, :3]
 
 
 def branches(
@@ -107,7 +100,7 @@ def branches(
         Positions ``x, y`` (m) from the start of each branch to its end, shape ``(M, steps + 1, 2)``, in the frame of
         :func:`path` for the measured velocities from ``starts[0]`` on.
     """
-    predicted = roll_out(model, recording.windows(starts, model.H, steps), steps, learned)
+    predicted, _ = predicted_states(model, recording, starts, steps, learned)
     driven = (
         path(np.concatenate([recording.states(slice(starts[0], start + 1)), states]), recording.T_s)
         for start, states in zip(starts, predicted, strict=True)
@@ -120,6 +113,7 @@ def score_rollouts(
     recording: Recording,
     starts: Indices,
     steps: int,
+    *,
     batch: int = BATCH,
     tick: Tick = silent,
     drive: DriveThrough | None = None,
@@ -138,11 +132,9 @@ def score_rollouts(
     squares, distances, T_s = np.zeros((steps, 3)), np.zeros(steps), recording.T_s
     for begin in range(0, len(starts), batch):
         chunk = starts[begin : begin + batch]
-        stretches = recording.windows(chunk, model.H, steps)
         known = None if drive is None else drive.at(chunk)
-        measured = stretches[:, model.H - 1 :, :3]
-        predicted = np.concatenate([measured[:, :1], roll_out(model, stretches, steps, known)], axis=1)
-        squares += np.sum((predicted - measured)[:, 1:] ** 2, axis=0)
-        distances += np.linalg.norm(path(predicted, T_s) - path(measured, T_s), axis=-1).sum(axis=0)
+        predicted, measured = predicted_states(model, recording, chunk, steps, known)
+        squares += np.sum((predicted - measured) ** 2, axis=0)
+        distances += path_errors(recording.states(chunk)[:, None], predicted, measured, T_s).sum(axis=0)
         tick(len(chunk) * steps)
     return Rollout(T_s, len(starts), np.sqrt(squares / len(starts)), distances / len(starts))

@@ -6,6 +6,7 @@ was fitted without it: one step ahead, and the path over the horizon of a contro
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +18,10 @@ from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.online import FittedLayer, LayerDrive, LeftOut, OnlineFeatures, fit_layer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.online import OnlineLayer, Seen
+from dynssm_ros.runtime.rollout import RolloutCorrection, path_errors, roll_out
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
-from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S, path
+from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
 NETWORK_GAIN_WANTED = 0.03
 """A network that takes away less of the online layer's error is left out of it. On the development cells of
@@ -103,33 +105,32 @@ def _errors(base: LayerBase, features: OnlineFeatures, fitted: FittedLayer, part
 def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording, base: LayerBase) -> LayerDrive:
     """What the layer sees of the windows of a recording, with what ``model`` predicts from them."""
     ends = recording.window_ends(base.H, min_speed=base.vehicle.minimum_speed)
-
-    @torch.no_grad()
-    def see(block: slice) -> Seen:
-        window = torch.tensor(recording.windows(ends[block], base.H), dtype=torch.float32)
-        return Seen(*(each.double().numpy() for each in features(window, model.eval()(window))))
-
-    return LayerDrive(see, recording, ends, np.searchsorted(ends, base.starts(recording)))
+    see = partial(_seen, features, model.eval())
+    starts = np.searchsorted(ends, base.starts(recording))
+    return LayerDrive(lambda block: see(recording.windows(ends[block], base.H)), recording, ends, starts)
 
 
 @torch.no_grad()
+def _seen(features: OnlineFeatures, model: TrainableModel, windows: Vector) -> Seen:
+    """What the layer sees of windows ``(N, H, 7)``."""
+    window = torch.tensor(windows, dtype=torch.float32)
+    return Seen(*(each.double().numpy() for each in features(window, model(window))))
+
+
 def _path_error(
     base: LayerBase, features: OnlineFeatures, left_out: LeftOut, model: TrainableModel, recording: Recording
 ) -> Vector:
     """Mean distance (m) of predicted from measured paths, for each of some starts; NaN for what diverges."""
-    (layer, _, known), steps, starts = left_out, base.path_steps, base.starts(recording)
+    H, steps, starts = base.H, base.path_steps, base.starts(recording)
     if len(starts) == 0:
         return np.empty(0)
-    rows = recording.windows(starts, base.H, steps)
-    rolled, mean_error = rows.copy(), None
-    for k in range(steps):
-        window = torch.tensor(rolled[:, k : k + base.H], dtype=torch.float32)
-        seen = Seen(*(each.double().numpy() for each in features(window, model(window))))
-        if mean_error is None:
-            mean_error, moved = layer.mean_error(seen.features), layer.increments(seen.features, known.weights)
-        else:
-            moved = layer.in_rollout(seen, known, mean_error, k)
-        rolled[:, k + base.H, :3] = rolled[:, k + base.H - 1, :3] + moved
-    driven, measured = (path(each[:, base.H - 1 :, :3], layer.T_s) for each in (rolled, rows))
-    distance: Vector = np.linalg.norm(driven - measured, axis=-1).mean(axis=1)
+    rows, correction = recording.windows(starts, H, steps), RolloutCorrection(left_out.layer, left_out.known)
+
+    def step(windows: Vector) -> Vector:
+        moved = correction.increments(_seen(features, model, windows))
+        following: Vector = windows[:, -1, :3] + moved
+        return following
+
+    errors = path_errors(rows[:, H - 1 : H, :3], roll_out(step, rows, H), rows[:, H:, :3], left_out.layer.T_s)
+    distance: Vector = errors.mean(axis=1)
     return distance

@@ -36,7 +36,6 @@ from dynssm_ros.nodes.support import (
 )
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.health import Health
-from dynssm_ros.runtime.online import expert_weights
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.wiring import Wiring
@@ -169,11 +168,10 @@ class PredictorNode(ManagedNode):
         queued = self._health.queued(self._names[decoder.topic])
         self._health.predicted(time.monotonic() - now, outcome.residual_share, queued)
         self._predictor.finish()
-        self._wiring.add(stamp, self._predictor.history.current[-1])
+        self._wiring.add(stamp, self._predictor.row)
 
     def _set_wiring(self) -> None:
-        model = self._predictor.model
-        self._wiring = Wiring(model.artifact.card.vehicle, model.T_s)
+        self._wiring = Wiring(self._predictor.vehicle, self._predictor.model.T_s)
 
     def _publish(self, prediction: Prediction, message: Any) -> None:
         odometry = self._prediction
@@ -197,8 +195,7 @@ class PredictorNode(ManagedNode):
             ahead = self._predictor.horizon(prediction, max(1, round(self._horizon / self._predictor.model.T_s)))
             self._publish_horizon(self._path(prediction, ahead))
         if prediction.pose is not None and self._markers is not None:
-            car = self._predictor.model.artifact.card.vehicle
-            self._markers.draw(odometry.header, car, prediction.pose, ahead)
+            self._markers.draw(odometry.header, self._predictor.vehicle, prediction.pose, ahead)
         if prediction.pose is not None and self._send_frame is not None:
             self._send_frame(odometry)
 
@@ -258,16 +255,9 @@ class PredictorNode(ManagedNode):
         level, words = self._health.verdict(now)
         if not self.active:
             words = f"inactive, publishes nothing: {words}"
-        values = {"model": self._predictor.model.name, "model folder": str(self._predictor.model.artifact.path)}
-        vehicle = self._predictor.model.artifact.card.vehicle.name
-        values["implausible"] = self._predictor.plausibility.last
-        if (state := self._predictor.online) is not None:
-            values["online steps"] = str(state.steps)
-            experts = expert_weights(state.layer, state.mean)
-            values |= {f"online weight of the {name}": f"{weight:.3f}" for name, weight in experts.items()}
-        self._publish_diagnostics(
-            diagnostics(self, "prediction", vehicle, level, words, values | self._health.values(now))
-        )
+        values = self._predictor.figures() | self._health.values(now)
+        vehicle = self._predictor.vehicle.name
+        self._publish_diagnostics(diagnostics(self, "prediction", vehicle, level, words, values))
 
 
 def main(args: list[str] | None = None) -> None:

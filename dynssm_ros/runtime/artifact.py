@@ -114,7 +114,9 @@ class Artifact:
         if card.online is None:
             return None
         scale = np.array(card.normalisation.increment_scale)
-        return load_layer(self.path / ONLINE, card.online, scale, card.vehicle, card.integrator, card.substeps)
+        return load_layer(
+            self.path / ONLINE, card.online, scale, card.vehicle, integrator=card.integrator, substeps=card.substeps
+        )
 
 
 def open_artifact(path: str | Path) -> Artifact:

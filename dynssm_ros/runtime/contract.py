@@ -29,7 +29,7 @@ class WindowPrediction(NamedTuple):
     def part(self, chosen: slice) -> WindowPrediction:
         """What it says of some of the windows."""
         theta, physics, variance = (None if array is None else array[chosen] for array in self[1:4])
-        seen = None if self.seen is None else Seen(*(array[chosen] for array in self.seen))
+        seen = None if self.seen is None else self.seen.at(chosen)
         return WindowPrediction(self.state[chosen], theta, physics, variance, seen)
 
 

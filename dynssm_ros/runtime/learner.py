@@ -1,4 +1,4 @@
-"""What a predictor learns online: each step of T_s once, whatever the rate of its odometry."""
+"""What an online layer learns from a drive, row after row, each one T_s after the last."""
 
 from __future__ import annotations
 
@@ -12,18 +12,16 @@ from dynssm_ros.runtime.contract import WindowPrediction, seen_by
 from dynssm_ros.runtime.online import CHANNELS, Learned, OnlineLayer, OnlineState, Seen
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.path_judge import PathJudge
-from dynssm_ros.runtime.rollout import corrected
-from dynssm_ros.signals.history import Refusal
+from dynssm_ros.runtime.rollout import RolloutCorrection
 
-Cut = Callable[[int], Vector | Refusal]
-"""From a stamp (ns) to the window ``(H, 7)`` that ends there, or why there is none."""
+Recut = Callable[[], Vector | None]
+"""The window ``(H, 7)`` of the last row as it is known now; ``None`` if it cannot be had any more."""
 
 
 class OnlineLearner:
     """The online layer of a model along a drive: what it has learned, and whether its paths are believed.
 
-    The grid is that of the odometry where its rate is 1 / T_s. Else rows between the messages are cut from the history.
-    Gaps and rows slower than the minimum speed teach nothing; after them the grid starts anew.
+    Rows slower than the minimum speed teach nothing.
 
     Args:
         model: predicts the windows.
@@ -35,47 +33,67 @@ class OnlineLearner:
         self.model = model
         self.layer = layer
         self.state: OnlineState = layer.start()
-        self.judge = PathJudge(layer)
+        self._judge = PathJudge(layer, self._see)
         self._judges = judges
-        self._period = round(layer.T_s * 1e9)
-        self._row: _Row | None = None
-        self._known: Learned | None = None
-        self._mean_error: Vector | None = None
+        self._last: _Row | None = None
         self._unjudged: tuple[Vector, Seen, Learned] | None = None
+        self._correction: RolloutCorrection | None = None
 
     def continued_with(self, model: OnnxModel) -> OnlineLearner:
-        """The learner of ``model``, which has the same prior: what was learned is kept, and the grid starts anew."""
+        """The learner of ``model``, which has the same prior: what was learned is kept."""
         self.judge_paths()
-        self.model, self._row = model, None
+        self.model, self._last = model, None
         return self
 
     def reset(self) -> None:
         """Forgets the drive."""
         self.state.reset()
-        self.judge.reset()
-        self._row = self._unjudged = None
+        self._judge.reset()
+        self._last = self._unjudged = None
 
-    def corrected(self, stamp: int, window: Vector, predicted: WindowPrediction, cut: Cut) -> WindowPrediction:
-        """Learns up to the row at ``stamp`` (ns), and corrects what the model predicts from it.
+    def interrupt(self) -> None:
+        """The next row is not one T_s after the last one."""
+        self._last = None
+
+    def learn(self, window: Vector, predicted: WindowPrediction, recut: Recut | None = None) -> bool:
+        """Learns the step from the last row to the next.
 
         Args:
-            stamp: of the window's last row.
-            window: ``(H, 7)``.
+            window: that ends with the next row, ``(H, 7)``.
             predicted: by the model, from ``window``.
-            cut: gives the windows of other rows. They may use the memory of ``window``.
+            recut: gives the last row with inputs that came after its odometry; till then the last ones were held.
+
+        Returns:
+            Whether the row after it can be learned: the car was not too slow.
         """
         assert predicted.seen is not None
-        self._learn(stamp, window, predicted, _beside(window, cut))
-        self._known = self.learned(predicted.seen)
-        self._mean_error = self.layer.mean_error(predicted.seen.features)
-        return corrected(predicted, window[None], self.layer, self._known)
+        last, self._last = self._last, None
+        fast = self._is_fast(window)
+        if last is None or not fast:
+            self.state.interrupt()
+            self.judge_paths()
+            self._judge.interrupt()
+        else:
+            last = self._completed(last, window[-2], recut)
+            self.state.update(last.seen, last.values, window[-1, :CHANNELS] - window[-2, :CHANNELS])
+        if fast:
+            self._last = _Row.of(window, predicted)
+            if self._judges:
+                self.judge_paths()
+                self._unjudged = window, predicted.seen, self.learned(predicted.seen)
+        return fast
 
-    def in_rollout(self, window: Vector, predicted: WindowPrediction, step: int) -> WindowPrediction:
-        """Corrects what the model predicts ``step`` steps into a rollout from the row that was corrected last."""
-        assert self._known is not None
+    def corrected(self, window: Vector, predicted: WindowPrediction) -> WindowPrediction:
+        """What the model predicts from ``window`` ``(H, 7)``, corrected by what was learned; rollouts go on from there."""
+        assert predicted.seen is not None
+        self._correction = RolloutCorrection(self.layer, self.learned(predicted.seen))
+        return self._correction.corrected(predicted, window[None])
+
+    def rollout(self) -> RolloutCorrection:
+        """Corrects the steps after the prediction that was :meth:`corrected` last."""
+        assert self._correction is not None
         self.judge_paths()
-        known = self._known._replace(trusted=np.array([float(self.judge.trusted)]))
-        return corrected(predicted, window[None], self.layer, known, self._mean_error, step)
+        return self._correction.believed(self._judge.trusted)
 
     def judge_paths(self) -> None:
         """Takes the paths that are under way to the row that was learned last.
@@ -84,74 +102,8 @@ class OnlineLearner:
         before, once the prediction is out.
         """
         if self._unjudged is not None:
-            self.judge.step(*self._unjudged, lambda windows: seen_by(self.model, windows))
+            self._judge.step(*self._unjudged)
             self._unjudged = None
-
-    def _learn(self, stamp: int, window: Vector, predicted: WindowPrediction, cut: Cut) -> None:
-        slack = self._period // 100
-        row, self._row = self._row, None
-        while row is not None and row.stamp + self._period <= stamp + slack:
-            due = row.stamp + self._period
-            if due >= stamp - slack:
-                row = self._learned_row(row, stamp, window, predicted, cut)
-                break
-            earlier = cut(due)
-            if isinstance(earlier, Refusal):
-                row = None
-            else:
-                row = self._learned_row(row, due, earlier, self.model.predict(earlier[None]), cut)
-        self._row = row or self._first_row(stamp, window, predicted)
-
-    def _learned_row(
-        self, before: _Row, stamp: int, window: Vector, predicted: WindowPrediction, cut: Cut
-    ) -> _Row | None:
-        """Learns the step that ends with ``window``; returns its last row, ``None`` if the car was too slow there."""
-        row = self._row_of(stamp, window, predicted)
-        if row is not None:
-            before = self._completed(before, window[-2], cut)
-            self.state.update(before.seen, before.values, window[-1, :3] - window[-2, :3])
-            self._to_be_judged(window, predicted)
-        return row
-
-    def _completed(self, row: _Row, now: Vector, cut: Cut) -> _Row:
-        """``row`` with inputs that came after its odometry; till then the last ones before were held.
-
-        Args:
-            row: as it was when its odometry came.
-            now: about the same row, as it is known now, ``(7,)``.
-            cut: as of :meth:`corrected`.
-        """
-        if np.array_equal(now[CHANNELS:], row.values[CHANNELS:]):
-            return row
-        window = cut(row.stamp)
-        if isinstance(window, Refusal) or np.array_equal(window[-1], row.values):
-            return row
-        return self._row_of(row.stamp, window, self.model.predict(window[None])) or row
-
-    def _first_row(self, stamp: int, window: Vector, predicted: WindowPrediction) -> _Row | None:
-        """The first row of a grid, ``None`` if the car is too slow."""
-        self.state.interrupt()
-        self.judge_paths()
-        self.judge.interrupt()
-        row = self._row_of(stamp, window, predicted)
-        if row is not None:
-            self._to_be_judged(window, predicted)
-        return row
-
-    def _to_be_judged(self, window: Vector, predicted: WindowPrediction) -> None:
-        """Keeps a row for :meth:`judge_paths`."""
-        if not self._judges:
-            return
-        assert predicted.seen is not None
-        self.judge_paths()
-        self._unjudged = window.copy(), predicted.seen, self.learned(predicted.seen)
-
-    def _row_of(self, stamp: int, window: Vector, predicted: WindowPrediction) -> _Row | None:
-        """The last row of ``window``; ``None`` if the car was slower than the layer's minimum speed within it."""
-        if not window[:, 0].min() >= self.layer.minimum_speed:
-            return None
-        assert predicted.seen is not None
-        return _Row(stamp, Seen(predicted.seen.features[0], predicted.seen.physics[0]), window[-1].copy())
 
     def learned(self, seen: Seen) -> Learned:
         """What is known now, for a prediction from one window."""
@@ -161,27 +113,35 @@ class OnlineLearner:
             state.variance(seen.features[0])[None],
             state.limit[None],
             state.coefficients.theta[None],
-            np.array([float(self.judge.trusted)]),
+            np.array([float(self._judge.trusted)]),
         )
 
+    def _see(self, windows: Vector) -> Seen:
+        return seen_by(self.model, windows)
 
-def _beside(window: Vector, cut: Cut) -> Cut:
-    """``cut`` that leaves ``window`` as it is."""
+    def _is_fast(self, window: Vector) -> bool:
+        """Whether the car was as fast as the layer's minimum speed throughout; not if that is not known."""
+        return bool(window[:, 0].min() >= self.layer.minimum_speed)
 
-    def beside(stamp: int) -> Vector | Refusal:
-        kept = window.copy()
-        found = cut(stamp)
-        if not isinstance(found, Refusal):
-            found = found.copy()
-        window[...] = kept
-        return found
-
-    return beside
+    def _completed(self, row: _Row, now: Vector, recut: Recut | None) -> _Row:
+        """``row`` with its inputs as they are known now, ``now`` ``(7,)`` being about the same row."""
+        if recut is None or np.array_equal(now[CHANNELS:], row.values[CHANNELS:]):
+            return row
+        window = recut()
+        if window is None or np.array_equal(window[-1], row.values) or not self._is_fast(window):
+            return row
+        return _Row.of(window, self.model.predict(window[None]))
 
 
 class _Row(NamedTuple):
     """A row that the layer has yet to see the next one of."""
 
-    stamp: int
     seen: Seen
+    """Features ``(3, n)`` and physics ``(3,)``."""
     values: Vector
+
+    @classmethod
+    def of(cls, window: Vector, predicted: WindowPrediction) -> _Row:
+        """The last row of a window."""
+        assert predicted.seen is not None
+        return cls(Seen(predicted.seen.features[0], predicted.seen.physics[0]), window[-1])

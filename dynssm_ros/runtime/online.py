@@ -66,6 +66,10 @@ class Seen(NamedTuple):
     physics: Vector
     """Increments of the physics with nominal coefficients, ``(N, 3)`` (m/s, m/s, rad/s)."""
 
+    def at(self, rows: Indices | slice) -> Seen:
+        """What it sees of some of them."""
+        return Seen(self.features[rows], self.physics[rows])
+
 
 class Learned(NamedTuple):
     """What an :class:`OnlineState` knows at each of ``N`` rows: all that a prediction from there needs."""
@@ -332,7 +336,7 @@ def save_layer(layer: OnlineLayer, path: Path) -> None:
 
 
 def load_layer(
-    path: Path, card: OnlineLayerCard, scale: Vector, vehicle: Vehicle, integrator: Integrator, substeps: int
+    path: Path, card: OnlineLayerCard, scale: Vector, vehicle: Vehicle, *, integrator: Integrator, substeps: int
 ) -> OnlineLayer:
     """Reads what :func:`save_layer` wrote.
 

@@ -9,20 +9,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
+from dynssm_ros.runtime.contract import WindowPrediction
 from dynssm_ros.runtime.learner import OnlineLearner
-from dynssm_ros.runtime.online import OnlineState
+from dynssm_ros.runtime.online import OnlineState, expert_weights
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.plausibility import Plausibility
+from dynssm_ros.runtime.rollout import states_ahead, step_of
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import SignalMap
-from dynssm_ros.vehicle import State
+from dynssm_ros.vehicle import State, Vehicle
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose, advance_pose
 
 
@@ -65,9 +68,10 @@ class Predictor:
 
     def __init__(self, model: OnnxModel, signal_map: SignalMap, max_age: float = 0.2, online: bool = True) -> None:
         self.signal_map = live_signal_map(model, signal_map)
-        self.history = History(self.signal_map, model.T_s, model.H, max_age, held=model.card.held)
+        self._history = History(self.signal_map, model.T_s, model.H, max_age, held=model.card.held)
         self._learner: OnlineLearner | None = None
         self._learns = online
+        self._window = np.zeros((model.H, len(WINDOW_COLUMNS)))
         self._set_model(model)
 
     @property
@@ -87,7 +91,7 @@ class Predictor:
                 f"'{self.model.commands}'; restart it with this model"
             )
         rows = np.zeros((model.H, len(WINDOW_COLUMNS)))
-        recent = self.history.current[-model.H :]
+        recent = self._window[-model.H :]
         if np.all(np.isfinite(recent)):
             rows[-len(recent) :] = recent
             rows[: -len(recent)] = recent[0]
@@ -101,8 +105,32 @@ class Predictor:
         What was learned online is kept by a model with the same prior, and forgotten by another.
         """
         self.check_swap(model)
-        self.history.resize(model.T_s, model.H, model.card.held)
+        self._history.resize(model.T_s, model.H, model.card.held)
         self._set_model(model)
+
+    @property
+    def row(self) -> Vector:
+        """Last row of the window that was predicted from last, with the columns ``WINDOW_COLUMNS`` ``(7,)``."""
+        row: Vector = self._window[-1]
+        return row
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The car that the model is for."""
+        return self.model.vehicle
+
+    def figures(self) -> dict[str, str]:
+        """By name, for the diagnostics: the model, what was implausible last, what the online layer has learned."""
+        figures = {
+            "model": self.model.name,
+            "model folder": str(self.model.artifact.path),
+            "implausible": self._plausibility.last,
+        }
+        if (state := self.online) is not None:
+            figures["online steps"] = str(state.steps)
+            experts = expert_weights(state.layer, state.mean)
+            figures |= {f"online weight of the {name}": f"{weight:.3f}" for name, weight in experts.items()}
+        return figures
 
     def finish(self) -> None:
         """Does what can wait until the prediction is out; the next one or a horizon does it else."""
@@ -132,18 +160,20 @@ class Predictor:
             self._learner = learner.continued_with(model)
         else:
             self._learner = OnlineLearner(model, layer)
+        self._learned_at: int | None = None
         self.model = model
-        self.plausibility = Plausibility(model.artifact.card.vehicle)
-        self._scale = model.artifact.card.normalisation.increment_scale
+        self._plausibility = Plausibility(model.card.vehicle)
+        self._scale = model.card.normalisation.increment_scale
         self._period = round(model.T_s * 1e9)
 
     def observe(self, stamp: int, values: dict[str, float]) -> Refusal | None:
         """Takes the samples of one message; see :meth:`History.add`. What the car cannot have produced is refused."""
-        refusal = self.plausibility.check(stamp, values) or self.history.add(stamp, values)
+        refusal = self._plausibility.check(stamp, values) or self._history.add(stamp, values)
         if refusal is Refusal.JUMPED_BACK:
-            self.plausibility.forget()
+            self._plausibility.forget()
             if self._learner is not None:
                 self._learner.reset()
+                self._learned_at = None
         return refusal
 
     def predict(self, stamp: int, values: dict[str, float]) -> Prediction | Refusal:
@@ -153,12 +183,14 @@ class Predictor:
             return refusal
         if not _finite(values.values()):  # the pose, which is no part of the window
             return Refusal.NOT_FINITE
-        window = self.history.window(stamp)
+        window = self._history.window(stamp)
         if isinstance(window, Refusal):
             return window
+        self._window = window
         predicted = self.model.predict(window[None])
         if self._learner is not None:
-            predicted = self._learner.corrected(stamp, window, predicted, self.history.window)
+            self._learn(self._learner, stamp, window, predicted)
+            predicted = self._learner.corrected(window, predicted)
         state, theta, physics, variance = predicted[:4]
         now, following = window[-1, :3].tolist(), state[0].tolist()  # a few floats are faster than a small array
         if not (_finite(following) and _finite_row(theta) and _finite_row(variance)):
@@ -181,22 +213,44 @@ class Predictor:
         """
         if prediction.pose is None:
             return []
-        window = self.history.current.copy()
-        poses, state = [prediction.pose], prediction.state
-        for done in range(1, steps):
-            row = window[-1].copy()
-            row[:3], row[3:5], row[5:7] = state, row[3:5] + row[5:7], 0.0
-            window = np.concatenate([window[1:], row[None]])
-            predicted = self.model.predict(window[None])
-            if self._learner is not None:
-                predicted = self._learner.in_rollout(window, predicted, done)
-            following = predicted.state[0]
-            pose = advance_pose(SCALAR, poses[-1], State(*state.tolist()), State(*following.tolist()), self.model.T_s)
+        ahead = np.zeros((steps, len(WINDOW_COLUMNS)))
+        ahead[0, :3], ahead[:, 3:5] = prediction.state, self._window[-1, 3:5] + self._window[-1, 5:7]
+        rows = np.concatenate([self._window[1:], ahead])[None]
+        step = step_of(self.model, None if self._learner is None else self._learner.rollout())
+        poses, state = [prediction.pose], State(*prediction.state.tolist())
+        for (values,) in states_ahead(step, rows, self.model.H):
+            following = State(*values.tolist())
+            pose = advance_pose(SCALAR, poses[-1], state, following, self.model.T_s)
             if not _finite(pose):
                 break
             poses.append(pose)
             state = following
         return poses
+
+    def _learn(self, learner: OnlineLearner, stamp: int, window: Vector, predicted: WindowPrediction) -> None:
+        """Lets the learner follow the drive up to the ``window`` at ``stamp`` (ns), in rows T_s apart.
+
+        These are those of the odometry where its rate is 1 / T_s. Else rows between the messages are cut from the
+        history. After a gap and after rows that are too slow they start anew, with ``window``.
+        """
+        slack, last = self._period // 100, self._learned_at
+
+        def learns(row: Vector | Refusal, said: WindowPrediction | None = None) -> bool:
+            if isinstance(row, Refusal):
+                return False
+            return learner.learn(row, said or self.model.predict(row[None]), partial(self._recut, last))
+
+        while last is not None and (due := last + self._period) < stamp - slack:
+            last = due if learns(self._history.window(due)) else None
+        if last is None:
+            learner.interrupt()
+        if last is None or last + self._period <= stamp + slack:
+            last = stamp if learns(window, predicted) else None
+        self._learned_at = last
+
+    def _recut(self, stamp: int | None) -> Vector | None:
+        window = Refusal.FILLING if stamp is None else self._history.window(stamp)
+        return None if isinstance(window, Refusal) else window
 
     def _residual_share(self, now: list[float], following: list[float], physics: list[float]) -> float:
         residual = sum(abs(a - b) / s for a, b, s in zip(following, physics, self._scale, strict=True))

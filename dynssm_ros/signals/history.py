@@ -14,7 +14,7 @@ from math import isfinite
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.signals.inputs import model_inputs
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS, model_inputs
 from dynssm_ros.signals.signal_map import ROUNDING, STATE_SIGNALS, SignalMap
 
 
@@ -126,6 +126,7 @@ class History:
         T_s: float,
         H: int,
         max_age: float = 0.2,
+        *,
         jump: float = 0.5,
         held: Collection[str] = (),
     ) -> None:
@@ -150,7 +151,6 @@ class History:
         self._offsets = -np.arange(H - 1, -1, -1, dtype=np.float64) * (T_s * 1e9)
         self._span = H * T_s * 1e9 + self._max_age + self._max_gap
         self._slack = ROUNDING * T_s * 1e9
-        self._window = np.zeros((H, 7))
 
     def add(self, stamp: int, values: dict[str, float]) -> Refusal | None:
         """Takes the samples of one message.
@@ -221,8 +221,8 @@ class History:
     def window(self, stamp: int) -> Vector | Refusal:
         """The ``(H, 7)`` window in the order of ``WINDOW_COLUMNS`` whose last row is at ``stamp`` (ns).
 
-        The array is reused by the next call. Instead of a window, the reason is returned if a signal is missing, older
-        than ``max_age``, or does not reach back without a gap.
+        Instead of a window, the reason is returned if a signal is missing, older than ``max_age``, or does not reach
+        back without a gap.
         """
         if self._epoch is None:
             return Refusal.MISSING
@@ -242,14 +242,10 @@ class History:
             name: buffer.held(late) if name in self._held else buffer.interpolate(grid)
             for name, buffer in self._buffers.items()
         }
+        window = np.empty((len(grid), len(WINDOW_COLUMNS)))
         for column, values in enumerate((*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled))):
-            self._window[:, column] = values
-        return self._window
-
-    @property
-    def current(self) -> Vector:
-        """The window cut last, shape ``(H, 7)``; reused by the next."""
-        return self._window
+            window[:, column] = values
+        return window
 
     def ages(self, stamp: int) -> dict[str, float]:
         """Age of the newest sample of each signal at ``stamp`` (s); infinite where none was received."""

@@ -5,7 +5,7 @@ import pytest
 
 from dynssm_ros.runtime.coefficients import SPREAD
 from dynssm_ros.runtime.online import MEAN_ERROR, Learned, OnlineLayer, OnlineLayerCard, Seen
-from dynssm_ros.runtime.path_judge import PathJudge, trusted_along
+from dynssm_ros.runtime.path_judge import PathJudge
 from dynssm_ros.vehicle import load_vehicle
 
 H = 4
@@ -34,10 +34,10 @@ def learned(again, limit=np.inf):
 
 
 def judged(rows, known):
-    judge = PathJudge(layer())
+    judge = PathJudge(layer(), see)
     for k in range(H, len(rows) + 1):
         window = rows[k - H : k]
-        judge.step(window, see(window[None]), known, see)
+        judge.step(window, see(window[None]), known)
     return judge
 
 
@@ -52,26 +52,26 @@ def drive(n=400, swing=0.0, noise=0.0, seed=0):
 
 def test_a_layer_that_leads_astray_is_not_believed():
     judge = judged(drive(noise=0.01), learned(1.4))
-    assert judge.paths == (400 - H) // judge.steps
-    assert judge.advantage < -1.0
+    assert judge.comparison.paths == (400 - H) // judge.steps
+    assert judge.comparison.advantage < -1.0
     assert not judge.trusted
 
 
 def test_a_layer_that_knows_better_is_believed():
     judge = judged(drive(swing=1.0), learned(0.98))
-    assert judge.advantage > 0.1
+    assert judge.comparison.advantage > 0.1
     assert judge.trusted
 
 
 def test_without_evidence_it_is_believed_and_trust_comes_back():
-    judge = PathJudge(layer())
+    judge = PathJudge(layer(), see)
     assert judge.trusted
     known = (learned(1.4), learned(0.98))
     rows = np.concatenate([drive(200, noise=0.01), drive(3000, swing=1.0)])
     believed = []
     for k in range(H, len(rows) + 1):
         window = rows[k - H : k]
-        judge.step(window, see(window[None]), known[k > 200], see)
+        judge.step(window, see(window[None]), known[k > 200])
         believed.append(judge.trusted)
     assert not all(believed[:200])
     assert believed[-1]
@@ -80,18 +80,18 @@ def test_without_evidence_it_is_believed_and_trust_comes_back():
 def test_what_diverges_counts_as_far_and_not_as_nan():
     with np.errstate(all="ignore"):
         judge = judged(drive(noise=0.01), learned(1e3))
-    assert np.isfinite(judge.advantage)
+    assert np.isfinite(judge.comparison.advantage)
     assert not judge.trusted
 
 
 def test_a_gap_drops_the_paths_under_way():
     judge = judged(drive(H + 10, swing=1.0), learned(0.98))
-    assert judge.paths == 0
+    assert judge.comparison.paths == 0
     judge.interrupt()
     rows = drive(H + judge.steps - 1, swing=1.0)
     for k in range(H, len(rows) + 1):
-        judge.step(rows[k - H : k], see(rows[None, k - H : k]), learned(0.98), see)
-    assert judge.paths == 0
+        judge.step(rows[k - H : k], see(rows[None, k - H : k]), learned(0.98))
+    assert judge.comparison.paths == 0
     judge.reset()
     assert judge.trusted
 
@@ -104,6 +104,6 @@ def test_along_a_recording_it_is_what_it_is_live(gap):
         ends = np.delete(ends, 100)
     windows = np.stack([rows[k - H + 1 : k + 1] for k in ends])
     whole = Learned(*(np.repeat(part, len(ends), axis=0) for part in known))
-    along = trusted_along(PathJudge(layer()), windows, ends, whole, see(windows), see)
+    along = PathJudge(layer(), see).along(windows, ends, whole, see(windows))
     assert along[0] == 1.0
     assert along[-1] == 0.0

@@ -100,9 +100,8 @@ def test_samples_on_the_grid_give_what_the_model_says_of_the_recordings_windows(
 
 def test_the_prediction_is_the_models_for_the_window_one_sampling_time_ahead(drive: Drive) -> None:
     outcome = drive.fill()
-    window = drive.predictor.history.current
-    np.testing.assert_allclose(window[:, 0], 1.0)
-    np.testing.assert_allclose(window[:, 4], 0.05)
+    window = np.tile(drive.predictor.row, (H, 1))  # of a steady drive
+    np.testing.assert_allclose(window[-1, [0, 4]], [1.0, 0.05])
     alone, among_others = (drive.predictor.model.predict(np.stack([window] * count)) for count in (1, 3))
     np.testing.assert_array_equal(outcome.state, alone.state[0])
     np.testing.assert_allclose(alone.state[0], among_others.state[1], rtol=0, atol=1e-6)
@@ -284,7 +283,7 @@ def test_over_the_horizon_the_actuators_stay_at_the_last_command(drive: Drive, s
         expected = np.tile([1.0, 0.0, 0.1, 0.5, -0.1, 0.0, 0.0], (k + 1, 1))
         np.testing.assert_allclose(asked[0, H - 1 - k :], expected, atol=1e-12)
         np.testing.assert_allclose(asked[0, H - 2 - k], [1.0, 0.0, 0.1, 0.2, 0.05, 0.3, -0.15], atol=1e-12)
-    np.testing.assert_allclose(drive.predictor.history.current[-1, 5:], [0.3, -0.15])  # not changed by the rollout
+    np.testing.assert_allclose(drive.predictor.row[5:], [0.3, -0.15])  # not changed by the rollout
 
 
 def test_without_a_pose_there_is_no_horizon(drive: Drive) -> None:
@@ -336,7 +335,7 @@ def test_implausible_samples_yield_no_prediction_and_cost_no_window(drive: Drive
         stamp = drive.stamp + 1
         state = {"v_x": 2.0, "v_y": 0.0, "omega": 0.0, "x": 0.0, "y": 0.0, "theta": 0.0} | {name: value}
         assert drive.predictor.predict(stamp, state) is Refusal.IMPLAUSIBLE
-        assert name in drive.predictor.plausibility.last
+        assert name in drive.predictor.figures()["implausible"]
     assert isinstance(drive.step(), Prediction)
 
 

@@ -170,7 +170,7 @@ def test_any_sequence_of_messages_is_answered_as_by_a_plain_list(
     sequence: list[tuple[float, dict[str, float]]],
 ) -> None:
     plain = PlainHistory(0.02, 4)
-    history = History(NO_COMMANDS, 0.02, 4, MAX_AGE, JUMP_BACK, plain.held)
+    history = History(NO_COMMANDS, 0.02, 4, MAX_AGE, jump=JUMP_BACK, held=plain.held)
     stamp = START
     for move, taken in sequence:
         stamp += round(move * SECOND)
@@ -336,7 +336,7 @@ def test_commands_and_brakes_are_merged_as_in_the_extractor() -> None:
     assert not isinstance(window, Refusal)
     expected = {"v_x": 1, "v_y": -1, "omega": 2, "r_fb": 0.3, "delta_fb": -0.3, "r_cmd": 0.2, "delta_cmd": 0.4}
     np.testing.assert_allclose(window, [[expected[column] for column in WINDOW_COLUMNS]] * 3, atol=1e-12)
-    assert history.current is window
+    assert history.window(stamp) is not window
 
 
 # --- bad data -----------------------------------------------------------------------------------
