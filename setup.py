@@ -42,7 +42,7 @@ EXTRAS = {
 
 setup(
     name=NAME,
-    version="0.3.0",
+    version="0.4.0",
     description="Vehicle dynamics for autonomous racing: learned from rosbags, deployed on ROS 2, explained.",
     maintainer="dynssm_ros developers",
     maintainer_email="maintainers@dynssm-ros.invalid",

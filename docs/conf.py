@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 project = "dynssm_ros"
 author = "dynssm_ros developers"
 copyright = "2026, dynssm_ros developers"
-release = "0.3.0"
+release = "0.4.0"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_heading_anchors = 3
 html_theme = "furo"

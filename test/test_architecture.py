@@ -37,8 +37,8 @@ GROUND = {
 TOP = {"__init__", "api"}  # the Python API: over all rooms but those that call it
 
 ROS = {
-    "ament_index_python", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "launch", "launch_ros", "nav_msgs",
-    "rcl_interfaces", "rclpy", "rosgraph_msgs", "rosidl_runtime_py", "sensor_msgs", "std_msgs",
+    "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "launch", "launch_ros", "nav_msgs",
+    "rcl_interfaces", "rclpy", "rosgraph_msgs", "sensor_msgs", "std_msgs",
 }  # fmt: skip
 OWNERS = {
     "torch": {"learning"}, "lightning_fabric": {"learning"}, "casadi": {"control"}, "matplotlib": {"reporting"},
