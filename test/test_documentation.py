@@ -32,7 +32,10 @@ from dynssm_ros.vehicle.effects import EFFECTS
 
 Declared = Callable[[str], dict[str, object]]
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = {path.name: path.read_text(encoding="utf-8") for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]}
+PAGES = {path.name: path.read_text(encoding="utf-8") for path in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]}
+FOLDERS = {path.name: path.parent for path in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]}
+USER_PAGES = {name: text for name, text in PAGES.items() if FOLDERS[name].name in ("start", "use", "understand")}
+WORDS, WORDS_OF_A_PAGE = 16_000, 1_600  # of docs/, and of a page of it
 RESULTS_FOLDER = ROOT / "benchmarks" / "results"  # in the words of the version that measured
 RESULTS = {path.name: path.read_text(encoding="utf-8") for path in RESULTS_FOLDER.glob("*.md")}
 README = PAGES["README.md"]
@@ -121,8 +124,7 @@ def test_every_node_parameter_in_a_code_block_is_declared(declared_parameters: D
 
 def test_links_lead_somewhere() -> None:
     for page, text in PAGES.items():
-        folder = ROOT if (ROOT / page).is_file() else ROOT / "docs"
-        assert_links_lead_somewhere(page, text, folder)
+        assert_links_lead_somewhere(page, text, FOLDERS[page])
     for page, text in RESULTS.items():
         assert_links_lead_somewhere(page, text, RESULTS_FOLDER)
 
@@ -138,14 +140,41 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
         [*command, str(ROOT / "docs"), str(tmp_path / "site")], capture_output=True, text=True, check=False
     )
     assert built.returncode == 0, built.stderr
-    pages = {path.name for path in (tmp_path / "site").glob("*.html")}
-    assert pages >= {name.replace(".md", ".html") for name in PAGES if (ROOT / "docs" / name).is_file()}
+    pages = {path.name for path in (tmp_path / "site").rglob("*.html")}
+    assert pages >= {name.replace(".md", ".html") for name in PAGES if FOLDERS[name] != ROOT}
 
 
 def test_the_readme_is_short_and_shows_a_picture() -> None:
-    assert len(README.splitlines()) <= 120
-    assert re.search(r"!\[.+\]\(docs/.+\)", README)
+    assert len(README.splitlines()) <= 90
+    assert re.search(r"!\[.+\]\(docs/.+\.png\)", README)
 
+
+def test_pages_for_users_are_short_and_begin_with_what_the_reader_can_do() -> None:
+    count = {name: len(text.split()) for name, text in PAGES.items() if FOLDERS[name] != ROOT}
+    assert sum(count.values()) <= WORDS
+    assert max(count.values()) <= WORDS_OF_A_PAGE, count
+    for name, text in USER_PAGES.items():
+        assert re.match(r"# .+\n\nAfter this page ", text), name
+
+
+def test_figures_that_pages_state_are_those_of_the_code() -> None:
+    shipped = {kind: len(list((ROOT / "config" / kind).glob("*.yaml"))) for kind in ("vehicles", "models", "signals")}
+    true = {"effects": len(EFFECTS), "commands": len(options()), "shipped vehicles": shipped["vehicles"],
+            "shipped models": shipped["models"], "shipped signal maps": shipped["signals"]}  # fmt: skip
+    for name, text in PAGES.items():
+        for number, what in re.findall(r"\b(\d+) (effects|commands|shipped \w+(?: maps)?)\b", text):
+            assert int(number) == true[what], f"{name}: {number} {what}"
+    assert f"{len(EFFECTS)} effects" in PAGES["how_it_works.md"]
+    minutes = [name for name, text in PAGES.items() if re.search(r"make test\b.*minutes", text)]
+    assert minutes == ["CONTRIBUTING.md"]  # said once
+
+
+def test_every_key_of_results_that_a_page_names_is_written() -> None:
+    source = " ".join(path.read_text(encoding="utf-8") for path in (ROOT / "dynssm_ros").rglob("*.py"))
+    named = [key for row in table("key in `results.json`", PAGES["diagnose.md"]) for key in re.findall(r"\w+", row)]
+    assert len(named) > 8
+    for key in named:
+        assert f'"{key}":' in source, key
 
 def test_python_in_the_pages_compiles_and_imports_what_there_is() -> None:
     blocks = [(page, block) for page, text in PAGES.items() for block in re.findall(r"```python\n(.*?)```", text, re.S)]
@@ -230,7 +259,7 @@ def test_every_verdict_is_explained_and_every_explained_one_exists() -> None:
 def test_the_switches_that_pages_name_are_fields_of_model_files() -> None:
     fields = load_model_config("dynssm_paper_av21").model_dump()
     fields |= {name: block for name, block in load_model_config("dynssm").model_dump().items() if block is not None}
-    named = [*table("block", PAGES["tuning.md"]), *(row[0] for row in table("deviation", PAGES["paper.md"]).values())]
+    named = [*table("block", PAGES["models.md"]), *(row[0] for row in table("deviation", PAGES["paper.md"]).values())]
     assert len(named) > 10
     for name in re.findall(r"[a-z_]+(?:\.[a-z_]+)?", " ".join(re.sub(r": \w+", "", each) for each in named)):
         block, _, field = name.partition(".")
@@ -287,7 +316,7 @@ def test_the_topics_are_those_of_the_default_signal_map_and_of_the_node() -> Non
 
 
 def test_every_signal_and_shipped_file_is_named() -> None:
-    text = " ".join(README.split())
+    text = " ".join(" ".join(USER_PAGES.values()).split())
     for name in SIGNALS:
         assert re.search(rf"\b{name}\b", text), name
     for kind in ("vehicles", "signals", "models"):
