@@ -261,9 +261,9 @@ def _learning_lines(known: Known, arguments: Sequence[str], figure: str, asked: 
     yield ""
     yield (
         f"Made by `{_command([*arguments, 'learning_page'])}`. Each cell is driven for {LEARNING_LAPS} laps with "
-        f"`dynssm`, beginning with {SAFE:g} of the car's limits ([how](../../docs/use/race.md#faster-every-lap)). The cells are "
-        "those of the [matrix](closed_loop.md). The last lap is compared with the best of the true model, which knows the "
-        f"plant and the change, at {', '.join(f'{pace:g}' for pace in TRUE_PACES)} of the limits."
+        f"`dynssm`, beginning with {SAFE:g} of the car's limits ([how](../../docs/use/race.md#faster-every-lap)). The cells "
+        "are those of the [matrix](closed_loop.md). The last lap is compared with the best of the true model, which knows "
+        f"the plant and the change, at {', '.join(f'{pace:g}' for pace in TRUE_PACES)} of the limits."
     )
     for label, part, missing in _parts(known, asked):
         yield ""
