@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import ast
+import fcntl
+import hashlib
 import io
 import os
+import shutil
 import sys
+import tempfile
+import time
 
 # tests run side by side; libraries read these when they are loaded
 os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -83,55 +89,94 @@ def declared_parameters() -> Callable[[str], dict[str, object]]:
     return declared
 
 
+@cache
+def _sources() -> bytes:
+    """Digest of what makes drives and models: the package, its configuration, these fixtures, the libraries' versions."""
+    digest = hashlib.sha256(sys.version.encode())
+    found = [*(REPOSITORY / "dynssm_ros").rglob("*.py"), *(REPOSITORY / "config").rglob("*.yaml")]
+    for path in sorted([*found, REPOSITORY / "constraints.txt", Path(__file__)]):
+        digest.update(path.relative_to(REPOSITORY).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.digest()
+
+
+Kept = Callable[[str, Callable[[Path], None]], Path]
+
+
 @pytest.fixture(scope="session")
-def laps_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def kept() -> Kept:
+    """``kept(name, make)``: the folder that ``make(folder)`` fills, made once for all workers and runs of these sources.
+
+    Its name has the digest of the sources. It lies in ``.pytest_cache``, where those of other sources stay for a day.
+    Tests read it and do not write there.
+    """
+    place = REPOSITORY / ".pytest_cache" / "kept"
+    place.mkdir(parents=True, exist_ok=True)
+
+    def get(name: str, make: Callable[[Path], None]) -> Path:
+        folder = place / f"{name}-{hashlib.sha256(_sources() + name.encode()).hexdigest()[:16]}"
+        with (place / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # others wait for what is being made
+            if not folder.is_dir():
+                for old in place.glob(f"{name}-*"):
+                    if time.time() - old.stat().st_mtime > 86400:
+                        shutil.rmtree(old)
+                with tempfile.TemporaryDirectory(dir=place) as scratch:
+                    made = Path(scratch) / "made"
+                    made.mkdir()
+                    make(made)
+                    made.rename(folder)  # whole or not at all
+        return folder
+
+    return get
+
+
+@pytest.fixture(scope="session")
+def laps_bag(kept: Kept) -> Path:
     """20 s of the simulated ORCA car on a club track, as a rosbag2 folder with the standard topics."""
-    from dynssm_ros.simulation.laps import simulate, write_run
-    from dynssm_ros.track.tracks import load_track
-    from dynssm_ros.vehicle import load_vehicle
 
-    bag = tmp_path_factory.mktemp("laps") / "club"
-    write_run(simulate(load_vehicle("orca"), load_track("club"), duration=20.0), bag)
-    return bag
+    def make(folder: Path) -> None:
+        from dynssm_ros.simulation.laps import simulate, write_run
+        from dynssm_ros.track.tracks import load_track
+        from dynssm_ros.vehicle import load_vehicle
+
+        write_run(simulate(load_vehicle("orca"), load_track("club"), duration=20.0), folder / "club")
+
+    return kept("laps_bag", make) / "club"
 
 
 @pytest.fixture(scope="session")
-def small_model(laps_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_model(laps_bag: Path, kept: Kept) -> Path:
     """The folder of a small DynSSM, trained for two epochs on ``laps_bag`` (T_s 0.02 s, H 5, commands from topics)."""
-    from dynssm_ros.learning.export import save_artifact
-    from dynssm_ros.learning.models.registry import parse_model_config
-    from dynssm_ros.learning.stages import train
-    from dynssm_ros.signals.extraction import extract
-    from dynssm_ros.signals.signal_map import load_signal_map
-    from dynssm_ros.vehicle import load_vehicle
 
-    config = parse_model_config(
-        {
-            "name": "small",
-            "history": 0.1,
-            "ssm": {"channels": 4, "states": 2},
-            "gru": {"hidden": 6},
-            "fusion": {"hidden": 8, "latent": 8},
-            "physics": {},
-            "adaptation": {"hidden": 8, "alpha": 0.5},
-            "residual": {"hidden": [8], "scale": 1.0},
-            "loss": {"parameters": 0.001},
-            "training": {
-                "epochs": 2,
-                "batch_size": 64,
-                "learning_rate": 0.001,
-                "patience": 5,
-                "validation_block": 1.0,
-            },
-        },
-        "small.yaml",
-    )
-    folder = tmp_path_factory.mktemp("models")
-    recording = extract([laps_bag], load_signal_map("default"), 50.0)
-    trained = train(recording, config, load_vehicle("orca"), folder / "checkpoint.pt")
-    return save_artifact(trained, folder / "small").path
+    def make(folder: Path) -> None:
+        from dynssm_ros.learning.export import save_artifact
+        from dynssm_ros.learning.models.registry import parse_model_config
+        from dynssm_ros.learning.stages import train
+        from dynssm_ros.signals.extraction import extract
+        from dynssm_ros.signals.signal_map import load_signal_map
+        from dynssm_ros.vehicle import load_vehicle
+
+        config = parse_model_config(SMALL, "small.yaml")
+        recording = extract([laps_bag], load_signal_map("default"), 50.0)
+        with tempfile.TemporaryDirectory() as scratch:
+            trained = train(recording, config, load_vehicle("orca"), Path(scratch) / "checkpoint.pt")
+        save_artifact(trained, folder / "small")
+
+    return kept("small_model", make) / "small"
 
 
+SMALL: dict[str, Any] = {
+    "name": "small",
+    "history": 0.1,
+    "ssm": {"channels": 4, "states": 2},
+    "gru": {"hidden": 6},
+    "fusion": {"hidden": 8, "latent": 8},
+    "physics": {},
+    "adaptation": {"hidden": 8, "alpha": 0.5},
+    "residual": {"hidden": [8], "scale": 1.0},
+    "loss": {"parameters": 0.001},
+    "training": {"epochs": 2, "batch_size": 64, "learning_rate": 0.001, "patience": 5, "validation_block": 1.0},
+}
 TINY = """
 base: dynssm_paper_orca
 name: tiny

@@ -46,6 +46,7 @@ def test_the_folder_holds_vehicle_report_and_results(dynssm: Run, offset: tuple[
     assert (status, err) == (0, "")
 
 
+@pytest.mark.slow
 def test_several_processes_find_what_one_finds(dynssm: Run, offset: tuple[Path, Path], tmp_path: Path) -> None:
     laps, car = offset
     found = []

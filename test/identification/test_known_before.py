@@ -75,6 +75,7 @@ def test_where_nothing_was_known_the_bounds_are(recording: Recording, calibrated
     assert before.correlation is None
 
 
+@pytest.mark.slow
 def test_what_took_up_a_cause_goes_back_where_the_cause_is_found() -> None:
     car, cause = load_vehicle("av21"), {"exponent": 0.6}
     I_z = car.coefficients["I_z"].nominal

@@ -94,6 +94,7 @@ def test_a_term_that_no_effect_has_is_proposed_as_a_formula() -> None:
     assert told["terms"] == yaw.terms
 
 
+@pytest.mark.slow
 def test_where_the_library_for_formulas_is_missing_a_note_says_how_to_have_it(
     spoiled: Callable[[Spoil], Diagnosis], monkeypatch: pytest.MonkeyPatch
 ) -> None:

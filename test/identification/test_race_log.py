@@ -25,6 +25,7 @@ def recording(putnam: Path, monkeypatch: pytest.MonkeyPatch) -> Recording:
     return extract([putnam], load_signal_map("av21"), 25.0)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_where_nothing_is_known_yaw_is_found_to_come_late(recording: Recording) -> None:
     seen = recording.split_last(0.25)[0]

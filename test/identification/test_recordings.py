@@ -207,6 +207,7 @@ def test_what_changed_since_the_reference_is_told_from_what_was_there(driven: Dr
     assert "grip (only in steering_lag+front_grip" in as_text(found)
 
 
+@pytest.mark.slow
 def test_what_one_of_three_days_has_is_named_with_it_and_not_written(driven: Drive) -> None:
     lag = {"yaw_rate_lag": {"time_constant": 0.05}}
     turned = {"odometry_misalignment": {"angle": -0.007}}
@@ -225,6 +226,7 @@ def test_what_one_of_three_days_has_is_named_with_it_and_not_written(driven: Dri
     assert any(note.startswith("odometry_misalignment: not in the vehicle file") for note in found.notes)
 
 
+@pytest.mark.slow
 def test_what_a_session_has_is_named_with_it(driven: Drive) -> None:
     """A sensor that was turned between two days is in both drives of the second."""
     turned = {"odometry_misalignment": {"angle": -0.007}}
@@ -245,6 +247,7 @@ def test_what_a_session_has_is_named_with_it(driven: Drive) -> None:
     assert "9414, one session)" in as_text(found)
 
 
+@pytest.mark.slow
 def test_three_healthy_days_of_unlike_noise_are_right(driven: Drive) -> None:
     found = diagnose([driven({}, seed) for seed in (9406, 9407, 9408)], vehicle_file(Case({}, 9400)), integrator="rk4")
     assert (found.verdict, found.causes) == ("none", ())
