@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from dynssm_ros.errors import ConfigurationError
 
 PACKAGE = "dynssm_ros"
+_REGISTERED: dict[str, list[Path]] = {}
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
@@ -51,20 +52,28 @@ def config_root() -> Path:
     raise ConfigurationError("shipped configuration not found: expected share/dynssm_ros/config beside the package")
 
 
+def register_folder(kind: str, folder: Path) -> None:
+    """Makes the YAML files of a folder known by name, as the shipped ones of ``kind`` are; a plugin calls it."""
+    folders = _REGISTERED.setdefault(kind, [])
+    if folder not in folders:
+        folders.append(folder)
+
+
 def find_config(kind: str, name_or_path: str | Path) -> Path:
-    """Resolves the name of a shipped file of ``kind`` (``vehicles``, ``signals``, ``models``) or a path.
+    """Resolves the name of a file of ``kind`` (``vehicles``, ``signals``, ``models``), shipped or registered, or a path.
 
     Raises:
-        ConfigurationError: neither a file nor a shipped name.
+        ConfigurationError: neither a file nor a known name.
     """
     path = Path(name_or_path)
     if os.path.isfile(path):  # unlike Path.is_file, False where looking is forbidden or the name impossible
         return path
-    shipped = config_root() / kind
-    candidate = shipped / f"{name_or_path}.yaml"
-    if os.path.isfile(candidate):
-        return candidate
-    names = ", ".join(sorted(p.stem for p in shipped.glob("*.yaml")))
+    folders = [config_root() / kind, *_REGISTERED.get(kind, [])]
+    for folder in folders:
+        candidate = folder / f"{name_or_path}.yaml"
+        if os.path.isfile(candidate):
+            return candidate
+    names = ", ".join(sorted(p.stem for folder in folders for p in folder.glob("*.yaml")))
     raise ConfigurationError(f"{kind}: '{name_or_path}' is neither a file nor a shipped name ({names})")
 
 
@@ -88,11 +97,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def validate(schema: type[_Model], content: dict[str, Any], source: str | Path) -> _Model:
     """Builds ``schema`` from ``content``; the first violation becomes a one-line error naming file, field and value.
 
+    Validators find ``source`` in their context, to read files that ``content`` refers to.
+
     Raises:
         ConfigurationError: ``content`` does not fit ``schema``.
     """
     try:
-        return schema.model_validate(content)
+        return schema.model_validate(content, context={"source": source})
     except ValidationError as error:
         raise ConfigurationError(f"{source}: {describe(error)}") from error
 

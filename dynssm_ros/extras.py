@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from importlib import import_module
 from importlib.util import find_spec
 
@@ -51,12 +52,17 @@ def require(what: str, *extras: str) -> None:
 def load_plugins() -> None:
     """Imports the modules that ``DYNSSM_PLUGINS`` names, apart by commas; they register effects, models or plants.
 
+    They are installed, on ``PYTHONPATH``, or in the current folder.
+
     Raises:
         ConfigurationError: one cannot be imported.
     """
+    names = [name.strip() for name in os.environ.get("DYNSSM_PLUGINS", "").split(",") if name.strip()]
+    if names and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # last: it shadows nothing
     name = ""
     try:
-        for name in filter(None, os.environ.get("DYNSSM_PLUGINS", "").split(",")):
-            import_module(name.strip())
+        for name in names:
+            import_module(name)
     except ImportError as error:
         raise ConfigurationError(f"DYNSSM_PLUGINS: module {name} cannot be imported ({error})") from error

@@ -17,6 +17,7 @@ import pytest
 import typer
 import yaml
 
+import benchmarks.rivals  # noqa: F401 - whose files a page names
 import dynssm_ros
 from benchmarks.paper.plan import load_plan
 from benchmarks.paper.stale import marked

@@ -68,6 +68,7 @@ def drive(training: Training, out: Path, data: Path) -> None:
 
 def train_model(training: Training, model: str, out: Path) -> None:
     """Trains one of :func:`models_of`."""
+    import benchmarks.rivals  # noqa: F401 - registers them
     from dynssm_ros.learning.models.registry import load_model_config, merge, parse_model_config
 
     content = dict(models_of(SETS)[model])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+import benchmarks.rivals
 from benchmarks.paper.parts import cut, quantity
 from benchmarks.paper.plan import Part, Range, Study, load_plan
 from benchmarks.paper.reference import load_reference
@@ -61,7 +62,8 @@ def test_no_test_of_the_shipped_plan_shares_a_row_with_its_training(plan, drive)
 
 def test_every_shipped_model_is_in_the_plan_and_every_change_fits(plan):
     used = {model.base or name for name, model in plan.models.items()}
-    shipped = {path.stem for path in (config_root() / "models").glob("*.yaml")}
+    folders = (config_root() / "models", Path(benchmarks.rivals.__file__).parent)
+    shipped = {path.stem for folder in folders for path in folder.glob("*.yaml")}
     assert shipped <= used
     assert {name: plan.configured(name).name for name in plan.models} == {name: name for name in plan.models}
     assert plan.configured("dynssm_av21_no_online").online is None

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import benchmarks.rivals  # noqa: F401 - one is fine-tuned
 from dynssm_ros.learning import optimisation as training
 from dynssm_ros.learning import stages
 from dynssm_ros.runtime.artifact import open_artifact

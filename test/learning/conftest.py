@@ -36,26 +36,6 @@ SMALL: dict[str, Any] = {
     },
 }
 
-SMALL_DDM: dict[str, Any] = {
-    "name": "small_ddm",
-    "kind": "ddm",
-    "history": 0.08,
-    "gru": {"hidden": 3, "layers": 2},
-    "dense": {"layers": 2, "width": 6},
-    "physics": {"load_transfer": False},
-    "loss": {"scale": "none", "parameters": 0.0},
-    "training": {
-        "epochs": 3,
-        "batch_size": 64,
-        "learning_rate": 0.005,
-        "schedule": "constant",
-        "gradient_clip": None,
-        "patience": 10,
-        "validation": "random",
-        "validation_every": 5,
-    },
-}
-
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
@@ -73,34 +53,13 @@ def make_config() -> MakeConfig:
     return partial(_changed, SMALL)
 
 
-@pytest.fixture(scope="session")
-def make_ddm() -> MakeConfig:
-    """The small DDM with other blocks."""
-    return partial(_changed, SMALL_DDM)
-
-
-@pytest.fixture(scope="session")
-def make_fthd() -> MakeConfig:
-    """The small DDM fine-tuned for two epochs, with other fields of ``fine_tuning``; ``start`` changes the DDM's blocks."""
-
-    def make(start: dict[str, Any] | None = None, **changes: Any) -> ModelConfig:
-        ddm = _changed(SMALL_DDM, **start or {}).model_dump()
-        settings = {"starts_from": ddm, "frozen": 0.7, "physics": 0.00004} | changes
-        training = ddm["training"] | {"epochs": 2, "learning_rate": 0.002}
-        content = ddm | {"name": "small_fthd", "kind": "fthd", "training": training, "fine_tuning": settings}
-        return parse_model_config(content, "test")
-
-    return make
-
-
 def _changed(base: dict[str, Any], **changes: Any) -> ModelConfig:
     content = dict(base)
     for key, value in changes.items():
         both = isinstance(value, dict) and isinstance(content.get(key), dict)
         content[key] = content[key] | value if both else value
-    if content.get("kind") in ("ridge", "rls", "gp", "on_track"):  # they have no layers, and no epochs
-        own = ("name", "kind", "history", "penalty", *(["physics"] if content["kind"] in ("gp", "on_track") else []))
-        content = {name: content[name] for name in own if name in content}
+    if content.get("kind") in ("ridge", "rls"):  # they have no layers, and no epochs
+        content = {name: content[name] for name in ("name", "kind", "history", "penalty") if name in content}
         content["training"] = {"validation_block": 1.0}
     return parse_model_config(content, "test")
 

@@ -38,8 +38,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "no_residual": {"residual": None},
     "neural_only": {"physics": None, "adaptation": None},
     "ridge": {"kind": "ridge"},
-    "ddm": {},
-    "fthd": {},
 }
 
 
@@ -47,8 +45,6 @@ KINDS: dict[str, dict[str, Any]] = {
 def trained(
     laps: Recording,
     make_config: MakeConfig,
-    make_ddm: MakeConfig,
-    make_fthd: MakeConfig,
     orca: Vehicle,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Callable[[str], Trained]:
@@ -57,9 +53,7 @@ def trained(
 
     def get(kind: str) -> Trained:
         if kind not in made:
-            rivals = {"ddm": make_ddm, "fthd": make_fthd}
-            config = rivals[kind]() if kind in rivals else make_config(**KINDS[kind])
-            config = config.with_training(epochs=2, learning_rate=0.03)
+            config = make_config(**KINDS[kind]).with_training(epochs=2, learning_rate=0.03)
             made[kind] = train(laps, config, orca, tmp_path_factory.mktemp(kind) / "checkpoint.pt")
         return made[kind]
 
@@ -138,7 +132,7 @@ def test_the_trained_model_is_left_as_it_was(trained: Callable[[str], Trained], 
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
 
 
-@pytest.mark.parametrize("kind", ["whole", "neural_only", "ridge", "ddm", "fthd"])
+@pytest.mark.parametrize("kind", ["whole", "neural_only", "ridge"])
 def test_the_weights_come_back(trained: Callable[[str], Trained], laps: Recording, tmp_path: Path, kind: str) -> None:
     original = trained(kind)
     loaded = load_torch(save_artifact(original, tmp_path / "model"))
@@ -176,17 +170,6 @@ def test_operations_of_a_ridge_are_two_per_weight(trained: Callable[[str], Train
     card = save_artifact(trained("ridge"), tmp_path / "model").card
     assert card.flops == 2 * 4 * 7 * 3
     assert card.parameters == 4 * 7 * 3 + 3
-
-
-@pytest.mark.parametrize("kind", ["ddm", "fthd"])
-def test_operations_of_a_ddm_are_those_of_its_matrix_products(
-    trained: Callable[[str], Trained], tmp_path: Path, kind: str
-) -> None:
-    card = save_artifact(trained(kind), tmp_path / "model").card
-    gru = 4 * ((7 + 3) * 9 + (3 + 3) * 9)
-    dense = 4 * 3 * 6 + 6 * 6 + 6 * 17
-    assert card.flops == 2 * (gru + dense)
-    assert card.parameters == gru // 4 + 4 * 9 + dense + 6 + 6 + 17  # frozen or not
 
 
 def test_operations_of_a_dynssm_are_those_of_its_matrix_products(artifact: Artifact) -> None:

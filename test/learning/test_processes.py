@@ -11,6 +11,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
+import benchmarks.rivals  # noqa: F401 - one is trained
 from dynssm_ros import train
 from dynssm_ros.errors import UserError
 from dynssm_ros.learning.models.registry import load_model_config

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import benchmarks.rivals  # noqa: F401 - one is trained
 from dynssm_ros import train
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.dataset import SplitConfig, all_windows, split_windows

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
 from dynssm_ros import configuration
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
-from dynssm_ros.learning.models.ddm import DDM
 from dynssm_ros.learning.models.dynssm.network import DynSSM
-from dynssm_ros.learning.models.ekf_fthd import EkfFTHD
-from dynssm_ros.learning.models.fthd import FTHD
-from dynssm_ros.learning.models.gp import GaussianProcess
-from dynssm_ros.learning.models.on_track import OnTrack
 from dynssm_ros.learning.models.ridge import Ridge
 from dynssm_ros.learning.models.rls import Rls
 from dynssm_ros.runtime.artifact import Normalisation
@@ -38,7 +35,7 @@ def register_model(model: type[TrainableModel]) -> type[TrainableModel]:
     return model
 
 
-for _model in (DynSSM, Rls, Ridge, GaussianProcess, OnTrack, DDM, FTHD, EkfFTHD):
+for _model in (DynSSM, Rls, Ridge):
     register_model(_model)
 
 
@@ -52,7 +49,7 @@ def build_model(config: ModelConfig, vehicle: Vehicle, normalisation: Normalisat
 
 
 def load_model_config(name_or_path: str | Path, overrides: dict[str, Any] | None = None) -> ModelConfig:
-    """Reads a model file by shipped name or path.
+    """Reads a model file by its name (shipped, or of a plugin) or path.
 
     Args:
         name_or_path: ``base: NAME`` in the file takes another file's fields where it has none.
@@ -62,11 +59,11 @@ def load_model_config(name_or_path: str | Path, overrides: dict[str, Any] | None
         ConfigurationError: not found, malformed or inconsistent.
     """
     path = configuration.find_config("models", name_or_path)
-    return parse_model_config(merge(_with_base(path), overrides or {}), path)
+    return parse_model_config(merge(fields_of(path), overrides or {}), path)
 
 
 def parse_model_config(content: dict[str, Any], source: str | Path) -> ModelConfig:
-    """The configuration from the fields of a model file; a model's name in ``fine_tuning.starts_from`` is read as a file.
+    """The configuration from the fields of a model file.
 
     Raises:
         ConfigurationError: an unknown kind, or fields that do not fit it.
@@ -74,10 +71,6 @@ def parse_model_config(content: dict[str, Any], source: str | Path) -> ModelConf
     kind = content.get("kind", DynSSM.KIND)
     if kind not in MODELS:
         raise ConfigurationError(f"{source}: kind: '{kind}'; expected one of {', '.join(sorted(MODELS))}")
-    fine_tuning = content.get("fine_tuning")
-    if isinstance(fine_tuning, dict) and isinstance(fine_tuning.get("starts_from"), str):
-        start = _with_base(_referred(Path(source), fine_tuning["starts_from"]))
-        content = content | {"fine_tuning": fine_tuning | {"starts_from": start}}
     return configuration.validate(MODELS[kind].CONFIG, content, source)
 
 
@@ -87,12 +80,12 @@ def field_of(config: ModelConfig, name: str) -> Any:
     Raises:
         ConfigurationError: the model file has none of that name.
     """
-    value: Any = config.model_dump(mode="json")
-    for part in name.split("."):
-        if not isinstance(value, dict) or part not in value:
-            raise ConfigurationError(f"{name}: no field of the model file; expected one, as training.learning_rate")
-        value = value[part]
-    return value
+    try:
+        return reduce(getitem, name.split("."), config.model_dump(mode="json"))
+    except (KeyError, TypeError):
+        raise ConfigurationError(
+            f"{name}: no field of the model file; expected one, as training.learning_rate"
+        ) from None
 
 
 def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -107,17 +100,22 @@ def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
     return nested
 
 
-def _with_base(path: Path, depth: int = 0) -> dict[str, Any]:
+def fields_of(path: Path, depth: int = 0) -> dict[str, Any]:
+    """The fields of a model file, with those of its ``base`` where it has none.
+
+    Raises:
+        ConfigurationError: a file is not found or malformed, or they refer to each other in a circle.
+    """
     content = configuration.read_yaml(path)
     base = content.pop("base", None)
     if base is None:
         return content
     if depth > 4:
         raise ConfigurationError(f"{path}: base: files refer to each other in a circle")
-    return merge(_with_base(_referred(path, base), depth + 1), content)
+    return merge(fields_of(referred(path, base), depth + 1), content)
 
 
-def _referred(path: Path, name: str) -> Path:
+def referred(path: Path, name: str) -> Path:
     """The model file that ``path`` calls ``name``: one beside it, else as on the command line."""
     sibling = path.parent / f"{name}.yaml"
     return sibling if sibling.is_file() else configuration.find_config("models", name)

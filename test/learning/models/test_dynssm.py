@@ -272,3 +272,9 @@ def test_effects_of_the_vehicle_act_in_the_physics_layer(
     np.testing.assert_allclose(found.numpy(), single_track(car, window), atol=1e-14)
     assert np.abs(found.numpy() - single_track(orca, window)).max() > 1e-3
     assert len(COEFFICIENTS) == theta.shape[1]
+
+
+def test_a_model_with_load_transfer_leaves_the_vehicle_as_it_is(make_config: MakeConfig) -> None:
+    car = load_vehicle("av21")
+    assert make_config().with_physics.modelled(car) is car
+    assert make_config(physics=None, adaptation=None).with_physics.modelled(car) is car

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rivals.on_track import TYRES, OnTrack
 from dynssm_ros.evaluation.open_loop import evaluate
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
-from dynssm_ros.learning.models.on_track import TYRES, OnTrack
 from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.onnx_model import OnnxModel
@@ -19,17 +19,17 @@ from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, Vehicle
 from dynssm_ros.vehicle.single_track import front_force, rear_force
 
 MakeConfig = Callable[..., ModelConfig]
-ON_TRACK = {"kind": "on_track", "physics": {"nominal": "vehicle", "integrator": "euler"}}
+ON_TRACK = {"kind": "on_track", "history": 0.08, "physics": {"nominal": "vehicle", "integrator": "euler"}}
 
 
 def test_tyres_that_the_file_has_wrong_are_found(
-    make_config: MakeConfig, drive: Callable[..., Recording], orca: Vehicle, tmp_path: Path
+    make_fitted: MakeConfig, drive: Callable[..., Recording], orca: Vehicle, tmp_path: Path
 ) -> None:
     wrong = {name: c.model_copy(update={"nominal": {"D": 0.8, "B": 1.2}.get(name[0], 1.0) * c.nominal}) if name in TYRES
              else c for name, c in orca.coefficients.items()}  # fmt: skip
     believed = orca.model_copy(update={"coefficients": wrong})
     laps, held = drive(orca, 4000).split_last(0.3)
-    trained = train(laps, make_config(**ON_TRACK), believed, tmp_path / "c.pt")
+    trained = train(laps, make_fitted(**ON_TRACK), believed, tmp_path / "c.pt")
     assert isinstance(trained.model, OnTrack)
     model = OnnxModel(save_artifact(trained, tmp_path / "model"))  # which compares the graph with torch
     scores = evaluate(held, {"found": model, "file": SingleTrack(believed, "euler")}, calls=1).scores
@@ -42,9 +42,9 @@ def test_tyres_that_the_file_has_wrong_are_found(
 
 
 def test_tyres_that_are_right_stay_and_all_else_too(
-    make_config: MakeConfig, drive: Callable[..., Recording], orca: Vehicle, tmp_path: Path
+    make_fitted: MakeConfig, drive: Callable[..., Recording], orca: Vehicle, tmp_path: Path
 ) -> None:
-    trained = train(drive(orca, 1500), make_config(**ON_TRACK), orca, tmp_path / "c.pt")
+    trained = train(drive(orca, 1500), make_fitted(**ON_TRACK), orca, tmp_path / "c.pt")
     assert isinstance(trained.model, OnTrack)
     others = [k for k, name in enumerate(COEFFICIENTS) if name not in TYRES]
     theta = trained.model.theta.numpy()

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.rivals.ddm import DDM
+from benchmarks.rivals.fthd import consecutive, physics_loss
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
-from dynssm_ros.learning.models.ddm import DDM
-from dynssm_ros.learning.models.fthd import consecutive, physics_loss
 from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import Trained, checkpoints, train
 from dynssm_ros.runtime.artifact import Normalisation

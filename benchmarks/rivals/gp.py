@@ -22,10 +22,10 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from benchmarks.rivals.fitting import driven, minimise
 from dynssm_ros.learning.dataset import SplitConfig, TrainingWindows
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel, scale_buffers
-from dynssm_ros.learning.models.fitting import driven, minimise
 from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.rivals.ekf_fthd import EkfFTHD, kalman_filtered
 from dynssm_ros.learning.dataset import normalisation, split_windows
 from dynssm_ros.learning.export import load_torch, save_artifact
 from dynssm_ros.learning.models.base import ModelConfig
-from dynssm_ros.learning.models.ekf_fthd import EkfFTHD, kalman_filtered
 from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import train
 from dynssm_ros.signals.recording import Recording

@@ -18,10 +18,10 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from benchmarks.rivals.fthd import FTHD, FthdConfig
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import ModelConfig
-from dynssm_ros.learning.models.fthd import FTHD, FthdConfig
 from dynssm_ros.learning.models.physics import INPUTS
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle

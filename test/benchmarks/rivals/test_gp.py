@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.rivals import gp
 from dynssm_ros.evaluation.open_loop import evaluate
 from dynssm_ros.learning.export import save_artifact
-from dynssm_ros.learning.models import gp
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.stages import train
 from dynssm_ros.runtime.baselines import SingleTrack
@@ -24,11 +24,11 @@ GP = {"kind": "gp", "history": 0.2, "physics": {"nominal": "vehicle"}}
 
 
 def test_a_changed_car_is_learned_to_a_fraction_of_the_physics_errors(
-    make_config: MakeConfig, drive: Callable[..., Recording], orca: Vehicle, tmp_path: Path
+    make_fitted: MakeConfig, drive: Callable[..., Recording], orca: Vehicle, tmp_path: Path
 ) -> None:
     changed = drive(orca.with_effect("front_grip", {"factor": 0.9}), 3000)
     laps, held = changed.split_last(0.3)
-    trained = train(laps, make_config(**GP), orca, tmp_path / "c.pt")
+    trained = train(laps, make_fitted(**GP), orca, tmp_path / "c.pt")
     model = OnnxModel(save_artifact(trained, tmp_path / "model"))  # which compares the graph with torch
     scores = evaluate(held, {"gp": model, "physics": SingleTrack(orca, "euler")}, calls=1).scores
     assert np.all(scores["gp"].rmse[1:] < 0.3 * scores["physics"].rmse[1:])
@@ -36,9 +36,9 @@ def test_a_changed_car_is_learned_to_a_fraction_of_the_physics_errors(
 
 
 def test_where_the_physics_is_exact_nothing_is_added(
-    make_config: MakeConfig, laps: Recording, orca: Vehicle, tmp_path: Path
+    make_fitted: MakeConfig, laps: Recording, orca: Vehicle, tmp_path: Path
 ) -> None:
-    trained = train(laps, make_config(**GP), orca, tmp_path / "c.pt")
+    trained = train(laps, make_fitted(**GP), orca, tmp_path / "c.pt")
     assert np.all(np.array(trained.validation_rmse) < 1e-4)
 
 

@@ -19,22 +19,24 @@ lowest ``L_1`` on them, the DDM itself included. ``w_1`` is 1 here and ``w_2`` i
 Because the window holds the measured ``s_t``, the loss is nearly the error of the step before: to first order
 ``s^_{t+1} - s^_t - T_s f(s^_t) = s_t - s^_t``. So it weighs what the supervised loss weighs, and does not add much to it.
 
-The variant that filters the states is :mod:`dynssm_ros.learning.models.ekf_fthd`.
+The variant that filters the states is :mod:`benchmarks.rivals.ekf_fthd`.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 from torch import Tensor
 from typing_extensions import Self
 
+from benchmarks.rivals.ddm import DDM, DdmConfig
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.learning.losses import LossConfig, Output, Scales, objective
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
-from dynssm_ros.learning.models.ddm import DDM, DdmConfig
+from dynssm_ros.learning.models.registry import fields_of, referred
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
 
@@ -51,6 +53,13 @@ class FineTuningConfig(StrictModel):
         default=0.75, ge=0, lt=1, description="share of the layers that stay as the DDM has them; the GRU is the first"
     )
     physics: float = Field(ge=0, description="weight of the unsupervised physics loss; the supervised loss has 1")
+
+    @field_validator("starts_from", mode="before")
+    @classmethod
+    def _by_name(cls, value: Any, info: ValidationInfo) -> Any:
+        """The fields of the model file, if its name is given."""
+        source = Path((info.context or {}).get("source", ""))
+        return fields_of(referred(source, value)) if isinstance(value, str) else value
 
 
 class FthdConfig(DdmConfig):
