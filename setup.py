@@ -31,8 +31,6 @@ EXTRAS = {
     "scale": ["joblib>=1.4"],
     # settings of models that are searched for
     "sweep": ["optuna>=4.0"],
-    # training in several processes that share each batch
-    "processes": ["lightning-fabric>=2.5"],
     # several processes on clusters
     "ray": ["joblib>=1.4", "ray>=2.40"],
     "dask": ["joblib>=1.4", "dask>=2024.12", "distributed>=2024.12"],

@@ -271,7 +271,6 @@ def train(
     on_progress: Callable[[int, int, str], None] | None = None,
     picture: Callable[[Trained, Path], None] | None = None,
     memory: float | None = None,
-    processes: int = 1,
 ) -> TrainingResult:
     """Trains a model and writes its folder: card, weights, ONNX graph, metrics. Continues after a kill.
 
@@ -287,10 +286,7 @@ def train(
         device: ``cpu`` or ``cuda``.
         on_progress: called after each epoch with epochs done, epochs at most and a line about them.
         picture: draws the training to the file in the folder that it is given.
-        memory: what the rows of the recordings' files may take (MB): a sample of all stays, the rest comes and goes. If not
-            given, all stays.
-        processes: that share each batch of the optimisation (extra ``processes``). A script that is run needs
-            ``if __name__ == "__main__"`` around its call.
+        memory: what the rows of the recordings' files may take (MB): if all take more, a sample of each log is trained on.
 
     Example:
         >>> laps = recorded(simulate("orca", "club", duration=20.0))
@@ -301,8 +297,8 @@ def train(
     require("train", "train")
     from dynssm_ros.identification.calibration import calibrate
     from dynssm_ros.learning.export import check_replaceable, save_artifact
+    from dynssm_ros.learning.sampling import sampled
     from dynssm_ros.learning.stages import check_device, checkpoints, train
-    from dynssm_ros.learning.streaming import RowStream
 
     check_device(device)
     folder = Path(out) if Path(out).name else Path(out).absolute()  # "." has no name to put the checkpoint beside
@@ -310,14 +306,12 @@ def train(
     config = model_config(model, seed, epochs)
     checkpoint, car = checkpoint_of(folder), _vehicle_in_windows(vehicle)
     if memory is None:
-        stream, data = None, _joined(_opened(recordings, car), commands, holdout)
+        data = _joined(_opened(recordings, car), commands, holdout)
     else:
-        stream = RowStream(_streamed(recordings, car), memory, commands, holdout)
-        data = stream.sample()
+        data = sampled(_looked_at(recordings, car), memory, commands=commands, holdout=holdout)
     trained = train(
-        data, config, car, checkpoint, device, on_progress,
-        lambda data, car, integrator: calibrate(data, car, integrator=integrator).vehicle, stream,
-        processes,
+        data, config, car, checkpoint, device=device, progress=on_progress,
+        calibrate=lambda data, car, integrator: calibrate(data, car, integrator=integrator).vehicle,
     )  # fmt: skip
     artifact = save_artifact(trained, folder, {"holdout": holdout, "device": device}, picture)
     for path in checkpoints(config, checkpoint):
@@ -802,11 +796,11 @@ def _opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
     return opened
 
 
-def _streamed(logs: Log | Sequence[Log], car: Vehicle) -> list[Path]:
+def _looked_at(logs: Log | Sequence[Log], car: Vehicle) -> list[Path]:
     """Files of recordings, each of which was looked at; see :func:`_opened`."""
     files = [log for log in _files(logs) if not isinstance(log, Recording)]
     if len(files) < sum(1 for _ in _files(logs)):
-        raise ConfigurationError("memory: a recording that is not in a file cannot come and go; expected files")
+        raise ConfigurationError("memory: a recording that is not in a file takes its memory already; expected files")
     for file in files:
         _opened(file, car)
     return [Path(file) for file in files]

@@ -16,7 +16,6 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "formula": ("sklearn",),
     "scale": ("joblib",),
     "sweep": ("optuna",),
-    "processes": ("lightning_fabric",),
     "ray": ("joblib", "ray"),
     "dask": ("joblib", "dask", "distributed"),
     "ros": ("rclpy",),

@@ -28,7 +28,6 @@ PACKAGE = "dynssm_ros"
 PIP_NAMES = {
     "yaml": "pyyaml",
     "typing_extensions": "typing-extensions",
-    "lightning_fabric": "lightning-fabric",
     "sklearn": "scikit-learn",
 }
 ROSDEP_KEYS = {

@@ -33,8 +33,6 @@ PARTS = (
     Part("network, without an online layer", "dynssm (offline)", "rls (offline)"),
     Part("innovation filter, beside the online layer", "dynssm", "no_innovation"),
     Part("innovation filter, without an online layer", "dynssm (offline)", "no_innovation (offline)"),
-    Part("mirrored laps, beside the online layer", "dynssm", "no_mirror"),
-    Part("mirrored laps, without an online layer", "dynssm (offline)", "no_mirror (offline)"),
     Part("not in the default: rollout loss", "rollout_loss", "dynssm"),
     Part("not in the default: rollout loss, without an online layer", "rollout_loss (offline)", "dynssm (offline)"),
     Part("not in the default: SSM and parameter head", "ssm_and_head", "dynssm"),

@@ -30,7 +30,6 @@ ABLATIONS: dict[str, dict[str, Any]] = {
         "base": "dynssm", "ssm": {"channels": 24, "states": 8}, "adaptation": {"hidden": 24, "alpha": 0.5},
         "loss": {"parameters": 0.01},
     },
-    "no_mirror": {"base": "dynssm", "training": {"augmentation": {"mirror": False}}},
     "rls_one_lag": {"base": "rls", "online": {"lags": 1, "other_lags": 1, "input_lags": 1}},
     "rls_long_lags": {"base": "rls", "online": {"lags": 15, "other_lags": 15, "input_lags": 15}},
     "rls_memory_100_s": {"base": "rls", "online": {"memory": 100.0}},

@@ -37,11 +37,10 @@ def train(
     memory: Annotated[
         float | None,
         typer.Option(
-            help="What the rows may take (MB): a sample of all recordings stays, the rest comes and goes.",
-            show_default="all stays",
+            help="What the rows may take (MB): if they take more, a sample of each recording is trained on.",
+            show_default="any",
         ),
     ] = None,
-    processes: Annotated[int, typer.Option(help="That share each batch; of a GPU each has its own.", min=1)] = 1,
     where: WhereOption = None,
 ) -> None:
     """Train a model on recordings and write its folder: card, weights, ONNX, metrics, loss picture."""
@@ -50,7 +49,6 @@ def train(
             trained, artifact = api.train(
                 recording_files(recordings, where), model, vehicle, out, holdout, commands, seed, epochs, device, progress,
                 None if missing_libraries("report") else _draw_losses, memory,
-                processes,
             )  # fmt: skip
         except KeyboardInterrupt:
             folder = out.absolute()

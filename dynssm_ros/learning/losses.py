@@ -62,7 +62,7 @@ def scales(config: LossConfig, normalisation: Normalisation) -> Scales:
 
 
 def rollout_objective(
-    model: Callable[[Tensor], Output], rows: Tensor, target: Tensor, steps: int, config: LossConfig, by: Scales
+    model: Callable[[Tensor], Output], rows: Tensor, target: Tensor, *, steps: int, config: LossConfig, by: Scales
 ) -> dict[str, Tensor]:
     """The mean over a rollout of :func:`objective`, where the error of a state ``k`` steps ahead counts over ``k``.
 

@@ -16,12 +16,9 @@ from torch import Tensor, nn
 from dynssm_ros import __version__
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.files import replacing
-from dynssm_ros.learning.augmentation import Augmentation
 from dynssm_ros.learning.dataset import TrainingWindows
 from dynssm_ros.learning.losses import COMPONENTS, LossConfig, Scales, rollout_objective, scales
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
-from dynssm_ros.learning.processes import ProcessGroup, run_in_processes
-from dynssm_ros.learning.streaming import StreamedWindows
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
@@ -79,7 +76,6 @@ class Optimisation:
         checkpoint: file that is kept up to date.
         anew: gives the model with other weights, for a restart; ``None``: it is not restarted.
         device: to compute on.
-        group: the processes that train.
     """
 
     def __init__(
@@ -87,17 +83,16 @@ class Optimisation:
         config: Any,
         vehicle: Vehicle,
         model: TrainableModel,
+        *,
         scale: Normalisation,
-        training: TrainingWindows | StreamedWindows,
+        training: TrainingWindows,
         validation: TrainingWindows,
         checkpoint: Path,
-        anew: Callable[[int], TrainableModel] | None,
-        device: torch.device,
-        group: ProcessGroup | None = None,
+        anew: Callable[[int], TrainableModel] | None = None,
+        device: str | torch.device = "cpu",
     ) -> None:
         self.config = config
         self.anew = anew
-        self.group = group or ProcessGroup()
         self.loss: LossConfig = config.loss
         self.settings = config.training
         self.steps = rollout_steps(config, vehicle)
@@ -105,12 +100,11 @@ class Optimisation:
         s_y, s_delta = scales(config.loss, scale)
         self.scales: Scales = (s_y.to(device), s_delta.to(device))
         self.H = config.rows(vehicle.sampling_time)
-        self.device = device
-        self.training, self.validation = training.to(device), validation.to(device)
+        self.device = torch.device(device)
+        self.training, self.validation = training.to(self.device), validation.to(self.device)
         self.trained = [parameter for parameter in self.model.parameters() if parameter.requires_grad]
         self.optimiser, self.schedule = self._optimiser(1.0)
         self.shuffle = torch.Generator().manual_seed(config.training.seed)
-        self.augmentation = Augmentation(config.training.augmentation, self.shuffle)
         self.checkpoint = checkpoint
         self.identity = _identity(config, vehicle, training)
         self.state = _TrainingState(history=_empty_history())
@@ -196,29 +190,24 @@ class Optimisation:
         totals = dict.fromkeys(COMPONENTS, 0.0)
         steps = self._ramped()
         for batch in self.training.epoch(self.shuffle, self.settings.batch_size):
-            window, target = map(self.group.share, self.augmentation(*batch))
-            terms = self._terms(window, target, steps)
-            loss = torch.stack(list(terms.values())).sum() * (weight := self.group.weight(len(batch[1])))
+            terms = self._terms(*batch, steps)
             self.optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            self.group.average_gradients(self.trained)
+            torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
             if self.settings.gradient_clip is not None:
                 nn.utils.clip_grad_norm_(self.trained, self.settings.gradient_clip)
             self.optimiser.step()
             for term, value in terms.items():
-                totals[term] += value.item() * weight * len(batch[1]) / len(self.training)
-        return self.group.average(totals)
+                totals[term] += value.item() * len(batch[1]) / len(self.training)
+        return totals
 
     @torch.no_grad()
     def _validate(self) -> dict[str, float]:
         self.model.eval()
         totals = dict.fromkeys(COMPONENTS, 0.0)
         for batch in self.validation.batches():
-            window, target = map(self.group.share, batch)
-            weight = self.group.weight(len(batch[1]))
-            for term, value in self._terms(window, target, self.steps).items():
-                totals[term] += value.item() * weight * len(batch[1]) / len(self.validation)
-        return self.group.average(totals)
+            for term, value in self._terms(*batch, self.steps).items():
+                totals[term] += value.item() * len(batch[1]) / len(self.validation)
+        return totals
 
     def _terms(self, window: Tensor, target: Tensor, steps: int) -> dict[str, Tensor]:
         if self.steps == 1:
@@ -226,7 +215,7 @@ class Optimisation:
         longer = self.steps - steps  # rows that this rollout does not reach
         if longer:
             window, target = window[:, :-longer], window[:, -longer, :3] - window[:, -longer - 1, :3]
-        return rollout_objective(self.model, window, target, steps, self.loss, self.scales)
+        return rollout_objective(self.model, window, target, steps=steps, config=self.loss, by=self.scales)
 
     def _ramped(self) -> int:
         """Steps of the rollouts in this epoch: one until half of the epochs are done, all in the last quarter."""
@@ -234,8 +223,6 @@ class Optimisation:
         return 1 + round((self.steps - 1) * float(min(max(share, 0.0), 1.0)))
 
     def _save(self) -> None:
-        if self.group.rank:
-            return
         content: dict[str, Any] = vars(self.state) | {
             "identity": self.identity,
             "model": self.model.state_dict(),
@@ -266,25 +253,6 @@ class Optimisation:
         return self.state.epoch
 
 
-def optimise(
-    task: Callable[..., Optimisation], device: torch.device, progress: NamedProgress | None, processes: int = 1
-) -> OptimisationResult:
-    """Runs an :class:`Optimisation` in so many processes; ``task`` makes it of a device and a group.
-
-    Raises:
-        ConfigurationError: it diverges before there is a best model.
-        UserError: a process was killed or has failed.
-    """
-    if processes == 1:
-        return task(device).run(progress)
-    return run_in_processes(processes, device, progress, _member, task)
-
-
-def _member(group: ProcessGroup, progress: NamedProgress, task: Callable[..., Optimisation]) -> OptimisationResult:
-    result = task(group.device, group).run(progress)
-    return replace(result, model=result.model.cpu())
-
-
 def rollout_steps(config: Any, vehicle: Vehicle) -> int:
     """Steps of the rollouts whose errors are minimised; 1 without."""
     loss: LossConfig | None = getattr(config, "loss", None)
@@ -300,9 +268,7 @@ def squared_errors(model: TrainableModel, windows: TrainingWindows) -> Tensor:
     return squares / len(windows)
 
 
-def unexplained(
-    model: TrainableModel, training: TrainingWindows | StreamedWindows, validation: TrainingWindows
-) -> float:
+def unexplained(model: TrainableModel, training: TrainingWindows, validation: TrainingWindows) -> float:
     """Mean squared error on ``validation`` over that of predicting the mean change in ``training``, mean of the states."""
     of_mean = (validation.increments - training.mean_increment).double().square().mean(0).cpu()
     return float((squared_errors(model, validation) / of_mean).mean())
@@ -312,7 +278,7 @@ def _empty_history() -> History:
     return {f"{part}/{term}": [] for part in ("train", "validation") for term in COMPONENTS}
 
 
-def _identity(config: ModelConfig, vehicle: Vehicle, training: TrainingWindows | StreamedWindows) -> str:
+def _identity(config: ModelConfig, vehicle: Vehicle, training: TrainingWindows) -> str:
     """Names a training by code, data, car and configuration, so that a checkpoint is never continued for another."""
     digest = hashlib.sha256(f"{__version__} {torch.__version__} {config.model_dump_json()}".encode())
     digest.update(vehicle.model_dump_json().encode())

@@ -21,12 +21,10 @@ from dynssm_ros.learning.optimisation import (
     History,
     Optimisation,
     OptimisationResult,
-    optimise,
     rollout_steps,
     squared_errors,
     unexplained,
 )
-from dynssm_ros.learning.streaming import RowStream
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.online import OnlineLayer
@@ -88,16 +86,54 @@ class Trained:
         return self.config.rows(self.vehicle.sampling_time)
 
 
+@dataclass(frozen=True)
+class _Stages:
+    """The stages of a training: the whole, and one without each part of the laps, which only tells how large errors are."""
+
+    config: ModelConfig
+    vehicle: Vehicle
+    device: str
+    progress: NamedProgress | None
+    calibrate: Calibrate | None
+    files: list[Path]
+    """The checkpoint of each stage."""
+    epochs: tuple[int, ...]
+    """Of each stage at most."""
+
+    def run(
+        self, data: Recording, config: ModelConfig, stage: int, name: str, integrator: Integrator | None
+    ) -> Trained:
+        """One stage, from what the model starts from on."""
+        car = self.vehicle
+        if self.calibrate is not None and (config.with_physics.nominal == "calibrated" or config.online is not None):
+            car = self.calibrate(data, car, integrator)
+        file, start, done = self.files[stage], None, 0
+        if config.start is not None:
+            first = config.start.name if name == config.name else f"{name}: {config.start.name}"
+            start = _train(data, config.start, car, _start_of(file), self.device, self._report(first, stage))
+            done = start.config.training.effort[0]
+        alone = len(self.epochs) == 1 and start is None
+        return _train(
+            data, config, car, file, self.device, self.progress if alone else self._report(name, stage, done), start
+        )
+
+    def _report(self, name: str, stage: int, done_before: int = 0) -> NamedProgress | None:
+        """Progress of a stage, in epochs of all; ``done_before`` within the stage."""
+        progress, before, total = self.progress, sum(self.epochs[:stage]) + done_before, sum(self.epochs)
+        if progress is None:
+            return None
+        return lambda done, _, words: progress(before + done, total, f"{name}: {words}")
+
+
 def train(
     recording: Recording,
     config: ModelConfig,
     vehicle: Vehicle,
     checkpoint: Path,
+    *,
     device: str = "cpu",
     progress: NamedProgress | None = None,
     calibrate: Calibrate | None = None,
-    stream: RowStream | None = None,
-    processes: int = 1,
 ) -> Trained:
     """Trains a model; ``checkpoint`` is kept up to date and continued from if it belongs to the same training.
 
@@ -113,47 +149,29 @@ def train(
         progress: called after each epoch.
         calibrate: from the data of a stage and the vehicle to the calibrated one, for models whose physics asks for it;
             ``None``: the vehicle is taken as calibrated. All stages step as the first.
-        stream: of which ``recording`` is the sample, and whose other rows are trained on as well.
-        processes: that share the optimisation.
 
     Raises:
         RecordingError: another sampling time than the vehicle's, or too little data.
         ConfigurationError: the training diverges at once.
     """
-    files = checkpoints(config, checkpoint)[-1 - config.parts :]
-    shorter = config.with_training(epochs=max(1, config.training.effort[0] // _SHORTER))
     parts = recording.stretches(config.parts) if config.parts else []
     left_out = [recording.select(part) for part in parts]
     if not all(_can_be_trained_on(_rest(recording, part), config, vehicle) for part in parts):
         parts = []
-
-    stages = (_epochs(config), *(_epochs(shorter) for _ in parts))
-
-    physics = config.with_physics
-    calibrates = physics.nominal == "calibrated" or config.online is not None
-
-    def run(data: Recording, of: ModelConfig, stage: int, name: str, integrator: Integrator | None) -> Trained:
-        """One stage, from what the model starts from on."""
-        car = calibrate(data, vehicle, integrator) if calibrate is not None and calibrates else vehicle
-        report, file, start = _stage(progress, name, stage, stages), files[stage], None
-        more = stream if stage == 0 else None  # the others only tell how large errors are
-        if len(stages) == 1 and of.start is None:
-            report = progress
-        if of.start is not None:
-            first = _stage(progress, of.start.name if name == of.name else f"{name}: {of.start.name}", stage, stages)
-            start = _train(data, of.start, car, _start_of(file), device, first, None, more, processes)
-            report = _stage(progress, name, stage, stages, start.config.training.effort[0])
-        return _train(data, of, car, file, device, report, start, more, processes)
-
-    trained = run(recording, config, 0, config.name, physics.integrator)
+    shorter = config.with_training(epochs=max(1, config.training.effort[0] // _SHORTER))
+    stages = _Stages(
+        config, vehicle, device, progress, calibrate, checkpoints(config, checkpoint)[-1 - config.parts :],
+        (_epochs(config), *(_epochs(shorter) for _ in parts)),
+    )  # fmt: skip
+    trained = stages.run(recording, config, 0, config.name, config.with_physics.integrator)
     if config.online is None:
         return trained
     if not trained.model.LEARNS:
         return _with_layer(trained, [(trained.model, part) for part in left_out])
-    integrator = trained.vehicle.integrator
+    names = [f"{config.name} without part {k} of {len(parts)}" for k in range(1, len(parts) + 1)]
     others = [
-        run(_rest(recording, part), shorter, k, f"{config.name} without part {k} of {len(parts)}", integrator).model
-        for k, part in enumerate(parts, 1)
+        stages.run(_rest(recording, part), shorter, k, name, trained.vehicle.integrator).model
+        for k, (part, name) in enumerate(zip(parts, names, strict=True), 1)
     ]
     return _with_layer(trained, list(zip(others, left_out, strict=False)))
 
@@ -214,16 +232,6 @@ def _can_be_trained_on(recording: Recording, config: ModelConfig, vehicle: Vehic
     return True
 
 
-def _stage(
-    progress: NamedProgress | None, name: str, stage: int, epochs: tuple[int, ...], done_before: int = 0
-) -> NamedProgress | None:
-    """Progress of one of several stages, in epochs of all; ``done_before`` within the stage."""
-    if progress is None:
-        return None
-    before = sum(epochs[:stage]) + done_before
-    return lambda done, _, words: progress(before + done, sum(epochs), f"{name}: {words}")
-
-
 def _begin(config: ModelConfig, vehicle: Vehicle, scale: Normalisation, restart: int) -> TrainableModel:
     """The model before training, with other weights for each restart."""
     torch.manual_seed(config.training.seed + _SEEDS_APART * restart)
@@ -238,8 +246,6 @@ def _train(
     device: str,
     progress: NamedProgress | None,
     start: Trained | None = None,
-    stream: RowStream | None = None,
-    processes: int = 1,
 ) -> Trained:
     """One stage; ``start`` is the outcome of the stage before."""
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
@@ -259,27 +265,18 @@ def _train(
     training, validation = split_windows(recording, rows, config.training, vehicle.minimum_speed, least)
     if start is not None:
         model.take_over(start.model)
-    windows = training if stream is None else stream.windows(training, vehicle.minimum_speed)
     if model.fit(training):
         run = OptimisationResult(model, {})
     else:
-        task = partial(
-            Optimisation,
-            config,
-            vehicle,
-            model,
-            scale,
-            windows,
-            validation,
-            checkpoint,
-            anew if start is None else None,
-        )
-        run = optimise(task, torch.device(device), progress, processes)
+        run = Optimisation(
+            config, vehicle, model, scale=scale, training=training, validation=validation, checkpoint=checkpoint,
+            anew=anew if start is None else None, device=device,
+        ).run(progress)  # fmt: skip
     model = run.model.cpu().eval()
     held = replace(validation, H=H)
     v_x, v_y, omega = squared_errors(model, held).sqrt().tolist()
     return Trained(
         config, vehicle, recording, model, scale, run.history, run.best_epoch, (v_x, v_y, omega),
         unexplained(model, training, held),
-        (len(windows), len(validation)), run.resumed_from + (start.resumed_from if start else 0), run.restarts, start,
+        (len(training), len(validation)), run.resumed_from + (start.resumed_from if start else 0), run.restarts, start,
     )  # fmt: skip

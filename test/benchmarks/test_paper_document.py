@@ -19,12 +19,12 @@ from dynssm_ros.vehicle import COEFFICIENTS
 STATE_SIGNALS = ("v_x", "v_y", "omega")
 SPLITS = {"slow": "slow to fast", "right": "right to left", "straight": "straight to corner"}
 MODELS = (
-    "persistence", "single_track", "ddm_av21", "dynssm_av21_paper", "dynssm_av21", "dynssm_av21_no_mirror",
+    "persistence", "single_track", "ddm_av21", "dynssm_av21_paper", "dynssm_av21", "dynssm_av21_no_innovation",
     "dynssm_av21_no_online",
 )  # fmt: skip
 LEVELS = {
     "persistence": 1.0, "single_track": 0.8, "ddm_av21": 0.6, "dynssm_av21_paper": 0.4, "dynssm_av21": 0.3,
-    "dynssm_av21_no_mirror": 0.5, "dynssm_av21_no_online": 0.31,
+    "dynssm_av21_no_innovation": 0.5, "dynssm_av21_no_online": 0.31,
 }  # fmt: skip
 UNTRAINED = ("persistence", "single_track")
 
@@ -143,7 +143,7 @@ def test_a_model_appears_only_with_results_on_every_test(make, scores):
     (comparison,) = make().comparisons
     assert "ddm_av21" not in comparison.models
     assert comparison.seeds("dynssm_av21") == 1
-    assert comparison.seeds("dynssm_av21_no_mirror") == 3
+    assert comparison.seeds("dynssm_av21_no_innovation") == 3
 
 
 def test_ablations_are_told_from_the_paper_s_configuration(make, scores):
@@ -155,7 +155,7 @@ def test_ablations_are_told_from_the_paper_s_configuration(make, scores):
     study = study.model_copy(update={"models": (*MODELS, "dynssm_av21_paper_no_ssm")})
     (comparison,) = make(plan=results.plan.model_copy(update={"studies": {"unseen": study}})).comparisons
     assert comparison.ablations("dynssm_av21") == {
-        "no_mirror": "dynssm_av21_no_mirror", "no_online": "dynssm_av21_no_online"
+        "no_innovation": "dynssm_av21_no_innovation", "no_online": "dynssm_av21_no_online"
     }  # fmt: skip
     assert comparison.ablations("dynssm_av21_paper") == {"no_ssm": "dynssm_av21_paper_no_ssm"}
     assert comparison.bases == ("dynssm_av21_paper", "dynssm_av21")
@@ -254,7 +254,7 @@ def test_coverage_is_in_percent_and_the_cost_leaves_ablations_out(make):
     assert tables.coverage_table(results.comparisons).rows[1][2].mean == pytest.approx(90.0)
     names = [row[0] for row in tables.cost_table(results).rows]
     assert "`dynssm_av21`" in names
-    assert "`dynssm_av21_no_mirror`" not in names
+    assert "`dynssm_av21_no_innovation`" not in names
     assert cells(tables.cost_table(results), "DynSSM, AV-21, the paper's")[:3] == ["81,000", "180,000", "2,000"]
 
 
@@ -348,7 +348,8 @@ def test_the_first_half_page_says_what_helps_and_where_a_rival_wins(make, scores
         in text
     )
     assert (
-        "`dynssm_av21` on unseen driving, lookahead, errors without its parts: w/o mirrored laps +67 % one step" in text
+        "`dynssm_av21` on unseen driving, lookahead, errors without its parts: w/o innovation filter +67 % one step"
+        in text
     )
     assert list(summary(make(scores={}))) == []
 

@@ -163,12 +163,13 @@ def test_a_training_that_is_interrupted_after_a_restart_ends_bit_for_bit_like_an
 
 
 def test_a_training_that_ends_worse_than_the_mean_change_has_failed(
-    short: Recording, make_ddm: MakeConfig, orca: Vehicle, tmp_path: Path
+    short: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path: Path
 ) -> None:
-    lost = train(short, make_ddm(training={"epochs": 1, "learning_rate": 1e-9}), orca, tmp_path / "a.pt")
+    hardly = make_config(physics=FAR_OFF, training={"epochs": 1, "learning_rate": 1e-9})
+    lost = train(short, hardly, orca, tmp_path / "a.pt")
     assert lost.unexplained > 1.0
     assert "the training failed" in lost.failure
-    fitted = train(short, make_ddm(kind="ridge"), orca, tmp_path / "b.pt")
+    fitted = train(short, make_config(kind="ridge"), orca, tmp_path / "b.pt")
     assert fitted.unexplained < 1.0
     assert fitted.failure == ""
 
@@ -240,7 +241,7 @@ from dynssm_ros.vehicle import load_vehicle
 folder = Path(sys.argv[1])
 config = parse_model_config(json.loads((folder / "config.json").read_text()), "config")
 show = lambda done, total, words: print(done, flush=True)
-trained = train(Recording.load(folder / "r.parquet"), config, load_vehicle("orca"), folder / "checkpoint.pt", "cpu", show)
+trained = train(Recording.load(folder / "r.parquet"), config, load_vehicle("orca"), folder / "checkpoint.pt", progress=show)
 save_artifact(trained, folder / "model")
 """
 

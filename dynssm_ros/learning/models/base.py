@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 from typing_extensions import Self
 
@@ -21,12 +21,6 @@ from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.coefficients import SPREAD
 from dynssm_ros.vehicle import Vehicle
-
-
-class AugmentationConfig(StrictModel):
-    """Beyond the paper: training windows changed at random, so that the model does not rely on what another track changes."""
-
-    mirror: bool = Field(default=False, description="half of the windows with left and right exchanged")
 
 
 class TrainingConfig(SplitConfig):
@@ -45,7 +39,16 @@ class TrainingConfig(SplitConfig):
         description="times that a training begins anew, with other weights and a quarter of the learning rate, if after a "
         "tenth of its epochs (at least 5) it is no better than predicting the mean change",
     )
-    augmentation: AugmentationConfig = Field(default_factory=AugmentationConfig)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_augmentation(cls, content: Any) -> Any:
+        """Reads what version 0.3 wrote: mirrored laps, if they are off, are the same as none."""
+        if not isinstance(content, dict) or "augmentation" not in content:
+            return content
+        if content["augmentation"] != {"mirror": False}:
+            raise ValueError("augmentation: this version does not mirror laps; train without it")
+        return {name: value for name, value in content.items() if name != "augmentation"}
 
     @property
     def effort(self) -> tuple[int, int]:
