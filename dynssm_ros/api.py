@@ -204,7 +204,9 @@ def extract_season(
     """
     from dynssm_ros.signals.season_extraction import extract_season, logs_of
 
-    logs = logs_of([Path(bag) for bag in bags], car, track, _signal_map(signals, commands), rate, drop_bad)
+    logs = logs_of(
+        [Path(bag) for bag in bags], car, track, _signal_map(signals, commands), rate=rate, drop_bad=drop_bad
+    )
     return extract_season(logs, out, workers, on_progress)
 
 
@@ -730,7 +732,10 @@ def race(
     for text in models:
         if list(models).count(text) > 1:
             raise ConfigurationError(f"--model {text}: given twice; expected different models")
-    opened = {text: load_prediction_model(text, car, driven, plant, along_horizon, as_is) for text in models}
+    opened = {
+        text: load_prediction_model(text, car, driven, plant, along_horizon=along_horizon, as_is=as_is)
+        for text in models
+    }
     for name, model in disambiguated(opened, lambda model: model.name).items():
         model.name = name
     pace = (SAFE if learn else 1.0) if speed_scale is None else speed_scale

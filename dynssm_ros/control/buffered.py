@@ -6,7 +6,7 @@ matrices by columns.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -63,8 +63,20 @@ class BufferedRows:
         return [array.copy() for array in self._results]
 
 
-class QuadraticProgram:
-    """Minimises ``z' H z / 2 + g' z`` with ``low <= A z <= high`` and ``z_low <= z <= z_high``, dense, by an active set.
+class QuadraticProgram(NamedTuple):
+    """``z' H z / 2 + g' z``, to be least with ``low <= A z <= high`` and ``z_low <= z <= z_high``."""
+
+    H: Vector
+    g: Vector
+    A: Vector
+    low: Vector
+    high: Vector
+    z_low: Vector
+    z_high: Vector
+
+
+class QuadraticSolver:
+    """Solves dense quadratic programs of one size by an active set.
 
     Args:
         variables: size of ``z``.
@@ -80,11 +92,9 @@ class QuadraticProgram:
         given = dict(zip(solver.name_in(), self._buffered.given, strict=True))
         self._given = [given[name] for name in ("h", "g", "a", "lba", "uba", "lbx", "ubx")]
 
-    def solve(
-        self, H: Vector, g: Vector, A: Vector, low: Vector, high: Vector, z_low: Vector, z_high: Vector
-    ) -> Vector:
+    def solve(self, program: QuadraticProgram) -> Vector:
         """The solution ``(variables,)``; not a number where there is none."""
-        for array, values in zip(self._given, (H, g, A.T, low, high, z_low, z_high), strict=True):
+        for array, values in zip(self._given, program._replace(A=program.A.T), strict=True):
             array.reshape(values.shape)[...] = values
         self._buffered.evaluate()
         z = self._buffered.results[0]

@@ -103,6 +103,7 @@ class Controller:
         reference: Reference,
         track: Track,
         settings: Settings,
+        *,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         require_context(model.car.effects, _KNOWN, f"model {model.name}")
@@ -113,7 +114,7 @@ class Controller:
         self._track = track
         self._clock = clock
         horizon = HorizonModel(model.car, settings.N, settings.travel, settings.scale.length / settings.scale.time)
-        self._nmpc = Nmpc(horizon, limits, reference, track, settings, clock)
+        self._nmpc = Nmpc(horizon, limits, reference, track, settings, clock=clock)
         self._disturbances = [Disturbance.of(settings, model.car.T_s) for _ in SOURCES]
         self._estimator = StateEstimator(model.car.T_s)
         constants = model.car.constants

@@ -138,7 +138,14 @@ class LapLearner:
     """
 
     def __init__(
-        self, vehicle: Vehicle, track: Track, reference: Reference, settings: Settings, car: SteppedCar, theta: Vector
+        self,
+        vehicle: Vehicle,
+        track: Track,
+        reference: Reference,
+        settings: Settings,
+        *,
+        car: SteppedCar,
+        theta: Vector,
     ) -> None:
         if reference.limits is None or reference.share is None:
             raise ConfigurationError(

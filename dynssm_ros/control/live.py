@@ -139,7 +139,7 @@ class LiveController:
         """A command acts that long after the stamp of the odometry that it answers (ns)."""
         self.remote = RemoteModel(vehicle, max_age)
         """What the predictor says."""
-        self._pilot = Controller(self.remote, vehicle.inputs, reference, track, settings, clock)
+        self._pilot = Controller(self.remote, vehicle.inputs, reference, track, settings, clock=clock)
         self._pursuit = Driver(vehicle, reference.line, vehicle_limits(vehicle), _LAUNCH_STYLE)
         self._reference = reference
         self._brakes = vehicle.inputs.throttle[0]

@@ -24,7 +24,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.control.buffered import QuadraticProgram
+from dynssm_ros.control.buffered import QuadraticSolver
 from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, PARAMETERS, HorizonModel
 from dynssm_ros.control.manoeuvres import manoeuvres
@@ -97,6 +97,7 @@ class Nmpc:
         reference: Reference,
         track: Track,
         settings: Settings,
+        *,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         if model.N != settings.N:
@@ -106,7 +107,7 @@ class Nmpc:
         self._program = HorizonProgram(model, limits, reference, track, settings)
         self._clock = clock
         self._plan: Plan | None = None
-        self._solver = QuadraticProgram(self._program.variables, self._program.rows)
+        self._solver = QuadraticSolver(self._program.variables, self._program.rows)
 
     @property
     def previous(self) -> Plan | None:
@@ -224,7 +225,7 @@ class Nmpc:
         program = self._program.of(x, offset, slope, p, margins)
         if not all(np.all(np.isfinite(each)) for each in program[:3]):
             return None
-        u, slack = self._program.parts(self._solver.solve(*program))
+        u, slack = self._program.parts(self._solver.solve(program))
         states = offset + slope @ u
         if not (np.all(np.isfinite(u)) and np.all(np.isfinite(states))):
             return None

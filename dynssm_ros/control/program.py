@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.control.buffered import QuadraticProgram
 from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.horizon_model import STATES, HorizonModel
 from dynssm_ros.control.reference import Reference
@@ -25,18 +26,6 @@ from dynssm_ros.vehicle.parameters import InputLimits
 
 V_X, R, DELTA = (STATES.index(name) for name in ("v_x", "r", "delta"))
 _ROAD_LEFT, _SLIP_LEFT = 0.5, 0.5  # shares of the road and of the slip's bound that no caution takes
-
-
-class Program(NamedTuple):
-    """What :meth:`QuadraticProgram.solve` takes."""
-
-    H: Vector
-    g: Vector
-    A: Vector
-    low: Vector
-    high: Vector
-    z_low: Vector
-    z_high: Vector
 
 
 class Whereabouts(NamedTuple):
@@ -92,7 +81,7 @@ class HorizonProgram:
         N = self.settings.N
         return z[: 2 * N], z[2 * N : 3 * N]
 
-    def of(self, guess: Vector, offset: Vector, slope: Vector, p: Vector, margins: Margins) -> Program:
+    def of(self, guess: Vector, offset: Vector, slope: Vector, p: Vector, margins: Margins) -> QuadraticProgram:
         """The program in increments and slacks.
 
         Args:
@@ -133,8 +122,18 @@ class HorizonProgram:
             A[rows, k : 2 * N : 2] = np.tri(N)
             low[rows], high[rows] = bounds[0] - held, bounds[1] - held
         borders, slips = slice(2 * N, 4 * N), slice(4 * N, 8 * N)
-        self.add_borders(A[borders], low[borders], high[borders], guess, positions, moves, margins.lateral)
-        self.add_slip(A[slips], high[slips], guess[1:], offset[1:], slope[1:], p, margins.slip)
+        self.add_borders(
+            A[borders],
+            low[borders],
+            high[borders],
+            guess=guess,
+            positions=positions,
+            moves=moves,
+            margin=margins.lateral,
+        )
+        self.add_slip(
+            A[slips], high[slips], guess=guess[1:], offset=offset[1:], slope=slope[1:], p=p, margin=margins.slip
+        )
         if w.terminal_speed > 0:
             A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -length / self.settings.scale.time
             high[-1] = float(self.reference.terminal_speed_at(points[-1])) - offset[-1, V_X]
@@ -143,7 +142,7 @@ class HorizonProgram:
         span = self.limits.throttle[1] - self.limits.throttle[0]
         z_low = np.concatenate([np.tile([-span, -reach], N), np.zeros(N + 1)])
         z_high = np.concatenate([np.tile([span, reach], N), np.full(N + 1, np.inf)])
-        return Program(H, g, A, low, high, z_low, z_high)
+        return QuadraticProgram(H, g, A, low, high, z_low, z_high)
 
     def costs(self, x: Vector, u: Vector, p: Vector, margins: Margins) -> Vector:
         """What the program minimises, ``(M,)``; infinite where a state is not finite.
@@ -187,7 +186,7 @@ class HorizonProgram:
         return self.reference.project(guess[..., 1:, :2], _along(guess[..., :2], self.at.on_line))
 
     def add_borders(
-        self, A: Vector, low: Vector, high: Vector, guess: Vector, positions: Vector, moves: Vector, margin: Vector
+        self, A: Vector, low: Vector, high: Vector, *, guess: Vector, positions: Vector, moves: Vector, margin: Vector
     ) -> None:
         """Half planes at the feet of the guessed positions on the centre line; both sides share a step's slack.
 
@@ -214,7 +213,7 @@ class HorizonProgram:
         return right - margin, left - margin
 
     def add_slip(
-        self, A: Vector, high: Vector, guess: Vector, offset: Vector, slope: Vector, p: Vector, margin: Vector
+        self, A: Vector, high: Vector, *, guess: Vector, offset: Vector, slope: Vector, p: Vector, margin: Vector
     ) -> None:
         """The slip angles (rad) of both axles after each step, within their bounds on both sides less ``margin`` ``(N, 2)``.
 

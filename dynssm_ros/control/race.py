@@ -220,7 +220,7 @@ class _Drive:
         settings = replace(
             course.settings, travel="start" if plant_type(course.plant).integrator == "euler" else "middle"
         )
-        self.pilot = Controller(model, vehicle.inputs, course.reference, track, settings, time.thread_time)
+        self.pilot = Controller(model, vehicle.inputs, course.reference, track, settings, clock=time.thread_time)
         rolling = LowSpeedRolling(vehicle, plant_type(course.plant).step(vehicle))
         self._car = make_plant(vehicle, course.plant, pose, state, (rolling,), track.centre)
         self._course = course
@@ -232,7 +232,7 @@ class _Drive:
         self._logged: list[tuple[Any, ...]] = []  # of the lap under way
         if course.learning is not None:
             theta = model.calibrated.first.theta
-            self._learner = LapLearner(course.learning, track, course.reference, settings, model.car, theta)
+            self._learner = LapLearner(course.learning, track, course.reference, settings, car=model.car, theta=theta)
             self.pilot.follow(self._learner.reference, self._learner.theta)
         self.s, self._lateral = (float(value) for value in track.project(pose[:2]))
         self.start, self.goal = self.s, self.s + course.laps * track.length

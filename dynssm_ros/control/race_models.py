@@ -28,6 +28,7 @@ def load_prediction_model(
     known: Vehicle,
     driven: Vehicle,
     plant: PlantKind,
+    *,
     along_horizon: bool = False,
     as_is: bool = False,
 ) -> PredictionModel:

@@ -121,7 +121,9 @@ class ControllerNode(ManagedNode):
         reference = load_reference(self._line, car, road, self._speed_scale)
         settings = Settings.of(car, self._objective, self._steps or None, self._offset_free, self._evidence)
         settings = replace(settings, deadline=car.sampling_time / self._rate)
-        driver = LiveController(car, reference, road, settings, self._max_age, self._watchdog, self._delay)
+        driver = LiveController(
+            car, reference, road, settings, max_age=self._max_age, max_gap=self._watchdog, delay=self._delay
+        )
         self.get_logger().info(
             f"{car.name} on {road.name} ({road.length:.4g} m), {self._objective} of the {reference.name} line "
             f"({reference.lap_time:.4g} s a lap at its own speed), {settings.N} steps of {car.sampling_time:g} s"
@@ -192,7 +194,9 @@ class ControllerNode(ManagedNode):
             values[f"{topic} age (s)"] = f"{health.age(topic, now):.3f}"
         for refusal, count in health.refusals.items():
             values[f"odometry refused: {refusal.name.lower()}"] = str(count)
-        self._publish_diagnostics(diagnostics(self, "control", self._driver.vehicle.name, level, words, values))
+        self._publish_diagnostics(
+            diagnostics(self, "control", self._driver.vehicle.name, level=level, words=words, values=values)
+        )
 
 
 def _stamp(message: Any) -> int:

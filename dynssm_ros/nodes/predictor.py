@@ -257,7 +257,7 @@ class PredictorNode(ManagedNode):
             words = f"inactive, publishes nothing: {words}"
         values = self._predictor.figures() | self._health.values(now)
         vehicle = self._predictor.vehicle.name
-        self._publish_diagnostics(diagnostics(self, "prediction", vehicle, level, words, values))
+        self._publish_diagnostics(diagnostics(self, "prediction", vehicle, level=level, words=words, values=values))
 
 
 def main(args: list[str] | None = None) -> None:

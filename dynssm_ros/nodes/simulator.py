@@ -204,7 +204,7 @@ class SimulatorNode(Node):
             "least room to the borders so far (m)": f"{self._least:.4f}",
             "held up so far (s)": f"{self._held_up:.3f}",
         }
-        self._publish_diagnostics(diagnostics(self, "car", self._vehicle.name, level, words, values))
+        self._publish_diagnostics(diagnostics(self, "car", self._vehicle.name, level=level, words=words, values=values))
 
     def _tell(self, sample: Sample) -> None:
         """Logs when an external driver falls silent, comes back, leaves the road or returns to it."""

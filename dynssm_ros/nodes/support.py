@@ -108,6 +108,7 @@ def describe(
     default: Any,
     description: str,
     bounds: tuple[float, float] | None = None,
+    *,
     read_only: bool = False,
 ) -> Any:
     """Declares a described, typed, bounded parameter and returns its value; ``~/`` in front of a path is the home."""
@@ -141,7 +142,7 @@ def actuators(stamp: int, applied: Applied) -> JointState:
 
 
 def diagnostics(
-    node: Node, part: str, hardware: str, level: int, words: str, values: Mapping[str, str]
+    node: Node, part: str, hardware: str, *, level: int, words: str, values: Mapping[str, str]
 ) -> DiagnosticArray:
     """What ``node`` says of its ``part``, stamped now."""
     status = DiagnosticStatus(

@@ -68,7 +68,7 @@ class Predictor:
 
     def __init__(self, model: OnnxModel, signal_map: SignalMap, max_age: float = 0.2, online: bool = True) -> None:
         self.signal_map = live_signal_map(model, signal_map)
-        self._history = History(self.signal_map, model.T_s, model.H, max_age, held=model.card.held)
+        self._history = History(self.signal_map, model.T_s, model.H, max_age=max_age, held=model.card.held)
         self._learner: OnlineLearner | None = None
         self._learns = online
         self._window = np.zeros((model.H, len(WINDOW_COLUMNS)))

@@ -98,7 +98,11 @@ def replay_to_bag(
             count += 1
             v_x, v_y, omega = outcome.state.tolist()
             covariance = planar_covariance(outcome.variance)
-            message = odometry(outcome.stamp, outcome.pose or (0.0, 0.0, 0.0), (v_x, v_y, omega), covariance, *frames)
+            frame_id, child_frame_id = frames
+            message = odometry(
+                outcome.stamp, outcome.pose or (0.0, 0.0, 0.0), (v_x, v_y, omega), twist_covariance=covariance,
+                frame_id=frame_id, child_frame_id=child_frame_id,
+            )  # fmt: skip
             sink.write(PREDICTION_TOPIC, log_time, message)
             if outcome.theta is not None:
                 values = dict(zip(COEFFICIENTS, outcome.theta.tolist(), strict=True))

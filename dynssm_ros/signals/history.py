@@ -125,8 +125,8 @@ class History:
         signal_map: SignalMap,
         T_s: float,
         H: int,
-        max_age: float = 0.2,
         *,
+        max_age: float = 0.2,
         jump: float = 0.5,
         held: Collection[str] = (),
     ) -> None:

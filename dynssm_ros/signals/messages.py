@@ -31,6 +31,7 @@ def odometry(
     stamp: int,
     pose: tuple[float, float, float],
     state: tuple[float, float, float],
+    *,
     twist_covariance: Vector | None = None,
     frame_id: str = "map",
     child_frame_id: str = "base_link",

@@ -44,7 +44,7 @@ class Log:
 
 
 def logs_of(
-    bags: Sequence[Path], car: str, track: str, signal_map: SignalMap, rate: float, drop_bad: bool
+    bags: Sequence[Path], car: str, track: str, signal_map: SignalMap, *, rate: float, drop_bad: bool
 ) -> list[Log]:
     """Bags as sessions that are named after them, and after their folder too where two have the same name.
 

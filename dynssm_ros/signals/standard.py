@@ -29,6 +29,7 @@ def write_standard_bag(
     time: npt.NDArray[np.int64],
     state: Vector,
     pose: Vector,
+    *,
     feedback: Vector,
     command: Vector | None,
 ) -> None:
@@ -68,9 +69,8 @@ def recording_to_bag(recording: Recording, path: str | Path) -> None:
         else np.zeros((len(recording), 3))
     )
     has_commands = recording.info.commands == "topics"
-    write_standard_bag(
-        path, recording.time, recording.states(slice(None)), pose, feedback, command if has_commands else None
-    )
+    state = recording.states(slice(None))
+    write_standard_bag(path, recording.time, state, pose, feedback=feedback, command=command if has_commands else None)
 
 
 def _actuators(stamp: int, values: Vector) -> object:

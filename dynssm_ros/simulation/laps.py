@@ -220,7 +220,7 @@ def write_run(run: Run, path: str | Path) -> None:
     Raises:
         BagError: ``path`` exists and is no bag.
     """
-    write_standard_bag(path, run.time, run.measured, run.pose, run.feedback, run.command)
+    write_standard_bag(path, run.time, run.measured, run.pose, feedback=run.feedback, command=run.command)
 
 
 def _check_motion(vehicle: Vehicle, track: Track, time: float, pose: Pose, state: State) -> None:

@@ -22,7 +22,7 @@ def learner(orca, club):
     """One whose coefficients are known well, so that they bound nothing and are not calibrated anew."""
     known = orca.with_nominal(orca.nominal, np.full(17, 1e-9))
     reference = load_reference("racing", known, club, SAFE)
-    built = LapLearner(known, club, reference, Settings.of(known), SteppedCar.of(known), known.nominal)
+    built = LapLearner(known, club, reference, Settings.of(known), car=SteppedCar.of(known), theta=known.nominal)
     built._calibrated = lambda: known
     return built
 
@@ -75,7 +75,9 @@ def test_where_the_rear_slipped_nearly_as_far_as_it_may_it_goes_back_and_stays_t
         assert learner._shares[2] == pytest.approx(SAFE + STEP / 2)
         learner.learn(lap(learner, slipping=again))
     np.testing.assert_allclose(np.delete(learner._shares, 2), SAFE + 5 * STEP)
-    fast = LapLearner(orca, club, learner._line, Settings.of(orca, "progress"), SteppedCar.of(orca), orca.nominal)
+    fast = LapLearner(
+        orca, club, learner._line, Settings.of(orca, "progress"), car=SteppedCar.of(orca), theta=orca.nominal
+    )
     assert not fast._slips(lap(learner, slipping=[2])).any()
     assert np.flatnonzero(learner._slips(lap(learner, slipping=[2]))).tolist() == [2]
 
@@ -121,7 +123,7 @@ def test_no_share_goes_beyond_what_the_coefficients_allow(orca, club):
     allowed = []
     for std in (1e-9, 0.02):
         known = orca.with_nominal(orca.nominal, std * np.abs(orca.nominal) + 1e-12)
-        learner = LapLearner(known, club, reference, Settings.of(known), SteppedCar.of(known), known.nominal)
+        learner = LapLearner(known, club, reference, Settings.of(known), car=SteppedCar.of(known), theta=known.nominal)
         allowed.append(learner._allowed.min() / MOST)
     assert allowed[0] == pytest.approx(1.0, abs=1e-3)
     assert 0.92 < allowed[1] < 0.98  # 10 % of such cars grip less by 2 % or more
@@ -132,7 +134,7 @@ def test_a_car_that_nobody_measured_begins_slower_still(orca, club):
         update={"coefficients": {n: c.model_copy(update={"std": None}) for n, c in orca.coefficients.items()}}
     )
     reference = load_reference("racing", orca, club, SAFE)
-    learner = LapLearner(unknown, club, reference, Settings.of(orca), SteppedCar.of(orca), orca.nominal)
+    learner = LapLearner(unknown, club, reference, Settings.of(orca), car=SteppedCar.of(orca), theta=orca.nominal)
     assert learner.reference.lap_time > 1.05 * reference.lap_time
     learner._calibrated = lambda: orca
     for _ in range(3):
@@ -150,7 +152,7 @@ def test_what_is_believed_stays_till_it_is_clearly_worse():
 def test_a_line_with_a_speed_of_its_own_is_refused(orca, club):
     own = replace(load_reference("racing", orca, club), share=None)
     with pytest.raises(ConfigurationError, match="has a speed of its own"):
-        LapLearner(orca, club, own, Settings.of(orca), SteppedCar.of(orca), orca.nominal)
+        LapLearner(orca, club, own, Settings.of(orca), car=SteppedCar.of(orca), theta=orca.nominal)
 
 
 def test_grip_is_learned_where_it_is_and_bounds_the_speed_there(orca, club):
@@ -174,7 +176,7 @@ def test_grip_is_learned_where_it_is_and_bounds_the_speed_there(orca, club):
 
 def test_a_model_that_knows_of_the_place_learns_without_it(learner, orca, club):
     driven = orca.with_effect("grip_patch", {"factor": 0.8, "centre": 0.5, "length": 0.4})
-    knowing = LapLearner(orca, club, learner._line, Settings.of(orca), SteppedCar.of(driven), orca.nominal)
+    knowing = LapLearner(orca, club, learner._line, Settings.of(orca), car=SteppedCar.of(driven), theta=orca.nominal)
     knowing._calibrated = lambda: orca
     for _ in range(2):
         knowing.learn(lap(learner))

@@ -35,7 +35,7 @@ def feedback(value: float = 1.0) -> dict[str, float]:
 
 def filled(T_s: float = 0.04, H: int = 5, until: float = 1.0, rate: float = 100.0) -> tuple[History, int]:
     """A history with samples at ``rate`` whose values are the time since the start, and the stamp of the last."""
-    history, stamp = History(NO_COMMANDS, T_s, H, MAX_AGE), START
+    history, stamp = History(NO_COMMANDS, T_s, H, max_age=MAX_AGE), START
     for k in range(int(until * rate) + 1):
         stamp = START + round(k * SECOND / rate)
         for values in (feedback((stamp - START) / SECOND), odometry((stamp - START) / SECOND)):
@@ -170,7 +170,7 @@ def test_any_sequence_of_messages_is_answered_as_by_a_plain_list(
     sequence: list[tuple[float, dict[str, float]]],
 ) -> None:
     plain = PlainHistory(0.02, 4)
-    history = History(NO_COMMANDS, 0.02, 4, MAX_AGE, jump=JUMP_BACK, held=plain.held)
+    history = History(NO_COMMANDS, 0.02, 4, max_age=MAX_AGE, jump=JUMP_BACK, held=plain.held)
     stamp = START
     for move, taken in sequence:
         stamp += round(move * SECOND)
@@ -203,7 +203,7 @@ def test_the_window_is_the_extractors_where_all_samples_are_known(data: st.DataO
         reject()
     ends = set(recording.window_ends(H, 0).tolist())
     for row in random.choice(len(recording), min(len(recording), 15), replace=False):
-        now, history = int(recording.time[row]), History(NO_COMMANDS, T_s, H, MAX_AGE, held=held)
+        now, history = int(recording.time[row]), History(NO_COMMANDS, T_s, H, max_age=MAX_AGE, held=held)
         for name, stream in streams.items():
             known = np.searchsorted(stream.stamps, now) + 1  # up to the first sample that is not older
             for stamp, value in zip(stream.stamps[:known].tolist(), stream.values[:known].tolist(), strict=True):
@@ -224,7 +224,7 @@ def test_the_window_is_the_extractors_where_all_samples_are_known(data: st.DataO
 @pytest.mark.parametrize("rate", [25.0, 100.0, 400.0, 2000.0])
 def test_any_odometry_rate_gets_a_window_per_message_once_it_is_full(rate: float, jitter: float) -> None:
     T_s, H, random = 0.04, 15, np.random.default_rng(3)
-    history, refused, windows = History(NO_COMMANDS, T_s, H, MAX_AGE), 0, 0
+    history, refused, windows = History(NO_COMMANDS, T_s, H, max_age=MAX_AGE), 0, 0
     feedback_due = 0.0
     for k in range(int(2.0 * rate)):
         t = (k + jitter * random.uniform(-1, 1)) / rate
@@ -250,7 +250,7 @@ def test_any_odometry_rate_gets_a_window_per_message_once_it_is_full(rate: float
 
 def test_real_stamps_lose_no_precision() -> None:
     """A float of nanoseconds since 1970 is good to 256 ns only, which at this slope would be 0.26."""
-    history, slope = History(NO_COMMANDS, 0.04, 5, MAX_AGE), 1e6
+    history, slope = History(NO_COMMANDS, 0.04, 5, max_age=MAX_AGE), 1e6
     for k in range(40):
         stamp = START + k * 10_000_001
         history.add(stamp, feedback(0.0))
@@ -261,7 +261,7 @@ def test_real_stamps_lose_no_precision() -> None:
 
 
 def test_a_first_message_without_a_stamp_does_no_harm() -> None:
-    history = History(NO_COMMANDS, 0.04, 5, MAX_AGE)
+    history = History(NO_COMMANDS, 0.04, 5, max_age=MAX_AGE)
     history.add(0, odometry(99.0))
     for k in range(40):
         stamp = START + k * 10_000_000
@@ -281,7 +281,7 @@ def test_the_window_may_end_before_the_newest_feedback() -> None:
 
 
 def test_slow_actuators_are_held_where_the_model_saw_them_held() -> None:
-    history = History(NO_COMMANDS, 0.04, 3, MAX_AGE, held=("steering_feedback",))
+    history = History(NO_COMMANDS, 0.04, 3, max_age=MAX_AGE, held=("steering_feedback",))
     for k in range(41):
         stamp = START + k * 10_000_000
         if k % 10 == 0:
@@ -300,7 +300,7 @@ def test_slow_actuators_are_held_where_the_model_saw_them_held() -> None:
 def test_a_signal_that_is_stamped_late_is_taken_back_to_when_it_was_true() -> None:
     signals = {name: source.model_dump() for name, source in NO_COMMANDS.signals.items()}
     signals["steering_feedback"]["delay"] = 0.02
-    history = History(SignalMap(name="own", commands="none", signals=signals), 0.04, 3, MAX_AGE)
+    history = History(SignalMap(name="own", commands="none", signals=signals), 0.04, 3, max_age=MAX_AGE)
     for k in range(41):
         stamp = START + k * 10_000_000
         assert history.add(stamp, feedback(0.01 * k)) is None
@@ -313,7 +313,7 @@ def test_a_signal_that_is_stamped_late_is_taken_back_to_when_it_was_true() -> No
 
 
 def test_signals_of_one_topic_may_come_in_separate_messages() -> None:
-    history = History(NO_COMMANDS, 0.04, 5, MAX_AGE)
+    history = History(NO_COMMANDS, 0.04, 5, max_age=MAX_AGE)
     for k in range(40):
         stamp = START + k * 10_000_000
         assert history.add(stamp, {"steering_feedback" if k % 2 else "throttle_feedback": 0.01 * k}) is None
@@ -326,7 +326,7 @@ def test_signals_of_one_topic_may_come_in_separate_messages() -> None:
 
 
 def test_commands_and_brakes_are_merged_as_in_the_extractor() -> None:
-    history = History(DEFAULT, 0.04, 3, MAX_AGE)
+    history = History(DEFAULT, 0.04, 3, max_age=MAX_AGE)
     for k in range(20):
         stamp = START + k * 10_000_000
         history.add(stamp, feedback(0.3))
@@ -344,7 +344,7 @@ def test_commands_and_brakes_are_merged_as_in_the_extractor() -> None:
 
 def test_a_window_needs_H_rows_of_history_and_no_more() -> None:
     """With samples at the window's own instants it is full at the H-th message."""
-    history, H = History(NO_COMMANDS, 0.04, 5, MAX_AGE), 5
+    history, H = History(NO_COMMANDS, 0.04, 5, max_age=MAX_AGE), 5
     for k in range(8):
         stamp = START + k * 40_000_000
         history.add(stamp, feedback())
@@ -387,7 +387,7 @@ def test_a_signal_older_than_max_age_is_stale(age: int, answer: Refusal | None) 
 
 
 def test_a_signal_that_never_came_is_missing() -> None:
-    history = History(DEFAULT, 0.04, 5, MAX_AGE)
+    history = History(DEFAULT, 0.04, 5, max_age=MAX_AGE)
     assert history.window(START) is Refusal.MISSING
     history.add(START, odometry())
     assert history.window(START) is Refusal.MISSING

@@ -14,7 +14,9 @@ STAMP = 1_700_000_000_999_999_999
 
 def test_odometry_carries_pose_state_frames_and_stamp() -> None:
     covariance = np.arange(36.0)
-    message = odometry(STAMP, (1.0, 2.0, -3.0), (4.0, 5.0, 6.0), covariance, "track", "car")
+    message = odometry(
+        STAMP, (1.0, 2.0, -3.0), (4.0, 5.0, 6.0), twist_covariance=covariance, frame_id="track", child_frame_id="car"
+    )
     position, twist = message.pose.pose.position, message.twist.twist
     assert (position.x, position.y, position.z) == (1.0, 2.0, 0.0)
     assert compile_field("yaw(pose.pose.orientation)")(message) == pytest.approx(-3.0, abs=1e-15)

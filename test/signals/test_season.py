@@ -57,7 +57,7 @@ def bags(made: Path, tmp_path: Path) -> list[Path]:
 
 
 def logs(bags: list[Path], track: str = "club") -> list[Log]:
-    return logs_of(bags, "orca", track, MAP, 50.0, False)
+    return logs_of(bags, "orca", track, MAP, rate=50.0, drop_bad=False)
 
 
 def stamps(season: Season) -> dict[str, int]:
@@ -242,10 +242,10 @@ def test_what_is_no_season_is_not_replaced_and_names_are_unique(bags: list[Path]
     assert not is_season(other)
     (tmp_path / "day").mkdir()
     shutil.copytree(bags[0], tmp_path / "day" / "run_0")
-    same = logs_of([bags[0], tmp_path / "day" / "run_0"], "orca", "club", MAP, 50.0, False)
+    same = logs_of([bags[0], tmp_path / "day" / "run_0"], "orca", "club", MAP, rate=50.0, drop_bad=False)
     assert [log.session for log in same] == ["bags-run_0", "day-run_0"]
     with pytest.raises(ConfigurationError, match="--track 'a/b': expected letters"):
-        logs_of(bags, "orca", "a/b", MAP, 50.0, False)
+        logs_of(bags, "orca", "a/b", MAP, rate=50.0, drop_bad=False)
 
 
 def test_another_log_of_the_same_name_takes_nothing_away(bags: list[Path], tmp_path: Path) -> None:
