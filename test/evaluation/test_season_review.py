@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from dynssm_ros.runtime.coefficients import daily_change
 from dynssm_ros.signals.season import Season, Session
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle
 
 ORCA = load_vehicle("orca")
 
@@ -107,38 +108,53 @@ def test_another_day_adds_what_changes_to_what_is_known() -> None:
     assert loose.known_correlation[0, 1] == pytest.approx(correlation, rel=1e-3)  # a file has few digits
 
 
+WORN = ORCA.with_effects([("rear_grip", {"factor": 0.85})])
+KNOWN = ORCA.with_nominal(ORCA.nominal, 0.03 * np.abs(ORCA.nominal))
+
+
 @pytest.fixture
-def season(tmp_path: Path) -> Season:
-    """Two sessions; in the second the car has lost a tenth of its rear grip. A third is too short."""
-    made = Season(tmp_path / "season")
-    hidden = load_vehicle("orca").with_effects([("rear_grip", {"factor": 0.85})])
-    for k, (car, duration) in enumerate(((ORCA, 24.0), (hidden, 24.0), (ORCA, 0.4))):
-        run = simulate(car, load_track("club"), duration, plant="rk4", seed=8500 + k, noise=(0.005, 0.005, 0.02))
-        laps = as_recording(run)
-        session = Session(
-            car="orca", track="club", session=f"run_{k}", bag="", files={}, checksum="", settings="", signal_map="",
-            rate=50.0, start=f"2026-06-0{k + 1}T10:00:00+00:00", rows=len(laps), seconds=laps.duration, segments=1,
-        )  # fmt: skip
-        made.sessions[session.place] = session
-        made.file(session.place).parent.mkdir(parents=True)
-        laps.save(made.file(session.place))
-    made.save()
-    return made
+def season_of(tmp_path: Path) -> Callable[..., Season]:
+    """``season_of((car, seconds), ...)``: one session of each drive on ``club``."""
+
+    def make(*drives: tuple[Vehicle, float]) -> Season:
+        made = Season(tmp_path / "season")
+        for k, (car, duration) in enumerate(drives):
+            run = simulate(car, load_track("club"), duration, plant="rk4", seed=8500 + k, noise=(0.005, 0.005, 0.02))
+            laps = as_recording(run)
+            session = Session(
+                car="orca", track="club", session=f"run_{k}", bag="", files={}, checksum="", settings="", signal_map="",
+                rate=50.0, start=f"2026-06-0{k + 1}T10:00:00+00:00", rows=len(laps), seconds=laps.duration, segments=1,
+            )  # fmt: skip
+            made.sessions[session.place] = session
+            made.file(session.place).parent.mkdir(parents=True)
+            laps.save(made.file(session.place))
+        made.save()
+        return made
+
+    return make
 
 
-def test_a_season_is_reviewed_and_not_again_what_is_as_it_was(season: Season, tmp_path: Path) -> None:
-    car = ORCA.with_nominal(ORCA.nominal, 0.03 * np.abs(ORCA.nominal))
-    reviews = review_season(season.path, ["persistence"], car, tmp_path / "review", stretch=12.0)
-    healthy, worn, short = reviews
-    assert [len(each.stretches) for each in reviews] == [2, 2, 0]
+def test_sessions_are_reviewed_once_and_what_cannot_be_told_of_a_short_one_is_a_failure(
+    season_of: Callable[..., Season], tmp_path: Path
+) -> None:
+    season, out = season_of((ORCA, 0.4), (WORN, 0.5)), tmp_path / "review"
+    reviews = review_season(season.path, ["persistence"], KNOWN, out)
+    for short in reviews:
+        assert {words.partition(":")[0] for words in short.failures} == {"models", "coefficients", "diagnosis"}
+    kept = {path: path.stat().st_mtime_ns for path in (out / "sessions").iterdir()}
+    assert review_season(season, ["persistence"], KNOWN, out) == reviews
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    other = review_season(season, [], KNOWN, out)
+    assert all(new.key != old.key for new, old in zip(other, reviews, strict=True))
+
+
+@pytest.mark.slow
+def test_a_season_tells_what_a_car_has_lost(season_of: Callable[..., Season], tmp_path: Path) -> None:
+    season = season_of((ORCA, 24.0), (WORN, 24.0), (ORCA, 0.4))
+    healthy, worn, short = review_season(season.path, ["persistence"], KNOWN, tmp_path / "review", stretch=12.0)
+    assert [len(each.stretches) for each in (healthy, worn, short)] == [2, 2, 0]
     assert healthy.causes == ()
     assert [cause.effect for cause in worn.causes][:1] == ["rear_grip"]
     assert worn.causes[0].values["factor"] == pytest.approx(0.85, abs=0.03)
     assert worn.stretches[0].coefficients["D_r"].value < 0.93 * healthy.stretches[0].coefficients["D_r"].value
     assert healthy.accuracy.keys() == {"persistence", "single_track", "single_track_ewma"}
-    assert {words.partition(":")[0] for words in short.failures} == {"models", "coefficients", "diagnosis"}
-    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "review" / "sessions").iterdir()}
-    assert review_season(season, ["persistence"], car, tmp_path / "review", stretch=12.0) == reviews
-    assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    other = review_season(season, [], car, tmp_path / "review", where="session == 'run_2'", stretch=12.0)
-    assert other[0].key != short.key
