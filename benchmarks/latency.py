@@ -148,13 +148,19 @@ def _predictor_call(artifact: Artifact, drive: Recording) -> Callable[[], float]
 
 
 def _eager_call(artifact: Artifact) -> Callable[[], float]:
-    from dynssm_ros.learning.export import eager_prediction
+    """One prediction by the model as trained, in eager torch on one core: what ONNX Runtime is compared with."""
+    import torch
 
-    run_eager = eager_prediction(artifact)
+    from dynssm_ros.learning.export import load_torch
+
+    torch.set_num_threads(1)
+    model = load_torch(artifact)
+    window = torch.tensor(artifact.card.normalisation.input_mean).expand(1, artifact.card.window, -1).contiguous()
 
     def predict() -> float:
         begin = time.perf_counter()
-        run_eager()
+        with torch.inference_mode():
+            model(window)
         return time.perf_counter() - begin
 
     return predict

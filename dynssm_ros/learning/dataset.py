@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
@@ -45,13 +45,6 @@ class SplitConfig(StrictModel):
         return 1, 1
 
 
-class Digest(Protocol):
-    """As of :mod:`hashlib`."""
-
-    def update(self, data: bytes, /) -> None:
-        """Adds bytes."""
-
-
 @dataclass(frozen=True)
 class TrainingWindows:
     """Windows that end at ``ends`` in the rows ``matrix`` ``(N, 7)``; formed batch by batch, never stored."""
@@ -84,16 +77,6 @@ class TrainingWindows:
         order = torch.randperm(len(self), generator=draw).to(self.ends.device)
         for index in torch.split(order, size) if len(order) else ():
             yield self.batch(index)
-
-    @property
-    def mean_increment(self) -> Tensor:
-        """Mean of the measured increments, ``(3,)``."""
-        return self.increments.mean(0)
-
-    def identify(self, digest: Digest) -> None:
-        """Adds what it is to a checksum."""
-        digest.update(np.ascontiguousarray(self.matrix.numpy()).tobytes())
-        digest.update(self.ends.numpy().tobytes())
 
     def to(self, device: torch.device) -> TrainingWindows:
         """The same windows on ``device``."""
@@ -147,11 +130,6 @@ def split_ends(
             "more driving is needed"
         )
     return training, held
-
-
-def all_windows(recording: Recording, H: int, min_speed: float) -> TrainingWindows:
-    """Every window of ``recording`` at ``min_speed`` (m/s) or more."""
-    return TrainingWindows(_matrix(recording), torch.tensor(recording.window_ends(H, min_speed=min_speed)), H)
 
 
 def _matrix(recording: Recording) -> Tensor:

@@ -243,19 +243,6 @@ def load_torch(artifact: Artifact) -> TrainableModel:
     return model.eval()
 
 
-def eager_prediction(artifact: Artifact) -> Callable[[], None]:
-    """One prediction by the model as trained, in eager torch on one core: what ONNX Runtime is compared with."""
-    torch.set_num_threads(1)
-    model = load_torch(artifact)
-    window = torch.tensor(artifact.card.normalisation.input_mean).expand(1, artifact.card.window, -1).contiguous()
-
-    def predict() -> None:
-        with torch.inference_mode():
-            model(window)
-
-    return predict
-
-
 def _sample_windows(trained: Trained, count: int = 256) -> Tensor:
     """Windows spread over the training data."""
     ends = trained.recording.window_ends(trained.H, min_speed=trained.vehicle.minimum_speed)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -270,7 +271,7 @@ def squared_errors(model: TrainableModel, windows: TrainingWindows) -> Tensor:
 
 def unexplained(model: TrainableModel, training: TrainingWindows, validation: TrainingWindows) -> float:
     """Mean squared error on ``validation`` over that of predicting the mean change in ``training``, mean of the states."""
-    of_mean = (validation.increments - training.mean_increment).double().square().mean(0).cpu()
+    of_mean = (validation.increments - training.increments.mean(0)).double().square().mean(0).cpu()
     return float((squared_errors(model, validation) / of_mean).mean())
 
 
@@ -282,5 +283,6 @@ def _identity(config: ModelConfig, vehicle: Vehicle, training: TrainingWindows) 
     """Names a training by code, data, car and configuration, so that a checkpoint is never continued for another."""
     digest = hashlib.sha256(f"{__version__} {torch.__version__} {config.model_dump_json()}".encode())
     digest.update(vehicle.model_dump_json().encode())
-    training.identify(digest)
+    for rows in (training.matrix, training.ends):
+        digest.update(np.ascontiguousarray(rows.cpu().numpy()).tobytes())
     return digest.hexdigest()

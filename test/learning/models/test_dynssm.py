@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dynssm_ros.configuration import config_root
-from dynssm_ros.learning.dataset import TrainingWindows, all_windows, normalisation
+from dynssm_ros.learning.dataset import TrainingWindows, normalisation
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.learning.models.dynssm.network import DynSSM, GatedResidual
@@ -36,7 +36,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(scope="module")
 def windows(laps: Recording) -> TrainingWindows:
-    return all_windows(laps, 4, 0.0)
+    return TrainingWindows(torch.tensor(laps.matrix, dtype=torch.float32), torch.tensor(laps.window_ends(4)), 4)
 
 
 @pytest.fixture(scope="module")
