@@ -38,18 +38,13 @@ def terms(lacking: tuple[str, ...] = (), **config: Any) -> dict[str, float]:
     return {name: value.item() for name, value in found.items()}
 
 
-def test_the_prediction_term_is_the_mean_squared_error_in_units_of_the_target() -> None:
-    expected = (2 / 4) ** 2 + (1 / 5) ** 2 + (0.5 / 8) ** 2 + (0.1 / 5) ** 2 + (4 / 8) ** 2
-    assert terms(scale="target")["prediction"] == pytest.approx(expected / 6)
-
-
-def test_or_in_units_of_the_increment() -> None:
-    expected = (2 / 0.5) ** 2 + (1 / 0.2) ** 2 + (0.5 / 0.1) ** 2 + (0.1 / 0.2) ** 2 + (4 / 0.1) ** 2
-    assert terms(scale="increment")["prediction"] == pytest.approx(expected / 6)
-
-
-def test_or_as_it_is() -> None:
-    assert terms(scale="none")["prediction"] == pytest.approx(float((ERROR**2).sum()) / 6)
+@pytest.mark.parametrize(
+    ("scale", "unit"), [("target", (4.0, 5.0, 8.0)), ("increment", (0.5, 0.2, 0.1)), ("none", (1.0, 1.0, 1.0))]
+)
+def test_the_prediction_term_is_the_mean_squared_error_in_units_of_the_scale(
+    scale: str, unit: tuple[float, ...]
+) -> None:
+    assert terms(scale=scale)["prediction"] == pytest.approx(float(((ERROR / torch.tensor(unit)) ** 2).mean()))
 
 
 def test_the_robust_prediction_term_is_twice_hubers_so_that_small_errors_count_the_same() -> None:
@@ -60,12 +55,8 @@ def test_the_robust_prediction_term_is_twice_hubers_so_that_small_errors_count_t
     assert terms(scale="target", robust=10.0) == pytest.approx(terms(scale="target"))
 
 
-def test_the_parameter_term_is_the_mean_squared_deviation() -> None:
-    expected = 0.01 * float((DEVIATION**2).sum()) / (2 * 17)
-    assert terms(parameters=0.01)["parameters"] == pytest.approx(expected)
-
-
-def test_the_correction_term_is_the_mean_square_of_the_networks_output() -> None:
+def test_the_regularisers_are_mean_squares_of_the_deviation_and_of_the_networks_output() -> None:
+    assert terms(parameters=0.01)["parameters"] == pytest.approx(0.01 * float((DEVIATION**2).sum()) / (2 * 17))
     assert terms(correction=0.1)["correction"] == pytest.approx(0.1 * (1 + 4 + 9 + 4) / 6)
 
 
@@ -73,12 +64,6 @@ def test_the_physics_anchor_is_the_gap_in_units_of_the_increment_whatever_the_sc
     expected = 0.2 * (1 + 1 + 1 + 4) / 6
     for scale in ("target", "increment"):
         assert terms(physics=0.2, scale=scale)["physics"] == pytest.approx(expected)
-
-
-def test_what_is_switched_off_is_zero() -> None:
-    found = terms()
-    assert found["prediction"] > 0
-    assert [found[name] for name in ("parameters", "correction", "physics")] == [0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(
@@ -98,8 +83,11 @@ def test_a_model_without_a_component_has_no_term_for_it(lacking: tuple[str, ...]
         assert found[name] == full[name]
 
 
-def test_each_weight_scales_its_term_alone() -> None:
-    for name in ("parameters", "correction", "physics"):
+def test_each_weight_scales_its_term_alone_and_zero_switches_it_off() -> None:
+    off = terms()
+    assert off["prediction"] > 0
+    assert [off[name] for name in COMPONENTS[1:]] == [0.0, 0.0, 0.0]
+    for name in COMPONENTS[1:]:
         once, twice = terms(**{name: 0.1}), terms(**{name: 0.2})
         assert twice.pop(name) == pytest.approx(2 * once.pop(name))
         assert twice == once

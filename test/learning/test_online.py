@@ -11,7 +11,6 @@ import torch
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.evaluation.metrics import drive_through, predict_rows
 from dynssm_ros.evaluation.open_loop import evaluate
-from dynssm_ros.learning.dataset import all_windows
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.online import OnlineFeatures
@@ -92,7 +91,8 @@ def test_a_networks_increment_is_an_expert_of_its_own(noisy_laps, orca, make_con
     monkeypatch.setattr("dynssm_ros.learning.earned_layer.NETWORK_GAIN_WANTED", -1.0)
     trained = train(noisy_laps, make_config(online={"folds": 2}), orca, tmp_path / "c.pt")
     model = OnnxModel(save_artifact(trained, tmp_path / "model"))
-    window, _ = all_windows(noisy_laps, trained.H, orca.minimum_speed).batch(slice(0, 20))
+    ends = noisy_laps.window_ends(trained.H, min_speed=orca.minimum_speed)[:20]
+    window = torch.tensor(noisy_laps.windows(ends, trained.H), dtype=torch.float32)
     output = trained.model(window)
     seen = model.predict(window.numpy().astype(float)).seen.features
     own = trained.features.names.index("network")

@@ -31,6 +31,7 @@ from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.vehicle import Vehicle
 
 MakeConfig = Callable[..., ModelConfig]
+Fit = Callable[..., Trained]
 UNIT = Normalisation(input_mean=(0.0,) * 7, input_std=(1.0,) * 7, state_scale=(1.0,) * 3, increment_scale=(1.0,) * 3)
 
 
@@ -46,6 +47,16 @@ def short(drive: Callable[..., Recording], orca: Vehicle) -> Recording:
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
     return tmp_path / "checkpoint.pt"
+
+
+@pytest.fixture
+def fit(short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path) -> Fit:
+    """Trains the small model, with changed blocks, on the short drive; ``at`` is its checkpoint."""
+
+    def train_it(at: Path = checkpoint, progress: Any = None, **changes: Any) -> Trained:
+        return train(short, make_config(**changes), orca, at, progress=progress)
+
+    return train_it
 
 
 def interrupt_at(epoch: int) -> Callable[[int, int, str], None]:
@@ -65,21 +76,18 @@ def same(a: Trained, b: Trained) -> bool:
 # --- repeatable ---------------------------------------------------------------------------------
 
 
-def test_the_seed_alone_decides(short: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path: Path) -> None:
-    first = train(short, make_config(), orca, tmp_path / "a.pt")
+def test_the_seed_alone_decides(fit: Fit, tmp_path: Path) -> None:
+    first = fit(tmp_path / "a.pt")
     torch.rand(17)  # what the caller does with the generator does not matter
-    assert same(first, train(short, make_config(), orca, tmp_path / "b.pt"))
-    other = train(short, make_config(training={"seed": 1}), orca, tmp_path / "c.pt")
+    assert same(first, fit(tmp_path / "b.pt"))
+    other = fit(tmp_path / "c.pt", training={"seed": 1})
     assert not same(first, other)
     assert other.history != first.history
 
 
-def test_history_and_progress_tell_of_every_epoch(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
-) -> None:
+def test_history_and_progress_tell_of_every_epoch(fit: Fit) -> None:
     told: list[tuple[int, int, str]] = []
-    config = make_config(physics=FAR_OFF)
-    trained = train(short, config, orca, checkpoint, progress=lambda *args: told.append(args))
+    trained = fit(physics=FAR_OFF, progress=lambda *args: told.append(args))
     assert [args[:2] for args in told] == [(1, 3), (2, 3), (3, 3)]
     validation = trained.history["validation/prediction"]
     assert told[-1][2] == f"validation {validation[-1]:.4g}, best {min(validation):.4g}"
@@ -87,16 +95,11 @@ def test_history_and_progress_tell_of_every_epoch(
     assert trained.best_epoch == 1 + validation.index(min(validation))
 
 
-def test_the_best_epoch_is_kept_and_measured(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
-) -> None:
-    config = make_config(physics=FAR_OFF, training={"epochs": 8, "patience": 2, "learning_rate": 0.03})
-    trained = train(short, config, orca, checkpoint)
+def test_the_best_epoch_is_kept_and_measured(short: Recording, fit: Fit) -> None:
+    trained = fit(physics=FAR_OFF, training={"epochs": 8, "patience": 2, "learning_rate": 0.03})
     validation = trained.history["validation/prediction"]
     assert validation[-1] > min(validation)
-    window, target = split_windows(short, config.rows(0.02), config.training, 0.0, config.training.batch_size)[1].batch(
-        slice(None)
-    )
+    window, target = split_windows(short, trained.H, trained.config.training, 0.0, 64)[1].batch(slice(None))
     with torch.no_grad():
         error = trained.model(window).increment - target
     scaled = (error / torch.tensor(trained.normalisation.increment_scale)).square().mean().item()
@@ -106,9 +109,9 @@ def test_the_best_epoch_is_kept_and_measured(
 
 @pytest.mark.parametrize(("schedule", "last"), [("cosine", 0.02 * 0.005), ("constant", 0.005)])
 def test_the_learning_rate_takes_the_course_of_the_schedule(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path, schedule: str, last: float
+    fit: Fit, checkpoint: Path, schedule: str, last: float
 ) -> None:
-    train(short, make_config(training={"schedule": schedule}), orca, checkpoint)
+    fit(training={"schedule": schedule})
     assert torch.load(checkpoint, weights_only=True)["optimiser"]["param_groups"][0]["lr"] == pytest.approx(last)
 
 
@@ -137,12 +140,12 @@ def plateaus(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
 
 
 def test_a_training_on_a_plateau_begins_anew_with_a_smaller_learning_rate(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+    fit: Fit, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plateaus(monkeypatch, 2)
-    config = make_config(training={"epochs": 6, "schedule": "constant", "learning_rate": 0.008})
+    settings = {"epochs": 6, "schedule": "constant", "learning_rate": 0.008}
     told: list[int] = []
-    trained = train(short, config, orca, checkpoint, progress=lambda done, *_: told.append(done))
+    trained = fit(training=settings, progress=lambda done, *_: told.append(done))
     assert trained.restarts == 2
     assert told == [*range(1, 6), *range(1, 6), *range(1, 7)]
     assert torch.load(checkpoint, weights_only=True)["optimiser"]["param_groups"][0]["lr"] == pytest.approx(0.0005)
@@ -150,26 +153,23 @@ def test_a_training_on_a_plateau_begins_anew_with_a_smaller_learning_rate(
 
 
 def test_a_training_that_is_interrupted_after_a_restart_ends_bit_for_bit_like_another(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plateaus(monkeypatch, 2)
-    config = make_config(training={"epochs": 8, "restarts": 1})
-    whole = train(short, config, orca, tmp_path / "whole.pt")
+    settings = {"epochs": 8, "restarts": 1}
+    whole = fit(tmp_path / "whole.pt", training=settings)
     with pytest.raises(KeyboardInterrupt):
-        train(short, config, orca, tmp_path / "cut.pt", progress=interrupt_at(7))
-    resumed = train(short, config, orca, tmp_path / "cut.pt")
+        fit(progress=interrupt_at(7), training=settings)
+    resumed = fit(training=settings)
     assert same(whole, resumed)
     assert (resumed.restarts, resumed.resumed_from) == (1, 7)
 
 
-def test_a_training_that_ends_worse_than_the_mean_change_has_failed(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path: Path
-) -> None:
-    hardly = make_config(physics=FAR_OFF, training={"epochs": 1, "learning_rate": 1e-9})
-    lost = train(short, hardly, orca, tmp_path / "a.pt")
+def test_a_training_that_ends_worse_than_the_mean_change_has_failed(fit: Fit, tmp_path: Path) -> None:
+    lost = fit(physics=FAR_OFF, training={"epochs": 1, "learning_rate": 1e-9})
     assert lost.unexplained > 1.0
     assert "the training failed" in lost.failure
-    fitted = train(short, make_config(kind="ridge"), orca, tmp_path / "b.pt")
+    fitted = fit(tmp_path / "b.pt", kind="ridge")
     assert fitted.unexplained < 1.0
     assert fitted.failure == ""
 
@@ -179,13 +179,12 @@ def test_a_training_that_ends_worse_than_the_mean_change_has_failed(
 
 @pytest.mark.parametrize("epoch", [1, 3, 5])
 def test_an_interrupted_training_ends_bit_for_bit_like_an_uninterrupted_one(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, tmp_path: Path, epoch: int
+    fit: Fit, tmp_path: Path, epoch: int
 ) -> None:
-    config = make_config(training={"epochs": 5})
-    whole = train(short, config, orca, tmp_path / "whole.pt")
+    whole = fit(tmp_path / "whole.pt", training={"epochs": 5})
     with pytest.raises(KeyboardInterrupt):
-        train(short, config, orca, tmp_path / "cut.pt", progress=interrupt_at(epoch))
-    resumed = train(short, config, orca, tmp_path / "cut.pt")
+        fit(progress=interrupt_at(epoch), training={"epochs": 5})
+    resumed = fit(training={"epochs": 5})
     assert resumed.resumed_from == epoch
     assert whole.resumed_from == 0
     assert same(whole, resumed)
@@ -194,14 +193,9 @@ def test_an_interrupted_training_ends_bit_for_bit_like_an_uninterrupted_one(
 
 
 def test_an_interruption_in_the_middle_of_an_epoch_costs_that_epoch_alone(
-    short: Recording,
-    make_config: MakeConfig,
-    orca: Vehicle,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = make_config(training={"epochs": 4})
-    whole = train(short, config, orca, tmp_path / "whole.pt")
+    whole = fit(tmp_path / "whole.pt", training={"epochs": 4})
     calls, objective = [0], base.objective
 
     def failing(*args: Any) -> Any:
@@ -213,17 +207,15 @@ def test_an_interruption_in_the_middle_of_an_epoch_costs_that_epoch_alone(
     with monkeypatch.context() as patched:
         patched.setattr(base, "objective", failing)
         with pytest.raises(KeyboardInterrupt):
-            train(short, config, orca, tmp_path / "cut.pt")
-    resumed = train(short, config, orca, tmp_path / "cut.pt")
+            fit(training={"epochs": 4})
+    resumed = fit(training={"epochs": 4})
     assert resumed.resumed_from == 2
     assert same(whole, resumed)
 
 
-def test_a_finished_training_is_not_trained_on(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
-) -> None:
-    first = train(short, make_config(), orca, checkpoint)
-    again = train(short, make_config(), orca, checkpoint, progress=interrupt_at(4))
+def test_a_finished_training_is_not_trained_on(fit: Fit) -> None:
+    first = fit()
+    again = fit(progress=interrupt_at(4))
     assert again.resumed_from == 3
     assert same(first, again)
 
@@ -299,16 +291,10 @@ def flipped(content: bytes, member: str) -> bytes:
     ],
     ids=["truncated", "empty", "text", "bit flipped in a name", "bit flipped in a weight"],
 )
-def test_a_damaged_checkpoint_is_ignored(
-    short: Recording,
-    make_config: MakeConfig,
-    orca: Vehicle,
-    checkpoint: Path,
-    damage: Callable[[bytes], bytes],
-) -> None:
-    first = train(short, make_config(), orca, checkpoint)
+def test_a_damaged_checkpoint_is_ignored(fit: Fit, checkpoint: Path, damage: Callable[[bytes], bytes]) -> None:
+    first = fit()
     checkpoint.write_bytes(damage(checkpoint.read_bytes()))
-    again = train(short, make_config(), orca, checkpoint)
+    again = fit()
     assert again.resumed_from == 0
     assert same(first, again)
 
@@ -340,16 +326,14 @@ class Harmful:
 
 
 @pytest.mark.parametrize("kind", ["pickle", "torch archive", "old torch file"])
-def test_nothing_is_unpickled_from_a_checkpoint(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path, tmp_path: Path, kind: str
-) -> None:
+def test_nothing_is_unpickled_from_a_checkpoint(fit: Fit, checkpoint: Path, tmp_path: Path, kind: str) -> None:
     harmful = Harmful(tmp_path / "executed")
     if kind == "pickle":
         checkpoint.write_bytes(pickle.dumps(harmful))
     else:
         torch.save({"model": harmful}, checkpoint, _use_new_zipfile_serialization=kind == "torch archive")
     assert zipfile.is_zipfile(checkpoint) == (kind == "torch archive")
-    assert train(short, make_config(training={"epochs": 1}), orca, checkpoint).resumed_from == 0
+    assert fit(training={"epochs": 1}).resumed_from == 0
     assert not (tmp_path / "executed").exists()
     execute, arguments = harmful.__reduce__()
     execute(*arguments)
@@ -359,30 +343,18 @@ def test_nothing_is_unpickled_from_a_checkpoint(
 # --- when it ends -------------------------------------------------------------------------------
 
 
-def test_it_stops_after_as_many_epochs_without_progress_as_patience_says(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
-) -> None:
-    config = make_config(training={"epochs": 50, "patience": 3, "learning_rate": 0.5})
-    trained = train(short, config, orca, checkpoint)
+def test_it_stops_after_as_many_epochs_without_progress_as_patience_says(fit: Fit) -> None:
+    trained = fit(training={"epochs": 50, "patience": 3, "learning_rate": 0.5})
     epochs = len(trained.history["train/prediction"])
     assert epochs == trained.best_epoch + 3 < 50
 
 
-def test_a_training_that_diverges_at_once_is_a_clear_error(
-    short: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path
-) -> None:
-    config = make_config(training={"learning_rate": 1e30})
+def test_a_training_that_diverges_at_once_is_a_clear_error(fit: Fit) -> None:
     with pytest.raises(ConfigurationError, match=r"model small: diverged .* smaller learning_rate than 1e\+30"):
-        train(short, config, orca, checkpoint)
+        fit(training={"learning_rate": 1e30})
 
 
-def test_a_training_that_diverges_later_keeps_the_best_it_had(
-    short: Recording,
-    make_config: MakeConfig,
-    orca: Vehicle,
-    checkpoint: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_training_that_diverges_later_keeps_the_best_it_had(fit: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
     validate = training_module.Optimisation._validate
 
     def diverging(self: Any) -> dict[str, float]:
@@ -390,7 +362,7 @@ def test_a_training_that_diverges_later_keeps_the_best_it_had(
         return terms if self.state.epoch < 2 else dict.fromkeys(terms, float("nan"))
 
     monkeypatch.setattr(training_module.Optimisation, "_validate", diverging)
-    trained = train(short, make_config(training={"epochs": 9}), orca, checkpoint)
+    trained = fit(training={"epochs": 9})
     assert len(trained.history["validation/prediction"]) == 2
     assert np.isfinite(trained.validation_rmse).all()
 
