@@ -37,8 +37,8 @@ demo: $(STAMP) ## from simulated laps to a live prediction and its report
 paper: OUT = out/paper
 paper: $(STAMP) ## results.md and results_race.md of benchmarks/results measured anew, about two and a half hours on two cores; continues after a kill
 	@doit() { $(BIN)/python -m doit "$$@"; }
-	doit run -f benchmarks/paper/dodo.py -n $(JOBS) out="$(OUT)" data="$(DYNSSM_DATA)" results=benchmarks/results/results.md $(ARGS) step || true
-	doit run -f benchmarks/paper/dodo.py out="$(OUT)" data="$(DYNSSM_DATA)" results=benchmarks/results/results.md $(ARGS) document
+	doit run -n $(JOBS) -f benchmarks/dodo.py group=paper out="$(OUT)" data="$(DYNSSM_DATA)" results=benchmarks/results/results.md $(ARGS) step || true
+	doit run -f benchmarks/dodo.py group=paper out="$(OUT)" data="$(DYNSSM_DATA)" results=benchmarks/results/results.md $(ARGS) document
 
 docs: $(STAMP) ## the documentation as a site, out/site/index.html
 	@$(BIN)/sphinx-build -W --keep-going -q -b html docs out/site

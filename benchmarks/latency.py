@@ -170,7 +170,7 @@ def measure_node(
     artifact: Artifact, drive: Recording, duration: float, progress: Callable[[int, int], None]
 ) -> dict[str, Any]:
     """Plays the drive to a predictor process; latency from odometry published to prediction received, rate, losses."""
-    from benchmarks.live_run import run_live
+    from benchmarks.endurance.live_run import run_live
 
     with tempfile.TemporaryDirectory(prefix="dynssm-") as folder:
         bag = Path(folder) / "drive"

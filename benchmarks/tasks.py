@@ -16,13 +16,11 @@ from doit import get_initial_workdir
 from doit.dependency import JsonDB
 from doit.exceptions import TaskFailed
 from doit.tools import config_changed
-from matplotlib.figure import Figure
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import replacing
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # several processes share the cores
-_DPI = 130  # of figures
 
 
 class NotingDB(JsonDB):  # type: ignore[misc]
@@ -37,12 +35,6 @@ class NotingDB(JsonDB):  # type: ignore[misc]
         """Writes the file aside and renames it."""
         with replacing(self.name) as aside:
             aside.write_text(self.codec.encode(self._db), encoding="utf-8")
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Writes a figure of a page aside as PNG and renames it; equal figures are equal files."""
-    with replacing(path) as aside:
-        figure.savefig(aside, format="png", dpi=_DPI, metadata={"Software": None})
 
 
 class Step(Protocol):

@@ -123,7 +123,7 @@ def _evaluate(recording: Recording, car: Vehicle, model: Path) -> Evaluation:
 
 def _run_live(model: Path, bag: Path, recording: Recording) -> _Live:
     """Plays the bag to the node and sets its predictions beside what was measured a moment later."""
-    from benchmarks.live_run import run_live
+    from benchmarks.endurance.live_run import run_live
 
     with progress_bar("6 predict live on DDS") as progress:
         run = run_live(model, bag, recording.T_s, duration=LIVE_TIME, progress=progress)

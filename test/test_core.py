@@ -87,7 +87,7 @@ def test_an_environment_with_the_core_alone_predicts_live_on_dds(
     laps_bag: Path, small_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Installed anew from the declared requirements; the node runs there, the bag is played from here."""
-    from benchmarks import live_run
+    from benchmarks.endurance import live_run
 
     environment = tmp_path / "core"
     subprocess.run([sys.executable, "-m", "venv", environment], check=True)

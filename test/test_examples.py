@@ -35,7 +35,7 @@ def test_an_mpc_of_ones_own_follows_the_line_on_published_coefficients() -> None
     from nav_msgs.msg import Odometry
     from sensor_msgs.msg import JointState
 
-    from benchmarks.live_run import LiveRun, collecting, isolated_environment, node_process
+    from benchmarks.endurance.live_run import LiveRun, collecting, isolated_environment, node_process
     from dynssm_ros.nodes.support import SENSOR_QOS
     from dynssm_ros.track.tracks import load_track
     from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 from benchmarks.hidden_causes import foreign, multi_body
 from benchmarks.hidden_causes.cases import OFF, Case, Hidden
 from benchmarks.hidden_causes.outcomes import Outcome, by_size, rates
+from benchmarks.page import render
 from dynssm_ros.vehicle.effects import EFFECTS
 
-PAGE, FIGURE = "hidden_causes.md", "hidden_causes_confusion.png"
 GOALS = {
     "strictly_first": ">= 95, 80, 80 %", "right_size": ">= 90 %", "covered": "85 to 95 %", "both_found": ">= 80 %",
     "false_alarms": "<= 2 % each",
@@ -28,100 +28,49 @@ _PLANTS = {
     "rk4": "one track, steps of 1 ms", "double_track": "four wheels", foreign.NAME: "another make",
     multi_body.NAME: "multi-body",
 }  # fmt: skip
-_MULTI_BODY = (
-    " The multi-body car is CommonRoad's: a body on springs, wheels that spin, PAC2002 tyres with camber and combined slip, "
-    "brakes on all wheels, an engine with a greatest power. Its first drives gave the library the effect `power_limit`; "
-    "nothing else was tuned to it."
-)
 
 
-def page(outcomes: Sequence[tuple[Case, Outcome | None]], asked: str) -> str:
+def hidden_causes_page(outcomes: Sequence[tuple[Case, Outcome | None]], arguments: Sequence[str], figure: str) -> str:
     """The results as Markdown.
 
     Args:
         outcomes: of the cases; ``None``: the car could not be driven.
-        asked: the variables that the cases were asked for with.
+        arguments: of doit's command that differ from the usual.
+        figure: name of the figure's file.
     """
-    return "\n".join(_lines(outcomes, asked)) + "\n"
-
-
-def _lines(of: Sequence[tuple[Case, Outcome | None]], asked: str) -> Iterator[str]:
-    outcomes = [outcome for _, outcome in of if outcome is not None]
-    undriven, seeds = len(of) - len(outcomes), [case.seed for case, _ in of]
-    plants = {plant: words for plant, words in _PLANTS.items() if any(case.plant == plant for case, _ in of)}
-    yield "# Hidden causes"
-    yield ""
-    yield (
-        f"Made by `python -m doit -f benchmarks/hidden_causes/dodo.py {asked}`: {len(outcomes)} simulated drives with hidden "
-        f"effects, seeds {min(seeds)} to {max(seeds)}"
-        + (f", without {undriven} whose car could not be driven" if undriven else "")
-        + ". How they are drawn and what counts as just noticeable: `benchmarks/hidden_causes/cases.py`."
+    known = [outcome for _, outcome in outcomes if outcome is not None]
+    plants = {plant: words for plant, words in _PLANTS.items() if any(case.plant == plant for case, _ in outcomes)}
+    hidden = {name for outcome in known for name in outcome.hidden}
+    thirds = zip(("least third", "middle third", "greatest third"), by_size(known), strict=True)
+    return render(
+        "hidden_causes",
+        arguments=arguments,
+        figure=figure,
+        multi_body=multi_body.NAME in plants,
+        never=[name for name in EFFECTS if name not in hidden],
+        off=OFF,
+        outcomes=known,
+        plants=list(plants.values()),
+        rates=_rates(known, [[o for c, o in outcomes if o is not None and c.plant == plant] for plant in plants]),
+        seeds=[case.seed for case, _ in outcomes],
+        sizes=[[words, str(rate["of"]), str(rate["count"])] for words, rate in thirds],
+        undriven=len(outcomes) - len(known),
+        wrong=[
+            [f"`{o.case}`", _with_values(o.values), _with_values(o.found)]
+            for o in known
+            if not o.right or o.sized is False
+        ],
     )
-    yield ""
-    yield f"| rate | cases | share | 95 % interval | goal | {' | '.join(plants.values())} |"
-    yield f"| --- | --- | --- | --- | --- |{' --- |' * len(plants)}"
-    by_plant = [rates([o for case, o in of if o is not None and case.plant == plant]) for plant in plants]
-    overall = rates(outcomes)
+
+
+def _rates(known: Sequence[Outcome], by_plant: Sequence[Sequence[Outcome]]) -> Iterator[list[str]]:
+    """A row for each rate of which there are cases, with those of each plant."""
+    overall, each = rates(known), [rates(some) for some in by_plant]
     for name, words in _IN_WORDS.items():
-        rate = overall[name]
-        if rate["of"]:
+        if (rate := overall[name])["of"]:
             low, high = rate["interval_95"]
-            goal = GOALS.get(name, "")
-            each = " | ".join(f"{one[name]['count']} of {one[name]['of']}" for one in by_plant)
-            yield (
-                f"| {words} | {rate['of']} | {100 * rate['share']:.0f} % | {100 * low:.0f} to {100 * high:.0f} % | {goal} "
-                f"| {each} |"
-            )
-    yield ""
-    yield (
-        "Four wheels are a car that the equations do not have: an axle loses grip as load moves from one wheel to the other, "
-        "and unequal forces at the steered wheels turn the car. An effect that is named there and not hidden may stand for "
-        "this. The car of another make has brush tyres, forces that grow less than the load, and steering that gives way."
-        + (_MULTI_BODY if multi_body.NAME in plants else "")
-    )
-    yield ""
-    yield f"![What was hidden and what was named first]({FIGURE})"
-    yield ""
-    yield (
-        "Cases of one effect or none; an alternative that is reported counts as named. What is listed as small, within the "
-        "structure of the model, does not."
-    )
-    hidden = {name for outcome in outcomes for name in outcome.hidden}
-    if never := [name for name in EFFECTS if name not in hidden]:
-        yield ""
-        yield f"So few cases did not come to {', '.join(f'`{name}`' for name in never)}."
-    yield from _conditions(outcomes)
-    wrong = [o for o in outcomes if not o.right or o.sized is False]
-    if wrong:
-        yield ""
-        yield "## What came out wrong"
-        yield ""
-        yield "| case | hidden | named |"
-        yield "| --- | --- | --- |"
-        for o in wrong:
-            yield f"| `{o.case}` | {_with_values(o.values)} | {_with_values(o.found)} |"
-
-
-def _conditions(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """What decides how hard the cases are: the sizes, and what the vehicle file tells."""
-    yield ""
-    yield "## How large, and what is known"
-    yield ""
-    yield (
-        "Sizes are drawn evenly in their logarithm from just noticeable (on the reference drive, twice the log-likelihood "
-        "falls by 49) to large (a car that is badly set up)."
-    )
-    yield ""
-    yield "| size, within that range | cases of one effect | named first, without alternatives |"
-    yield "| --- | --- | --- |"
-    for words, rate in zip(("least third", "middle third", "greatest third"), by_size(outcomes), strict=True):
-        yield f"| {words} | {rate['of']} | {rate['count']} |"
-    yield ""
-    yield (
-        f"The vehicle file tells mass and geometry as they are. Its coefficients are off by {100 * OFF:g} % (standard "
-        "deviation), and it says so. Those of the car of another make (and of the multi-body car) were calibrated on "
-        "two minutes of a healthy drive, the former from nothing but the bounds, and then diagnosed."
-    )
+            shares = [f"{100 * rate['share']:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %", GOALS.get(name, "")]
+            yield [words, str(rate["of"]), *shares, *(f"{one[name]['count']} of {one[name]['of']}" for one in each)]
 
 
 def _with_values(effects: Hidden) -> str:

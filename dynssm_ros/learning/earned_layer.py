@@ -25,7 +25,7 @@ from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
 NETWORK_GAIN_WANTED = 0.03
 """A network that takes away less of the online layer's error is left out of it. On the development cells of
-``benchmarks/generalisation`` gains of 1 to 2 % on left-out laps did not carry over to another track."""
+the generalisation matrix, gains of 1 to 2 % on left-out laps did not carry over to another track."""
 _STRETCHES = 4  # of the laps, for a layer without a network
 _STARTS = 400  # rollouts in a part, at most
 

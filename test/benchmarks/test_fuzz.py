@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.fuzz import fuzz
+from benchmarks.endurance.fuzz import fuzz
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.history import Refusal
 

@@ -14,7 +14,7 @@ import pytest
 
 from benchmarks.hidden_causes.cases import NOISE, TRACKS, Case, cases, off, size
 from benchmarks.hidden_causes.outcomes import Outcome, by_size, judge, matrix, rates, share_of_range
-from benchmarks.hidden_causes.page import page
+from benchmarks.hidden_causes.page import hidden_causes_page
 from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
 from dynssm_ros.files import write_json
 from dynssm_ros.identification.car import CarEstimate
@@ -169,12 +169,12 @@ def test_rates_and_confusion_count_what_happened() -> None:
 
 
 def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
-    text = page(OF, "seed=7 count=9 cars=rk4,double_track")
-    assert "/dodo.py seed=7 count=9 cars=rk4,double_track`: 4 simulated drives" in text
+    text = hidden_causes_page(OF, ["seed=7", "count=9", "cars=rk4,double_track"], "confusion.png")
+    assert "/dodo.py group=hidden_causes seed=7 count=9 cars=rk4,double_track`: 4 simulated drives" in text
     seeds = [case.seed for case, _ in OF]
     assert f"seeds {min(seeds)} to {max(seeds)}, without 1 whose car could not be driven" in text
     assert (
-        "| the hidden effect, or an alternative reported with it, is named first | 2 | 50 % | 9 to 91 % |  "
+        "| the hidden effect, or an alternative reported with it, is named first | 2 | 50 % | 9 to 91 % | "
         "| 1 of 1 | 0 of 1 |" in text
     )
     assert "| the same without alternatives | 2 | 50 % | 9 to 91 % | >= 95, 80, 80 % | 1 of 1 | 0 of 1 |" in text
@@ -198,19 +198,10 @@ def test_doit_goes_on_with_what_is_done_and_writes_the_page(tmp_path: Path) -> N
     for case, named in zip(cases(0, 2), (("steering_offset",), ()), strict=True):
         outcome = Outcome(case.name, tuple(case.hidden), named, bool(named), bool(named), True if named else None)
         write_json(outcome_file(case, tmp_path), {"outcome": asdict(outcome)})
-    command = [
-        sys.executable,
-        "-m",
-        "doit",
-        "run",
-        "-f",
-        "benchmarks/hidden_causes/dodo.py",
-        f"out={tmp_path}",
-        "count=2",
-    ]
-    done = subprocess.run([*command, "page"], capture_output=True, text=True, check=False, cwd=REPOSITORY)
+    words = f"-m doit run -f benchmarks/dodo.py group=hidden_causes out={tmp_path} count=2 page"
+    done = subprocess.run([sys.executable, *words.split()], capture_output=True, text=True, check=False, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
-    assert "named_first" in done.stdout
+    assert "is named first | 2 | 50 %" in done.stdout
     assert (tmp_path / "hidden_causes_confusion.png").read_bytes()[1:4] == b"PNG"
     assert "2 simulated drives with hidden effects" in (tmp_path / "hidden_causes.md").read_text()
     assert json.loads((tmp_path / "outcomes.json").read_text())["cases"] == 2

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import kills
-from benchmarks.kills import Command, kill
+from benchmarks.endurance import kills
+from benchmarks.endurance.kills import Command, kill
 
 _IN_PLACE = """
 import pathlib, shutil, sys, time

@@ -1,8 +1,8 @@
-"""`python -m benchmarks.live_seeds`."""
+"""`python -m benchmarks.endurance.live_seeds`."""
 
 import pytest
 
-from benchmarks.live_seeds import Seeded, drive_seeded, words
+from benchmarks.endurance.live_seeds import Seeded, drive_seeded, words
 
 
 @pytest.mark.parametrize("seed", [22, 23])

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fuzz import Traffic
-from benchmarks.soak import main, soak
+from benchmarks.endurance.fuzz import Traffic
+from benchmarks.endurance.soak import main, soak
 
 pytestmark = pytest.mark.live
 

@@ -18,7 +18,7 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from benchmarks.live_run import Collector, LiveRun, collecting, isolated_environment, predictor_process
+from benchmarks.endurance.live_run import Collector, LiveRun, collecting, isolated_environment, predictor_process
 from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC, PREDICTION_TOPIC
 

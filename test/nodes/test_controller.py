@@ -16,8 +16,8 @@ import pytest
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 
-from benchmarks.live_laps import drive_live
-from benchmarks.live_run import LiveRun, collecting, isolated_environment, node_process
+from benchmarks.endurance.live_laps import drive_live
+from benchmarks.endurance.live_run import LiveRun, collecting, isolated_environment, node_process
 from dynssm_ros.nodes.support import SENSOR_QOS, set_pose, set_stamp
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.signals.messages import COMMAND_TOPIC, ODOMETRY_TOPIC, PARAMETERS_TOPIC
@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 
 PERIOD = 20_000_000  # ns
 PATIENCE = 120.0  # s for a lap, and for processes to start
-RATE = 0.25  # of real time: these laps are not about the machine's speed; `benchmarks.live_laps` is
+RATE = 0.25  # of real time: these laps are not about the machine's speed; `benchmarks.endurance.live_laps` is
 
 
 class Stand:

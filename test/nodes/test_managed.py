@@ -11,7 +11,7 @@ import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 
-from benchmarks.live_run import Collector, LiveRun, collecting, isolated_environment, node_process
+from benchmarks.endurance.live_run import Collector, LiveRun, collecting, isolated_environment, node_process
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(240)]
 

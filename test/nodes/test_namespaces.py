@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 
-from benchmarks.live_run import LiveRun, collecting, isolated_environment, predictor_process
+from benchmarks.endurance.live_run import LiveRun, collecting, isolated_environment, predictor_process
 from dynssm_ros.nodes.support import SENSOR_QOS
 
 pytestmark = pytest.mark.live

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 import dynssm_ros
-from benchmarks.live_run import LiveRun, collecting, isolated_environment, node_process, predictor_process, run_live
+from benchmarks.endurance.live_run import (
+    LiveRun,
+    collecting,
+    isolated_environment,
+    node_process,
+    predictor_process,
+    run_live,
+)
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor

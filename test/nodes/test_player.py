@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from nav_msgs.msg import Odometry
 
-from benchmarks import live_run
-from benchmarks.live_run import (
+from benchmarks.endurance import live_run
+from benchmarks.endurance.live_run import (
     PROFILES,
     LiveRun,
     collecting,
@@ -142,6 +142,6 @@ def test_what_killed_participants_left_in_a_domain_is_removed(monkeypatch: pytes
 
 def test_a_domain_is_reserved_before_anybody_takes_part_in_it() -> None:
     domain = isolated_environment()["ROS_DOMAIN_ID"]
-    of_another_process = f"from benchmarks.live_run import _reserve; print(_reserve({domain}))"
+    of_another_process = f"from benchmarks.endurance.live_run import _reserve; print(_reserve({domain}))"
     asked = subprocess.run([sys.executable, "-c", of_another_process], capture_output=True, text=True, check=True)
     assert asked.stdout.strip() == "False"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.live_run import LiveRun, collecting, isolated_environment, node_process
+from benchmarks.endurance.live_run import LiveRun, collecting, isolated_environment, node_process
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(240)]
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
 
-from benchmarks.live_run import run_live
+from benchmarks.endurance.live_run import run_live
 from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.onnx_model import OnnxModel

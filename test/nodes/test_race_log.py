@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.live_run import run_live
+from benchmarks.endurance.live_run import run_live
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.learning.stages import train

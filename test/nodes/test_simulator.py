@@ -17,7 +17,7 @@ import pytest
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 
-from benchmarks.live_run import LiveRun, collecting, isolated_environment, predictor_process
+from benchmarks.endurance.live_run import LiveRun, collecting, isolated_environment, predictor_process
 from dynssm_ros.nodes.support import SENSOR_QOS, actuators
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.live_run import isolated_environment, node_process
+from benchmarks.endurance.live_run import isolated_environment, node_process
 from dynssm_ros.errors import UserError
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map

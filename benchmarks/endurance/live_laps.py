@@ -1,4 +1,4 @@
-"""Laps of the live stack over DDS, with noise, delay and a patch of little grip: ``python -m benchmarks.live_laps``.
+"""Live laps over DDS, with noise, delay and a patch of little grip: ``python -m benchmarks.endurance.live_laps``.
 
 Simulated car, predictor and controller are processes of their own and run in real time, or in lockstep, beside processes that
 keep a core busy each. The simulator tells how near the borders the car truly came, whatever is measured of it.
@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.closed_loop.cells import CHANGES, Cell, sensing
-from benchmarks.generalisation.cells import CARS
-from benchmarks.live_run import LiveRun, check_running, collecting, isolated_environment, node_process
+from benchmarks.endurance.live_run import LiveRun, check_running, collecting, isolated_environment, node_process
+from benchmarks.matrix.raced_cells import CHANGES, Cell, sensing
+from benchmarks.matrix.scored_cells import CARS
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.control.race import PATIENCE
 from dynssm_ros.control.reference import load_reference

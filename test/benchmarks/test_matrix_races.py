@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.closed_loop import seeds, step_times
-from benchmarks.closed_loop.cells import CHANGES, OBJECTIVES, PACE, PLANTS, TRACKS, Cell, cells, variation
-from benchmarks.closed_loop.page import lap_times, learned_laps, learning_page, page, summary
-from benchmarks.closed_loop.run import AS_IS, race_model, read_cell
-from benchmarks.generalisation.cells import CARS, NOISE_LEVELS
-from benchmarks.generalisation.run import model_folder
+from benchmarks.matrix import seeds, step_times
+from benchmarks.matrix.raced_cells import CHANGES, OBJECTIVES, PACE, PLANTS, TRACKS, Cell, cells, variation
+from benchmarks.matrix.races import AS_IS, race_model, read_cell
+from benchmarks.matrix.races_page import closed_loop_page, lap_times, learned_laps, learning_page, summary
+from benchmarks.matrix.scored_cells import CARS, NOISE_LEVELS
+from benchmarks.matrix.scores import model_folder
 from dynssm_ros.control.horizon_model import HorizonModel
 from dynssm_ros.control.nmpc import Nmpc
 from dynssm_ros.control.race import Course, Start
@@ -70,15 +70,15 @@ def test_the_page_counts_those_that_come_round_and_compares_last_laps():
     models = [part["models"]["dynssm"] for part in parts if part["cells"]]
     assert sum(model["came_round"] for model in models) == 1
     assert [name for model in models for name in model["lost"]] == [every[1].name]
-    words = page(known, ["part=all"], "laps.png", every)
+    words = closed_loop_page(known, ["part=all"], "laps.png", every)
     assert "(laps.png)" in words
-    assert "dodo.py part=all" in words
+    assert "dodo.py group=closed_loop part=all" in words
     assert every[1].name in words
     assert "Not driven" not in words
     same = [
         cell for cell in cells() if cell.car == every[0].car and cell.is_test == every[0].is_test and cell not in every
     ]
-    assert f"Not driven: {len(same)} of" in page(known, [], "laps.png", [*every, *same])
+    assert f"Not driven: {len(same)} of" in closed_loop_page(known, [], "laps.png", [*every, *same])
     assert len(lap_times(known).axes) == 1
 
 
@@ -96,7 +96,7 @@ def test_the_page_tells_what_each_change_costs_each_model():
             name: outcome(9.0, violation=name != "true") for name in ("true", "calibrated", "dynssm", "dynssm as it is")
         },
     }
-    words = page(known, [], "laps.png", list(known))
+    words = closed_loop_page(known, [], "laps.png", list(known))
     assert "| | cells | `calibrated` | `dynssm` |" in words
     assert "| mass | 1 | 1.040, 1.040 | 1.010, 1.010 |" in words
     assert "| drag | 1 | – | – |" in words
@@ -107,7 +107,7 @@ def test_a_part_of_which_nothing_was_driven_is_told():
     test, development = (next(cell for cell in cells() if cell.is_test == part) for part in (True, False))
     known = {test: {name: outcome(10.0) for name in ("true", "calibrated", "dynssm")}}
     for words in (
-        page(known, [], "laps.png", [test, development]),
+        closed_loop_page(known, [], "laps.png", [test, development]),
         learning_page({test: {"true_best_s": 10.0, "learned": outcome(10.1)}}, [], "laps.png", [test, development]),
     ):
         assert "## Development cells" in words
@@ -123,7 +123,7 @@ def test_the_page_of_learning_names_what_stays_behind():
         slow: {"true_best_s": None, "learned": outcome(12.0)},
     }
     words = learning_page(known, ["part=all"], "lap_learning.png", list(known))
-    assert "dodo.py part=all learning_page" in words
+    assert "dodo.py group=closed_loop part=all learning_page" in words
     assert "| all | 4 | 3 | 1.030 | 1.020, 1.030 | 1 of 2 |" in words
     assert f"More than 1.5 % behind: {far.name} (1.030)." in words
     (axes,) = learned_laps(known).axes

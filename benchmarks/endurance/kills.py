@@ -1,4 +1,4 @@
-"""Kills commands at random instants: ``python -m benchmarks.kills --kills 100``.
+"""Kills commands at random instants: ``python -m benchmarks.endurance.kills --kills 100``.
 
 Each command is run once to its end. Then it is started again and again where its older output lies, and killed (SIGKILL)
 at an instant that is drawn between its start and the time that it took. What lies there afterwards must be the older
@@ -175,7 +175,7 @@ def _remove(path: Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Kills all commands in turn and says what came of it."""
-    parser = argparse.ArgumentParser(prog="benchmarks.kills", description=__doc__)
+    parser = argparse.ArgumentParser(prog="benchmarks.endurance.kills", description=__doc__)
     parser.add_argument("--kills", type=int, default=100, help="how many in all")
     parser.add_argument("--seed", type=int, default=0, help="of the instants")
     parser.add_argument("--only", default="", help="names of commands, separated by commas; all if empty")

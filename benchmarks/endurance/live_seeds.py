@@ -1,8 +1,8 @@
-"""Laps of the live stack in one process, for many seeds of the noise: ``python -m benchmarks.live_seeds --count 100``.
+"""Live laps in one process, for many seeds of the noise: ``python -m benchmarks.endurance.live_seeds --count 100``.
 
-The same car, road, noise, delay and patch of little grip as in :mod:`benchmarks.live_laps`. Nothing waits for anything: each
-message is answered before the next, so that a drive depends on its seed alone. The predictor's answer is there at the next
-step, as on the bus. What is left is whether the controller holds the road, whatever is measured.
+The same car, road, noise, delay and patch of little grip as in :mod:`benchmarks.endurance.live_laps`. Nothing waits for
+anything: each message is answered before the next, so that a drive depends on its seed alone. The predictor's answer is there
+at the next step, as on the bus. What is left is whether the controller holds the road, whatever is measured.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.closed_loop.cells import CHANGES, Cell, sensing
-from benchmarks.generalisation.cells import CARS
-from benchmarks.live_laps import CHANGE, PLANT, ROAD, SPEED_SCALE, WATCHDOG
+from benchmarks.endurance.live_laps import CHANGE, PLANT, ROAD, SPEED_SCALE, WATCHDOG
+from benchmarks.matrix.raced_cells import CHANGES, Cell, sensing
+from benchmarks.matrix.scored_cells import CARS
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.control.live import LiveController
 from dynssm_ros.control.race import PATIENCE

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.generalisation import ablations
-from benchmarks.generalisation import cells as of_cells
-from benchmarks.generalisation.cells import CARS, CHANGES, NOISE_LEVELS, PLANTS, Cell, Training, simulated_cells
-from benchmarks.generalisation.page import errors, heat_map, page, ratios, summary
-from benchmarks.generalisation.run import (
+from benchmarks.matrix import ablations
+from benchmarks.matrix import scored_cells as of_cells
+from benchmarks.matrix.scored_cells import CARS, CHANGES, NOISE_LEVELS, PLANTS, Cell, Training, simulated_cells
+from benchmarks.matrix.scores import (
     ABLATIONS,
     BASELINES,
     RIVALS,
@@ -21,6 +20,7 @@ from benchmarks.generalisation.run import (
     score_cell,
     train_model,
 )
+from benchmarks.matrix.scores_page import errors, generalisation_page, heat_map, ratios, summary
 from dynssm_ros.learning.models.registry import load_model_config
 
 HERE = Path()
@@ -104,8 +104,8 @@ def test_the_page_has_means_worst_cells_and_exact_cells():
     content = summary(known)
     parts = [content[name] for name in ("development", "test") if content[name]["cells"]]
     assert sum(part["cells"] for part in parts) == 3
-    text = page(known, "part=all", 2)
-    assert "dodo.py part=all`" in text
+    text = generalisation_page(known, ["part=all"], "generalisation.png", 2)
+    assert "dodo.py group=generalisation part=all`" in text
     assert "2 cells are missing" in text
     assert "![Heat map" in text
     assert len(heat_map(known).axes[0].get_yticklabels()) == 3
@@ -117,20 +117,20 @@ def test_the_page_says_how_near_the_noise_of_the_sensors_the_errors_are():
     assert next(iter(known)).noise == pytest.approx((0.03, 0.03, 0.09))
     (part,) = (part for part in summary(known).values() if part["cells"])
     np.testing.assert_allclose(part["models"]["dynssm"]["over_noise"], [1.0, 2.0, 1.0])
-    assert "1.00, 2.00, 1.00 (`dynssm`)" in page(known, "", 0)
+    assert "1.00, 2.00, 1.00 (`dynssm`)" in generalisation_page(known, [], "x.png", 0)
     assert Cell(Training("dart-free", "racer"), "circles").noise is None
 
 
 def test_a_cell_from_laps_to_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     short = {"orca": replace(CARS["orca"], seconds=(20.0, 6.0))}
     monkeypatch.setattr(of_cells, "CARS", short)
-    monkeypatch.setattr("benchmarks.generalisation.run.MODELS", {name: {"base": name} for name in ("rls", "ridge")})
+    monkeypatch.setattr("benchmarks.matrix.scores.MODELS", {name: {"base": name} for name in ("rls", "ridge")})
     training = Training("orca-euler-usual", "orca", ("orca", "euler", "usual"))
     drive(training, tmp_path, HERE)
     for name in ("rls", "ridge"):
         train_model(training, name, tmp_path)
         assert (model_folder(training, name, tmp_path) / "model.yaml").is_file()
-    monkeypatch.setattr("benchmarks.generalisation.run.models_of", lambda _: {"rls": {}, "ridge": {}})
+    monkeypatch.setattr("benchmarks.matrix.scores.models_of", lambda _: {"rls": {}, "ridge": {}})
     cell = Cell(training, "steering")
     score_cell(cell, tmp_path, HERE, ["shipped"])
     content = read_cell(cell, tmp_path)
@@ -164,6 +164,6 @@ def test_every_ablation_has_a_row_on_its_page():
     shown = {name for part in ablations.PARTS for name in part[1:]}
     assert set(ABLATIONS) <= shown
     known = {cell: of_models(**dict.fromkeys(shown, 1.0)) for cell in simulated_cells()}
-    text = ablations.page(known, "part=all sets=shipped,ablations")
+    text = ablations.ablations_page(known, ["part=all", "sets=shipped,ablations"])
     assert text.count("| 1.000 | 1.000 | 1.000 | 1.000 | no |") == len(ablations.PARTS)
-    assert "dodo.py part=all sets=shipped,ablations`" in text
+    assert "dodo.py group=generalisation part=all sets=shipped,ablations`" in text

@@ -1,10 +1,10 @@
-"""A predictor at work for an hour, in a process of its own: ``python -m benchmarks.soak --model DIR --minutes 60``.
+"""A predictor at work for an hour, in a process of its own: ``python -m benchmarks.endurance.soak --model DIR --minutes 60``.
 
 A car that drives straight on sends its messages over DDS at a steady rate. What comes back is counted and timed, and every
 second the operating system is asked what the node's process holds. ``--spoilt 0.15`` damages messages as
-:mod:`benchmarks.fuzz` does; then nothing may be predicted from an invalid one. ``--swap DIR`` exchanges the model for another
-one and back, again and again. Ends with status 1 if messages are lost that were good, if the node predicts what it must
-not, or if it refuses a swap.
+:mod:`benchmarks.endurance.fuzz` does; then nothing may be predicted from an invalid one. ``--swap DIR`` exchanges the model
+for another one and back, again and again. Ends with status 1 if messages are lost that were good, if the node predicts what
+it must not, or if it refuses a swap.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from rcl_interfaces.srv import SetParameters
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
 
-from benchmarks.fuzz import Traffic
-from benchmarks.live_run import (
+from benchmarks.endurance.fuzz import Traffic
+from benchmarks.endurance.live_run import (
     Collector,
     LiveRun,
     check_running,
@@ -279,7 +279,7 @@ def _time(run: LiveRun, swaps: Sequence[float], done: Soaked) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs it and says what came of it."""
-    parser = argparse.ArgumentParser(prog="benchmarks.soak", description=__doc__)
+    parser = argparse.ArgumentParser(prog="benchmarks.endurance.soak", description=__doc__)
     parser.add_argument("--model", type=Path, required=True, help="model folder")
     parser.add_argument("--minutes", type=float, default=60.0, help="how long")
     parser.add_argument("--rate", type=float, default=100.0, help="of the odometry (Hz)")

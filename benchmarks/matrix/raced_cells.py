@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.generalisation.cells import CARS, NOISE_LEVELS, Training, simulated_car
+from benchmarks.matrix.scored_cells import CARS, NOISE_LEVELS, Training, simulated_car
 from dynssm_ros.control.settings import Objective
 from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.simulation.sensing import Sensing

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.generalisation.cells import Cell
-from benchmarks.generalisation.run import BASELINES
+from benchmarks.matrix.scored_cells import Cell
+from benchmarks.matrix.scores import BASELINES
+from benchmarks.page import render
 from dynssm_ros.learning.earned_layer import NETWORK_GAIN_WANTED
 
-PAGE, FIGURE = "generalisation.md", "generalisation.png"
-_LOOKED = (
-    "The test cells had been scored once when the gain that is wanted of a network was raised from 1 to 3 % because of "
-    "development cells (2026-11-22). All cells were scored anew after the integrator was left to the data and slow actuators "
-    "were held (2026-11-23); both were decided on development logs. They were scored once more for the intervals that models "
-    "state, which were mended on development cells without noise (2026-11-25)."
-)
 QUANTITIES = ("v_x", "v_y", "omega", "ADE", "FDE")
 EXACT = 1e-5
 """Where the best baseline errs less than this, the car is known exactly and ratios mean nothing (m/s, rad/s, m)."""
@@ -113,86 +107,43 @@ def heat_map(known: Known, model: str = "dynssm") -> Figure:
     return figure
 
 
-def page(known: Known, arguments: str, undriven: int) -> str:
-    """The results as Markdown; ``arguments`` of doit's command that differ from the default."""
-    return "\n".join(_lines(known, arguments, undriven)) + "\n"
+def generalisation_page(known: Known, arguments: Sequence[str], figure: str, missing: int) -> str:
+    """The results as Markdown.
+
+    Args:
+        known: outcomes.
+        arguments: of doit's command that differ from the usual.
+        figure: name of the figure's file.
+        missing: how many cells were not scored.
+    """
+    return render(
+        "generalisation", arguments=arguments, baselines=BASELINES, figure=figure, gain_wanted=NETWORK_GAIN_WANTED,
+        missing=missing, over_noise=_over_noise, parts=summary(known), quantities=list(QUANTITIES), rows=_rows,
+    )  # fmt: skip
 
 
-def _lines(known: Known, arguments: str, undriven: int) -> Iterator[str]:
-    command = " ".join(["python -m doit -n 2 -f benchmarks/generalisation/dodo.py", *arguments.split()])
-    yield "# Generalisation"
-    yield ""
-    yield (
-        f"Made by `{command}`. Every cell is a training and a drive that differs from it: another track, another line and "
-        "more speed. One change of the car is hidden: 20 % less grip, a steering offset of 0.01 rad, 10 % more mass, or a "
-        "bank of 0.05 rad. Cars: 1:43, full size, 1:10, and the real logs. Plants: Euler steps of T_s, steps of "
-        "1 ms, four wheels. Sensor noise: none, usual, three times. Rollouts take 0.6 s."
-    )
-    yield ""
-    yield (
-        "What is shown are ratios to the best baseline of each cell and quantity: geometric means, and the worst cell. The "
-        f"baselines are {', '.join(f'`{name}`' for name in BASELINES)}. Decisions were taken on development cells; of "
-        f"simulated cells a hash of the name says which these are, of real logs their README. {_LOOKED}"
-        + (
-            f" {undriven} cells are missing: the changed car leaves the road, or they were not made."
-            if undriven
-            else ""
-        )
-    )
-    for label, content in summary(known).items():
-        if not content["cells"]:
-            continue
-        yield ""
-        yield f"## {label.capitalize()} cells ({content['cells']})"
-        yield ""
-        quantities = " | ".join(QUANTITIES)
-        yield f"| model | one step | {quantities} | worst one step | worst ADE | one step, ADE without `rls` | coverage |"
-        yield f"| --- |{' --- |' * (len(QUANTITIES) + 5)}"
-        for model, entry in content["models"].items():
-            over, other = entry["over_best"], entry["over_best_but_rls"]
-            means = " | ".join(_ratio(over["by_quantity"][name]) for name in QUANTITIES)
-            worst = max(over["worst"][name] for name in QUANTITIES[:3])
-            covered = entry.get("coverage")
-            yield (
-                f"| `{model}` | {_ratio(over['one_step'])} | {means} | {_ratio(worst)} | {_ratio(over['worst']['ADE'])} | "
-                f"{_ratio(other['one_step'])}, {_ratio(other['by_quantity']['ADE'])} | "
-                + ("–" if covered is None else f"{100 * covered[0]:.0f} to {100 * covered[2]:.0f} %")
-                + " |"
-            )
-        best = content["models"]["dynssm"]
-        yield ""
-        yield from _noise(content)
-        used, of = content["network_used"]
-        yield ""
-        if best["exact_cells"]:
-            yield (
-                f"In {best['exact_cells']} cells the calibrated car is exact to 1e-5; `dynssm` errs by at most "
-                f"{best['worst_exact']:.1e} there."
-            )
-        worst_cells = ", ".join(f"{q} {c}" for q, c in zip(QUANTITIES, best["over_best"]["worst_cell"], strict=True))
-        yield (
-            f"The network earned its place in the online layer ({100 * NETWORK_GAIN_WANTED:.0f} % on left-out laps) in "
-            f"{used} of {of} cells. Worst cells "
-            f"of `dynssm`: {worst_cells}."
-        )
-    yield ""
-    yield f"![Heat map of the cells]({FIGURE})"
+def _rows(content: Mapping[str, Any]) -> Iterator[list[str]]:
+    """A row for each model of the cells of one part."""
+    for model, entry in content["models"].items():
+        over, other, covered = entry["over_best"], entry["over_best_but_rls"], entry.get("coverage")
+        worst = max(over["worst"][name] for name in QUANTITIES[:3])
+        means = [over["one_step"], *over["by_quantity"].values(), worst, over["worst"]["ADE"]]
+        yield [
+            f"`{model}`",
+            *map(_ratio, means),
+            f"{_ratio(other['one_step'])}, {_ratio(other['by_quantity']['ADE'])}",
+            "–" if covered is None else f"{100 * covered[0]:.0f} to {100 * covered[2]:.0f} %",
+        ]
 
 
-def _noise(content: Mapping[str, Any]) -> Iterator[str]:
-    """What of the errors is the sensors' noise."""
-    said = {
-        name: ", ".join(f"{ratio:.2f}" for ratio in entry["over_noise"])
+def _over_noise(content: Mapping[str, Any]) -> str:
+    """What of the errors is the sensors' noise, by model."""
+    shown = ("dynssm", "rls", "single_track_ewma", "ridge")
+    return "; ".join(
+        f"{', '.join(f'{ratio:.2f}' for ratio in entry['over_noise'])} (`{name}`)"
         for name, entry in content["models"].items()
-        if name in ("dynssm", "rls", "single_track_ewma", "ridge") and "over_noise" in entry
-    }
-    if said:
-        yield (
-            "No model can predict the noise of the measurement that it is compared with. In simulated cells with noise the "
-            "one-step errors of v_x, v_y and omega are, in units of that noise, "
-            + "; ".join(f"{ratios} (`{name}`)" for name, ratios in said.items())
-            + ". One is the least that there can be."
-        )
+        if name in shown and "over_noise" in entry
+    )
 
 
 def _ratio(value: float) -> str:

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.closed_loop.cells import LAPS, PACE, Cell
-from benchmarks.generalisation.cells import simulated_car
-from benchmarks.generalisation.run import model_folder
+from benchmarks.matrix.raced_cells import LAPS, PACE, Cell
+from benchmarks.matrix.scored_cells import simulated_car
+from benchmarks.matrix.scores import model_folder
 from dynssm_ros.control.lap_learning import SAFE
 from dynssm_ros.control.prediction_model import Adaptive, PredictionModel
 from dynssm_ros.control.race import Course, Race, race
@@ -22,6 +22,8 @@ from dynssm_ros.runtime.registry import load_model
 
 CALIBRATED = "calibrated"
 BASELINES = (TRUE, CALIBRATED)
+LEARNS = "dynssm"
+"""What is driven faster every lap."""
 CALIBRATES = "rls"
 """Whose folder has the calibrated car."""
 TRUE_PACES = (0.9, 1.0, 1.1, 1.2, 1.3)

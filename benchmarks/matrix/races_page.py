@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.closed_loop.cells import CHANGES, LAPS, OBJECTIVES, PACE, Cell
-from benchmarks.closed_loop.run import AS_IS, CALIBRATED, LEARNING_LAPS, TRUE_PACES
-from benchmarks.generalisation.run import RIVALS
+from benchmarks.matrix.raced_cells import CHANGES, LAPS, OBJECTIVES, PACE, Cell
+from benchmarks.matrix.races import AS_IS, CALIBRATED, LEARNING_LAPS, TRUE_PACES
+from benchmarks.matrix.scores import RIVALS
+from benchmarks.page import render
 from dynssm_ros.control.lap_learning import SAFE
 from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.reporting.evaluation_figures import model_colours
 
-LEARNING_PAGE = "lap_learning.md"
 _GOAL = 1.015
 _CARS = {"orca": "the 1:43 car", "racer": "the 1:10 car", "av21": "the AV-21"}
 
@@ -109,109 +109,57 @@ def lap_times(known: Known) -> Figure:
     return figure
 
 
-def page(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[Cell]) -> str:
+def closed_loop_page(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[Cell]) -> str:
     """The results as Markdown.
 
     Args:
         known: outcomes.
-        arguments: of doit's command that differ from the default.
+        arguments: of doit's command that differ from the usual.
         figure: name of the figure's file.
         asked: the cells that the command drives, whether or not it has come to them.
     """
-    return "\n".join(_lines(known, arguments, figure, asked)) + "\n"
-
-
-def _lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[Cell]) -> Iterator[str]:
-    rivals = [name for name in RIVALS if name in next(iter(known.values()))]
-    cars = ", ".join(_CARS[name] for name in dict.fromkeys(cell.car for cell in known))
-    yield f"# Closed loop with rivals: {cars}" if rivals else "# Closed loop"
-    yield ""
-    tracking, progress = (f"{PACE[objective]:g}" for objective in OBJECTIVES)
-    yield (
-        f"Made by `{_command(arguments)}`. Each cell is {LAPS} laps of one car on a track that nothing was tuned on: a "
-        "variation of a built-in one by a seed. One change of the car is hidden from the models. It is 20 % less grip on a "
-        "third of the lap, 15 % less front grip, a steering offset of 0.02 rad, 10 % more mass, or half as much drag again. "
-        "A hash of the cell's name draws the rest. The plant has steps of 1 ms or four wheels, noise is none, usual or three "
-        f"times that, and delay none or a step. The car tracks at {tracking} of the limits or progresses at {progress}. "
-        "Models were trained on another track, of the car without the change."
-    )
-    yield ""
-    yield (
-        "`true` knows the plant and the change. `calibrated` is the single-track car that the training calibrated. Models "
-        "are planned with as far as they have earned it, and once more as they are. Decisions were taken on development "
-        "cells; a hash of the name says which these are. Where the network earned nothing, `dynssm` is `rls`."
-    )
-    if rivals:
-        yield ""
-        yield (
-            f"Rivals are {', '.join(f'`{name}`' for name in rivals)} ([what they are](rivals.md)), trained with what their "
-            "authors chose for a car of about that size. Nothing of theirs was decided on these cells. "
-            + ("`gp` corrects the calibrated car. " if "gp" in rivals else "")
-            + "DDM and FTHD calibrate nothing. With evidence the calibrated car is stepped, and what they say beyond it is "
-            "added as far as they have earned it. As they are, their own physics is stepped, with the vehicle file's nominal "
-            "values, in Euler steps and without load transfer."
-        )
+    compared = _with_evidence(known)
+    parts = []
     for label, part, missing in _parts(known, asked):
-        yield ""
-        if part:
-            content = _summary(part)
-            yield f"## {label.capitalize()} cells ({content['possible']} of {content['cells']})"
-            yield from _results(content)
-            yield from _grouped(part)
-        else:
-            yield f"## {label.capitalize()} cells"
-        yield from missing
-    yield ""
-    yield f"![Last laps over the true model's]({figure})"
+        content = _summary(part) if part else None
+        rows = _rows(content) if content else []
+        groups = [
+            [name, str(len(group)), *(_both(_middle_and_worst(ratios(group, model, TRUE))) for model in compared)]
+            for name, group in (_groups(part) if part else ())
+        ]
+        head = ["", "cells", *(f"`{model}`" for model in compared)]
+        parts.append(
+            {"label": label, "content": content, "rows": rows, "head": head, "groups": groups, "missing": missing}
+        )
+    return render(
+        "closed_loop",
+        arguments=arguments,
+        cars=", ".join(_CARS[name] for name in dict.fromkeys(cell.car for cell in known)),
+        figure=figure,
+        laps=LAPS,
+        paces=[f"{PACE[objective]:g}" for objective in OBJECTIVES],
+        parts=parts,
+        rivals=[name for name in RIVALS if name in next(iter(known.values()))],
+    )
 
 
-def _command(arguments: Sequence[str]) -> str:
-    """By which a page is made."""
-    return " ".join(["python -m doit -n 2 -f benchmarks/closed_loop/dodo.py", *arguments])
-
-
-def _parts(known: Known, asked: Sequence[Cell]) -> Iterator[tuple[str, Known, list[str]]]:
-    """The parts of which cells are asked for: what is known of each, and the lines that say what was not driven."""
+def _parts(known: Known, asked: Sequence[Cell]) -> Iterator[tuple[str, Known, str]]:
+    """The parts of which cells are asked for: what is known of each, and in words what was not driven."""
     for label, test in _PARTS.items():
         part = _those(known, "is_test", test)
         missing = Counter(cell.car for cell in asked if cell.is_test == test and cell not in known)
-        words = ", ".join(f"{count} of {_CARS[car]}" for car, count in missing.items())
         if part or missing:
-            yield label, part, ["", f"Not driven: {words}."] if missing else []
+            yield label.capitalize(), part, ", ".join(f"{count} of {_CARS[car]}" for car, count in missing.items())
 
 
-def _results(content: Mapping[str, Any]) -> Iterator[str]:
+def _rows(content: Mapping[str, Any]) -> list[list[str]]:
     """How each model did in the cells that the true model can drive."""
-    yield ""
-    yield "Those in which the true model comes round between the borders."
-    yield ""
-    yield (
-        "| model | comes round | last lap over `true`: median, worst | over `calibrated`: median, worst | "
-        "changed cars, over `calibrated`: median, worst | worst p99 (ms) | plans missing |"
-    )
-    yield "| --- | --- | --- | --- | --- | --- | --- |"
-    for model, entry in content["models"].items():
-        over = " | ".join(_both(entry[key]) for key in ("over_true", "over_calibrated", "over_calibrated_changed"))
-        yield (
-            f"| `{model}` | {entry['came_round']} of {content['possible']} | {over} | {entry['p99_ms']:.1f} | "
-            f"{entry['missing']} |"
-        )
-    if lost := {model: entry["lost"] for model, entry in content["models"].items() if entry["lost"]}:
-        yield ""
-        yield from (f"- `{model}` is lost in {', '.join(where)}." for model, where in lost.items())
-
-
-def _grouped(part: Known) -> Iterator[str]:
-    """Last laps over the true model's by what is hidden, by car and by objective."""
-    models = _with_evidence(part)
-    yield ""
-    yield "Last lap over `true`, median and worst, of those that come round:"
-    yield ""
-    yield f"| | cells | {' | '.join(f'`{model}`' for model in models)} |"
-    yield f"| --- | --- | {' | '.join('---' for _ in models)} |"
-    for name, group in _groups(part):
-        over = (_both(_middle_and_worst(ratios(group, model, TRUE))) for model in models)
-        yield f"| {name} | {len(group)} | {' | '.join(over)} |"
+    over = ("over_true", "over_calibrated", "over_calibrated_changed")
+    return [
+        [f"`{model}`", f"{entry['came_round']} of {content['possible']}", *(_both(entry[key]) for key in over),
+         f"{entry['p99_ms']:.1f}", str(entry["missing"])]
+        for model, entry in content["models"].items()
+    ]  # fmt: skip
 
 
 def _both(values: Sequence[float] | None) -> str:
@@ -252,35 +200,22 @@ def learned_laps(known: Known) -> Figure:
 
 
 def learning_page(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[Cell]) -> str:
-    """What learned lap by lap, as Markdown; see :func:`page`."""
-    return "\n".join(_learning_lines(known, arguments, figure, asked)) + "\n"
-
-
-def _learning_lines(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[Cell]) -> Iterator[str]:
-    yield "# Faster every lap"
-    yield ""
-    yield (
-        f"Made by `{_command([*arguments, 'learning_page'])}`. Each cell is driven for {LEARNING_LAPS} laps with "
-        f"`dynssm`, beginning with {SAFE:g} of the car's limits ([how](../../docs/use/race.md#faster-every-lap)). The cells "
-        "are those of the [matrix](closed_loop.md). The last lap is compared with the best of the true model, which knows "
-        f"the plant and the change, at {', '.join(f'{pace:g}' for pace in TRUE_PACES)} of the limits."
-    )
+    """What learned lap by lap, as Markdown; see :func:`closed_loop_page`."""
+    parts = []
     for label, part, missing in _parts(known, asked):
-        yield ""
-        yield f"## {label.capitalize()} cells"
-        if part:
-            yield ""
-            yield "| | cells | between the borders | first lap | last lap: median, worst | within 1.5 % |"
-            yield "| --- | --- | --- | --- | --- | --- |"
-            yield from (_learning_row(name, row) for name, row in _groups(part))
-            if behind := [
-                f"{cell.name} ({laps[-1]:.3f})" for cell, laps in _over_best(part).items() if laps[-1] > _GOAL
-            ]:
-                yield ""
-                yield f"More than 1.5 % behind: {', '.join(behind)}."
-        yield from missing
-    yield ""
-    yield f"![Laps over the true model's best]({figure})"
+        behind = [f"{cell.name} ({laps[-1]:.3f})" for cell, laps in _over_best(part).items() if laps[-1] > _GOAL]
+        rows = [_learning_row(name, group) for name, group in _groups(part)] if part else []
+        parts.append({"label": label, "rows": rows, "behind": ", ".join(behind), "missing": missing})
+    paces = ", ".join(f"{pace:g}" for pace in TRUE_PACES)
+    return render(
+        "lap_learning",
+        arguments=arguments,
+        figure=figure,
+        laps=LEARNING_LAPS,
+        paces=paces,
+        parts=parts,
+        safe=f"{SAFE:g}",
+    )
 
 
 def _over_best(part: Known) -> dict[Cell, np.ndarray]:
@@ -292,9 +227,9 @@ def _over_best(part: Known) -> dict[Cell, np.ndarray]:
     }
 
 
-def _learning_row(name: str, part: Known) -> str:
+def _learning_row(name: str, part: Known) -> list[str]:
     safe = sum(came_round(outcome["learned"]) for outcome in part.values())
     over = _over_best(part).values()
     first, last = (np.array([laps[k] for laps in over]) for k in (0, -1))
-    middle = f"{np.median(first):.3f} | {np.median(last):.3f}, {np.max(last):.3f}" if over else "– | –"
-    return f"| {name} | {len(part)} | {safe} | {middle} | {np.sum(last <= _GOAL)} of {len(over)} |"
+    laps = [f"{np.median(first):.3f}", f"{np.median(last):.3f}, {np.max(last):.3f}"] if over else ["–", "–"]
+    return [name, str(len(part)), str(safe), *laps, f"{np.sum(last <= _GOAL)} of {len(over)}"]

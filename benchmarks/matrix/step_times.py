@@ -1,4 +1,4 @@
-"""How long a control step takes, apart from the machine: ``python -m benchmarks.closed_loop.step_times CELL --count 10``.
+"""How long a control step takes, apart from the machine: ``python -m benchmarks.matrix.step_times CELL --count 10``.
 
 A cell of the matrix is driven several times with the same seed, so that each step computes the same in every drive. The
 least of its times is nearest to what the step needs; what the others have beyond it is the machine's. The percentiles over
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.closed_loop.cells import named
-from benchmarks.closed_loop.run import BASELINES, drive
+from benchmarks.matrix.raced_cells import named
+from benchmarks.matrix.races import BASELINES, drive
 from dynssm_ros.control.race import Race
 
 
@@ -29,7 +29,7 @@ def summary(drives: Sequence[Race]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Drives each cell so many times and prints percentiles of its steps."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.closed_loop.step_times", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.matrix.step_times", description=__doc__)
     parser.add_argument("cells", nargs="+", metavar="CELL", type=named)
     parser.add_argument("--count", type=int, default=10, help="drives of each cell")
     parser.add_argument("--models", nargs="+", default=["true"], help=f"{', '.join(BASELINES)}, or trained ones")

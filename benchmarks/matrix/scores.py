@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import dynssm_ros
-from benchmarks.generalisation.cells import Cell, Training, test_drive, training_drive
+from benchmarks.matrix.scored_cells import Cell, Training, test_drive, training_drive
 from dynssm_ros.api import with_offline
 from dynssm_ros.evaluation.open_loop import evaluate
 from dynssm_ros.files import write_json

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.generalisation.cells import Cell
-from benchmarks.generalisation.page import EXACT, errors
+from benchmarks.matrix.scored_cells import Cell
+from benchmarks.matrix.scores_page import EXACT, errors
+from benchmarks.page import render
 from dynssm_ros.learning.models.base import OnlineConfig
 
-PAGE = "ablations.md"
 Known = Mapping[Cell, Mapping[str, Any]]
 _EARNS = 0.01  # less does not stay in the default
 
@@ -71,35 +71,13 @@ def earned(known: Known, part: Part) -> Earned | None:
     return Earned(float(np.exp(one_step)), float(np.exp(ade)), len(logs))
 
 
-def page(known: Known, arguments: str) -> str:
-    """The page as Markdown; ``arguments``: of doit's command."""
-    return "\n".join(_lines(known, arguments)) + "\n"
-
-
-def _lines(known: Known, arguments: str) -> Iterator[str]:
-    command = " ".join(["python -m doit -n 2 -f benchmarks/generalisation/dodo.py", *arguments.split()])
-    yield "# What each part earns"
-    yield ""
-    yield (
-        f"Made by `{command}`. Models that differ by one part are trained and scored on the same cells of the "
-        "[matrix](generalisation.md). Shown are errors without the part over errors with it, as geometric means over the "
-        "cells: above 1 it earns its place. Errors below 1e-5 count as 1e-5. A part that earns less than "
-        f"{100 * _EARNS:.0f} % on test cells leaves the default."
-    )
-    yield ""
-    yield (
-        "A network acts beside the online layer only where it has earned 3 % on laps that were left out. Where none has, "
-        "models that differ in the network alone are the same there; what their networks are worth is in the rows without an "
-        "online layer."
-    )
-    yield ""
-    yield "| part | development: one step | ADE | test: one step | ADE | earns its place |"
-    yield "| --- | --- | --- | --- | --- | --- |"
+def ablations_page(known: Known, arguments: Sequence[str]) -> str:
+    """The page as Markdown; ``arguments``: of doit's command that differ from the usual."""
     sides = [{cell: v for cell, v in known.items() if cell.is_test == test} for test in (False, True)]
+    rows = []
     for part in PARTS:
         found = [earned(side, part) for side in sides]
-        numbers = " | ".join("– | –" if f is None else f"{f.one_step:.3f} | {f.ade:.3f}" for f in found)
+        numbers = [["–", "–"] if f is None else [f"{f.one_step:.3f}", f"{f.ade:.3f}"] for f in found]
         verdict = "–" if found[1] is None else "yes" if found[1].earns else "no"
-        yield f"| {part.name} | {numbers} | {verdict} |"
-    yield ""
-    yield f"Development cells: {len(sides[0])}; test cells: {len(sides[1])}."
+        rows.append([part.name, *numbers[0], *numbers[1], verdict])
+    return render("ablations", arguments=arguments, cells=[len(side) for side in sides], earns=_EARNS, rows=rows)

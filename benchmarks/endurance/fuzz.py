@@ -1,4 +1,4 @@
-"""Damaged messages for the predictor, in process: ``python -m benchmarks.fuzz --model DIR --messages 1000000``.
+"""Damaged messages for the predictor, in process: ``python -m benchmarks.endurance.fuzz --model DIR --messages 1000000``.
 
 A car drives straight on, and each of its messages may be spoilt: numbers that are none or beyond any car, stamps that
 repeat, run backwards or far ahead, joints without a name, a position or an order, messages that are lost or come twice.
@@ -201,7 +201,7 @@ def fuzz(model: Path, count: int, seed: int, progress: Progress | None = None) -
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs it and says what came of it."""
-    parser = argparse.ArgumentParser(prog="benchmarks.fuzz", description=__doc__)
+    parser = argparse.ArgumentParser(prog="benchmarks.endurance.fuzz", description=__doc__)
     parser.add_argument("--model", type=Path, required=True, help="model folder")
     parser.add_argument("--messages", type=int, default=1_000_000, help="how many")
     parser.add_argument("--seed", type=int, default=0, help="what they are")

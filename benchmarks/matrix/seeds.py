@@ -1,4 +1,4 @@
-"""What a lap owes to chance: cells again with other noise, ``python -m benchmarks.closed_loop.seeds CELL --count 12``.
+"""What a lap owes to chance: cells again with other noise, ``python -m benchmarks.matrix.seeds CELL --count 12``.
 
 A cell of the matrix is one drive. With another seed of the noise the same drive takes another time, and the worst of many
 cells is partly the one with the worst noise. So a figure that misses its goal in one cell is asked again here. Models are
@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.closed_loop.cells import Cell, named
-from benchmarks.closed_loop.page import last_lap
-from benchmarks.closed_loop.run import CALIBRATED, drive, learn, true_best
+from benchmarks.matrix.raced_cells import Cell, named
+from benchmarks.matrix.races import CALIBRATED, drive, learn, true_best
+from benchmarks.matrix.races_page import last_lap
 from dynssm_ros.control.race_models import TRUE
 
 
@@ -34,7 +34,7 @@ def learned_ratio(cell: Cell, model: str, trained: Path) -> dict[str, float]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Drives each cell with so many seeds and prints ratios of lap times."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.closed_loop.seeds", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.matrix.seeds", description=__doc__)
     parser.add_argument("cells", nargs="+", metavar="CELL", type=named)
     parser.add_argument("--count", type=int, default=12, help="seeds; the first is the matrix' own")
     parser.add_argument("--model", default="dynssm")

@@ -1,1 +1,0 @@
-"""The robustness matrix: laps in closed loop, on tracks and cars that nothing was tuned on."""

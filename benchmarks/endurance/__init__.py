@@ -1,0 +1,1 @@
+"""What node and commands endure: hours, damaged messages, kills, laps over DDS."""
