@@ -40,11 +40,6 @@ class DdmConfig(ModelConfig):
     loss: LossConfig
     training: TrainingConfig
 
-    @property
-    def with_physics(self) -> PhysicsConfig:
-        """The block ``physics``."""
-        return self.physics
-
 
 class DDM(TrainableModel):
     """``theta = theta_min + sigmoid(network(window)) * (theta_max - theta_min)``, and a step of the physics with it."""

@@ -46,11 +46,6 @@ class GpConfig(ModelConfig):
     physics: PhysicsConfig = Field(default_factory=lambda: PhysicsConfig(nominal="calibrated"))
     training: SplitConfig = Field(default_factory=SplitConfig)
 
-    @property
-    def with_physics(self) -> PhysicsConfig:
-        """The block ``physics``."""
-        return self.physics
-
 
 class GaussianProcess(TrainableModel):
     """Physics with nominal coefficients, and what the processes expect of its errors."""

@@ -49,11 +49,6 @@ class OnTrackConfig(ModelConfig):
     physics: PhysicsConfig = Field(default_factory=lambda: PhysicsConfig(nominal="calibrated"))
     training: SplitConfig = Field(default_factory=SplitConfig)
 
-    @property
-    def with_physics(self) -> PhysicsConfig:
-        """The block ``physics``."""
-        return self.physics
-
 
 class OnTrack(TrainableModel):
     """The physics with the tyres that were identified."""

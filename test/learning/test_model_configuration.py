@@ -37,6 +37,11 @@ def test_base_gives_what_a_file_leaves_out_block_by_block(tmp_path: Path) -> Non
     assert config.gru == shipped.gru
 
 
+def test_what_version_0_3_wrote_of_laps_that_are_not_mirrored_is_read(tmp_path: Path) -> None:
+    written = write(tmp_path, "a", {"base": "dynssm", "training": {"augmentation": {"mirror": False}}})
+    assert load_model_config(written) == load_model_config("dynssm")
+
+
 def test_files_that_refer_to_each_other_in_a_circle_are_refused(tmp_path: Path) -> None:
     write(tmp_path, "a", {"base": "b"})
     with pytest.raises(ConfigurationError, match="circle"):
@@ -75,6 +80,7 @@ def test_a_base_that_does_not_exist_is_named(tmp_path: Path) -> None:
             "kind: 'transformer'; expected one of " + ", ".join(sorted(MODELS)),
         ),
         ({"dense": {"layers": 2, "width": 4}}, "dense: Extra inputs are not permitted"),
+        ({"training": {"augmentation": {"mirror": True}}}, "augmentation: this version does not mirror laps"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_field_and_value(

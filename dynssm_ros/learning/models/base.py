@@ -100,8 +100,9 @@ class ModelConfig(StrictModel):
 
     @property
     def with_physics(self) -> PhysicsConfig:
-        """Its physics; of a model without any, what its online layer takes the car for."""
-        return PhysicsConfig()
+        """Its block ``physics``; of a model without one, what its online layer takes the car for."""
+        block: PhysicsConfig | None = getattr(self, "physics", None)
+        return block or PhysicsConfig()
 
     @property
     def start(self) -> ModelConfig | None:

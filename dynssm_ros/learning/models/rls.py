@@ -26,11 +26,6 @@ class RlsConfig(ModelConfig):
     online: OnlineConfig = Field(default_factory=OnlineConfig)
     training: SplitConfig = Field(default_factory=SplitConfig)
 
-    @property
-    def with_physics(self) -> PhysicsConfig:
-        """The block ``physics``."""
-        return self.physics
-
 
 class Rls(TrainableModel):
     """The physics with nominal coefficients; the rest is the online layer's."""

@@ -85,6 +85,16 @@ def test_the_loss_is_what_two_steps_of_another_car_disagree(
     assert loss_of(with_coefficients(make_ddm(), orca, theta), windows, unit) == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.fixture
+def fit(short: Recording, make_fthd: MakeConfig, orca: Vehicle, tmp_path: Path) -> Callable[..., Trained]:
+    """Trains the small FTHD, with other fields of ``fine_tuning``; ``at`` is its checkpoint."""
+
+    def train_it(at: str = "c.pt", progress: Any = None, **changes: Any) -> Trained:
+        return train(short, make_fthd(**changes), orca, tmp_path / at, progress=progress)
+
+    return train_it
+
+
 # --- two stages ---------------------------------------------------------------------------------
 
 
@@ -119,11 +129,9 @@ def test_frozen_layers_stay_and_the_others_learn(whole: Trained) -> None:
     assert changed == {"dense.1.0", "dense.2"}  # 0 is frozen, as is the GRU
 
 
-def test_the_physics_loss_is_part_of_the_history_by_its_weight(
-    whole: Trained, short: Recording, make_fthd: MakeConfig, orca: Vehicle, tmp_path: Path
-) -> None:
+def test_the_physics_loss_is_part_of_the_history_by_its_weight(whole: Trained, fit: Callable[..., Trained]) -> None:
     assert min(whole.history["validation/physics"]) > 0
-    without = train(short, make_fthd(physics=0.0), orca, tmp_path / "c.pt")
+    without = fit(physics=0.0)
     assert without.history["validation/physics"] == [0.0, 0.0]
     assert not torch.equal(weights(without)["dense.2.weight"], weights(whole)["dense.2.weight"])
 
@@ -148,26 +156,25 @@ def interrupt_at(epoch: int) -> Callable[[int, int, str], None]:
 
 @pytest.mark.parametrize("epoch", [2, 3, 4, 5])
 def test_an_interrupted_training_ends_bit_for_bit_like_an_uninterrupted_one(
-    whole: Trained, short: Recording, make_fthd: MakeConfig, orca: Vehicle, tmp_path: Path, epoch: int
+    whole: Trained, fit: Callable[..., Trained], tmp_path: Path, epoch: int
 ) -> None:
-    config, checkpoint = make_fthd(), tmp_path / "c.pt"
     with pytest.raises(KeyboardInterrupt):
-        train(short, config, orca, checkpoint, progress=interrupt_at(epoch))
-    kept = checkpoints(config, checkpoint)
+        fit(progress=interrupt_at(epoch))
+    kept = checkpoints(whole.config, tmp_path / "c.pt")
     assert [path.is_file() for path in kept] == [True, epoch > 3]
     done: list[int] = []
-    resumed = train(short, config, orca, checkpoint, progress=lambda *args: done.append(args[0]))
+    resumed = fit(progress=lambda *args: done.append(args[0]))
     assert done == list(range(epoch + 1, 6))  # nothing is trained twice
     assert resumed.resumed_from == epoch
     assert same(resumed, whole)
-    assert resumed.start is not None
-    assert whole.start is not None
+    assert resumed.start
+    assert whole.start
     assert same(resumed.start, whole.start)
 
 
-def test_progress_covers_both_stages(short: Recording, make_fthd: MakeConfig, orca: Vehicle, tmp_path: Path) -> None:
+def test_progress_covers_both_stages(fit: Callable[..., Trained]) -> None:
     told: list[tuple[int, int, str]] = []
-    train(short, make_fthd(), orca, tmp_path / "c.pt", progress=lambda *args: told.append(args))
+    fit(progress=lambda *args: told.append(args))
     assert [args[:2] for args in told] == [(k, 5) for k in range(1, 6)]
     assert [words.split(":")[0] for _, _, words in told] == ["small_ddm"] * 3 + ["small_fthd"] * 2
 
@@ -175,14 +182,11 @@ def test_progress_covers_both_stages(short: Recording, make_fthd: MakeConfig, or
 @pytest.mark.parametrize(
     "changes", [{"start": {"training": {"learning_rate": 0.001}}}, {"physics": 0.2}, {"frozen": 0.4}]
 )
-def test_the_checkpoint_of_another_fine_tuning_is_ignored(
-    short: Recording, make_fthd: MakeConfig, orca: Vehicle, tmp_path: Path, changes: dict[str, Any]
-) -> None:
-    checkpoint = tmp_path / "c.pt"
-    train(short, make_fthd(), orca, checkpoint)
-    again = train(short, make_fthd(**changes), orca, checkpoint)
+def test_the_checkpoint_of_another_fine_tuning_is_ignored(fit: Callable[..., Trained], changes: dict[str, Any]) -> None:
+    fit()
+    again = fit(**changes)
     assert again.resumed_from == (0 if "start" in changes else 3)  # the same DDM serves another fine-tuning
-    assert same(again, train(short, make_fthd(**changes), orca, tmp_path / "fresh.pt"))
+    assert same(again, fit("fresh.pt", **changes))
 
 
 def test_the_metrics_tell_of_both_stages(whole: Trained, tmp_path: Path) -> None:

@@ -107,11 +107,6 @@ class DynssmConfig(ModelConfig):
         """Whether the encoders see changes from row to row, so that the first row of the window has none."""
         return self.inputs.features == "increments" or self.inputs.physics_errors
 
-    @property
-    def with_physics(self) -> PhysicsConfig:
-        """The block ``physics``, if there is one."""
-        return self.physics or super().with_physics
-
     def check_rows(self, T_s: float) -> None:
         """Checks that all parts of the window fit into it at the sampling time ``T_s`` (s).
 
