@@ -5,30 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.runtime.artifact import ModelCard
-from dynssm_ros.runtime.contract import WindowPrediction
-from dynssm_ros.runtime.online import OnlineLayer
+from dynssm_ros.runtime.contract import Untrained, WindowPrediction
 from dynssm_ros.runtime.operations import count_operations
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
-from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
 from dynssm_ros.vehicle.effects.carried import CARRIED_S, carries, effect_states_along
 from dynssm_ros.vehicle.single_track import Integrator, step_with_effect_states
 
 
-class Persistence:
+class Persistence(Untrained):
     """The next state is the present one: the mark that every model must pass."""
 
     name = "persistence"
     T_s = 0.0
     H = 1
-    commands: Commands | None = None
-    online: OnlineLayer | None = None
     vehicle = None
-    card: ModelCard | None = None
     origin = "the next state is the present one"
-    parameters = 0
     flops = 0
 
     def predict(self, windows: Vector) -> WindowPrediction:
@@ -36,7 +29,7 @@ class Persistence:
         return WindowPrediction(windows[:, -1, :3].copy(), None, None)
 
 
-class SingleTrack:
+class SingleTrack(Untrained):
     """The nominal single-track model of a vehicle file, without learning.
 
     Where effects of the vehicle have states (a lagging steering, relaxing tyres), these are carried over a window of
@@ -44,10 +37,6 @@ class SingleTrack:
     """
 
     name = "single_track"
-    commands: Commands | None = None
-    online: OnlineLayer | None = None
-    card: ModelCard | None = None
-    parameters = 0
 
     def __init__(self, vehicle: Vehicle, integrator: Integrator | None = None, substeps: int = 1) -> None:
         self.vehicle = vehicle

@@ -26,12 +26,6 @@ class WindowPrediction(NamedTuple):
     seen: Seen | None = None
     """What the online layer sees; ``None`` if the model has no such layer."""
 
-    def part(self, chosen: slice) -> WindowPrediction:
-        """What it says of some of the windows."""
-        theta, physics, variance = (None if array is None else array[chosen] for array in self[1:4])
-        seen = None if self.seen is None else self.seen.at(chosen)
-        return WindowPrediction(self.state[chosen], theta, physics, variance, seen)
-
 
 class WindowModel(Protocol):
     """Any model that predicts one step ahead from a history window."""
@@ -63,6 +57,15 @@ class WindowModel(Protocol):
 
     def predict(self, windows: Vector) -> WindowPrediction:
         """Predicts from ``windows`` of shape ``(N, H, 7)``, columns ``WINDOW_COLUMNS``."""
+
+
+class Untrained:
+    """What models without training have in common; see :class:`WindowModel`."""
+
+    commands: Commands | None = None
+    online: OnlineLayer | None = None
+    card: ModelCard | None = None
+    parameters = 0
 
 
 def without_online(model: WindowModel) -> WindowModel:

@@ -14,13 +14,10 @@ from __future__ import annotations
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.runtime.artifact import ModelCard
 from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.coefficients import SPREAD
-from dynssm_ros.runtime.contract import WindowPrediction
-from dynssm_ros.runtime.online import OnlineLayer
+from dynssm_ros.runtime.contract import Untrained, WindowPrediction
 from dynssm_ros.signals.inputs import applied_inputs
-from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
 from dynssm_ros.vehicle.single_track import Integrator, step_with_effect_states
@@ -35,14 +32,10 @@ _SECANT = 1e-3  # step of the derivatives: m/s, m/s, rad/s, and shares of the sp
 _STATES = 3
 
 
-class SingleTrackEkf:
+class SingleTrackEkf(Untrained):
     """A joint extended Kalman filter over states and some coefficients of the single-track model."""
 
     name = "single_track_ekf"
-    commands: Commands | None = None
-    online: OnlineLayer | None = None
-    card: ModelCard | None = None
-    parameters = 0
 
     def __init__(self, vehicle: Vehicle, integrator: Integrator | None = None, substeps: int = 1) -> None:
         self.vehicle = vehicle

@@ -107,14 +107,7 @@ class OnlineLearner:
 
     def learned(self, seen: Seen) -> Learned:
         """What is known now, for a prediction from one window."""
-        state = self.state
-        return Learned(
-            state.mean[None],
-            state.variance(seen.features[0])[None],
-            state.limit[None],
-            state.coefficients.theta[None],
-            np.array([float(self._judge.trusted)]),
-        )
+        return self.state.learned(seen.features[0], self._judge.trusted)
 
     def _see(self, windows: Vector) -> Seen:
         return seen_by(self.model, windows)

@@ -15,7 +15,7 @@ The features are stateless and computed by the model's graph. What is learned is
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -177,8 +177,16 @@ class OnlineLayer:
         moved: Vector = seen.physics + kept * correction
         return moved
 
-    def drive(self, seen: Seen, rows: Vector, increments: Vector, ends: Indices) -> Learned:
-        """Learns over a recording, row after row, and notes what was known at each.
+
+class Along:
+    """An online layer that learns along a recording, block of rows after block."""
+
+    def __init__(self, layer: OnlineLayer) -> None:
+        self._state = layer.start()
+        self._last: tuple[int, Seen, Vector, Vector] | None = None
+
+    def over(self, seen: Seen, rows: Vector, increments: Vector, ends: Indices) -> Learned:
+        """Learns the next block, row after row; returns what was known at each.
 
         Args:
             seen: of the windows that end at ``ends``.
@@ -186,33 +194,16 @@ class OnlineLayer:
             increments: measured from them to the next (m/s, m/s, rad/s), ``(N, 3)``.
             ends: row numbers, ascending. The layer learns a step once the row after it is one of them.
         """
-        return Along(self).over(seen, rows, increments, ends)
-
-
-class Along:
-    """An online layer that learns along a recording, block of rows after block."""
-
-    def __init__(self, layer: OnlineLayer) -> None:
-        self._state = layer.start()
-        self._shape = layer.mean.shape
-        self._last: tuple[int, Seen, Vector, Vector] | None = None
-
-    def over(self, seen: Seen, rows: Vector, increments: Vector, ends: Indices) -> Learned:
-        """The next block; as :meth:`OnlineLayer.drive`."""
-        state, shapes = self._state, (self._shape, self._shape[:1], self._shape[:1], (17,), ())
-        learned = Learned(*(np.empty((len(ends), *shape)) for shape in shapes))
+        state = self._state
+        known = [state.learned(np.zeros_like(state.mean)).at(np.arange(0))]  # also where there are no rows
         for k, row in enumerate(ends.tolist()):
             if self._last is not None and self._last[0] == row - 1:
                 state.update(*self._last[1:])
             else:
                 state.interrupt()
             self._last = row, Seen(seen.features[k].copy(), seen.physics[k]), rows[k], increments[k]
-            learned.weights[k] = state.mean
-            learned.variance[k] = state.variance(seen.features[k])
-            learned.limit[k] = state.limit
-            learned.theta[k] = state.coefficients.theta
-            learned.trusted[k] = True
-        return learned
+            known.append(state.learned(seen.features[k]))
+        return Learned.joined(known)
 
 
 class OnlineState:
@@ -242,6 +233,11 @@ class OnlineState:
     def interrupt(self) -> None:
         """The next step does not follow on the last one."""
         self.coefficients.interrupt()
+
+    def learned(self, features: Vector, trusted: bool = True) -> Learned:
+        """What is known now, for a prediction from one window with features ``(3, n)``."""
+        now = self.mean, self.variance(features), self.limit, self.coefficients.theta, np.array(float(trusted))
+        return Learned(*(part[None] for part in now))
 
     @property
     def limit(self) -> Vector:
@@ -304,24 +300,13 @@ class OnlineState:
         Raises:
             ArtifactError: unreadable, not finite, or learned by another model.
         """
-        try:
-            with safe_open(path, framework="numpy") as content:
-                about = content.metadata() or {}
-            arrays = load_file(path)
-        except (SafetensorError, OSError) as error:
-            raise ArtifactError(f"{path}: not a readable online state ({error})") from error
-        if about.get("prior") != owner:
-            raise ArtifactError(f"{path}: was learned by another model; expected the state of prior {owner[:12]}")
-        arrays.setdefault("recent", np.ones(CHANNELS))  # states of 0.3.0 have none
-        estimator = self.coefficients.kept()
-        for name in (*_SAVED, *(f"coefficients.{name}" for name in estimator)):
-            value = arrays.get(name)
-            expected = getattr(self, name) if name in _SAVED else estimator[name.removeprefix("coefficients.")]
-            if value is None or value.shape != expected.shape or not np.isfinite(value).all():
-                raise ArtifactError(f"{path}: {name} is missing, of another shape or not finite")
+        coefficients = self.coefficients.kept()
+        expected = {name: getattr(self, name) for name in _SAVED}
+        expected |= {f"coefficients.{name}": value for name, value in coefficients.items()}
+        arrays, about = _read(path, "online state", {name: value.shape for name, value in expected.items()}, owner)
         for name in _SAVED:
             setattr(self, name, arrays[name])
-        self.coefficients.restore({name: arrays[f"coefficients.{name}"] for name in estimator})
+        self.coefficients.restore({name: arrays[f"coefficients.{name}"] for name in coefficients})
         self.steps = int(about.get("steps", "0"))
 
 
@@ -343,20 +328,31 @@ def load_layer(
     Raises:
         ArtifactError: unreadable, or of other sizes than the card says.
     """
+    n = len(card.features)
+    shapes = dict.fromkeys(_PRIOR, (CHANNELS,)) | {"mean": (CHANNELS, n), "covariance": (CHANNELS, n, n)}
+    prior, _ = _read(path, "online layer", shapes)
+    return OnlineLayer(card, **prior, scale=scale, vehicle=vehicle, integrator=integrator, substeps=substeps)
+
+
+def _read(
+    path: Path, what: str, shapes: Mapping[str, tuple[int, ...]], owner: str | None = None
+) -> tuple[dict[str, Vector], dict[str, str]]:
+    """Finite arrays of the expected shapes from a safetensors file of an ``owner``, and what it says of itself."""
     try:
+        with safe_open(path, framework="numpy") as content:
+            about = content.metadata() or {}
         arrays = load_file(path)
     except (SafetensorError, OSError) as error:
-        raise ArtifactError(f"{path}: not a readable online layer ({error})") from error
-    n = len(card.features)
-    shapes = {"mean": (CHANNELS, n), "covariance": (CHANNELS, n, n)}
-    for name in _PRIOR:
+        raise ArtifactError(f"{path}: not a readable {what} ({error})") from error
+    if owner is not None and about.get("prior") != owner:
+        raise ArtifactError(f"{path}: was learned by another model; expected the {what} of prior {owner[:12]}")
+    if "recent" in shapes:
+        arrays.setdefault("recent", np.ones(CHANNELS))  # states of 0.3.0 have none
+    for name, shape in shapes.items():
         value = arrays.get(name)
-        if value is None or value.shape != shapes.get(name, (CHANNELS,)) or not np.isfinite(value).all():
-            raise ArtifactError(
-                f"{path}: {name} is missing, not finite, or not of the {n} features that the card names"
-            )
-    prior = {name: arrays[name] for name in _PRIOR}
-    return OnlineLayer(card, **prior, scale=scale, vehicle=vehicle, integrator=integrator, substeps=substeps)
+        if value is None or value.shape != shape or not np.isfinite(value).all():
+            raise ArtifactError(f"{path}: {name} is missing, not finite or of another shape; expected {shape}")
+    return {name: arrays[name] for name in shapes}, about
 
 
 def expert_weights(layer: OnlineLayer, weights: Vector) -> dict[str, float]:

@@ -27,7 +27,7 @@ def make_layer(memory=1e12, prior_rows=10.0, noise=1e-2, mean=None):
 def drive(layer, features, weights, noise, rng):
     targets = np.einsum("kci,ci->kc", features, weights) + noise * rng.standard_normal((len(features), 3))
     seen = Seen(features, features[:, :, 0] * SCALE)
-    return layer.drive(seen, ROWS[: len(features)], targets * SCALE, np.arange(len(features))), targets
+    return Along(layer).over(seen, ROWS[: len(features)], targets * SCALE, np.arange(len(features))), targets
 
 
 def learn(state, features, target):
@@ -118,7 +118,7 @@ def test_its_90_percent_intervals_cover_90_percent(kind, size):
     }[kind]
     growing = size * np.linspace(0.02, 0.2, 5000)[:, None]
     targets = features[:, :, 0] + errors * growing  # the prior's noise is wrong
-    learned = layer.drive(Seen(features, features[:, :, 0] * SCALE), ROWS, targets * SCALE, np.arange(5000))
+    learned = Along(layer).over(Seen(features, features[:, :, 0] * SCALE), ROWS, targets * SCALE, np.arange(5000))
     missed = targets - np.einsum("kci,kci->kc", features, learned.weights)
     covered = np.mean(np.abs(missed) <= 1.6448536 * np.sqrt(learned.variance), axis=0)
     assert np.all(np.abs(covered - 0.9) < 0.02)
@@ -128,8 +128,8 @@ def test_what_was_known_at_a_row_does_not_depend_on_what_came_after():
     rng = np.random.default_rng(5)
     layer, features = make_layer(), rng.standard_normal((50, 3, N))
     increments = rng.standard_normal((50, 3))
-    whole = layer.drive(Seen(features, increments), ROWS[:50], increments, np.arange(50))
-    half = layer.drive(Seen(features[:25], increments[:25]), ROWS[:25], increments[:25], np.arange(25))
+    whole = Along(layer).over(Seen(features, increments), ROWS[:50], increments, np.arange(50))
+    half = Along(layer).over(Seen(features[:25], increments[:25]), ROWS[:25], increments[:25], np.arange(25))
     np.testing.assert_array_equal(whole.weights[:25], half.weights)
     np.testing.assert_array_equal(whole.variance[:25], half.variance)
     along = Along(layer)
@@ -143,7 +143,7 @@ def test_what_was_known_at_a_row_does_not_depend_on_what_came_after():
 def test_a_step_across_a_gap_is_not_learned():
     rng = np.random.default_rng(6)
     layer, features = make_layer(), rng.standard_normal((3, 3, N))
-    learned = layer.drive(Seen(features, np.ones((3, 3))), ROWS[:3], np.ones((3, 3)), np.array([4, 7, 8]))
+    learned = Along(layer).over(Seen(features, np.ones((3, 3))), ROWS[:3], np.ones((3, 3)), np.array([4, 7, 8]))
     np.testing.assert_array_equal(learned.weights[1], layer.mean)
     assert not np.array_equal(learned.weights[2], layer.mean)
 
