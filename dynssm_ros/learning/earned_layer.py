@@ -45,7 +45,7 @@ class LayerBase(NamedTuple):
 
     def features(self, network: bool) -> OnlineFeatures:
         """What the layer sees, with a network's prediction or without."""
-        return OnlineFeatures(self.config, self.vehicle, self.physics, self.normalisation, self.H, network)
+        return OnlineFeatures(self.config, self.vehicle, self.physics, self.normalisation, self.H, network=network)
 
     @property
     def path_steps(self) -> int:

@@ -52,6 +52,7 @@ class OnlineFeatures(nn.Module):
         physics: PhysicsConfig,
         scale: Normalisation,
         H: int,
+        *,
         network: bool,
     ) -> None:
         super().__init__()
@@ -206,7 +207,7 @@ def fit_layer(
 
     vehicle, stepping = features.physics.vehicle, features.physics.stepping
     nothing = BlockErrors(np.ones(CHANNELS), np.ones(CHANNELS))
-    estimator = CoefficientEstimator(vehicle, s_delta, nothing, *stepping, config.spread)
+    estimator = CoefficientEstimator(vehicle, s_delta, nothing, *stepping, spread=config.spread)
     usual = estimator.usual_errors((part.ends, part.measured) for part in parts)
 
     def layer(prior: _Prior, rows: float, spread: dict[str, float]) -> OnlineLayer:

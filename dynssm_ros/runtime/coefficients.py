@@ -91,6 +91,7 @@ class CoefficientEstimator:
         errors: BlockErrors,
         integrator: Integrator = "euler",
         substeps: int = 1,
+        *,
         spread: Mapping[str, float] = SPREAD,
     ) -> None:
         if unknown := [name for name in spread if name not in COEFFICIENTS]:

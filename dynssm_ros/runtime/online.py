@@ -138,7 +138,9 @@ class OnlineLayer:
     def estimator(self) -> CoefficientEstimator:
         """What follows the coefficients, as it begins."""
         errors = BlockErrors(self.block_noise, self.block_slow)
-        return CoefficientEstimator(self.vehicle, self.scale, errors, self.integrator, self.substeps, self.card.spread)
+        return CoefficientEstimator(
+            self.vehicle, self.scale, errors, self.integrator, self.substeps, spread=self.card.spread
+        )
 
     def start(self) -> OnlineState:
         """The state at the beginning of a drive: the prior."""

@@ -254,7 +254,7 @@ def test_features_fit_into_a_short_window(orca, noisy_model):
     from dynssm_ros.learning.models.base import OnlineConfig
     from dynssm_ros.learning.models.physics import PhysicsConfig
 
-    features = OnlineFeatures(OnlineConfig(), orca, PhysicsConfig(), noisy_model.card.normalisation, 5, False)
+    features = OnlineFeatures(OnlineConfig(), orca, PhysicsConfig(), noisy_model.card.normalisation, 5, network=False)
     seen, physics = features(torch.rand(7, 5, 7) + 1.0, Output(torch.zeros(7, 3), None, None, None, None))
     assert seen.shape == (7, 3, len(features.names))
     assert physics.shape == (7, 3)
