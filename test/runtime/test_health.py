@@ -75,12 +75,9 @@ def test_the_verdict_follows_the_share_that_is_refused(health: Health) -> None:
     )  # fmt: skip
 
 
-def test_more_than_one_publisher_is_named(health: Health) -> None:
+def test_more_than_one_publisher_is_named_and_a_wrong_wiring_is_an_error(health: Health) -> None:
     health.publishers = {ODOMETRY: 2, FEEDBACK: 1}
     assert health.verdict(1.05) == (Level.WARN, "/odometry: 2 publishers")
-
-
-def test_a_wrong_wiring_is_an_error(health: Health) -> None:
     health.wiring = "the steering's sign is swapped"
     assert health.verdict(1.05) == (Level.ERROR, "the steering's sign is swapped")
 
