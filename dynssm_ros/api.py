@@ -26,8 +26,8 @@ from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.signals.season import Season, recording_files
 from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
 from dynssm_ros.vehicle import Vehicle, load_vehicle
+from dynssm_ros.vehicle.integrators import Integrator
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
-from dynssm_ros.vehicle.single_track import Integrator
 
 if TYPE_CHECKING:
     from dynssm_ros.control.race import Race

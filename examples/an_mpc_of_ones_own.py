@@ -19,9 +19,8 @@ from dynssm_ros import load_vehicle
 from dynssm_ros.nodes.support import NEWEST_QOS, SENSOR_QOS, actuators, run
 from dynssm_ros.signals.decoding import header_stamp_ns
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose
-from dynssm_ros.vehicle.single_track import step
 
 STEPS = 15  # of T_s that are planned
 SPEED = 1.3  # m/s
@@ -45,6 +44,7 @@ class OwnMpc(Node):
     def _program(self) -> ca.Function:
         """The plan as a function of state, last command, coefficients, points to pass and a first guess."""
         opti, car = ca.Opti(), self.car
+        physics = CarModel.of(car, xp=ca)
         u = opti.variable(STEPS, 2)
         start, last, theta, points = (opti.parameter(*shape) for shape in ((6, 1), (1, 2), (17, 1), (STEPS, 2)))
         pose, state = Pose(*ca.vertsplit(start[:3])), State(*ca.vertsplit(start[3:]))
@@ -53,7 +53,7 @@ class OwnMpc(Node):
             # a command acts one step after the odometry that it answers: until then, the last one
             command = last if k == 0 else u[k - 1, :]
             applied, coefficients = Applied(command[0], command[1]), Coefficients(*ca.vertsplit(theta))
-            after = step(ca, state, applied, coefficients, car.constants, car.sampling_time)
+            after, _ = physics.step(state, applied, coefficients)
             pose, state = advance_pose(ca, pose, state, after, car.sampling_time), after
             if k > 0:
                 away = ca.vertcat(pose.x, pose.y) - points[k - 1, :].T

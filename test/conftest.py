@@ -275,7 +275,7 @@ def drive() -> Callable[..., Any]:
     """
     from dynssm_ros.signals.inputs import WINDOW_COLUMNS
     from dynssm_ros.signals.recording import Recording, RecordingInfo
-    from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step
+    from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
     from dynssm_ros.vehicle.kinematics import SCALAR
 
     def make(
@@ -290,12 +290,13 @@ def drive() -> Callable[..., Any]:
         rng = np.random.default_rng(seed)
         r, delta = smooth(rng, N + 1, *throttle, 40), smooth(rng, N + 1, 0.0, steering, 15)
         pushes = rng.standard_normal((N, 3)) * noise
-        theta, effects = Coefficients(*vehicle.nominal.tolist()), vehicle.active_effects
+        theta = Coefficients(*vehicle.nominal.tolist())
+        car = CarModel(vehicle.constants, vehicle.sampling_time, vehicle.active_effects, xp=SCALAR)
         state, states = State(1.8, 0.0, 0.0), np.empty((N, 3))
         for k in range(N):
             states[k] = state
             applied = Applied(float(r[k + 1]), float(delta[k + 1]))
-            following = step(SCALAR, state, applied, theta, vehicle.constants, vehicle.sampling_time, effects)
+            following, _ = car.step(state, applied, theta)
             state = State(*(value + push for value, push in zip(following, pushes[k].tolist(), strict=True)))
         matrix = np.column_stack([states, r[:-1], delta[:-1], np.diff(r), np.diff(delta)])
         info = RecordingInfo(sampling_time=vehicle.sampling_time, commands="topics", source=(f"drive {seed}",))

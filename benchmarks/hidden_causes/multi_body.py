@@ -20,9 +20,10 @@ from dynssm_ros.simulation.plant import RK4_STEP, Plant, Rk4Plant, register_plan
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle import Applied, State, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
+from dynssm_ros.vehicle.integrators import integrate
 from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.parameters import EffectEntry
-from dynssm_ros.vehicle.single_track import GRAVITY, StageEffect, integrate
+from dynssm_ros.vehicle.single_track import GRAVITY, StageEffect
 
 NAME = "multi_body"
 FILE = Path(__file__).with_name("bmw_320i.yaml")

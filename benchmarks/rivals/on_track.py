@@ -26,7 +26,6 @@ from dynssm_ros.learning.models.base import ModelConfig, TrainableModel, scale_b
 from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
-from dynssm_ros.vehicle.single_track import motion
 
 TYRES = ("B_f", "C_f", "D_f", "E_f", "S_hf", "B_r", "C_r", "D_r", "E_r", "S_hr")
 """Coefficients that are identified; the others are the vehicle file's, or those of its calibration."""
@@ -138,16 +137,14 @@ class OnTrack(TrainableModel):
         share = ((self.theta.double()[which] - lower) / wide).clamp(_EDGE, 1 - _EDGE)
         p = torch.logit(share).requires_grad_()
         columns = [column.double() for column in circles.T]
+        car = self.physics.car.under(torch)
 
         def theta() -> Tensor:
             return self.theta.double().index_copy(0, which, lower + torch.sigmoid(p) * wide)
 
         def unbalanced() -> Any:
             """Mean squared lateral and yaw acceleration over a step, in units of s_delta."""
-            q = motion(
-                torch, State(*columns[:3]), Applied(*columns[3:5]), Coefficients(*theta()), self.vehicle.constants,
-                self.physics.effects,
-            )  # fmt: skip
+            q = car.motion(State(*columns[:3]), Applied(*columns[3:5]), Coefficients(*theta()))
             units = self.increment_scale[_LATERAL] / self.vehicle.sampling_time
             return ((q.a_y / units[0]).square() + (q.omega_dot / units[1]).square()).mean()
 

@@ -13,7 +13,7 @@ from dynssm_ros.cli.console import CommandsOption, JsonOption, VehicleOption, Wh
 from dynssm_ros.files import write_json
 from dynssm_ros.signals.season import recording_files
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, save_vehicle
-from dynssm_ros.vehicle.single_track import Integrator
+from dynssm_ros.vehicle.integrators import Integrator
 
 if TYPE_CHECKING:
     from dynssm_ros.identification.calibration import Calibration

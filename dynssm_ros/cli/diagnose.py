@@ -27,7 +27,7 @@ from dynssm_ros.extras import require
 from dynssm_ros.parallel import Workers
 from dynssm_ros.signals.season import recording_files
 from dynssm_ros.vehicle import save_vehicle
-from dynssm_ros.vehicle.single_track import Integrator
+from dynssm_ros.vehicle.integrators import Integrator
 
 
 def diagnose(

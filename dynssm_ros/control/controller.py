@@ -28,7 +28,6 @@ from dynssm_ros.vehicle import Applied, Coefficients, State
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose
 from dynssm_ros.vehicle.parameters import InputLimits
-from dynssm_ros.vehicle.single_track import settled_effect_states
 
 LOST = 1.0  # widths of the road that the car may be outside of it and is still driven
 _AS_IT_IS = np.array([float(source == "model") for source in SOURCES])
@@ -286,5 +285,5 @@ class Controller:
         s = float(self._track.project(pose[:2])[0])
         context = {"t": t, **self._track.centre.place(s), **pose._asdict()}
         theta = Coefficients(*(float(value) for value in adapted.first.theta))
-        effect_states = settled_effect_states(SCALAR, seen, feedback, theta, car.constants, car.effects, None, context)
+        effect_states = car.under(SCALAR).settled(seen, feedback, theta, context=context)
         return np.array([effect_states[name] for name in car.effect_states])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Literal, NamedTuple
 
@@ -11,19 +9,10 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.buffered import BufferedRows
-from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State
 from dynssm_ros.vehicle.effects.base import PLACE, SLOWEST
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose
-from dynssm_ros.vehicle.low_speed import LowSpeedRolling
-from dynssm_ros.vehicle.single_track import (
-    Constants,
-    Integrator,
-    StageEffect,
-    at_least,
-    motion,
-    step_with_effect_states,
-    true_state,
-)
+from dynssm_ros.vehicle.single_track import at_least
 
 STATES = ("x", "y", "theta", "v_x", "v_y", "omega", "r", "delta")
 """Pose (m, m, rad), velocities (m/s, m/s, rad/s), what the actuators do (fraction, rad). The effects' own follow."""
@@ -38,50 +27,6 @@ CONTEXT = ("t", *PLACE)
 """What effects may read beside the pose: time (s), track position and length of the lap (m)."""
 PARAMETERS = len(COEFFICIENTS) + 3 + len(CONTEXT)
 """Per step: the 17 coefficients, the correction of ``v_x, v_y, omega``, the context."""
-
-
-@dataclass(frozen=True)
-class SteppedCar:
-    """The physics that a model steps by.
-
-    Attributes:
-        constants: mass and geometry.
-        T_s: length of a step (s).
-        effects: physics beyond the nominal model; they may read the pose and ``CONTEXT``.
-        integrator: of the step.
-        substeps: of the integrator.
-    """
-
-    constants: Constants
-    T_s: float
-    effects: Sequence[StageEffect] = ()
-    integrator: Integrator = "euler"
-    substeps: int = 1
-
-    @classmethod
-    def of(
-        cls,
-        vehicle: Vehicle,
-        integrator: Integrator | None = None,
-        substeps: int = 1,
-        first: Sequence[StageEffect] = (),
-    ) -> SteppedCar:
-        """The car of a vehicle file, also at low speed, where a step of T_s is too long for the tyres.
-
-        Args:
-            vehicle: the car with its effects.
-            integrator: of the step; ``None``: the vehicle's.
-            substeps: of the integrator.
-            first: acts before the vehicle's own effects.
-        """
-        effects = (*first, *vehicle.active_effects, LowSpeedRolling(vehicle, vehicle.sampling_time))
-        integrator = integrator or vehicle.model_integrator
-        return cls(vehicle.constants, vehicle.sampling_time, effects, integrator, substeps)
-
-    @property
-    def effect_states(self) -> tuple[str, ...]:
-        """Names of the effects' own states."""
-        return tuple(name for effect in self.effects for name in effect.carries)
 
 
 class _Symbols(NamedTuple):
@@ -109,7 +54,7 @@ class HorizonModel:
         slowest: speed (m/s) up to which slip angles are those of this speed; slower wheels roll.
     """
 
-    def __init__(self, car: SteppedCar, N: int, travel: Travel = "middle", slowest: float = SLOWEST) -> None:
+    def __init__(self, car: CarModel, N: int, travel: Travel = "middle", slowest: float = SLOWEST) -> None:
         self.car = car
         self.N = N
         self._travel = travel
@@ -175,9 +120,9 @@ class HorizonModel:
     def _slip_angles(self, x: Any, p: Any, slowest: float) -> Any:
         import casadi as ca
 
-        car, at = self.car, self._split(x, p, slowest)
-        state = true_state(ca, at.state, car.effects, at.effect_states)
-        q = motion(ca, state, at.applied, at.theta, car.constants, car.effects, at.effect_states, at.context, car.T_s)
+        car, at = self.car.under(ca), self._split(x, p, slowest)
+        state = car.true_state(at.state, at.effect_states)
+        q = car.motion(state, at.applied, at.theta, at.effect_states, context=at.context, h=car.T_s)
         return ca.vertcat(q.alpha_f, q.alpha_r)
 
     def _split(self, x: Any, p: Any, slowest: float) -> _Symbols:
@@ -200,21 +145,9 @@ class HorizonModel:
     def _following(self, x: Any, u: Any, p: Any) -> Any:
         import casadi as ca
 
-        car, at = self.car, self._split(x, p, SLOWEST)  # standing still the slip angles have no derivative
+        car, at = self.car.under(ca), self._split(x, p, SLOWEST)  # standing still the slip angles have no derivative
         now, applied = at.state, Applied(at.applied.r + u[0], at.applied.delta + u[1])
-        state, effect_states = step_with_effect_states(
-            ca,
-            now,
-            at.effect_states,
-            applied,
-            at.theta,
-            car.constants,
-            car.T_s,
-            car.effects,
-            car.integrator,
-            car.substeps,
-            at.context,
-        )
+        state, effect_states = car.step(now, applied, at.theta, at.effect_states, context=at.context)
         state = State(*(value + by for value, by in zip(state, at.correction, strict=True)))
         share = 0.5 if self._travel == "middle" else 0.0
         pose = advance_pose(ca, at.pose, now, state, car.T_s, share)

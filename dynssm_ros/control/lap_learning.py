@@ -31,7 +31,6 @@ import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.control.horizon_model import SteppedCar
 from dynssm_ros.control.prediction_model import stepped
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import HORIZON, Settings
@@ -42,7 +41,7 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.track.tracks import Track
-from dynssm_ros.vehicle import COEFFICIENTS, State, Vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, CarModel, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose, axle_direction
 from dynssm_ros.vehicle.limits import vehicle_limits
 
@@ -144,7 +143,7 @@ class LapLearner:
         reference: Reference,
         settings: Settings,
         *,
-        car: SteppedCar,
+        car: CarModel,
         theta: Vector,
     ) -> None:
         if reference.limits is None or reference.share is None:

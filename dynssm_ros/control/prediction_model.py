@@ -8,21 +8,21 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.buffered import BufferedRows
-from dynssm_ros.control.horizon_model import INPUTS, MOVING, STATES, SteppedCar
+from dynssm_ros.control.horizon_model import INPUTS, MOVING, STATES
 from dynssm_ros.control.nmpc import Adapted, Plan
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.learner import OnlineLearner
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.rollout import RolloutCorrection
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
-from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle, step
+from dynssm_ros.vehicle import COEFFICIENTS, CarModel, Coefficients, State, Vehicle
 
 
 class PredictionModel(Protocol):
     """What the controller asks of a model."""
 
     name: str
-    car: SteppedCar
+    car: CarModel
     """The physics that its coefficients are for."""
     H: int
     """Rows of history that it reads; 0: none."""
@@ -54,7 +54,7 @@ class Fixed:
 
     H = 0
 
-    def __init__(self, name: str, car: SteppedCar, theta: Vector) -> None:
+    def __init__(self, name: str, car: CarModel, theta: Vector) -> None:
         self.name = name
         self.car = car
         self.calibrated = Adapted(theta, np.zeros(3))
@@ -96,7 +96,7 @@ class Adaptive:
             self._learner = OnlineLearner(model, model.online, judges=False)
         self.H = model.H
         stepping = (card.integrator, card.substeps) if card is not None and self._is_own else ()
-        self.car = SteppedCar.of(own, *stepping)
+        self.car = CarModel.at_any_speed(own, *stepping)
         self._step = _compiled_step(self.car)
         self._model = model
         self._along_horizon = along_horizon
@@ -153,7 +153,7 @@ class Adaptive:
         return Adapted(theta, correction)
 
 
-def stepped(car: SteppedCar, rows: Vector, theta: Vector) -> Vector:
+def stepped(car: CarModel, rows: Vector, theta: Vector) -> Vector:
     """Next states of ``car`` (m/s, m/s, rad/s), shape ``(k, 3)``.
 
     Args:
@@ -161,24 +161,21 @@ def stepped(car: SteppedCar, rows: Vector, theta: Vector) -> Vector:
         rows: with the columns ``WINDOW_COLUMNS``, shape ``(k, 7)``.
         theta: coefficients, shape ``(17,)`` or ``(k, 17)``.
     """
-    return np.reshape(_step(np, car, rows.T, np.transpose(theta)), (3, -1)).T
+    return np.reshape(_step(car, rows.T, np.transpose(theta)), (3, -1)).T
 
 
-def _compiled_step(car: SteppedCar) -> BufferedRows:
+def _compiled_step(car: CarModel) -> BufferedRows:
     """:func:`stepped` of one row ``(7,)`` and its coefficients ``(17,)``: each control step asks for it."""
     import casadi as ca  # takes a while, and most of the command line does without
 
     row, theta = ca.SX.sym("row", len(WINDOW_COLUMNS)), ca.SX.sym("theta", len(COEFFICIENTS))
-    following = _step(ca, car, ca.vertsplit(row), ca.vertsplit(theta))
+    following = _step(car.under(ca), ca.vertsplit(row), ca.vertsplit(theta))
     return BufferedRows(ca.Function("step", [row, theta], [ca.densify(ca.vertcat(*following))]), 1)
 
 
-def _step(library: Any, car: SteppedCar, now: Any, theta: Any) -> State:
-    """The next state, from the columns of rows and of their coefficients, with ``library``'s numbers."""
-    return step(
-        library, State(*now[:3]), applied_inputs(now), Coefficients(*theta), car.constants, car.T_s, car.effects,
-        car.integrator, car.substeps,
-    )  # fmt: skip
+def _step(car: CarModel, now: Any, theta: Any) -> State:
+    """The next state, from the columns of rows and of their coefficients."""
+    return car.step(State(*now[:3]), applied_inputs(now), Coefficients(*theta))[0]
 
 
 def _planned_rows(plan: Plan) -> Vector:

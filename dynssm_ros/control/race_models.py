@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynssm_ros.control.horizon_model import SteppedCar
 from dynssm_ros.control.prediction_model import Adaptive, Fixed, PredictionModel
 from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.registry import UNTRAINED, load_model
 from dynssm_ros.simulation.plant import PlantKind, plant_type
-from dynssm_ros.vehicle import Vehicle, load_vehicle
+from dynssm_ros.vehicle import CarModel, Vehicle, load_vehicle
 
 TRUE = "true"
 SHARED = ("m", "l_f", "l_r")  # what makes it the same car
@@ -20,7 +19,9 @@ SHARED = ("m", "l_f", "l_r")  # what makes it the same car
 def true_model(vehicle: Vehicle, plant: PlantKind) -> Fixed:
     """The plant's own model: its coefficients, effects and wheels. Steps of 1 ms become two of Runge and Kutta."""
     of = plant_type(plant)
-    return Fixed(TRUE, SteppedCar.of(vehicle, of.integrator, of.substeps, of.first(vehicle)), vehicle.nominal)
+    return Fixed(
+        TRUE, CarModel.at_any_speed(vehicle, of.integrator, of.substeps, first=of.first(vehicle)), vehicle.nominal
+    )
 
 
 def load_prediction_model(

@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, VELOCITIES, HorizonModel, SteppedCar
+from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, VELOCITIES, HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Plan
-from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose
-from dynssm_ros.vehicle.single_track import settled_effect_states
 
 Context = tuple[float, ...]
 """The values of ``CONTEXT``: what effects may read beside the pose."""
@@ -54,7 +53,7 @@ class RemoteModel:
     CORRECTED = "nominal car, corrected"
 
     def __init__(self, vehicle: Vehicle, max_age: float) -> None:
-        self.car = SteppedCar.of(vehicle)
+        self.car = CarModel.at_any_speed(vehicle)
         self._model = HorizonModel(self.car, 1)
         self._period = round(vehicle.sampling_time * 1e9)
         self._max_age = max_age * 1e9
@@ -112,7 +111,7 @@ class RemoteModel:
         if effect_states is None:
             car, theta = self.car, Coefficients(*self.output.adapted.theta.tolist())
             around = dict(zip(CONTEXT, context, strict=True)) | pose._asdict()
-            settled = settled_effect_states(SCALAR, seen, applied, theta, car.constants, car.effects, None, around)
+            settled = car.under(SCALAR).settled(seen, applied, theta, context=around)
             effect_states = np.array([settled[name] for name in car.effect_states])
         return np.array([*pose, *seen, *applied, *effect_states])
 

@@ -32,7 +32,7 @@ from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.effects.base import LAP
-from dynssm_ros.vehicle.single_track import Integrator
+from dynssm_ros.vehicle.integrators import Integrator
 
 HORIZONS_S = (0.5, 0.25, 0.1)
 """Lengths of the simulations: the first for which a recording has stretches enough."""

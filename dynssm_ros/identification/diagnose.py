@@ -31,7 +31,7 @@ from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, require_context
-from dynssm_ros.vehicle.single_track import Integrator
+from dynssm_ros.vehicle.integrators import Integrator
 
 _HORIZON = 0.5  # s
 _HOLDOUT = 0.25

@@ -25,7 +25,7 @@ from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.vehicle.effects.actuators import SteeringLag
 from dynssm_ros.vehicle.effects.inertia import YawInertia
-from dynssm_ros.vehicle.single_track import Integrator
+from dynssm_ros.vehicle.integrators import Integrator
 
 _TRIED = 300  # windows with which the integrator is chosen at first
 

@@ -17,8 +17,9 @@ from dynssm_ros.identification.car import CarBatch, CarEstimate
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Hold
-from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
-from dynssm_ros.vehicle.single_track import Integrator, settled_effect_states, settling_rate, step_with_effect_states
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.integrators import Integrator
+from dynssm_ros.vehicle.single_track import settling_rate
 
 _LONGEST = 1.5  # integration step, times the rate at which the linear car settles
 _FINEST = 16  # integration steps per sampling time, at most
@@ -171,21 +172,19 @@ class SimulationWindows:
     def _simulate(self, cars: Sequence[CarEstimate], context: dict[str, float] | None, out: Vector) -> None:
         """Writes the predicted states of ``P`` cars to ``out``, shape ``(P, W, K, 3)``."""
         fleet = CarBatch.of(cars, self.number)
-        carries = any(effect.carries for effect in fleet.effects)
-        shift = -self.warm if carries or self.filtered else 0
+        car = self._bound(fleet)
+        shift = -self.warm if car.effect_states or self.filtered else 0
         taken = 1.0 - np.exp(-self.data.T_s / _FOLLOWING) if self.filtered else 1.0
         first = self.data.rows[:, self.starts + shift]
         here = self.context(shift) | (context or {})
         state = State(*first[:3])
-        effect_states = settled_effect_states(
-            np, state, Applied(*first[3:5]), fleet.theta, fleet.constants, fleet.effects, context=here
-        )
+        effect_states = car.settled(state, Applied(*first[3:5]), fleet.theta, context=here)
         with np.errstate(all="ignore"):
             for k in range(shift, self.steps):
                 rows = self.data.rows[:, self.starts + k]
                 if k <= 0:
                     state = State(*(led + taken * (row - led) for led, row in zip(state, rows[:3], strict=True)))
-                state, effect_states = self._step(fleet, state, effect_states, rows, k, context)
+                state, effect_states = self._step(car, fleet.theta, state, effect_states, rows, k, context)
                 if k >= 0 and (k + 1) % self.every == 0:
                     for channel, value in enumerate(state):
                         out[:, :, k // self.every, channel] = value
@@ -194,15 +193,16 @@ class SimulationWindows:
         """Derivatives of each compared row by the one before, along the measured rows, shape ``(W, K, 3, 3)``."""
         fleet = CarBatch.of([car], self.number)
         fleet = fleet._replace(effects=tuple(effect for effect in fleet.effects if not effect.carries))
+        bound, theta = self._bound(fleet), fleet.theta
         out = np.empty((len(self), self.steps, 3, 3))
         for k in range(self.steps):
             rows = self.data.rows[:, self.starts + k]
             state = State(*rows[:3])
-            base, _ = self._step(fleet, state, {}, rows, k, None)
+            base, _ = self._step(bound, theta, state, {}, rows, k, None)
             for j in range(3):
                 h = 1e-4 * self.spread[j]
                 there = State(*(v + h * (i == j) for i, v in enumerate(state)))
-                moved, _ = self._step(fleet, there, {}, rows, k, None)
+                moved, _ = self._step(bound, theta, there, {}, rows, k, None)
                 out[:, k, :, j] = np.stack([(a - b) / h for a, b in zip(moved, base, strict=True)], axis=-1)
         steps = np.clip(np.nan_to_num(out), -10.0, 10.0).reshape(len(self), -1, self.every, 3, 3)
         through = steps[:, :, 0]
@@ -217,7 +217,8 @@ class SimulationWindows:
 
     def _step(
         self,
-        fleet: CarBatch,
+        car: CarModel,
+        theta: Coefficients,
         state: State,
         effect_states: Mapping[str, Vector],
         rows: Vector,
@@ -229,19 +230,12 @@ class SimulationWindows:
         if self.hold == "first":
             lines, now = self.data.lines, self.starts + k
             applied = Applied(*(lines[:, now] + lines[:, now + 1]) / 2)
-        return step_with_effect_states(
-            np,
-            state,
-            effect_states,
-            applied,
-            fleet.theta,
-            fleet.constants,
-            self.data.T_s,
-            fleet.effects,
-            self.integrator,
-            self.substeps,
-            self.context(k) | dict(context or {}),
-        )
+        around = self.context(k) | dict(context or {})
+        return car.step(state, applied, theta, effect_states, context=around)
+
+    def _bound(self, fleet: CarBatch) -> CarModel:
+        """``fleet`` with the steps of these simulations."""
+        return CarModel(fleet.constants, self.data.T_s, fleet.effects, self.integrator, self.substeps)
 
 
 def recorded_rows(recording: Recording, context: dict[str, Vector]) -> RecordedRows:

@@ -30,7 +30,7 @@ from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.online import OnlineLayer
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
-from dynssm_ros.vehicle.single_track import Integrator
+from dynssm_ros.vehicle.integrators import Integrator
 
 Calibrate = Callable[[Recording, Vehicle, Integrator | None], Vehicle]
 """Fits the nominal values of a vehicle to a recording, for an integrator or, ``None``, the one that is closest to it."""

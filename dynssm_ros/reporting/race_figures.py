@@ -18,7 +18,7 @@ from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.evaluation.coefficients import coefficient_label
 from dynssm_ros.reporting.evaluation_figures import MEASURED, SYMBOLS, UNITS, WIDTH, model_colours, styled
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
-from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, motion
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State
 from dynssm_ros.vehicle.single_track import Motion, lateral_force
 
 _ENLARGED = 6.0  # where the paths part is enlarged if it is smaller than the track by this factor
@@ -142,11 +142,11 @@ def _motion(race: Race, with_effects: bool = True, theta: Vector | None = None) 
     centre = course.track.centre
     place = {"s": race.s, "lap_length": centre.length, "bend": centre.bend(race.s)}
     context = {"t": race.time, **place, "x": x, "y": y, "theta": heading}
-    effects = [effect for effect in course.vehicle.active_effects if not effect.SENSOR]
-    acting = Coefficients(*(course.vehicle.nominal if theta is None else theta.T))
-    state, command = State(*race.state.T), Applied(*race.command.T)
-    constants = course.vehicle.constants
-    return motion(np, state, command, acting, constants, effects if with_effects else [], context=context)
+    vehicle = course.vehicle
+    effects = [effect for effect in vehicle.active_effects if with_effects and not effect.SENSOR]
+    acting = Coefficients(*(vehicle.nominal if theta is None else theta.T))
+    car = CarModel(vehicle.constants, vehicle.sampling_time, effects)
+    return car.motion(State(*race.state.T), Applied(*race.command.T), acting, context=context)
 
 
 def driven_coefficients(race: Race) -> dict[str, Any]:

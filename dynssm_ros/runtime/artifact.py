@@ -23,8 +23,8 @@ from dynssm_ros.files import checksum
 from dynssm_ros.runtime.online import OnlineLayer, OnlineLayerCard, load_layer
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import Commands
+from dynssm_ros.vehicle.integrators import Integrator
 from dynssm_ros.vehicle.parameters import Vehicle
-from dynssm_ros.vehicle.single_track import Integrator
 
 FORMAT_VERSION = 1
 CARD, WEIGHTS, ONNX, METRICS = "model.yaml", "weights.safetensors", "model.onnx", "metrics.json"

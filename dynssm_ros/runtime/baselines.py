@@ -8,10 +8,9 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.runtime.contract import Untrained, WindowPrediction
 from dynssm_ros.runtime.operations import count_operations
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
-from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
-from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.effects.carried import CARRIED_S, carries, effect_states_along
-from dynssm_ros.vehicle.single_track import Integrator, step_with_effect_states
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.car import CARRIED_S
+from dynssm_ros.vehicle.integrators import Integrator
 
 
 class Persistence(Untrained):
@@ -42,10 +41,8 @@ class SingleTrack(Untrained):
         self.vehicle = vehicle
         self.T_s = vehicle.sampling_time
         self._theta = vehicle.nominal
-        self._effects = vehicle.active_effects
-        self._carries = carries(self._effects)
-        self._stepping: tuple[Integrator, int] = integrator or vehicle.model_integrator, substeps
-        self.H = 1 + (round(CARRIED_S / self.T_s) if self._carries else 0)
+        self._car = CarModel.of(vehicle, integrator, substeps)
+        self.H = 1 + (round(CARRIED_S / self.T_s) if self._car.effect_states else 0)
         self.flops = count_operations(self.predict, np.ones((1, self.H, len(WINDOW_COLUMNS))))
 
     @property
@@ -60,22 +57,12 @@ class SingleTrack(Untrained):
 
     def _following(self, windows: Vector, latest: int) -> Vector:
         """Next states ``(N, latest, 3)`` from the latest rows of windows ``(N, H, 7)``."""
-        theta = Coefficients(*self._theta)
-        now = np.moveaxis(windows[:, -latest:], -1, 0)
-        if self._carries:
-            rows = [windows[:, k].T for k in range(windows.shape[1])]
-            carried = effect_states_along(
-                np, [State(*row[:3]) for row in rows], [applied_inputs(row) for row in rows], Applied(*rows[0][3:5]), theta,
-                self.vehicle.constants, self.T_s, self._effects, *self._stepping,
-            )[-latest:]  # fmt: skip
-            effect_states = {name: np.stack([each[name] for each in carried], axis=1) for name in carried[0]}
-        else:
-            effect_states = initial_effect_states(self._effects, now[3], now[4])
-        state, _ = step_with_effect_states(
-            np, State(*now[:3]), effect_states, applied_inputs(now), theta, self.vehicle.constants, self.T_s,
-            self._effects, *self._stepping,
-        )  # fmt: skip
-        return np.stack(state, axis=-1)
+        columns = np.moveaxis(windows, -1, 0)
+        moved = self._car.over(
+            State(*columns[:3]), applied_inputs(columns), Applied(*columns[3:5]), Coefficients(*self._theta), latest
+        )
+        following: Vector = windows[:, -latest:, :3] + np.stack(moved, axis=-1)
+        return following
 
 
 class SingleTrackEwma(SingleTrack):

@@ -22,10 +22,8 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.signals.inputs import applied_inputs
-from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
-from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.effects.carried import carries, effect_states_along
-from dynssm_ros.vehicle.single_track import Integrator, increment
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.integrators import Integrator
 
 SPREAD: dict[str, float] = {
     "B_f": 0.1, "C_f": 0.03, "D_f": 0.15, "B_r": 0.1, "C_r": 0.03, "D_r": 0.15, "S_hf": 0.01, "S_hr": 0.01,
@@ -98,9 +96,7 @@ class CoefficientEstimator:
             raise ConfigurationError(f"spread: unknown {', '.join(unknown)}; expected some of {' '.join(COEFFICIENTS)}")
         self.nominal = vehicle.nominal
         self._vehicle, self._scale = vehicle, scale
-        self._stepping: tuple[Integrator, int] = integrator, substeps
-        self._effects = vehicle.active_effects
-        self._carries = carries(self._effects)
+        self._car = CarModel.of(vehicle, integrator, substeps)
         change = daily_change(vehicle, spread)
         known = np.array([vehicle.coefficients[name].std or 0.0 for name in COEFFICIENTS])
         self.adapted = np.flatnonzero(change > 0)
@@ -255,25 +251,10 @@ class CoefficientEstimator:
 
     def _mean_increments(self, rows: Vector, cars: Vector) -> Vector:
         """Mean increments over ``rows`` ``(L, 7)`` of cars with coefficients ``(P, 17)``: ``(P, 3)``."""
-        theta, now = Coefficients(*cars.T[:, :, None]), rows.T[:, None]
-        constants, T_s = self._vehicle.constants, self._vehicle.sampling_time
+        now = np.broadcast_to(rows.T[:, None], (rows.shape[1], len(cars), len(rows)))
         with np.errstate(all="ignore"):
-            if self._carries:
-                columns = [[np.full((1, 1), value) for value in row] for row in rows]
-                carried = effect_states_along(
-                    np, [State(*row[:3]) for row in columns], [applied_inputs(row) for row in columns],
-                    Applied(*columns[0][3:5]), theta, constants, T_s, self._effects, *self._stepping,
-                )  # fmt: skip
-                effect_states = {
-                    name: np.concatenate([np.broadcast_to(each[name], (len(cars), 1)) for each in carried], axis=1)
-                    for name in carried[0]
-                }
-            else:
-                effect_states = initial_effect_states(self._effects, now[3], now[4])
-            found, _ = increment(
-                np, State(*now[:3]), effect_states, applied_inputs(now), theta, constants, T_s, self._effects,
-                *self._stepping,
-            )  # fmt: skip
-            moved = [np.broadcast_to(part, (len(cars), len(rows))) for part in found]
+            moved = self._car.over(
+                State(*now[:3]), applied_inputs(now), Applied(*now[3:5]), Coefficients(*cars.T[:, :, None])
+            )
         means: Vector = np.stack([part.mean(axis=1) for part in moved], axis=1)
         return means

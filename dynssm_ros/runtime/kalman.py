@@ -18,9 +18,9 @@ from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.coefficients import SPREAD
 from dynssm_ros.runtime.contract import Untrained, WindowPrediction
 from dynssm_ros.signals.inputs import applied_inputs
-from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.single_track import Integrator, step_with_effect_states
+from dynssm_ros.vehicle.integrators import Integrator
 
 FOLLOWED = ("D_f", "D_r", "S_hf", "S_hr", "C_m1", "C_r0")
 """Coefficients that the filter follows: grip and offset of each axle, drive, resistance."""
@@ -40,8 +40,7 @@ class SingleTrackEkf(Untrained):
     def __init__(self, vehicle: Vehicle, integrator: Integrator | None = None, substeps: int = 1) -> None:
         self.vehicle = vehicle
         self.T_s = vehicle.sampling_time
-        self._stepping: tuple[Integrator, int] = integrator or vehicle.model_integrator, substeps
-        self._effects = vehicle.active_effects
+        self._car = CarModel.of(vehicle, integrator, substeps)
         self._theta = vehicle.nominal
         self._steps = round(_WINDOW_S / self.T_s)
         self.H = self._steps + 1
@@ -102,18 +101,8 @@ class SingleTrackEkf(Untrained):
         """Next states ``(N, 3)``; the effects' states are settled at each row."""
         theta = Coefficients(*self._coefficients(changes).T)
         applied = Applied(*inputs.T)
-        settled = initial_effect_states(self._effects, *applied)
-        following, _ = step_with_effect_states(
-            np,
-            State(*state.T),
-            settled,
-            applied,
-            theta,
-            self.vehicle.constants,
-            self.T_s,
-            self._effects,
-            *self._stepping,
-        )
+        settled = initial_effect_states(self._car.effects, *applied)
+        following, _ = self._car.step(State(*state.T), applied, theta, settled)
         return np.stack(np.broadcast_arrays(*following), axis=-1)
 
     def _linearised(self, state: Vector, inputs: Vector, changes: Vector) -> tuple[Vector, Vector]:

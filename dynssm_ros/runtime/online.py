@@ -32,8 +32,8 @@ from dynssm_ros.files import replacing
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.integrators import Integrator
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
-from dynssm_ros.vehicle.single_track import Integrator
 
 CHANNELS = 3
 MEAN_ERROR = "mean error of the physics"

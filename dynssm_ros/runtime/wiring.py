@@ -13,7 +13,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
-from dynssm_ros.vehicle import Coefficients, State, Vehicle, step
+from dynssm_ros.vehicle import CarModel, Coefficients, State, Vehicle
 
 _SECONDS = 6.0  # that are compared
 _FEWEST = 60  # rows, before anything is said
@@ -74,7 +74,8 @@ class Wiring:
         self._suspicions = [words for words, _, _ in suspicions]
         self._factors = np.stack([factors for _, factors, _ in suspicions])[:, None]
         longer = np.array([factor for _, _, factor in suspicions])[:, None]
-        self._constants = constants.model_copy(update={"l_f": constants.l_f * longer, "l_r": constants.l_r * longer})
+        suspected = constants.model_copy(update={"l_f": constants.l_f * longer, "l_r": constants.l_r * longer})
+        self._car = CarModel(suspected, T_s, (), "rk4", 2)
 
     def add(self, stamp: int, row: Vector) -> None:
         """Takes the newest row of a window, with the columns ``WINDOW_COLUMNS`` ``(7,)``; ``stamp`` in ns."""
@@ -127,9 +128,7 @@ class Wiring:
         moved = np.zeros_like(state)
         for k in range(self._ahead):
             now = np.moveaxis(np.concatenate([state, rows[:, starts + k, 3:]], axis=-1), -1, 0)
-            following = np.stack(
-                step(np, State(*now[:3]), applied_inputs(now), theta, self._constants, self._T_s, (), "rk4", 2), axis=-1
-            )
+            following = np.stack(self._car.step(State(*now[:3]), applied_inputs(now), theta)[0], axis=-1)
             moved, state = moved + following - state, following
         measured = rows[:, starts + self._ahead, :3] - first
         spread = np.mean(rows[:, :, 1:3] ** 2, axis=1) + 1e-12

@@ -10,10 +10,11 @@ from typing import Any, Protocol
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.double_track import DoubleTrack
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, step_with_effect_states
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import require_context
+from dynssm_ros.vehicle.integrators import Integrator
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose, world_velocity
-from dynssm_ros.vehicle.single_track import Integrator, Motion, StageEffect, measured_state, settled_effect_states
+from dynssm_ros.vehicle.single_track import Motion, StageEffect
 
 PlantKind = str
 """Name of a plant, see :data:`PLANTS`."""
@@ -87,27 +88,32 @@ class SingleTrackPlant:
     ) -> None:
         self.state = state
         self._vehicle = vehicle
-        self._integrator: Integrator = integrator
         self._theta = Coefficients(*(float(value) for value in vehicle.nominal))
         effects = vehicle.active_effects
         sensors = [effect for effect in effects if effect.SENSOR and not effect.reading_delay]
         physics = [effect for effect in effects if not effect.SENSOR]
-        self._effects: tuple[StageEffect, ...] = (_Odometer(), *first, *physics, *last, *sensors)
+        acting: tuple[StageEffect, ...] = (_Odometer(), *first, *physics, *last, *sensors)
+        delay = sum(effect.reading_delay for effect in effects)
+        substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
+        self._pieces = substeps if delay > 0 else 1  # a late reading falls between two steps
+        T_s, substeps = vehicle.sampling_time / self._pieces, substeps // self._pieces
+        self._car = CarModel(vehicle.constants, T_s, acting, integrator, substeps, xp=SCALAR, measured=False)
         self._steps = 0
         self._line = line
         require_context(effects, {*self._context(0.0), *Pose._fields}, "simulation")
-        self._memory = settled_effect_states(
-            SCALAR, state, Applied(0.0, 0.0), self._theta, vehicle.constants, self._effects,
-            dict(zip(_Odometer.POSE, pose, strict=True)), self._context(0.0), measured=False,
-        )  # fmt: skip
-        self._substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
-        delay = sum(effect.reading_delay for effect in effects)
+        self._effect_states = self._car.settled(
+            state,
+            Applied(0.0, 0.0),
+            self._theta,
+            dict(zip(_Odometer.POSE, pose, strict=True)),
+            context=self._context(0.0),
+        )
         self._late = _Late(delay, self._seen()) if delay > 0 else None
 
     @property
     def pose(self) -> Pose:
         """Where the car is."""
-        return Pose(*(self._memory[name] for name in _Odometer.POSE))
+        return Pose(*(self._effect_states[name] for name in _Odometer.POSE))
 
     @property
     def measured(self) -> State:
@@ -116,25 +122,13 @@ class SingleTrackPlant:
 
     def advance(self, applied: Applied, s: float = 0.0) -> None:
         """Moves the car on by T_s under constant inputs; ``s`` is its track position (m)."""
-        pieces = self._substeps if self._late else 1  # a late reading falls between two steps
-        h, context = self._vehicle.sampling_time / pieces, self._context(s)
-        for _ in range(pieces):
-            self.state, self._memory = step_with_effect_states(
-                SCALAR,
-                self.state,
-                self._memory,
-                applied,
-                self._theta,
-                self._vehicle.constants,
-                h,
-                self._effects,
-                self._integrator,
-                self._substeps // pieces,
-                context,
-                measured=False,
+        context = self._context(s)
+        for _ in range(self._pieces):
+            self.state, self._effect_states = self._car.step(
+                self.state, applied, self._theta, self._effect_states, context=context
             )
             if self._late:
-                self._late.add(h, self._seen())
+                self._late.add(self._car.T_s, self._seen())
         self._steps += 1
 
     def _context(self, s: float) -> dict[str, float]:
@@ -143,7 +137,7 @@ class SingleTrackPlant:
 
     def _seen(self) -> State:
         """The present state as the sensors see it."""
-        return measured_state(SCALAR, self.state, self._effects, self._memory)
+        return self._car.measured_state(self.state, self._effect_states)
 
 
 class _Late:

@@ -8,9 +8,10 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
+from dynssm_ros.vehicle.car import CarModel
 from dynssm_ros.vehicle.effects import CONTEXT_UNITS
 from dynssm_ros.vehicle.parameters import Vehicle
-from dynssm_ros.vehicle.single_track import Applied, Coefficients, Motion, State, motion
+from dynssm_ros.vehicle.single_track import Applied, Coefficients, Motion, State
 
 TOP_SPEED = 120.0  # m/s; where the table ends for a car that drag does not stop before
 _CONTEXT = {**dict.fromkeys(CONTEXT_UNITS, 0.0), "lap_length": 1.0}  # at the start of the lap, heading along x
@@ -95,5 +96,4 @@ def _cornering(vehicle: Vehicle, speed: Vector) -> Vector:
 
 def _settled(vehicle: Vehicle, state: State, applied: Applied) -> Motion:
     """The equations of motion at ``state`` once the effects' own states have settled."""
-    theta = Coefficients(*vehicle.nominal)
-    return motion(np, state, applied, theta, vehicle.constants, vehicle.active_effects, context=_CONTEXT)
+    return CarModel.of(vehicle).motion(state, applied, Coefficients(*vehicle.nominal), context=_CONTEXT)

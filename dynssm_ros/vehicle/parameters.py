@@ -19,7 +19,8 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.files import replacing
 from dynssm_ros.vehicle.effects import EFFECTS, Effect, build_effect
-from dynssm_ros.vehicle.single_track import Applied, Coefficients, Integrator
+from dynssm_ros.vehicle.integrators import Integrator
+from dynssm_ros.vehicle.single_track import Applied, Coefficients
 
 COEFFICIENT_UNITS: dict[str, str] = {
     "B_f": "1/rad", "C_f": "1", "D_f": "N", "E_f": "1",

@@ -11,21 +11,20 @@ The equations run in named stages over one :class:`Motion`:
 After each stage the effects of the vehicle (:mod:`dynssm_ros.vehicle.effects`) may change what it computed. Physics
 beyond the paper enters there, not here.
 
-Some effects change what is measured and not what happens. :func:`motion` is about what happens; the steps take and give
-what is measured, because that is what a model starts from and is compared with: measured -> true -> step -> measured.
+:class:`~dynssm_ros.vehicle.car.CarModel` binds them to a car and steps it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 GRAVITY = 9.81  # m/s^2
-_INSTANT = 1e-3  # s; the time that a single evaluation stands for
+INSTANT = 1e-3
+"""Time that a single evaluation stands for (s)."""
 
 Array = Any  # float, numpy array, torch tensor or casadi expression: whatever ``xp`` computes with
-Integrator = Literal["euler", "rk4"]
 
 
 class Coefficients(NamedTuple):
@@ -136,7 +135,7 @@ class Motion:
     effect_states: dict[str, Array] = field(default_factory=dict)
     effect_state_rates: dict[str, Array] = field(default_factory=dict)
     context: Mapping[str, Array] = field(default_factory=dict)
-    h: float = _INSTANT
+    h: float = INSTANT
 
 
 class StageEffect:
@@ -290,268 +289,25 @@ def at_least(value: Array, floor: Array) -> Array:
     return (value + floor + abs(value - floor)) / 2
 
 
-def motion(
-    xp: Any,
-    state: State,
-    applied: Applied,
-    theta: Coefficients,
-    constants: Constants,
-    effects: Sequence[StageEffect] = (),
-    effect_states: Mapping[str, Array] | None = None,
-    context: Mapping[str, Array] | None = None,
-    h: float = _INSTANT,
-) -> Motion:
-    """Evaluates all stages for one instant.
+Stage = Callable[[Any, Motion], None]
+"""Takes the array namespace and the motion, which it changes."""
 
-    Args:
-        xp: array namespace of the values.
-        state: true body-frame velocities, each of shape ``(...)``.
-        applied: throttle and steering that act now, broadcastable to ``(...)``.
-        theta: the 17 coefficients, broadcastable to ``(...)``.
-        constants: mass and geometry.
-        effects: physics beyond the nominal model, in the order in which it acts.
-        effect_states: the effects' own states by name; those left out are settled and returned with the result.
-        context: other signals by the names of ``CONTEXT_UNITS`` (time, heading, track position, ...) that effects read.
-        h: time (s) over which an integrator holds the rates; lags that are quicker settle within it.
+STAGES: tuple[Stage, ...] = (inputs, slip, drive, loads, tyres, forces, accelerations)
+"""The nominal equations, in the order in which they run."""
 
-    Raises:
-        ConfigurationError: an effect needs a signal that ``context`` does not have.
-    """
-    q = Motion(
-        *state,
-        *applied,
-        theta=theta,
-        m=constants.m,
-        l_f=constants.l_f,
-        l_r=constants.l_r,
-        h_cg=constants.h_cg,
-        F_z0=constants.F_z0,
-        load_transfer=constants.load_transfer,
-        effect_states=dict(effect_states or {}),
-        context=context or {},
-        h=h,
-    )
+
+def staged(effects: Sequence[StageEffect]) -> tuple[Stage, ...]:
+    """The equations, each followed by what ``effects`` change of it, in their order. Neutral effects are left out."""
     acting = [effect for effect in effects if not effect.is_neutral]
-    inputs(xp, q)
-    for effect in acting:
-        effect.inputs(xp, q)
-    slip(xp, q)
-    for effect in acting:
-        effect.slip(xp, q)
-    drive(xp, q)
-    for effect in acting:
-        effect.drive(xp, q)
-    loads(xp, q)
-    for effect in acting:
-        effect.loads(xp, q)
-    tyres(xp, q)
-    for effect in acting:
-        effect.tyres(xp, q)
-    forces(xp, q)
-    for effect in acting:
-        effect.forces(xp, q)
-    accelerations(xp, q)
-    for effect in acting:
-        effect.accelerations(xp, q)
-    return q
-
-
-def measuring(effects: Sequence[StageEffect]) -> tuple[StageEffect, ...]:
-    """Those of ``effects`` that change what is measured."""
-    return tuple(effect for effect in effects if effect.measures)
-
-
-def measured_state(xp: Any, state: State, effects: Sequence[StageEffect], effect_states: Mapping[str, Array]) -> State:
-    """What sensors show of the true ``state``: the effects that measure, one after the other."""
-    for effect in measuring(effects):
-        state = effect.measured(xp, state, effect_states)
-    return state
-
-
-def true_state(xp: Any, state: State, effects: Sequence[StageEffect], effect_states: Mapping[str, Array]) -> State:
-    """The true state behind a measured one: the inverse of :func:`measured_state`."""
-    for effect in reversed(measuring(effects)):
-        state = effect.true(xp, state, effect_states)
-    return state
-
-
-def settled_effect_states(
-    xp: Any,
-    state: State,
-    applied: Applied,
-    theta: Coefficients,
-    constants: Constants,
-    effects: Sequence[StageEffect],
-    effect_states: Mapping[str, Array] | None = None,
-    context: Mapping[str, Array] | None = None,
-    measured: bool = True,
-) -> dict[str, Array]:
-    """``effect_states`` and the effects' own states that it lacks, settled.
-
-    A sensor's state that hides part of the true motion hangs on that motion in turn; where ``state`` is a measured one,
-    both are found by a secant step, exact as far as the motion is linear in what is hidden.
-
-    Args:
-        xp: array namespace of the values.
-        state: body-frame velocities, each of shape ``(...)``.
-        applied: the inputs under which the states settle: to start from measured rows, what acted until then, the
-            actuators' feedback.
-        theta: the 17 coefficients.
-        constants: mass and geometry.
-        effects: physics beyond the nominal model.
-        effect_states: own states that are known, by name; they stay.
-        context: other signals, as in :func:`motion`.
-        measured: whether ``state`` is what is measured or the true one.
-    """
-    known = dict(effect_states or {})
-    if all(name in known for effect in effects for name in effect.carries):
-        return known
-    sensors = measuring(effects) if measured else ()
-
-    def settled(hidden: Mapping[str, Array]) -> dict[str, Array]:
-        true = true_state(xp, state, sensors, {**known, **hidden})
-        return motion(xp, true, applied, theta, constants, effects, known, context).effect_states
-
-    first = settled({})
-    names = [name for sensor in sensors for name in sensor.carries if name not in known]
-    if not names:
-        return first
-    second = settled({name: first[name] for name in names})
-    hidden = {name: _meeting(first[name], second[name]) for name in names}
-    return settled(hidden) | hidden
-
-
-def step(
-    xp: Any,
-    state: State,
-    applied: Applied,
-    theta: Coefficients,
-    constants: Constants,
-    T_s: float,
-    effects: Sequence[StageEffect] = (),
-    integrator: Integrator = "euler",
-    substeps: int = 1,
-    context: Mapping[str, Array] | None = None,
-) -> State:
-    """Advances the measured state by ``T_s`` seconds under constant inputs, Eq. (32).
-
-    The paper's step is one forward Euler step; ``integrator="rk4"`` and ``substeps`` refine it. States of effects
-    start settled; :func:`step_with_effect_states` carries it on.
-    """
-    return step_with_effect_states(
-        xp, state, {}, applied, theta, constants, T_s, effects, integrator, substeps, context
-    )[0]
-
-
-def step_with_effect_states(
-    xp: Any,
-    state: State,
-    effect_states: Mapping[str, Array],
-    applied: Applied,
-    theta: Coefficients,
-    constants: Constants,
-    T_s: float,
-    effects: Sequence[StageEffect] = (),
-    integrator: Integrator = "euler",
-    substeps: int = 1,
-    context: Mapping[str, Array] | None = None,
-    measured: bool = True,
-) -> tuple[State, dict[str, Array]]:
-    """Like :func:`step`, and integrates the effects' own states (``effect_states``, by name) with the car's.
-
-    States of effects that ``effect_states`` lacks start settled. ``measured`` says whether the states are measured ones, as
-    models step them, or true ones, as a plant does.
-    """
-    effect_states = settled_effect_states(
-        xp, state, applied, theta, constants, effects, effect_states, context, measured
+    return tuple(
+        act
+        for stage in STAGES
+        for act in (
+            stage,
+            *(getattr(effect, stage.__name__) for effect in acting if _overrides(effect, stage.__name__)),
+        )
     )
-    moved, changed = increment(
-        xp, state, effect_states, applied, theta, constants, T_s, effects, integrator, substeps, context, measured
-    )
-    return State(*_add(state, moved)), {name: value + changed[name] for name, value in effect_states.items()}
 
 
-def increment(
-    xp: Any,
-    state: State,
-    effect_states: Mapping[str, Array],
-    applied: Applied,
-    theta: Coefficients,
-    constants: Constants,
-    T_s: float,
-    effects: Sequence[StageEffect] = (),
-    integrator: Integrator = "euler",
-    substeps: int = 1,
-    context: Mapping[str, Array] | None = None,
-    measured: bool = True,
-) -> tuple[State, dict[str, Array]]:
-    """How much the state and the effects' own states change in ``T_s`` seconds; see :func:`step_with_effect_states`.
-
-    In single precision an increment is known far better than the difference of two states.
-    """
-    effect_states = settled_effect_states(
-        xp, state, applied, theta, constants, effects, effect_states, context, measured
-    )
-    sensors = measuring(effects) if measured else ()
-    true = true_state(xp, state, sensors, effect_states)
-    names, h = tuple(effect_states), T_s / substeps
-
-    def rates(y: Sequence[Array]) -> tuple[Array, ...]:
-        carried = dict(zip(names, y[3:], strict=True))
-        q = motion(xp, State(*y[:3]), applied, theta, constants, effects, carried, context, h)
-        return (q.a_x, q.a_y, q.omega_dot, *(q.effect_state_rates[name] for name in names))
-
-    moved = integrate(rates, (*true, *effect_states.values()), T_s, integrator, substeps)
-    change, changed = State(*moved[:3]), dict(zip(names, moved[3:], strict=True))
-    if sensors:
-        end = {name: value + changed[name] for name, value in effect_states.items()}
-        change = State(*_subtract(measured_state(xp, State(*_add(true, change)), sensors, end), state))
-    return change, changed
-
-
-def _meeting(first: Array, second: Array) -> Array:
-    """Where the line through ``(0, first)`` and ``(first, second)`` meets the diagonal, if it falls or hardly rises."""
-    square = first * first
-    return first * square / at_least(2 * square - first * second, square / 4 + 1e-30)
-
-
-Rates = Callable[[Sequence[Array]], tuple[Array, ...]]
-"""From quantities to their time derivatives."""
-
-
-def integrate(
-    rates: Rates, start: tuple[Array, ...], T_s: float, integrator: Integrator, substeps: int
-) -> tuple[Array, ...]:
-    """How much the quantities ``start`` change in ``T_s`` seconds."""
-    advance, h = _INTEGRATORS[integrator], T_s / substeps
-    moved = advance(rates, start, h)
-    for _ in range(substeps - 1):
-        moved = _add(moved, advance(rates, _add(start, moved), h))
-    return moved
-
-
-def _euler(rates: Rates, y: tuple[Array, ...], h: float) -> tuple[Array, ...]:
-    return _times(h, rates(y))
-
-
-def _rk4(rates: Rates, y: tuple[Array, ...], h: float) -> tuple[Array, ...]:
-    k1 = rates(y)
-    k2 = rates(_add(y, _times(h / 2, k1)))
-    k3 = rates(_add(y, _times(h / 2, k2)))
-    k4 = rates(_add(y, _times(h, k3)))
-    return tuple(h * (a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
-
-
-def _add(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, ...]:
-    return tuple(x + y for x, y in zip(a, b, strict=True))
-
-
-def _subtract(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, ...]:
-    return tuple(x - y for x, y in zip(a, b, strict=True))
-
-
-def _times(h: float, k: Sequence[Array]) -> tuple[Array, ...]:
-    return tuple(h * x for x in k)
-
-
-_INTEGRATORS = {"euler": _euler, "rk4": _rk4}
+def _overrides(effect: StageEffect, hook: str) -> bool:
+    return getattr(type(effect), hook) is not getattr(StageEffect, hook)

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.control.horizon_model import HorizonModel, SteppedCar
+from dynssm_ros.control.horizon_model import HorizonModel
 from dynssm_ros.control.nmpc import Nmpc
 from dynssm_ros.control.reference import Reference, load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.track.tracks import Track, load_track
-from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, CarModel, load_vehicle
 
 N = 10
 
@@ -60,7 +60,7 @@ def circle():
 
 @pytest.fixture(scope="session")
 def horizon_model(orca):
-    return HorizonModel(SteppedCar(orca.constants, orca.sampling_time, (), "rk4", 2), N)
+    return HorizonModel(CarModel(orca.constants, orca.sampling_time, (), "rk4", 2), N)
 
 
 @pytest.fixture

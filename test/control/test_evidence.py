@@ -8,12 +8,13 @@ import pytest
 
 from dynssm_ros.control.caution import QUANTILE
 from dynssm_ros.control.evidence import SOURCES, Evidence, sources
-from dynssm_ros.control.horizon_model import STATES, SteppedCar
+from dynssm_ros.control.horizon_model import STATES
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.control.prediction_model import Fixed
 from dynssm_ros.control.race import Course, race
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
+from dynssm_ros.vehicle import CarModel
 
 STEPS = 8
 AXLES = (0.03, -0.03)
@@ -126,8 +127,8 @@ def test_a_model_that_is_wrong_drives_like_the_calibrated_car(orca, club):
     reference = load_reference("racing", orca, club, 0.9)
     settings = replace(Settings.of(orca, "progress"), deadline=math.inf)  # no load of the machine changes a lap
     course = Course(orca, club, "euler", reference, settings)
-    car = Wrong("wrong", SteppedCar.of(orca), orca.nominal)
-    plain = race(course, Fixed("calibrated", SteppedCar.of(orca), orca.nominal))
+    car = Wrong("wrong", CarModel.at_any_speed(orca), orca.nominal)
+    plain = race(course, Fixed("calibrated", CarModel.at_any_speed(orca), orca.nominal))
     judged = race(course, car)
     assert judged.completed
     assert judged.lap_times == plain.lap_times

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from dynssm_ros.control.horizon_model import HorizonModel, SteppedCar
+from dynssm_ros.control.horizon_model import HorizonModel
 from dynssm_ros.runtime.predictor import propagate_pose
 from dynssm_ros.simulation.double_track import DoubleTrack
 from dynssm_ros.simulation.plant import Pose, make_plant
-from dynssm_ros.vehicle import Applied, Coefficients, State, step
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State
 from dynssm_ros.vehicle.effects import EFFECTS
 
 N = 3
@@ -22,11 +22,11 @@ def parameters(vehicle):
 
 @pytest.mark.parametrize(("integrator", "substeps"), [("euler", 1), ("rk4", 2)])
 def test_a_step_is_the_single_track_step_plus_the_correction(orca, integrator, substeps):
-    model = HorizonModel(SteppedCar(orca.constants, 0.02, (), integrator, substeps), N)
+    model = HorizonModel(CarModel(orca.constants, 0.02, (), integrator, substeps), N)
     x = model.step(NOW, U, parameters(orca))
     now, applied = State(*NOW[3:6]), Applied(*(NOW[6:] + U))
     theta = Coefficients(*orca.nominal)
-    stepped = step(np, now, applied, theta, orca.constants, 0.02, (), integrator, substeps)
+    stepped = CarModel(orca.constants, 0.02, (), integrator, substeps).step(now, applied, theta)[0]
     following = np.array(stepped) + ADDED
     np.testing.assert_allclose(x[3:6], following, rtol=1e-12)
     np.testing.assert_allclose(x[6:8], applied, rtol=1e-15)
@@ -44,7 +44,7 @@ def test_the_true_model_moves_as_its_plant(orca, plant, car, travel, off):
     driven.advance(Applied(*(NOW[6:] + U)))
     p = np.concatenate([orca.nominal, np.zeros(3), [0.0, 0.0, 12.0, 0.0]])
     following = {
-        each: HorizonModel(SteppedCar(orca.constants, 0.02, (), *car), N, each).step(NOW, U, p)
+        each: HorizonModel(CarModel(orca.constants, 0.02, (), *car), N, each).step(NOW, U, p)
         for each in ("start", "middle")
     }
     np.testing.assert_allclose(following[travel][:6], [*driven.pose, *driven.state], rtol=0, atol=off)
@@ -53,7 +53,7 @@ def test_the_true_model_moves_as_its_plant(orca, plant, car, travel, off):
 
 @pytest.mark.parametrize("travel", ["start", "middle"])
 def test_the_jacobians_are_those_of_the_step(orca, travel):
-    model = HorizonModel(SteppedCar(orca.constants, 0.02, (), "rk4", 1), N, travel)
+    model = HorizonModel(CarModel(orca.constants, 0.02, (), "rk4", 1), N, travel)
     x, u = np.tile(NOW, (N, 1)) * np.array([[1.0], [1.1], [0.9]]), np.tile(U, (N, 1))
     p = np.tile(parameters(orca), (N, 1))
     following, by_x, by_u = model.linearised(x, u, p)
@@ -77,10 +77,10 @@ def test_every_effect_acts_and_can_be_differentiated(orca, acting, name):
     if "roll" in getattr(effect, "needs", ()):
         pytest.skip("needs the measured roll, which a controller does not have")
     effects = (effect,)
-    model = HorizonModel(SteppedCar(car.constants, 0.02, effects), N)
+    model = HorizonModel(CarModel(car.constants, 0.02, effects), N)
     x = np.concatenate([NOW, np.zeros(model.size - 8)])
     following, by_x, _ = model.linearised(np.tile(x, (N, 1)), np.tile(U, (N, 1)), np.tile(parameters(orca), (N, 1)))
-    plain = HorizonModel(SteppedCar(car.constants, 0.02), N).step(NOW, U, parameters(orca))
+    plain = HorizonModel(CarModel(car.constants, 0.02), N).step(NOW, U, parameters(orca))
     assert np.all(np.isfinite(by_x))
     if name != "odometry_delay":
         assert not np.allclose(following[0, :8], plain, rtol=1e-9, atol=0)
@@ -89,7 +89,7 @@ def test_every_effect_acts_and_can_be_differentiated(orca, acting, name):
 def test_slip_angles_are_those_of_the_physics_with_shifts_and_effects(orca):
     """Closed form, and what an effect on the steering changes; the Jacobian by differences."""
     car = orca.with_effect("steering_offset", {"offset": 0.02})
-    model = HorizonModel(SteppedCar.of(car), 2)
+    model = HorizonModel(CarModel.at_any_speed(car), 2)
     x = np.zeros((2, model.size))
     x[:, 3:8] = [[1.9, 0.03, 1.5, 0.3, 0.1], [2.4, -0.1, -2.0, 0.2, -0.05]]
     p = np.tile(parameters(car), (2, 1)) if parameters(car).ndim == 1 else parameters(car)[:2]

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.control.horizon_model import SteppedCar
 from dynssm_ros.control.lap_learning import SAFE, LapLearner, LapLog, _better
 from dynssm_ros.control.prediction_model import Fixed
 from dynssm_ros.control.race import Course, race
@@ -13,6 +12,7 @@ from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.sensing import Sensing
+from dynssm_ros.vehicle import CarModel
 
 STEP, MOST = 0.06, 1.3
 
@@ -22,7 +22,9 @@ def learner(orca, club):
     """One whose coefficients are known well, so that they bound nothing and are not calibrated anew."""
     known = orca.with_nominal(orca.nominal, np.full(17, 1e-9))
     reference = load_reference("racing", known, club, SAFE)
-    built = LapLearner(known, club, reference, Settings.of(known), car=SteppedCar.of(known), theta=known.nominal)
+    built = LapLearner(
+        known, club, reference, Settings.of(known), car=CarModel.at_any_speed(known), theta=known.nominal
+    )
     built._calibrated = lambda: known
     return built
 
@@ -76,7 +78,7 @@ def test_where_the_rear_slipped_nearly_as_far_as_it_may_it_goes_back_and_stays_t
         learner.learn(lap(learner, slipping=again))
     np.testing.assert_allclose(np.delete(learner._shares, 2), SAFE + 5 * STEP)
     fast = LapLearner(
-        orca, club, learner._line, Settings.of(orca, "progress"), car=SteppedCar.of(orca), theta=orca.nominal
+        orca, club, learner._line, Settings.of(orca, "progress"), car=CarModel.at_any_speed(orca), theta=orca.nominal
     )
     assert not fast._slips(lap(learner, slipping=[2])).any()
     assert np.flatnonzero(learner._slips(lap(learner, slipping=[2]))).tolist() == [2]
@@ -123,7 +125,9 @@ def test_no_share_goes_beyond_what_the_coefficients_allow(orca, club):
     allowed = []
     for std in (1e-9, 0.02):
         known = orca.with_nominal(orca.nominal, std * np.abs(orca.nominal) + 1e-12)
-        learner = LapLearner(known, club, reference, Settings.of(known), car=SteppedCar.of(known), theta=known.nominal)
+        learner = LapLearner(
+            known, club, reference, Settings.of(known), car=CarModel.at_any_speed(known), theta=known.nominal
+        )
         allowed.append(learner._allowed.min() / MOST)
     assert allowed[0] == pytest.approx(1.0, abs=1e-3)
     assert 0.92 < allowed[1] < 0.98  # 10 % of such cars grip less by 2 % or more
@@ -134,7 +138,9 @@ def test_a_car_that_nobody_measured_begins_slower_still(orca, club):
         update={"coefficients": {n: c.model_copy(update={"std": None}) for n, c in orca.coefficients.items()}}
     )
     reference = load_reference("racing", orca, club, SAFE)
-    learner = LapLearner(unknown, club, reference, Settings.of(orca), car=SteppedCar.of(orca), theta=orca.nominal)
+    learner = LapLearner(
+        unknown, club, reference, Settings.of(orca), car=CarModel.at_any_speed(orca), theta=orca.nominal
+    )
     assert learner.reference.lap_time > 1.05 * reference.lap_time
     learner._calibrated = lambda: orca
     for _ in range(3):
@@ -152,7 +158,7 @@ def test_what_is_believed_stays_till_it_is_clearly_worse():
 def test_a_line_with_a_speed_of_its_own_is_refused(orca, club):
     own = replace(load_reference("racing", orca, club), share=None)
     with pytest.raises(ConfigurationError, match="has a speed of its own"):
-        LapLearner(orca, club, own, Settings.of(orca), car=SteppedCar.of(orca), theta=orca.nominal)
+        LapLearner(orca, club, own, Settings.of(orca), car=CarModel.at_any_speed(orca), theta=orca.nominal)
 
 
 def test_grip_is_learned_where_it_is_and_bounds_the_speed_there(orca, club):
@@ -161,7 +167,7 @@ def test_grip_is_learned_where_it_is_and_bounds_the_speed_there(orca, club):
     settings, line = replace(Settings.of(orca), deadline=np.inf), load_reference("racing", orca, club, SAFE)
     sensing = Sensing((0.01, 0.01, 0.03), (0.002, 0.002, 0.002), 0.02)
     course = Course(driven, club, "rk4", line, settings, 4, sensing=sensing, learning=orca)
-    outcome = race(course, Fixed("file", SteppedCar.of(orca, "rk4", 2), orca.nominal))
+    outcome = race(course, Fixed("file", CarModel.at_any_speed(orca, "rk4", 2), orca.nominal))
     assert outcome.completed
     assert outcome.outside == 0
     last = outcome.learned[-1]
@@ -176,7 +182,9 @@ def test_grip_is_learned_where_it_is_and_bounds_the_speed_there(orca, club):
 
 def test_a_model_that_knows_of_the_place_learns_without_it(learner, orca, club):
     driven = orca.with_effect("grip_patch", {"factor": 0.8, "centre": 0.5, "length": 0.4})
-    knowing = LapLearner(orca, club, learner._line, Settings.of(orca), car=SteppedCar.of(driven), theta=orca.nominal)
+    knowing = LapLearner(
+        orca, club, learner._line, Settings.of(orca), car=CarModel.at_any_speed(driven), theta=orca.nominal
+    )
     knowing._calibrated = lambda: orca
     for _ in range(2):
         knowing.learn(lap(learner))
@@ -189,7 +197,7 @@ def test_a_car_with_less_grip_than_its_file_learns_it_and_comes_round_faster(orc
     settings, line = replace(Settings.of(orca, "progress"), deadline=np.inf), load_reference("racing", orca, club, SAFE)
     sensing = Sensing((0.01, 0.01, 0.03), (0.002, 0.002, 0.002), 0.02)
     course = Course(driven, club, "rk4", line, settings, 5, sensing=sensing, learning=orca)
-    outcome = race(course, Fixed("file", SteppedCar.of(orca, "rk4", 2), orca.nominal))
+    outcome = race(course, Fixed("file", CarModel.at_any_speed(orca, "rk4", 2), orca.nominal))
     assert outcome.completed
     assert outcome.outside == 0
     assert outcome.lap_times[-1] < 0.975 * outcome.lap_times[0]

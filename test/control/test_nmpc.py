@@ -12,7 +12,7 @@ from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import WEIGHTS
 from dynssm_ros.simulation.plant import Pose, make_plant
-from dynssm_ros.vehicle import Applied, Coefficients, State, motion
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State
 
 
 def nominal(vehicle):
@@ -28,7 +28,7 @@ def steady_turn(vehicle, speed, yaw_rate):
     theta = Coefficients(*vehicle.nominal)
 
     def rates(unknown):
-        q = motion(np, State(speed, unknown[0], yaw_rate), Applied(*unknown[1:]), theta, vehicle.constants)
+        q = CarModel(vehicle.constants, 0.04).motion(State(speed, unknown[0], yaw_rate), Applied(*unknown[1:]), theta)
         return [q.a_x, q.a_y, q.omega_dot]
 
     return fsolve(rates, [0.0, 0.3, 0.06 * np.sign(yaw_rate)], xtol=1e-12)

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from dynssm_ros.control.horizon_model import HorizonModel, SteppedCar
+from dynssm_ros.control.horizon_model import HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Nmpc
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Scale, Settings
 from dynssm_ros.track.tracks import Track
-from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle import CarModel, load_vehicle
 from dynssm_ros.vehicle.limits import vehicle_limits
 
 SIZE = 9.0
@@ -65,7 +65,7 @@ def test_a_car_of_any_size_is_driven_alike(orca, club, club_line, objective):
         track: Track = club.scaled(size)
         line = Reference("line", club_line.line.scaled(size), club_line.speed * time)
         settings = Settings.of(car, objective, 10)
-        nmpc = Nmpc(HorizonModel(SteppedCar.of(car), settings.N), car.inputs, line, track, settings)
+        nmpc = Nmpc(HorizonModel(CarModel.at_any_speed(car), settings.N), car.inputs, line, track, settings)
         (x, y), heading = line.line.position(size * 1.0, size * 0.03), float(line.line.heading(size * 1.0))
         speed = 0.95 * float(line.speed_at(size * 1.0))
         now = np.array([x, y, heading, speed, 0.0, 0.0, 0.2, 0.05])

@@ -13,7 +13,7 @@ from dynssm_ros.runtime.kalman import SingleTrackEkf
 from dynssm_ros.runtime.operations import count_operations
 from dynssm_ros.runtime.registry import load_model
 from dynssm_ros.signals.inputs import applied_inputs
-from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, State, Vehicle, load_vehicle, step
+from dynssm_ros.vehicle import COEFFICIENTS, CarModel, Coefficients, State, Vehicle, load_vehicle
 
 CAR = load_vehicle("orca")
 
@@ -26,7 +26,9 @@ def drive(bias: np.ndarray, rows: int = 80, car: Vehicle = CAR) -> np.ndarray:
     drive[0, :3] = 1.5, 0.0, 0.0
     for k in range(rows - 1):
         applied = applied_inputs(drive[k])
-        state = step(np, State(*drive[k, :3]), applied, Coefficients(*car.nominal), CAR.constants, CAR.sampling_time)
+        state = CarModel(CAR.constants, CAR.sampling_time).step(
+            State(*drive[k, :3]), applied, Coefficients(*car.nominal)
+        )[0]
         drive[k + 1, :3] = np.array(state) + bias
     return drive
 

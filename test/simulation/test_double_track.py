@@ -11,7 +11,7 @@ from dynssm_ros.simulation.double_track import DoubleTrack
 from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.simulation.plant import Pose, make_plant
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, motion
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, load_vehicle
 from dynssm_ros.vehicle.single_track import StageEffect
 
 AV21, ORCA = load_vehicle("av21"), load_vehicle("orca")
@@ -27,7 +27,9 @@ class Keeper(StageEffect):
 
 
 def moved(state, applied, *bodies, vehicle=AV21):
-    return motion(np, State(*state), Applied(*applied), Coefficients(*vehicle.nominal), vehicle.constants, bodies)
+    return CarModel(vehicle.constants, 0.04, bodies).motion(
+        State(*state), Applied(*applied), Coefficients(*vehicle.nominal)
+    )
 
 
 def sideways(slip, v_x=40.0, body=None):
@@ -152,6 +154,6 @@ def test_laps_on_it_differ_from_the_single_track_ones_in_what_a_model_cannot_kno
     run = simulate(AV21, load_track("road_course"), duration=12.0, plant="double_track", seed=2)
     theta = Coefficients(*AV21.nominal)
     late = np.abs(run.state[:, 0] * run.state[:, 2]) > 8
-    q = motion(np, State(*run.state[late].T), Applied(*run.command[late].T), theta, AV21.constants)
-    p = motion(np, State(*run.state[late].T), Applied(*run.command[late].T), theta, AV21.constants, (PLAIN,))
+    q = CarModel(AV21.constants, 0.04).motion(State(*run.state[late].T), Applied(*run.command[late].T), theta)
+    p = CarModel(AV21.constants, 0.04, (PLAIN,)).motion(State(*run.state[late].T), Applied(*run.command[late].T), theta)
     assert np.mean(np.abs(q.F_y)) > 1.005 * np.mean(np.abs(p.F_y))

@@ -14,10 +14,9 @@ from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.simulation.plant import PlantKind, Pose, make_plant
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle, load_vehicle
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDelay
-from dynssm_ros.vehicle.single_track import settled_effect_states, step_with_effect_states
 
 AV21, COURSE = load_vehicle("av21"), load_track("road_course")
 LINE, STEPS, WARM = load_track("club").centre.scaled(70.0), 25, 8
@@ -80,13 +79,13 @@ def test_a_model_from_the_vehicle_file_follows_the_measured_car(name: str, nomin
     _, measured, signals = driven(vehicle, "rk4")
     effects, theta = vehicle.active_effects, Coefficients(*vehicle.nominal)
     state, errors = State(*measured[0]), []
-    effect_states = settled_effect_states(
-        np, state, Applied(0.0, 0.0), theta, vehicle.constants, effects, context=signals[0]
+    effect_states = CarModel(vehicle.constants, 0.04, effects).settled(
+        state, Applied(0.0, 0.0), theta, context=signals[0]
     )
     for k, applied in enumerate(commands()):
         state = State(*measured[k]) if k <= WARM else state  # until then it is led along what is measured
-        state, effect_states = step_with_effect_states(
-            np, state, effect_states, applied, theta, vehicle.constants, 0.04, effects, "rk4", 40, signals[k]
+        state, effect_states = CarModel(vehicle.constants, 0.04, effects, "rk4", 40).step(
+            state, applied, theta, effect_states, context=signals[k]
         )
         errors.append(np.abs(state - measured[k + 1]).max())
     shown = np.abs(measured - nominal["rk4"]).max()

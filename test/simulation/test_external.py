@@ -9,7 +9,7 @@ from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.simulation.plant import RK4_STEP
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, step
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, load_vehicle
 from dynssm_ros.vehicle.low_speed import LowSpeedRolling
 
 ORCA, AV21, CLUB = load_vehicle("orca"), load_vehicle("av21"), load_track("club")
@@ -86,7 +86,7 @@ def test_above_creeping_speed_each_step_is_the_vehicle_model():
     ]
     assert len(fast) > 30
     for before, after in fast:
-        reached = step(np, before.state, before.command, Coefficients(*ORCA.nominal), ORCA.constants, 0.02)
+        reached = CarModel(ORCA.constants, 0.02).step(before.state, before.command, Coefficients(*ORCA.nominal))[0]
         np.testing.assert_allclose(after.state, reached, rtol=1e-9)
         assert after.feedback == before.command
 
@@ -106,7 +106,7 @@ def test_creeping_speed_is_where_forward_euler_starts_to_ring():
     def settles(v_x):
         state = State(v_x, 0.0, 0.5)
         for _ in range(200):
-            moved = step(np, state, Applied(0.2, 0.0), Coefficients(*ORCA.nominal), ORCA.constants, 0.02)
+            moved = CarModel(ORCA.constants, 0.02).step(state, Applied(0.2, 0.0), Coefficients(*ORCA.nominal))[0]
             state = State(v_x, moved.v_y, moved.omega)
         return abs(state.omega - moved.omega) < 1e-9 and abs(state.omega) < 0.3
 

@@ -12,7 +12,7 @@ from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.simulation.laps import SimulationError, drive, simulate, write_run
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, step
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, load_vehicle
 
 ORCA, CLUB = load_vehicle("orca"), load_track("club")
 
@@ -80,7 +80,7 @@ def test_bag_holds_the_steps_that_the_plant_made(lap, tmp_path):
     np.testing.assert_array_equal(recording.time, lap.time)
     state = State(*(recording[name] for name in ("v_x", "v_y", "omega")))
     applied = Applied(recording["r_fb"] + recording["r_cmd"], recording["delta_fb"] + recording["delta_cmd"])
-    reached = step(np, state, applied, Coefficients(*ORCA.nominal), ORCA.constants, ORCA.sampling_time)
+    reached = CarModel(ORCA.constants, ORCA.sampling_time).step(state, applied, Coefficients(*ORCA.nominal))[0]
     for name, values in reached._asdict().items():
         np.testing.assert_allclose(values[:-1], recording[name][1:], rtol=0, atol=1e-9)
     for name, values in zip(("x", "y", "theta"), lap.pose.T, strict=True):

@@ -95,8 +95,9 @@ def test_effects_see_time_place_and_pose():
             seen.append(dict(q.context))
 
     line = load_track("club").centre
-    car = SingleTrackPlant(load_vehicle("orca"), "euler", Pose(1.0, 2.0, 0.5), State(2.0, 0.0, 0.0), line=line)
-    car._effects = (*car._effects, Witness())
+    start = Pose(1.0, 2.0, 0.5), State(2.0, 0.0, 0.0)
+    car = SingleTrackPlant(load_vehicle("orca"), "euler", *start, last=(Witness(),), line=line)
+    seen.clear()
     car.advance(Applied(0.0, 0.0), s=3.0)
     car.advance(Applied(0.0, 0.0), s=3.1)
     assert seen[0] == {"t": 0.0, **line.place(3.0), "x": 1.0, "y": 2.0, "theta": 0.5}

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, load_vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State, load_vehicle
 from dynssm_ros.vehicle.effects import CONTEXT_UNITS, EFFECTS, Effect, build_effect
-from dynssm_ros.vehicle.single_track import Integrator, settled_effect_states, step_with_effect_states
+from dynssm_ros.vehicle.integrators import Integrator
 
 AV21 = load_vehicle("av21_paper")
 SIZES = (3, 2, len(COEFFICIENTS), len(CONTEXT_UNITS))
@@ -36,9 +36,11 @@ def advance(xp: Any, effect: Effect, integrator: Integrator, state: Any, inputs:
     context = dict(zip(CONTEXT_UNITS, signals, strict=True))
     feedback, applied = Applied(0.5 * inputs[0], 0.5 * inputs[1]), Applied(*inputs)
     effects = (effect,)
-    effect_states = settled_effect_states(xp, start, feedback, coefficients, AV21.constants, effects, context=context)
-    following, carried = step_with_effect_states(
-        xp, start, effect_states, applied, coefficients, AV21.constants, 0.04, effects, integrator, 2, context
+    effect_states = CarModel(AV21.constants, 0.04, effects, xp=xp).settled(
+        start, feedback, coefficients, context=context
+    )
+    following, carried = CarModel(AV21.constants, 0.04, effects, integrator, 2, xp=xp).step(
+        start, applied, coefficients, effect_states, context=context
     )
     return [*following, *carried.values()]
 

@@ -7,9 +7,9 @@ import pytest
 from scipy.interpolate import BSpline
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, motion
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, load_vehicle
 from dynssm_ros.vehicle.effects import build_effect
-from dynssm_ros.vehicle.single_track import GRAVITY, Motion, step_with_effect_states
+from dynssm_ros.vehicle.single_track import GRAVITY, Motion
 
 AV21 = load_vehicle("av21")
 CONSTANTS, THETA = AV21.constants, Coefficients(*AV21.nominal)
@@ -20,7 +20,7 @@ STATE, APPLIED = State(30.0, 0.4, 0.2), Applied(0.4, 0.05)
 def act(state: State = STATE, applied: Applied = APPLIED, context: dict[str, float] | None = None, **effects) -> Motion:
     """The motion with effects given as ``name={parameter: value}``."""
     built = tuple(build_effect(name, parameters) for name, parameters in effects.items())
-    return motion(np, state, applied, THETA, CONSTANTS, built, context=context)
+    return CarModel(CONSTANTS, 0.04, built).motion(state, applied, THETA, context=context)
 
 
 PLAIN = act()
@@ -150,7 +150,7 @@ def test_load_transfer_of_a_car_without_any_begins_at_the_ground() -> None:
     car = load_vehicle("orca")
     theta, constants = Coefficients(*car.nominal), car.constants
     effects = (build_effect("load_transfer", {"height": 0.1}),)
-    q = motion(np, State(2.0, 0.0, 0.0), Applied(0.6, 0.1), theta, constants, effects)
+    q = CarModel(constants, 0.04, effects).motion(State(2.0, 0.0, 0.0), Applied(0.6, 0.1), theta)
     assert q.F_zr - constants.F_z0 == pytest.approx(0.1 * q.F_rx)
     assert constants.F_z0 - q.F_zf == pytest.approx(0.1 * q.F_rx)
 
@@ -159,10 +159,10 @@ def test_load_sensitivity_leaves_the_axles_as_they_are_at_rest() -> None:
     effects = (build_effect("load_sensitivity", {"exponent": 0.7}),)
     flat = CONSTANTS.model_copy(update={"h_cg": 0.0, "F_z0": CONSTANTS.m * GRAVITY / 2})
     state, applied = State(30.0, 0.5, 0.2), Applied(0.5, 0.03)
-    plain, sensitive = (motion(np, state, applied, THETA, flat, these) for these in ((), effects))
+    plain, sensitive = (CarModel(flat, 0.04, these).motion(state, applied, THETA) for these in ((), effects))
     assert (sensitive.F_fy, sensitive.F_ry) == pytest.approx((plain.F_fy, plain.F_ry), rel=1e-12)
     high = flat.model_copy(update={"h_cg": 0.3})
-    plain, sensitive = (motion(np, state, applied, THETA, high, these) for these in ((), effects))
+    plain, sensitive = (CarModel(high, 0.04, these).motion(state, applied, THETA) for these in ((), effects))
     rest = flat.m * GRAVITY * flat.l_r / (flat.l_f + flat.l_r)
     assert plain.F_zf < 0.99 * rest
     assert sensitive.F_fy / plain.F_fy == pytest.approx((plain.F_zf / rest) ** -0.3, rel=1e-12)
@@ -181,9 +181,7 @@ def test_relaxing_tyres_reach_their_slip_over_the_distance_rolled() -> None:
     # too heavy to be moved by its tyres, so that speed and slip stay as the slip angles build up
     heavy = CONSTANTS.model_copy(update={"m": 1e9, "h_cg": 0.0, "load_transfer": False})
     theta, state = THETA._replace(I_z=1e12), State(20.0, 0.0, 0.0)
-    _, effect_states = step_with_effect_states(
-        np, state, {front: 0.0, rear: 0.0}, APPLIED, theta, heavy, 0.03, relaxing, "rk4", 100
-    )
+    _, effect_states = CarModel(heavy, 0.03, relaxing, "rk4", 100).step(state, APPLIED, theta, {front: 0.0, rear: 0.0})
     assert effect_states[front] == pytest.approx(APPLIED.delta * (1 - np.exp(-20.0 * 0.03 / 0.6)), rel=1e-3)
     assert effect_states[rear] == pytest.approx(0.0, abs=1e-6)
 
@@ -191,7 +189,7 @@ def test_relaxing_tyres_reach_their_slip_over_the_distance_rolled() -> None:
 def test_relaxing_tyres_pull_by_the_slip_that_they_have_reached() -> None:
     relaxing = build_effect("tire_relaxation", {"length": 0.6})
     reached = dict(zip(relaxing.EFFECT_STATES, (0.01, -0.02), strict=True))
-    q = motion(np, STATE, APPLIED, THETA, CONSTANTS, (relaxing,), reached)
+    q = CarModel(CONSTANTS, 0.04, (relaxing,)).motion(STATE, APPLIED, THETA, reached)
     assert (q.alpha_f, q.alpha_r) == pytest.approx((0.01, -0.02))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, motion
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, load_vehicle
 from dynssm_ros.vehicle.effects import (
     CONTEXT_UNITS,
     EFFECTS,
@@ -22,15 +22,8 @@ from dynssm_ros.vehicle.effects import (
     require_context,
 )
 from dynssm_ros.vehicle.effects.base import lagged
-from dynssm_ros.vehicle.single_track import (
-    GRAVITY,
-    Array,
-    Integrator,
-    Motion,
-    StageEffect,
-    settled_effect_states,
-    step_with_effect_states,
-)
+from dynssm_ros.vehicle.integrators import Integrator
+from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion, StageEffect
 
 VEHICLE = load_vehicle("av21_paper")
 CONSTANTS = VEHICLE.constants
@@ -40,7 +33,7 @@ CONTEXT = {"t": 60.0, "s": 1900.0, "lap_length": 4000.0, "bend": 0.6, "x": 5.0, 
 
 
 def act(*effects: Effect, effect_states: dict[str, Array] | None = None) -> Motion:
-    return motion(np, STATE, APPLIED, THETA, CONSTANTS, effects, effect_states)
+    return CarModel(CONSTANTS, 0.04, effects).motion(STATE, APPLIED, THETA, effect_states)
 
 
 @dataclass(frozen=True)
@@ -108,13 +101,13 @@ class ThrottleLag(Effect):
 
 
 def test_an_effect_on_the_inputs_is_a_motion_under_other_inputs() -> None:
-    biased = motion(np, STATE._replace(omega=STATE.omega + 0.1), APPLIED, THETA, CONSTANTS)
+    biased = CarModel(CONSTANTS, 0.04).motion(STATE._replace(omega=STATE.omega + 0.1), APPLIED, THETA)
     found = act(YawRateBias(0.1))
     assert (found.a_x, found.a_y, found.omega_dot) == (biased.a_x, biased.a_y, biased.omega_dot)
 
 
 def test_an_effect_on_the_slip_is_a_shift_of_the_slip() -> None:
-    shifted = motion(np, STATE, APPLIED, THETA._replace(S_hf=THETA.S_hf + 0.01), CONSTANTS)
+    shifted = CarModel(CONSTANTS, 0.04).motion(STATE, APPLIED, THETA._replace(S_hf=THETA.S_hf + 0.01))
     assert act(Camber(0.01)).F_fy == pytest.approx(shifted.F_fy, rel=1e-12)
 
 
@@ -154,7 +147,7 @@ def test_each_stage_of_the_equations_can_be_entered_and_in_order() -> None:
     stages = ("inputs", "slip", "drive", "loads", "tyres", "forces", "accelerations")
     noted = {stage: lambda self, xp, q, stage=stage: seen.append(stage) for stage in stages}
     Spy = type("Spy", (StageEffect,), noted)
-    motion(np, STATE, APPLIED, THETA, CONSTANTS, (Spy(), Spy()))
+    CarModel(CONSTANTS, 0.04, (Spy(), Spy())).motion(STATE, APPLIED, THETA)
     assert seen == [stage for stage in stages for _ in range(2)]
     assert (*stages, "measured") == StageEffect.HOOKS
 
@@ -184,9 +177,7 @@ def test_a_lag_approaches_its_input_exponentially(effect: Effect, target: float,
     name, T, tau = effect.EFFECT_STATES[0], 0.3, 0.1 if effect.NAME == "odometry_delay" else 0.2
     effect_states = initial_effect_states((effect,), 0.1, 0.02)
     assert effect_states[name] == start
-    _, effect_states = step_with_effect_states(
-        np, STATE, effect_states, APPLIED, THETA, CONSTANTS, T, (effect,), integrator="rk4", substeps=100
-    )
+    _, effect_states = CarModel(CONSTANTS, T, (effect,), "rk4", 100).step(STATE, APPLIED, THETA, effect_states)
     assert effect_states[name] == pytest.approx(target + (start - target) * np.exp(-T / tau), rel=1e-8)
 
 
@@ -195,28 +186,24 @@ def test_a_lag_under_forward_euler_decays_by_its_own_factor() -> None:
     effect_states: dict[str, Array] = {"steering_lag.delta": 0.0}
     state = STATE
     for _ in range(5):
-        state, effect_states = step_with_effect_states(
-            np, state, effect_states, APPLIED, THETA, CONSTANTS, 0.04, (effect,)
-        )
+        state, effect_states = CarModel(CONSTANTS, 0.04, (effect,)).step(state, APPLIED, THETA, effect_states)
     assert effect_states["steering_lag.delta"] == pytest.approx(APPLIED.delta * (1 - (1 - 0.04 / 0.2) ** 5), rel=1e-12)
 
 
 def test_a_lag_that_the_steps_do_not_resolve_settles_and_acts_as_its_mean_over_the_step() -> None:
     tau, T_s = 0.004, 0.04
     effect = build_effect("steering_lag", {"time_constant": tau})
-    state, effect_states = step_with_effect_states(
-        np, STATE, {"steering_lag.delta": 0.0}, APPLIED, THETA, CONSTANTS, T_s, (effect,)
-    )
+    state, effect_states = CarModel(CONSTANTS, T_s, (effect,)).step(STATE, APPLIED, THETA, {"steering_lag.delta": 0.0})
     assert effect_states["steering_lag.delta"] == APPLIED.delta
     mean = APPLIED.delta * (1 - tau / T_s * (1 - np.exp(-T_s / tau)))
-    expected, _ = step_with_effect_states(np, STATE, {}, APPLIED._replace(delta=mean), THETA, CONSTANTS, T_s)
+    expected, _ = CarModel(CONSTANTS, T_s).step(STATE, APPLIED._replace(delta=mean), THETA)
     np.testing.assert_allclose(state, expected, rtol=0, atol=1e-5)
 
 
 def test_the_lagged_steering_is_what_acts_on_the_tyres() -> None:
     lag = build_effect("steering_lag", {"time_constant": 0.1})
     lagged_motion = act(lag, effect_states={"steering_lag.delta": 0.02})
-    direct = motion(np, STATE, APPLIED._replace(delta=0.02), THETA, CONSTANTS)
+    direct = CarModel(CONSTANTS, 0.04).motion(STATE, APPLIED._replace(delta=0.02), THETA)
     found = (lagged_motion.a_x, lagged_motion.a_y, lagged_motion.omega_dot)
     np.testing.assert_allclose(found, (direct.a_x, direct.a_y, direct.omega_dot), rtol=1e-12)
 
@@ -225,18 +212,18 @@ def test_states_of_effects_start_settled_one_behind_the_other() -> None:
     chain = (build_effect("steering_offset", {"offset": 0.01}), build_effect("steering_lag", {"time_constant": 0.1}))
     assert initial_effect_states(chain, 0.3, 0.02) == {"steering_lag.delta": 0.02 + 0.01}
     known = {"steering_lag.delta": 0.5}
-    assert settled_effect_states(np, STATE, APPLIED, THETA, CONSTANTS, chain, known) == known
-    settled, _ = step_with_effect_states(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, chain)
-    plain, _ = step_with_effect_states(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, chain[:1])
+    assert CarModel(CONSTANTS, 0.04, chain).settled(STATE, APPLIED, THETA, known) == known
+    settled, _ = CarModel(CONSTANTS, 0.04, chain).step(STATE, APPLIED, THETA)
+    plain, _ = CarModel(CONSTANTS, 0.04, chain[:1]).step(STATE, APPLIED, THETA)
     np.testing.assert_allclose(settled, plain, rtol=1e-15)
 
 
 def advanced(integrator: Integrator, *effects: Effect) -> State:
     """Two half steps after the inputs have changed to ``APPLIED``."""
     context = CONTEXT if effects else {}
-    effect_states = settled_effect_states(np, STATE, Applied(0.1, 0.02), THETA, CONSTANTS, effects, context=context)
-    return step_with_effect_states(
-        np, STATE, effect_states, APPLIED, THETA, CONSTANTS, 0.04, effects, integrator, 2, context
+    effect_states = CarModel(CONSTANTS, 0.04, effects).settled(STATE, Applied(0.1, 0.02), THETA, context=context)
+    return CarModel(CONSTANTS, 0.04, effects, integrator, 2).step(
+        STATE, APPLIED, THETA, effect_states, context=context
     )[0]
 
 
@@ -249,9 +236,7 @@ def test_a_neutral_effect_changes_nothing(name: str, integrator: Integrator) -> 
     assert effect.carries == effect.needs == ()
     assert initial_effect_states((effect,), *APPLIED) == {}
     plain = advanced(integrator)
-    found, effect_states = step_with_effect_states(
-        np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, (effect,), integrator, 2
-    )
+    found, effect_states = CarModel(CONSTANTS, 0.04, (effect,), integrator, 2).step(STATE, APPLIED, THETA)
     assert found == plain
     assert effect_states == {}
 
@@ -311,7 +296,7 @@ def test_every_shipped_effect_acts_away_from_its_neutral_value(
     name: str, acting: Callable[..., dict[str, float]]
 ) -> None:
     effect = build_effect(name, acting(name))
-    effect_states = settled_effect_states(np, STATE, APPLIED, THETA, CONSTANTS, (effect,), context=CONTEXT)
+    effect_states = CarModel(CONSTANTS, 0.04, (effect,)).settled(STATE, APPLIED, THETA, context=CONTEXT)
     assert set(effect_states) == set(effect.carries) == set(effect.EFFECT_STATES)
     assert np.abs(np.subtract(advanced("rk4", effect), advanced("rk4"))).max() > 1e-4
 
@@ -326,7 +311,7 @@ def test_a_signal_that_an_effect_needs_and_nobody_has_is_one_clear_line(
         known = {key: value for key, value in CONTEXT.items() if key != signal}
         expected = rf"^effect {name} needs the signal {signal} \({CONTEXT_UNITS[signal]}\), which is not known here \("
         with pytest.raises(ConfigurationError, match=expected) as caught:
-            motion(np, STATE, APPLIED, THETA, CONSTANTS, (effect,), context=known)
+            CarModel(CONSTANTS, 0.04, (effect,)).motion(STATE, APPLIED, THETA, context=known)
         assert "\n" not in str(caught.value)
         with pytest.raises(ConfigurationError, match=f"laps.parquet: effect {name} needs the signal {signal} "):
             require_context((effect,), known, "laps.parquet")
@@ -344,7 +329,7 @@ def test_only_what_is_used_needs_its_signals() -> None:
 
 def test_an_effect_takes_many_values_at_once() -> None:
     angles = np.linspace(-0.1, 0.1, 5)
-    together = motion(np, STATE, APPLIED, THETA, CONSTANTS, (EFFECTS["road_bank"](angle=angles),)).a_y
+    together = CarModel(CONSTANTS, 0.04, (EFFECTS["road_bank"](angle=angles),)).motion(STATE, APPLIED, THETA).a_y
     alone = [act(build_effect("road_bank", {"angle": angle})).a_y for angle in angles]
     np.testing.assert_allclose(together, alone, rtol=1e-14)
 

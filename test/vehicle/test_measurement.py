@@ -10,19 +10,11 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from dynssm_ros.vehicle import Applied, Coefficients, State, load_vehicle, motion
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, Effect, build_effect
 from dynssm_ros.vehicle.effects.measurement import MeasurementEffect
-from dynssm_ros.vehicle.single_track import (
-    Integrator,
-    Motion,
-    measured_state,
-    measuring,
-    settled_effect_states,
-    step,
-    step_with_effect_states,
-    true_state,
-)
+from dynssm_ros.vehicle.integrators import Integrator
+from dynssm_ros.vehicle.single_track import Motion
 
 AV21 = load_vehicle("av21")
 CONSTANTS, THETA = AV21.constants, Coefficients(*AV21.nominal)
@@ -41,7 +33,7 @@ class Torque(Effect):
 
 
 def seen(name: str, **parameters: float) -> State:
-    return measured_state(np, STATE, (build_effect(name, parameters),), {})
+    return CarModel(CONSTANTS, 0.04, (build_effect(name, parameters),)).measured_state(STATE, {})
 
 
 def test_off_the_centre_of_gravity_yawing_shows_as_velocity() -> None:
@@ -61,23 +53,24 @@ def test_a_bias_is_added() -> None:
 
 def test_sensors_act_in_the_order_of_the_file() -> None:
     bias, arm = build_effect("yaw_rate_bias", {"bias": 0.1}), build_effect("odometry_lever_arm", {"x": 2.0})
-    assert measured_state(np, STATE, (arm, bias), {}).v_y == pytest.approx(0.4 + 0.2 * 2.0)
-    assert measured_state(np, STATE, (bias, arm), {}).v_y == pytest.approx(0.4 + 0.3 * 2.0)
+    assert CarModel(CONSTANTS, 0.04, (arm, bias)).measured_state(STATE, {}).v_y == pytest.approx(0.4 + 0.2 * 2.0)
+    assert CarModel(CONSTANTS, 0.04, (bias, arm)).measured_state(STATE, {}).v_y == pytest.approx(0.4 + 0.3 * 2.0)
 
 
 def test_only_sensors_that_are_off_measure() -> None:
     drag, still = build_effect("drag", {"coefficient": 0.2}), build_effect("yaw_rate_bias", {})
     bias = build_effect("yaw_rate_bias", {"bias": 0.1})
-    assert measuring((drag, still, bias)) == (bias,)
+    assert CarModel(CONSTANTS, 0.04, (drag, still, bias)).sensors == (bias,)
 
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_true_state_comes_back_from_the_measured_one(name: str, acting: Callable[..., dict[str, float]]) -> None:
     chain = (build_effect("odometry_misalignment", {"angle": 0.03}), build_effect(name, acting(name)))
     effect_states = dict.fromkeys(chain[1].EFFECT_STATES, 0.07)
-    back = true_state(np, measured_state(np, STATE, chain, effect_states), chain, effect_states)
-    np.testing.assert_allclose(back, STATE, rtol=1e-14)
-    assert measured_state(np, STATE, chain, effect_states) != STATE
+    car = CarModel(CONSTANTS, 0.04, chain)
+    measured = car.measured_state(STATE, effect_states)
+    np.testing.assert_allclose(car.true_state(measured, effect_states), STATE, rtol=1e-14)
+    assert measured != STATE
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
@@ -85,61 +78,51 @@ def test_the_true_state_comes_back_from_the_measured_one(name: str, acting: Call
 def test_a_model_steps_what_is_measured_of_the_true_motion(
     name: str, integrator: Integrator, acting: Callable[..., dict[str, float]]
 ) -> None:
-    car = (build_effect("drag", {"coefficient": 0.3}), build_effect(name, acting(name)))
-    rest = (THETA, CONSTANTS, 0.04, car, integrator, 2)
-    effect_states = settled_effect_states(np, STATE, Applied(0.1, 0.02), THETA, CONSTANTS, car, measured=False)
-    true, carried = step_with_effect_states(np, STATE, effect_states, APPLIED, *rest, measured=False)
-    found, beside = step_with_effect_states(
-        np, measured_state(np, STATE, car, effect_states), effect_states, APPLIED, *rest
-    )
-    np.testing.assert_allclose(found, measured_state(np, true, car, carried), rtol=1e-13)
+    effects = (build_effect("drag", {"coefficient": 0.3}), build_effect(name, acting(name)))
+    plant, model = (CarModel(CONSTANTS, 0.04, effects, integrator, 2, measured=of) for of in (False, True))
+    effect_states = plant.settled(STATE, Applied(0.1, 0.02), THETA)
+    true, carried = plant.step(STATE, APPLIED, THETA, effect_states)
+    found, beside = model.step(model.measured_state(STATE, effect_states), APPLIED, THETA, effect_states)
+    np.testing.assert_allclose(found, model.measured_state(true, carried), rtol=1e-13)
     assert beside == pytest.approx(carried, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_what_happens_does_not_depend_on_the_sensors(name: str, acting: Callable[..., dict[str, float]]) -> None:
     sensor = (build_effect(name, acting(name)),)
-    true, _ = step_with_effect_states(np, STATE, {}, APPLIED, THETA, CONSTANTS, 0.04, sensor, measured=False)
-    assert true == step(np, STATE, APPLIED, THETA, CONSTANTS, 0.04)
+    true, _ = CarModel(CONSTANTS, 0.04, sensor, measured=False).step(STATE, APPLIED, THETA)
+    assert true == CarModel(CONSTANTS, 0.04).step(STATE, APPLIED, THETA)[0]
 
 
 def test_a_filtered_yaw_rate_approaches_a_constant_one_exponentially() -> None:
     lag = build_effect("yaw_rate_lag", {"time_constant": 0.1})
     (name,) = lag.EFFECT_STATES
     effects = (Torque(0.0), lag)
-    true, effect_states = step_with_effect_states(
-        np, STATE, {name: 0.15}, APPLIED, THETA, CONSTANTS, 0.08, effects, "rk4", 40, measured=False
+    true, effect_states = CarModel(CONSTANTS, 0.08, effects, "rk4", 40, measured=False).step(
+        STATE, APPLIED, THETA, {name: 0.15}
     )
-    measured = measured_state(np, true, effects, effect_states).omega
+    measured = CarModel(CONSTANTS, 0.04, effects).measured_state(true, effect_states).omega
     assert measured == pytest.approx(0.2 - 0.15 * np.exp(-0.08 / 0.1), rel=1e-9)
 
 
 def test_a_filtered_yaw_rate_follows_a_ramp_one_time_constant_behind() -> None:
     lag = build_effect("yaw_rate_lag", {"time_constant": 0.1})
     effects = (Torque(1.5), lag)
-    true, effect_states = step_with_effect_states(
-        np,
-        STATE,
-        dict.fromkeys(lag.EFFECT_STATES, 0.0),
-        APPLIED,
-        THETA,
-        CONSTANTS,
-        1.5,
-        effects,
-        "rk4",
-        100,
-        measured=False,
+    true, effect_states = CarModel(CONSTANTS, 1.5, effects, "rk4", 100, measured=False).step(
+        STATE, APPLIED, THETA, dict.fromkeys(lag.EFFECT_STATES, 0.0)
     )
     assert true.omega == pytest.approx(0.2 + 1.5 * 1.5)
-    assert measured_state(np, true, effects, effect_states).omega == pytest.approx(true.omega - 0.1 * 1.5, rel=1e-5)
+    assert CarModel(CONSTANTS, 0.04, effects).measured_state(true, effect_states).omega == pytest.approx(
+        true.omega - 0.1 * 1.5, rel=1e-5
+    )
 
 
 def test_a_filter_that_the_steps_do_not_resolve_settles() -> None:
     lag = build_effect("yaw_rate_lag", {"time_constant": 0.004})
     effects, effect_states, state = (Torque(1.5), lag), dict.fromkeys(lag.EFFECT_STATES, 0.3), STATE
     for _ in range(2):
-        state, effect_states = step_with_effect_states(
-            np, state, effect_states, APPLIED, THETA, CONSTANTS, 0.04, effects, measured=False
+        state, effect_states = CarModel(CONSTANTS, 0.04, effects, measured=False).step(
+            state, APPLIED, THETA, effect_states
         )
     assert effect_states[lag.EFFECT_STATES[0]] == pytest.approx(0.004 * 1.5)
 
@@ -149,11 +132,11 @@ def test_behind_one_filtered_row_is_the_yaw_rate_whose_acceleration_explains_the
     """``omega = z + time_constant * domega/dt(omega)``; the yaw damping at this speed is near 10/s."""
 
     def unexplained(behind: float) -> float:
-        omega_dot = motion(np, STATE._replace(omega=0.2 + behind), APPLIED, THETA, CONSTANTS).omega_dot
+        omega_dot = CarModel(CONSTANTS, 0.04).motion(STATE._replace(omega=0.2 + behind), APPLIED, THETA).omega_dot
         return float(behind - time_constant * omega_dot)
 
     lag = build_effect("yaw_rate_lag", {"time_constant": time_constant})
-    effect_states = settled_effect_states(np, STATE, APPLIED, THETA, CONSTANTS, (lag,))
+    effect_states = CarModel(CONSTANTS, 0.04, (lag,)).settled(STATE, APPLIED, THETA)
     expected = brentq(unexplained, -1.0, 1.0)
     assert abs(expected) > 0.05
     assert effect_states[lag.EFFECT_STATES[0]] == pytest.approx(expected, rel=0.02)
@@ -164,9 +147,9 @@ def test_tyres_relax_behind_a_filtered_yaw_rate_by_the_true_slip() -> None:
         build_effect("yaw_rate_lag", {"time_constant": 0.08}),
         build_effect("tire_relaxation", {"length": 0.5}),
     )
-    effect_states = settled_effect_states(np, STATE, APPLIED, THETA, CONSTANTS, (tyres, lag))
-    true = true_state(np, STATE, (lag,), effect_states)
-    slip = motion(np, true, APPLIED, THETA, CONSTANTS)
+    effect_states = CarModel(CONSTANTS, 0.04, (tyres, lag)).settled(STATE, APPLIED, THETA)
+    true = CarModel(CONSTANTS, 0.04, (lag,)).true_state(STATE, effect_states)
+    slip = CarModel(CONSTANTS, 0.04).motion(true, APPLIED, THETA)
     assert [effect_states[name] for name in tyres.EFFECT_STATES] == pytest.approx(
         [slip.alpha_f, slip.alpha_r], rel=1e-12
     )
@@ -177,11 +160,11 @@ def test_late_odometry_is_early_actuators(delay: float) -> None:
     """From a late measurement on, a step of T_s has the inputs of before for ``delay`` and the present ones after."""
     before, T_s = Applied(0.1, 0.02), 0.04
     late = (build_effect("odometry_delay", {"delay": delay}),)
-    effect_states = settled_effect_states(np, STATE, before, THETA, CONSTANTS, late)
-    found, _ = step_with_effect_states(np, STATE, effect_states, APPLIED, THETA, CONSTANTS, T_s, late)
+    effect_states = CarModel(CONSTANTS, 0.04, late).settled(STATE, before, THETA)
+    found, _ = CarModel(CONSTANTS, T_s, late).step(STATE, APPLIED, THETA, effect_states)
     share = delay / T_s
     mean = Applied(*(share * old + (1 - share) * new for old, new in zip(before, APPLIED, strict=True)))
-    np.testing.assert_allclose(found, step(np, STATE, mean, THETA, CONSTANTS, T_s), rtol=1e-13)
+    np.testing.assert_allclose(found, CarModel(CONSTANTS, T_s).step(STATE, mean, THETA)[0], rtol=1e-13)
 
 
 def test_delayed_inputs_keep_their_swing() -> None:
@@ -192,7 +175,9 @@ def test_delayed_inputs_keep_their_swing() -> None:
     times = np.arange(0.0, 3.0, h)
     acted = np.empty_like(times)
     for k, t in enumerate(times):
-        q = motion(np, STATE, Applied(0.0, 0.1 * np.sin(w * t)), THETA, CONSTANTS, (late,), effect_states, h=h)
+        q = CarModel(CONSTANTS, 0.04, (late,)).motion(
+            STATE, Applied(0.0, 0.1 * np.sin(w * t)), THETA, effect_states, h=h
+        )
         acted[k] = q.delta
         effect_states = {name: value + h * q.effect_state_rates[name] for name, value in effect_states.items()}
     wave = np.exp(-1j * w * times[2000:])  # the last period

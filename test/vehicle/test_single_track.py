@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from dynssm_ros.vehicle import COEFFICIENTS, Applied, Coefficients, State, Vehicle, load_vehicle, motion, step
+from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State, Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.single_track import GRAVITY, Integrator, step_with_effect_states
+from dynssm_ros.vehicle.integrators import Integrator
+from dynssm_ros.vehicle.single_track import GRAVITY
 
 SPEEDS = {"orca": (0.5, 3.0), "av21_paper": (5.0, 60.0)}
 SHIFTS = ("S_hf", "S_vf", "S_hr", "S_vr")
@@ -67,18 +68,11 @@ def advance(
     """Accelerations of the motion, then the next state and effect states, each entry of shape ``(n,)``."""
     applied, effects = Applied(*inputs), vehicle.active_effects
     effect_states = initial_effect_states(effects, inputs[0], 0.5 * inputs[1])
-    q = motion(xp, State(*state), applied, Coefficients(*theta), vehicle.constants, effects, effect_states)
-    following, carried = step_with_effect_states(
-        xp,
-        State(*state),
-        effect_states,
-        applied,
-        Coefficients(*theta),
-        vehicle.constants,
-        vehicle.sampling_time,
-        effects,
-        integrator,
-        substeps,
+    q = CarModel(vehicle.constants, 0.04, effects, xp=xp).motion(
+        State(*state), applied, Coefficients(*theta), effect_states
+    )
+    following, carried = CarModel(vehicle.constants, vehicle.sampling_time, effects, integrator, substeps, xp=xp).step(
+        State(*state), applied, Coefficients(*theta), effect_states
     )
     return [q.a_x, q.a_y, q.omega_dot, *following, *carried.values()]
 
@@ -131,7 +125,7 @@ def test_a_batch_equals_its_rows_one_by_one(vehicle: Vehicle) -> None:
 
 def test_without_slip_and_shifts_there_is_no_lateral_force(vehicle: Vehicle) -> None:
     speed = SPEEDS[vehicle.name][1]
-    q = motion(np, State(speed, 0.0, 0.0), Applied(0.7, 0.0), without_shifts(vehicle), vehicle.constants)
+    q = CarModel(vehicle.constants, 0.04).motion(State(speed, 0.0, 0.0), Applied(0.7, 0.0), without_shifts(vehicle))
     assert (q.alpha_f, q.alpha_r, q.F_fy, q.F_ry, q.a_y, q.omega_dot) == (0.0,) * 6
     assert q.a_x == q.F_rx / vehicle.constants.m
 
@@ -142,7 +136,7 @@ def test_straight_coasting_follows_the_closed_form(vehicle: Vehicle) -> None:
     v_0, T = SPEEDS[vehicle.name][1], 0.4
     a, b = np.sqrt(theta.C_r0 / theta.C_r2), np.sqrt(theta.C_r0 * theta.C_r2) / m
     state = State(v_0, 0.0, 0.0)
-    end = step(np, state, Applied(0.0, 0.0), theta, vehicle.constants, T, integrator="rk4", substeps=200)
+    end = CarModel(vehicle.constants, T, integrator="rk4", substeps=200).step(state, Applied(0.0, 0.0), theta)[0]
     assert end.v_x == pytest.approx(a * np.tan(np.arctan(v_0 / a) - b * T), rel=1e-9)
     assert end.v_y == end.omega == 0.0
 
@@ -150,7 +144,7 @@ def test_straight_coasting_follows_the_closed_form(vehicle: Vehicle) -> None:
 def test_constants_of_load_transfer_balance_weight_and_pitching_moment(vehicle: Vehicle) -> None:
     vehicle = with_load_transfer(vehicle, True)
     c, (state, inputs, theta) = vehicle.constants, samples(vehicle)
-    q = motion(np, State(*state), Applied(*inputs), Coefficients(*theta), c)
+    q = CarModel(c, 0.04).motion(State(*state), Applied(*inputs), Coefficients(*theta))
     assert np.ptp(q.F_rx) > 0
     np.testing.assert_allclose(q.F_zf + q.F_zr, c.m * GRAVITY, rtol=1e-13)
     np.testing.assert_allclose(c.l_f * q.F_zf - c.l_r * q.F_zr, -c.h_cg * q.F_rx, rtol=1e-9, atol=1e-12 * c.m)
@@ -159,17 +153,19 @@ def test_constants_of_load_transfer_balance_weight_and_pitching_moment(vehicle: 
 def test_at_rest_the_axles_carry_the_weight_by_the_lever_rule(vehicle: Vehicle) -> None:
     c = with_load_transfer(vehicle, True).constants
     theta = theta_of(vehicle, C_r0=0.0)
-    q = motion(np, State(0.0, 0.0, 0.0), Applied(0.0, 0.0), theta, c)
+    q = CarModel(c, 0.04).motion(State(0.0, 0.0, 0.0), Applied(0.0, 0.0), theta)
     assert q.F_zf == pytest.approx(c.m * GRAVITY * c.l_r / (c.l_f + c.l_r), rel=1e-14)
     assert q.F_zr == pytest.approx(c.m * GRAVITY * c.l_f / (c.l_f + c.l_r), rel=1e-14)
 
 
 def test_without_load_transfer_forces_are_those_at_the_nominal_load(vehicle: Vehicle) -> None:
     state, inputs, theta = samples(vehicle)
-    off = motion(
-        np, State(*state), Applied(*inputs), Coefficients(*theta), with_load_transfer(vehicle, False).constants
+    off = CarModel(with_load_transfer(vehicle, False).constants, 0.04).motion(
+        State(*state), Applied(*inputs), Coefficients(*theta)
     )
-    on = motion(np, State(*state), Applied(*inputs), Coefficients(*theta), with_load_transfer(vehicle, True).constants)
+    on = CarModel(with_load_transfer(vehicle, True).constants, 0.04).motion(
+        State(*state), Applied(*inputs), Coefficients(*theta)
+    )
     F_z0 = vehicle.constants.F_z0
     np.testing.assert_allclose(on.F_fy, off.F_fy * on.F_zf / F_z0, rtol=1e-12)
     np.testing.assert_allclose(on.F_ry, off.F_ry * on.F_zr / F_z0, rtol=1e-12)
@@ -180,8 +176,8 @@ def test_without_shifts_left_mirrors_right(vehicle: Vehicle, load_transfer: bool
     c = with_load_transfer(vehicle, load_transfer).constants
     (v_x, v_y, omega), (r, delta), theta = samples(vehicle)
     level = Coefficients(*theta)._replace(**dict.fromkeys(SHIFTS, 0.0))
-    left = motion(np, State(v_x, v_y, omega), Applied(r, delta), level, c)
-    right = motion(np, State(v_x, -v_y, -omega), Applied(r, -delta), level, c)
+    left = CarModel(c, 0.04).motion(State(v_x, v_y, omega), Applied(r, delta), level)
+    right = CarModel(c, 0.04).motion(State(v_x, -v_y, -omega), Applied(r, -delta), level)
     np.testing.assert_array_equal(right.a_x, left.a_x)
     np.testing.assert_array_equal(right.a_y, -left.a_y)
     np.testing.assert_array_equal(right.omega_dot, -left.omega_dot)
@@ -190,7 +186,7 @@ def test_without_shifts_left_mirrors_right(vehicle: Vehicle, load_transfer: bool
 def test_slip_angles_are_those_of_the_axles_velocities(vehicle: Vehicle) -> None:
     """A car that rotates about a point beside its centre of gravity: each axle's course is known geometry."""
     c, radius, omega = vehicle.constants, 20 * vehicle.constants.l_f, 0.4
-    q = motion(np, State(radius * omega, 0.0, omega), Applied(0.0, 0.0), without_shifts(vehicle), c)
+    q = CarModel(c, 0.04).motion(State(radius * omega, 0.0, omega), Applied(0.0, 0.0), without_shifts(vehicle))
     assert q.alpha_f == pytest.approx(-np.arctan(c.l_f / radius), rel=1e-14)
     assert q.alpha_r == pytest.approx(np.arctan(c.l_r / radius), rel=1e-14)
 
@@ -198,7 +194,7 @@ def test_slip_angles_are_those_of_the_axles_velocities(vehicle: Vehicle) -> None
 def test_the_tyre_peaks_at_D_and_starts_with_slope_B_C_D(vehicle: Vehicle) -> None:
     c, theta = with_load_transfer(vehicle, False).constants, without_shifts(vehicle)._replace(E_f=0.0, C_f=1.5)
     delta = np.linspace(0.0, 1.5, 200001)
-    q = motion(np, State(1.0, 0.0, 0.0), Applied(0.0, delta), theta, c)
+    q = CarModel(c, 0.04).motion(State(1.0, 0.0, 0.0), Applied(0.0, delta), theta)
     assert q.F_fy.max() == pytest.approx(theta.D_f, rel=1e-9)
     assert q.F_fy[1] / delta[1] == pytest.approx(theta.B_f * theta.C_f * theta.D_f, rel=1e-6)
 
@@ -207,7 +203,9 @@ def test_a_free_body_keeps_its_velocity_in_the_inertial_frame(vehicle: Vehicle) 
     """Without forces the body frame turns under a constant velocity, which the terms with omega must give back."""
     theta = without_shifts(vehicle)._replace(C_m1=0.0, C_m2=0.0, C_r0=0.0, C_r2=0.0, D_f=0.0, D_r=0.0)
     v, omega, T = np.array([2.0, 0.5]), 0.8, 1.3
-    end = step(np, State(*v, omega), Applied(0.0, 0.0), theta, vehicle.constants, T, integrator="rk4", substeps=400)
+    end = CarModel(vehicle.constants, T, integrator="rk4", substeps=400).step(
+        State(*v, omega), Applied(0.0, 0.0), theta
+    )[0]
     c, s = np.cos(omega * T), np.sin(omega * T)
     np.testing.assert_allclose([end.v_x, end.v_y], [c * v[0] + s * v[1], -s * v[0] + c * v[1]], atol=1e-10)
 
@@ -219,7 +217,8 @@ def test_integrators_converge_at_their_order(integrator: Integrator, order: int)
 
     def end(substeps: int, method: Integrator) -> np.ndarray:
         return np.array(
-            step(np, state, applied, theta, vehicle.constants, 0.4, integrator=method, substeps=substeps), dtype=float
+            CarModel(vehicle.constants, 0.4, integrator=method, substeps=substeps).step(state, applied, theta)[0],
+            dtype=float,
         )
 
     exact = end(4000, "rk4")
@@ -231,24 +230,24 @@ def test_integrators_converge_at_their_order(integrator: Integrator, order: int)
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_substeps_are_steps_of_the_divided_time(vehicle: Vehicle, integrator: Integrator) -> None:
     state, inputs, theta = samples(vehicle, 5)
-    args = (Applied(*inputs), Coefficients(*theta), vehicle.constants)
+    given = Applied(*inputs), Coefficients(*theta)
     T_s, one_by_one = vehicle.sampling_time, State(*state)
     for _ in range(4):
-        one_by_one = step(np, one_by_one, *args, T_s / 4, integrator=integrator)
-    in_one_go = step(np, State(*state), *args, T_s, integrator=integrator, substeps=4)
+        one_by_one, _ = CarModel(vehicle.constants, T_s / 4, (), integrator).step(one_by_one, *given)
+    in_one_go, _ = CarModel(vehicle.constants, T_s, (), integrator, 4).step(State(*state), *given)
     np.testing.assert_allclose(in_one_go, one_by_one, rtol=1e-14)  # increments are summed first: rounding differs
 
 
 def test_the_default_step_is_one_forward_euler_step(vehicle: Vehicle) -> None:
     state, inputs, theta = samples(vehicle, 5)
-    q = motion(np, State(*state), Applied(*inputs), Coefficients(*theta), vehicle.constants)
-    following = step(np, State(*state), Applied(*inputs), Coefficients(*theta), vehicle.constants, 0.02)
+    q = CarModel(vehicle.constants, 0.04).motion(State(*state), Applied(*inputs), Coefficients(*theta))
+    following = CarModel(vehicle.constants, 0.02).step(State(*state), Applied(*inputs), Coefficients(*theta))[0]
     np.testing.assert_array_equal(following, state + 0.02 * np.stack([q.a_x, q.a_y, q.omega_dot]))
 
 
 def test_slip_is_defined_at_standstill_and_in_reverse(vehicle: Vehicle) -> None:
-    q = motion(
-        np, State(np.array([0.0, -1.0]), 0.0, 0.0), Applied(0.0, 0.1), without_shifts(vehicle), vehicle.constants
+    q = CarModel(vehicle.constants, 0.04).motion(
+        State(np.array([0.0, -1.0]), 0.0, 0.0), Applied(0.0, 0.1), without_shifts(vehicle)
     )
     assert np.isfinite([q.a_x, q.a_y, q.omega_dot]).all()
     np.testing.assert_allclose(q.alpha_f, 0.1)
@@ -256,8 +255,8 @@ def test_slip_is_defined_at_standstill_and_in_reverse(vehicle: Vehicle) -> None:
 
 def test_memory_and_context_are_not_changed_by_motion(vehicle: Vehicle) -> None:
     effect_states, context = {"own": 1.0}, {"time": 2.0}
-    q = motion(
-        np, State(1.0, 0.0, 0.0), Applied(0.0, 0.0), theta_of(vehicle), vehicle.constants, (), effect_states, context
+    q = CarModel(vehicle.constants, 0.04).motion(
+        State(1.0, 0.0, 0.0), Applied(0.0, 0.0), theta_of(vehicle), effect_states, context=context
     )
     q.effect_states["own"] = 5.0
     assert effect_states == {"own": 1.0}
@@ -269,8 +268,8 @@ def test_published_orca_run_is_reproduced_step_by_step(data: Path) -> None:
     run = np.load(data / "orca" / "ethz_pure_pursuit.npz")
     vehicle = load_vehicle("orca")
     states, inputs = run["dstates"][3:6], run["inputs"]
-    following = step(
-        np, State(*states[:, :-1]), Applied(*inputs), theta_of(vehicle), vehicle.constants, vehicle.sampling_time
-    )
+    following = CarModel(vehicle.constants, vehicle.sampling_time).step(
+        State(*states[:, :-1]), Applied(*inputs), theta_of(vehicle)
+    )[0]
     assert states.shape[1] == 1001
     np.testing.assert_allclose(np.stack(following), states[:, 1:], rtol=0, atol=1e-12)

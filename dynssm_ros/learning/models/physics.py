@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any, Literal, cast
 
 import torch
@@ -11,10 +10,9 @@ from torch import Tensor, nn
 
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
-from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import initial_effect_states
-from dynssm_ros.vehicle.effects.carried import carries, effect_states_along
-from dynssm_ros.vehicle.single_track import Integrator, increment
+from dynssm_ros.vehicle.integrators import Integrator
 
 INPUTS = len(WINDOW_COLUMNS)
 
@@ -74,8 +72,7 @@ class PhysicsLayer(nn.Module):
         super().__init__()
         self.vehicle = vehicle
         self.stepping = config.stepping(vehicle)
-        self.effects = vehicle.active_effects
-        self.carries = carries(self.effects)
+        self.car = CarModel.of(vehicle, *self.stepping, xp=_XP)
 
     def forward(self, latest: Tensor, theta: Tensor) -> Tensor:
         """Raw rows ``(..., 7)`` and coefficients, broadcastable to ``(..., 17)``, to increments ``(..., 3)``.
@@ -84,21 +81,8 @@ class PhysicsLayer(nn.Module):
         """
         # columns of shape (B, 1), which the deployed graph need not squeeze and stack again
         rows = torch.split(latest, 1, dim=-1)
-        return self._from(rows, theta, initial_effect_states(self.effects, rows[3], rows[4]))
-
-    def _from(self, rows: Sequence[Tensor], theta: Tensor, effect_states: Mapping[str, Tensor]) -> Tensor:
-        """Increments from columns of rows, ``(..., 1)`` each, with the states that effects have there."""
-        moved, _ = increment(
-            _XP,
-            State(*rows[:3]),
-            effect_states,
-            applied_inputs(rows),
-            Coefficients(*torch.split(theta, 1, dim=-1)),
-            self.vehicle.constants,
-            self.vehicle.sampling_time,
-            self.effects,
-            *self.stepping,
-        )
+        settled = initial_effect_states(self.car.effects, rows[3], rows[4])
+        moved, _ = self.car.increment(State(*rows[:3]), applied_inputs(rows), _coefficients(theta), settled)
         return torch.cat(list(moved), dim=-1)
 
     def over(self, window: Tensor, theta: Tensor, latest: int) -> Tensor:
@@ -109,21 +93,12 @@ class PhysicsLayer(nn.Module):
             theta: coefficients ``(17,)``, or ``(B, 1, ..., 17)`` with the same over the window.
             latest: rows wanted, at most H.
         """
-        if not self.carries:
+        if not self.car.effect_states:
             return cast(Tensor, self(window[:, window.shape[1] - latest :], theta))
-        wanted = torch.split(window[:, window.shape[1] - latest :], 1, dim=-1)
-        rows = [torch.split(row, 1, dim=-1) for row in torch.unbind(window, dim=1)]
-        each = theta if theta.dim() == 1 else theta[:, 0]
-        carried = effect_states_along(
-            _XP,
-            [State(*row[:3]) for row in rows],
-            [applied_inputs(row) for row in rows],
-            Applied(*rows[0][3:5]),
-            Coefficients(*torch.split(each, 1, dim=-1)),
-            self.vehicle.constants,
-            self.vehicle.sampling_time,
-            self.effects,
-            *self.stepping,
-        )[-latest:]
-        effect_states = {name: torch.stack([at[name] for at in carried], dim=1) for name in carried[0]}
-        return self._from(wanted, theta, effect_states)
+        rows = torch.split(window, 1, dim=-1)
+        moved = self.car.over(State(*rows[:3]), applied_inputs(rows), Applied(*rows[3:5]), _coefficients(theta), latest)
+        return torch.cat(list(moved), dim=-1)
+
+
+def _coefficients(theta: Tensor) -> Coefficients:
+    return Coefficients(*torch.split(theta, 1, dim=-1))

@@ -238,10 +238,10 @@ def _is_number(value: Array, number: float) -> bool:
 def initial_effect_states(effects: Sequence[StageEffect], r: Array, delta: Array) -> dict[str, Array]:
     """The own states of ``effects`` on the inputs, settled under throttle ``r`` and steering ``delta``.
 
-    States on anything else depend on the car's motion: ``settled_effect_states`` finds all of them, and the step functions
-    those that are missing.
+    States on anything else depend on the car's motion: ``CarModel.settled`` finds all of them, and its steps those that
+    are missing.
     """
-    return inputs_alone(None, State(0.0, 0.0, 0.0), Applied(r, delta), effects, {}).effect_states
+    return inputs_alone(None, State(0.0, 0.0, 0.0), Applied(r, delta), effects, effect_states={}).effect_states
 
 
 def inputs_alone(
@@ -249,10 +249,11 @@ def inputs_alone(
     state: State,
     applied: Applied,
     effects: Sequence[StageEffect],
+    *,
     effect_states: Mapping[str, Array],
     h: float = 0.0,
 ) -> Motion:
-    """The stage of the inputs alone, without a car: the states on the inputs and their rates; else as ``motion``."""
+    """The stage of the inputs alone, without a car: the states on the inputs and their rates."""
     zero = Coefficients(*(0.0,) * len(Coefficients._fields))
     q = Motion(
         *state, *applied, theta=zero, m=0.0, l_f=0.0, l_r=0.0, h_cg=0.0, F_z0=0.0, load_transfer=False,
