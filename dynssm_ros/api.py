@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from dynssm_ros.evaluation.open_loop import Evaluation
     from dynssm_ros.evaluation.season_review import Review
     from dynssm_ros.evaluation.sweep import Errors, Space, Sweep
-    from dynssm_ros.identification.calibration import Calibration
-    from dynssm_ros.identification.diagnosis import Diagnosis
+    from dynssm_ros.identification.result.calibration import Calibration
+    from dynssm_ros.identification.result.diagnosis import Diagnosis
     from dynssm_ros.learning.models.base import ModelConfig
     from dynssm_ros.learning.stages import Trained
     from dynssm_ros.runtime.artifact import Artifact
@@ -245,7 +245,7 @@ def calibrate(
         0.192
     """
     require("calibrate", "train")
-    from dynssm_ros.identification.calibration import calibrate
+    from dynssm_ros.identification.result.calibration import calibrate
 
     car = _vehicle(vehicle)
     data = _joined(_opened(recordings, car), commands, holdout)
@@ -297,7 +297,7 @@ def train(
         30
     """
     require("train", "train")
-    from dynssm_ros.identification.calibration import calibrate
+    from dynssm_ros.identification.result.calibration import calibrate
     from dynssm_ros.learning.export import check_replaceable, save_artifact
     from dynssm_ros.learning.sampling import sampled
     from dynssm_ros.learning.stages import check_device, checkpoints, train
@@ -649,7 +649,7 @@ def diagnose(
         ['steering_offset']
     """
     require("diagnose", "train")
-    from dynssm_ros.identification.diagnose import diagnose
+    from dynssm_ros.identification.result.diagnose import diagnose
 
     line, car = None if track is None else _track(track).centre, _vehicle(vehicle)
     report = on_progress or (lambda words: None)

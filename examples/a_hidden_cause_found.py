@@ -6,7 +6,7 @@ python -m examples.a_hidden_cause_found
 from __future__ import annotations
 
 from dynssm_ros import diagnose, recorded, simulate
-from dynssm_ros.identification.diagnosis import Diagnosis
+from dynssm_ros.identification.result.diagnosis import Diagnosis
 
 HIDDEN = {"steering_offset": {"offset": 0.03}}  # rad
 

@@ -243,7 +243,7 @@ def laps() -> Callable[..., tuple[Any, Any]]:
 @pytest.fixture(scope="session")
 def lagging(laps: Callable[..., tuple[Any, Any]]) -> tuple[Any, Any, Any]:
     """A recording of a car whose steering lags, the vehicle file that does not know it, and the diagnosis."""
-    from dynssm_ros.identification.diagnose import diagnose
+    from dynssm_ros.identification.result.diagnose import diagnose
     from dynssm_ros.track.tracks import load_track
 
     recording, vehicle = laps("steering_lag")

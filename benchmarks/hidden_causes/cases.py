@@ -22,8 +22,8 @@ from itertools import cycle
 import numpy as np
 
 from benchmarks.hidden_causes import foreign, multi_body
-from dynssm_ros.identification.calibration import calibrate
-from dynssm_ros.identification.diagnose import diagnose
+from dynssm_ros.identification.result.calibration import calibrate
+from dynssm_ros.identification.result.diagnose import diagnose
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import SimulationError, as_recording, simulate
 from dynssm_ros.simulation.plant import PlantKind

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.stats import binomtest
 
 from benchmarks.hidden_causes.cases import Case, Hidden
-from dynssm_ros.identification.diagnosis import Cause
+from dynssm_ros.identification.result.diagnosis import Cause
 from dynssm_ros.vehicle.effects import EFFECTS
 
 _NINETY = 1.645  # standard deviations of a 90 % interval

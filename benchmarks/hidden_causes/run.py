@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks.hidden_causes.cases import Case, drive, vehicle_file
 from benchmarks.hidden_causes.outcomes import Outcome, judge
 from dynssm_ros.files import write_json
-from dynssm_ros.identification.diagnose import diagnose
+from dynssm_ros.identification.result.diagnose import diagnose
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import SimulationError
 

@@ -23,7 +23,7 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.metrics import by_channel, latency_us
 from dynssm_ros.evaluation.open_loop import Evaluation, evaluate
 from dynssm_ros.files import digest, write_json
-from dynssm_ros.identification.calibration import calibrate
+from dynssm_ros.identification.result.calibration import calibrate
 from dynssm_ros.learning.models.base import ModelConfig
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.registry import UNTRAINED, load_model

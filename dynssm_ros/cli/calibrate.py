@@ -16,7 +16,7 @@ from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, save_vehicle
 from dynssm_ros.vehicle.integrators import Integrator
 
 if TYPE_CHECKING:
-    from dynssm_ros.identification.calibration import Calibration
+    from dynssm_ros.identification.result.calibration import Calibration
 
 
 def calibrate(

@@ -35,8 +35,8 @@ from dynssm_ros.control.prediction_model import stepped
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import HORIZON, Settings
 from dynssm_ros.errors import ConfigurationError, RecordingError, UserError
-from dynssm_ros.identification.calibration import calibrate
-from dynssm_ros.identification.car import prior_std
+from dynssm_ros.identification.problem.car import prior_std
+from dynssm_ros.identification.result.calibration import calibrate
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.track.speed_profile import speed_profile

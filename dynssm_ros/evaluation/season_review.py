@@ -19,9 +19,9 @@ from pydantic import Field, ValidationError
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
-from dynssm_ros.identification.calibration import calibrate
-from dynssm_ros.identification.diagnose import diagnose
-from dynssm_ros.identification.diagnosis import Cause
+from dynssm_ros.identification.result.calibration import calibrate
+from dynssm_ros.identification.result.diagnose import diagnose
+from dynssm_ros.identification.result.diagnosis import Cause
 from dynssm_ros.runtime.coefficients import SHIFTS, daily_change
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.signals.recording import Recording

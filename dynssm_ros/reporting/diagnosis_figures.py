@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.regimes import liveliest
-from dynssm_ros.identification.improvement import Improvement
-from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.identification.problem.windows import SimulationWindows
+from dynssm_ros.identification.result.improvement import Improvement
 from dynssm_ros.reporting.evaluation_figures import (
     MEASURED,
     NO_MODEL,

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
-from dynssm_ros.identification.formula import Formula
-from dynssm_ros.identification.residuals import ExplainedVariance
-from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC
+from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
+from dynssm_ros.identification.result.formula import Formula
+from dynssm_ros.identification.result.residuals import ExplainedVariance
+from dynssm_ros.identification.search.selection import DECISIVE_DELTA_BIC
 from dynssm_ros.reporting import diagnosis_figures
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.page import Report, Section

@@ -17,11 +17,11 @@ from benchmarks.hidden_causes.outcomes import Outcome, by_size, judge, matrix, r
 from benchmarks.hidden_causes.page import hidden_causes_page
 from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
 from dynssm_ros.files import write_json
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.confirmation import Confirmation
-from dynssm_ros.identification.diagnosis import Cause
-from dynssm_ros.identification.problem import IdentificationProblem
-from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import IdentificationProblem
+from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows
+from dynssm_ros.identification.result.diagnosis import Cause
+from dynssm_ros.identification.search.confirmation import Confirmation
 from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import load_track

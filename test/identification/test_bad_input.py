@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.identification.diagnose import _check_signals, _hidden, _not_live, diagnose
-from dynssm_ros.identification.diagnosis import Diagnosis
-from dynssm_ros.identification.recordings import _cut
+from dynssm_ros.identification.problem.recordings import _cut
+from dynssm_ros.identification.result.diagnose import _check_signals, _hidden, _not_live, diagnose
+from dynssm_ros.identification.result.diagnosis import Diagnosis
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS

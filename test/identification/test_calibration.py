@@ -10,7 +10,7 @@ import pytest
 
 import dynssm_ros
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.identification.calibration import calibrate
+from dynssm_ros.identification.result.calibration import calibrate
 from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording

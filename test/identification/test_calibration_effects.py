@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.identification.calibration import _context, calibrate
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.windows import SimulationWindows, recorded_rows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.windows import SimulationWindows, recorded_rows
+from dynssm_ros.identification.result.calibration import _context, calibrate
 from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate

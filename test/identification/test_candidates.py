@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.candidates import Candidate, Responses, ScoreTest, candidates
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.problem import IdentificationProblem
-from dynssm_ros.identification.windows import fit_windows, recorded_rows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import IdentificationProblem
+from dynssm_ros.identification.problem.windows import fit_windows, recorded_rows
+from dynssm_ros.identification.search.candidates import Candidate, Responses, ScoreTest, candidates
 from dynssm_ros.signals.context import recording_context
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.lap_position import lap_context

@@ -13,13 +13,13 @@ from benchmarks.hidden_causes.cases import Case, record, size
 from benchmarks.hidden_causes.outcomes import judge
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.identification import windows
-from dynssm_ros.identification.candidates import Responses, ScoreTest, candidates
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.diagnose import _moved_together, diagnose
-from dynssm_ros.identification.diagnosis import Cause, Diagnosis
-from dynssm_ros.identification.problem import IdentificationProblem
-from dynssm_ros.identification.recordings import RecordingSet
-from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import IdentificationProblem
+from dynssm_ros.identification.problem.recordings import RecordingSet
+from dynssm_ros.identification.result.diagnose import _moved_together, diagnose
+from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis
+from dynssm_ros.identification.search.candidates import Responses, ScoreTest, candidates
+from dynssm_ros.identification.search.selection import DECISIVE_DELTA_BIC
 from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report, headline
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.tracks import load_track

@@ -11,8 +11,8 @@ from dynssm_ros.control.race import Course, race
 from dynssm_ros.control.race_models import load_prediction_model
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Settings
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.windows import SimulationWindows, recorded_rows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.windows import SimulationWindows, recorded_rows
 from dynssm_ros.learning.export import save_artifact
 from dynssm_ros.learning.models.registry import parse_model_config
 from dynssm_ros.learning.stages import train

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.formula import _formula, _Missing
+from dynssm_ros.identification.result.formula import _formula, _Missing
 
 PARTS, EACH = 4, 300
 

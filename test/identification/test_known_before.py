@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.calibration import calibrate
-from dynssm_ros.identification.diagnose import diagnose
+from dynssm_ros.identification.result.calibration import calibrate
+from dynssm_ros.identification.result.diagnose import diagnose
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.candidates import candidates
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.levels import Levels
-from dynssm_ros.identification.problem import IdentificationProblem
-from dynssm_ros.identification.recordings import RecordingSet
-from dynssm_ros.identification.windows import fit_windows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import IdentificationProblem
+from dynssm_ros.identification.problem.levels import Levels
+from dynssm_ros.identification.problem.recordings import RecordingSet
+from dynssm_ros.identification.problem.windows import fit_windows
+from dynssm_ros.identification.search.candidates import candidates
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track

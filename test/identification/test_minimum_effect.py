@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.diagnose import diagnose
-from dynssm_ros.identification.diagnosis import Diagnosis
+from dynssm_ros.identification.result.diagnose import diagnose
+from dynssm_ros.identification.result.diagnosis import Diagnosis
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle

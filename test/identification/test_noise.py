@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.noise import Noise, NoiseResponse, fit_noise, weights
+from dynssm_ros.identification.problem.noise import Noise, NoiseResponse, fit_noise, weights
 
 R, Q, P = np.array([4e-4, 1e-4, 9e-4]), np.array([1e-4, 4e-4, 1e-4]), np.array([9e-4, 1e-4, 4e-4])
 TRUE = np.concatenate([R, Q, P])

@@ -12,8 +12,8 @@ import pytest
 
 from benchmarks.hidden_causes.cases import Case, record
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.diagnose import diagnose
-from dynssm_ros.identification.diagnosis import Diagnosis
+from dynssm_ros.identification.result.diagnose import diagnose
+from dynssm_ros.identification.result.diagnosis import Diagnosis
 from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.simulation.plant import Rk4Plant, register_plant
@@ -98,7 +98,9 @@ def test_a_term_that_no_effect_has_is_proposed_as_a_formula() -> None:
 def test_where_the_library_for_formulas_is_missing_a_note_says_how_to_have_it(
     spoiled: Callable[[Spoil], Diagnosis], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dynssm_ros.identification.diagnose.missing_libraries", lambda *extras: {"sklearn": "formula"})
+    monkeypatch.setattr(
+        "dynssm_ros.identification.result.diagnose.missing_libraries", lambda *extras: {"sklearn": "formula"}
+    )
     found = spoiled(loose_sensor)
     assert found.formulas == ()
     assert any("pip install 'dynssm_ros[formula]'" in note for note in found.notes)

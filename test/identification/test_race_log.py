@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from dynssm_ros.identification import windows
-from dynssm_ros.identification.calibration import calibrate
-from dynssm_ros.identification.diagnose import diagnose
-from dynssm_ros.identification.diagnosis import RECALIBRATED
+from dynssm_ros.identification.result.calibration import calibrate
+from dynssm_ros.identification.result.diagnose import diagnose
+from dynssm_ros.identification.result.diagnosis import RECALIBRATED
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import load_signal_map

@@ -10,11 +10,11 @@ import pytest
 
 from benchmarks.hidden_causes.cases import Case, drive, vehicle_file
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.diagnose import diagnose
-from dynssm_ros.identification.problem import BLOCK
-from dynssm_ros.identification.recordings import RecordingSet, driven_alike
-from dynssm_ros.identification.windows import SimulationWindows, fit_windows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import BLOCK
+from dynssm_ros.identification.problem.recordings import RecordingSet, driven_alike
+from dynssm_ros.identification.problem.windows import SimulationWindows, fit_windows
+from dynssm_ros.identification.result.diagnose import diagnose
 from dynssm_ros.reporting.diagnosis_report import as_text
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate

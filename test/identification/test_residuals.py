@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.residuals import clustered, explained_variance
-from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
+from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows
+from dynssm_ros.identification.result.residuals import clustered, explained_variance
 
 N, K = 6000, 10
 

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.candidates import Candidate, Responses, ScoredCandidate, ScoreTest
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
-from dynssm_ros.identification.diagnose import _not_confirmed
-from dynssm_ros.identification.integrator import _with_what_hides, search_causes
-from dynssm_ros.identification.problem import IdentificationProblem
-from dynssm_ros.identification.recordings import CrossValidation, Folds
-from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
-from dynssm_ros.identification.size_search import SizeSearch
-from dynssm_ros.identification.windows import SimulationWindows, fit_windows, recorded_rows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import IdentificationProblem
+from dynssm_ros.identification.problem.recordings import CrossValidation, Folds
+from dynssm_ros.identification.problem.windows import SimulationWindows, fit_windows, recorded_rows
+from dynssm_ros.identification.result.diagnose import _not_confirmed
+from dynssm_ros.identification.search.candidates import Candidate, Responses, ScoredCandidate, ScoreTest
+from dynssm_ros.identification.search.confirmation import Confirmation, LeaveOneOut
+from dynssm_ros.identification.search.integrator import _with_what_hides, search_causes
+from dynssm_ros.identification.search.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
+from dynssm_ros.identification.search.size_search import SizeSearch
 from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate

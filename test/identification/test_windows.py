@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.car import CarEstimate, prior_std
-from dynssm_ros.identification.noise import Noise, NoiseResponse, fit_noise, weights
-from dynssm_ros.identification.problem import IdentificationProblem, position, with_values
-from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
+from dynssm_ros.identification.problem.car import CarEstimate, prior_std
+from dynssm_ros.identification.problem.fit import IdentificationProblem, position, with_values
+from dynssm_ros.identification.problem.noise import Noise, NoiseResponse, fit_noise, weights
+from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.simulation.laps import simulate
@@ -57,7 +57,7 @@ def test_simulations_in_blocks_are_those_at_once(monkeypatch: pytest.MonkeyPatch
     some, car = windows(AV21), CarEstimate.of(AV21)
     cars = [car.with_effect("steering_lag", {"time_constant": value}) for value in (0.05, 0.1)]
     at_once = some.errors_of(cars)
-    monkeypatch.setattr("dynssm_ros.identification.windows._AT_ONCE", 7)
+    monkeypatch.setattr("dynssm_ros.identification.problem.windows._AT_ONCE", 7)
     np.testing.assert_array_equal(some.errors_of(cars), at_once)
     assert len(some) % 7
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynssm_ros.identification.candidates import Candidate
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Diagnosis
-from dynssm_ros.identification.improvement import Improvement, measure_improvement
-from dynssm_ros.identification.minimum_effect import minimum_detectable
-from dynssm_ros.identification.problem import IdentificationProblem
-from dynssm_ros.identification.windows import RecordedRows, SimulationWindows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import IdentificationProblem
+from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows
+from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Diagnosis
+from dynssm_ros.identification.result.improvement import Improvement, measure_improvement
+from dynssm_ros.identification.result.minimum_effect import minimum_detectable
+from dynssm_ros.identification.search.candidates import Candidate
 from dynssm_ros.reporting.diagnosis_figures import cause_pictures, errors_over, gain_by_horizon, simulated_and_measured
 from dynssm_ros.reporting.diagnosis_report import (
     as_text,

@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.problem import BLOCK
-from dynssm_ros.identification.residuals import ExplainedVariance, explained_variance
-from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import BLOCK
+from dynssm_ros.identification.problem.windows import SimulationWindows
+from dynssm_ros.identification.result.residuals import ExplainedVariance, explained_variance
 
 _DRAWS = 400
 _NEXT_TO_NONE = 0.01  # of the squared error

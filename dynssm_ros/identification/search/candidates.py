@@ -13,10 +13,10 @@ from itertools import product
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.car import CarEstimate, Values
-from dynssm_ros.identification.levels import ONE_RECORDING, Levels
-from dynssm_ros.identification.noise import weights
-from dynssm_ros.identification.problem import Fit, IdentificationProblem, unit
+from dynssm_ros.identification.problem.car import CarEstimate, Values
+from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, unit
+from dynssm_ros.identification.problem.levels import ONE_RECORDING, Levels
+from dynssm_ros.identification.problem.noise import weights
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 from dynssm_ros.vehicle.effects.base import LAP, section
 

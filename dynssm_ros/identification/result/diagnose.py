@@ -12,18 +12,18 @@ from scipy import stats
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.extras import missing_libraries
-from dynssm_ros.identification.candidates import Candidate
-from dynssm_ros.identification.car import CarEstimate, Values
-from dynssm_ros.identification.diagnosis import Cause, Diagnosis
-from dynssm_ros.identification.formula import Formula, formulas
-from dynssm_ros.identification.gate import HeldOut, Without, gated
-from dynssm_ros.identification.integrator import search_causes
-from dynssm_ros.identification.levels import Group, Levels
-from dynssm_ros.identification.minimum_effect import minimum_detectable
-from dynssm_ros.identification.problem import BLOCK, Fit, IdentificationProblem, per_unit
-from dynssm_ros.identification.recordings import CrossValidation, RecordingSet, driven_alike
-from dynssm_ros.identification.selection import Refined, Selection
-from dynssm_ros.identification.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
+from dynssm_ros.identification.problem.car import CarEstimate, Values
+from dynssm_ros.identification.problem.fit import BLOCK, Fit, IdentificationProblem, per_unit
+from dynssm_ros.identification.problem.levels import Group, Levels
+from dynssm_ros.identification.problem.recordings import CrossValidation, RecordingSet, driven_alike
+from dynssm_ros.identification.problem.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
+from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis
+from dynssm_ros.identification.result.formula import Formula, formulas
+from dynssm_ros.identification.result.gate import HeldOut, Without, gated
+from dynssm_ros.identification.result.minimum_effect import minimum_detectable
+from dynssm_ros.identification.search.candidates import Candidate
+from dynssm_ros.identification.search.integrator import search_causes
+from dynssm_ros.identification.search.selection import Refined, Selection
 from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.signals.recording import Recording
@@ -61,7 +61,8 @@ def diagnose(
     """Finds out what a vehicle file gets wrong about recordings.
 
     An effect acts in all recordings, or in some and not in the others: in one alone, in those of one session, or in those of
-    one road (:mod:`~dynssm_ros.identification.levels`). With ``suspect`` it acts in all or in those: what has changed since.
+    one road (:mod:`~dynssm_ros.identification.problem.levels`). With ``suspect`` it acts in all or in those: what has changed
+    since.
 
     Args:
         recordings: measured laps of one car.

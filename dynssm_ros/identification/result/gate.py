@@ -7,15 +7,20 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.diagnosis import EXTENDED, GIVEN, RECALIBRATED
-from dynssm_ros.identification.improvement import Improvement, measure_improvement
-from dynssm_ros.identification.integrator import SearchResult
-from dynssm_ros.identification.noise import weights
-from dynssm_ros.identification.problem import IdentificationProblem
-from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance, clustered, explained_variance
-from dynssm_ros.identification.selection import Search, Selection
-from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import IdentificationProblem
+from dynssm_ros.identification.problem.noise import weights
+from dynssm_ros.identification.problem.windows import SimulationWindows
+from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED
+from dynssm_ros.identification.result.improvement import Improvement, measure_improvement
+from dynssm_ros.identification.result.residuals import (
+    ClusteredResiduals,
+    ExplainedVariance,
+    clustered,
+    explained_variance,
+)
+from dynssm_ros.identification.search.integrator import SearchResult
+from dynssm_ros.identification.search.selection import Search, Selection
 
 _NO_WORSE = 0.01  # of the error on held-out laps, that the car may be worse with a cause than without
 

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Mask, Vector
-from dynssm_ros.identification.noise import Noise
-from dynssm_ros.identification.problem import Fit, IdentificationProblem
-from dynssm_ros.identification.recordings import CrossValidation, Folds
+from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem
+from dynssm_ros.identification.problem.noise import Noise
+from dynssm_ros.identification.problem.recordings import CrossValidation, Folds
 from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.vehicle.effects import EFFECTS
 

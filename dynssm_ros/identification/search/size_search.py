@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynssm_ros.identification.candidates import BOTH_SIDES_UNITS, Candidate, ScoredCandidate, steps_off
-from dynssm_ros.identification.car import CarEstimate, Values
-from dynssm_ros.identification.problem import Fit, IdentificationProblem, position
+from dynssm_ros.identification.problem.car import CarEstimate, Values
+from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, position
+from dynssm_ros.identification.search.candidates import BOTH_SIDES_UNITS, Candidate, ScoredCandidate, steps_off
 from dynssm_ros.vehicle.effects import EFFECTS
 
 _WARM_STARTS = 3  # times that nominal values make room for an effect before it is fitted

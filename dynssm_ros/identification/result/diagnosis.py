@@ -9,15 +9,15 @@ from typing import Any, Literal
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.confirmation import Confirmation
-from dynssm_ros.identification.formula import Formula
-from dynssm_ros.identification.improvement import Improvement
-from dynssm_ros.identification.levels import Level
-from dynssm_ros.identification.recordings import RecordingSet
-from dynssm_ros.identification.residuals import ClusteredResiduals, ExplainedVariance
-from dynssm_ros.identification.selection import Selection
-from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.levels import Level
+from dynssm_ros.identification.problem.recordings import RecordingSet
+from dynssm_ros.identification.problem.windows import SimulationWindows
+from dynssm_ros.identification.result.formula import Formula
+from dynssm_ros.identification.result.improvement import Improvement
+from dynssm_ros.identification.result.residuals import ClusteredResiduals, ExplainedVariance
+from dynssm_ros.identification.search.confirmation import Confirmation
+from dynssm_ros.identification.search.selection import Selection
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS

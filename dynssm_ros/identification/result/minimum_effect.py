@@ -12,12 +12,12 @@ from itertools import groupby
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.identification.candidates import Candidate
-from dynssm_ros.identification.car import Values
-from dynssm_ros.identification.diagnosis import SMALL_SHARE
-from dynssm_ros.identification.noise import weights
-from dynssm_ros.identification.problem import Fit, IdentificationProblem, limits, unit, with_values
-from dynssm_ros.identification.selection import DECISIVE_DELTA_BIC
+from dynssm_ros.identification.problem.car import Values
+from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, limits, unit, with_values
+from dynssm_ros.identification.problem.noise import weights
+from dynssm_ros.identification.result.diagnosis import SMALL_SHARE
+from dynssm_ros.identification.search.candidates import Candidate
+from dynssm_ros.identification.search.selection import DECISIVE_DELTA_BIC
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 
 _PLACES = np.linspace(0.0, 1.0, 4, endpoint=False)  # of the lap

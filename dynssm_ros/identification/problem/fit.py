@@ -11,9 +11,9 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from dynssm_ros.arrays import Indices, Mask, Vector, normal_equations
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.noise import Noise, NoiseResponse, fit_noise, weights
-from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.noise import Noise, NoiseResponse, fit_noise, weights
+from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.vehicle.effects import EFFECTS
 
 Free = tuple[tuple[str, str], ...]

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dynssm_ros.arrays import Indices, Mask, Vector
-from dynssm_ros.identification.levels import Group, Levels
-from dynssm_ros.identification.problem import BLOCK
-from dynssm_ros.identification.windows import RecordedRows, SimulationWindows, rows_per_sample
+from dynssm_ros.identification.problem.fit import BLOCK
+from dynssm_ros.identification.problem.levels import Group, Levels
+from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows, rows_per_sample
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number, track_position
 from dynssm_ros.track.lines import ClosedLine

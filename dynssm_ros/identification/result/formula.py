@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.confirmation import standard_error, sums_of
-from dynssm_ros.identification.recordings import CrossValidation
-from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.recordings import CrossValidation
+from dynssm_ros.identification.problem.windows import SimulationWindows
+from dynssm_ros.identification.search.confirmation import standard_error, sums_of
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _SPAN = 0.12  # s; over which the missing acceleration is taken: shorter is noise, longer the car answers to it

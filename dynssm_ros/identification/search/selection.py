@@ -1,7 +1,7 @@
 """Which effects the data ask for: forward, exchanged, backward; and which of them the data cannot tell apart.
 
 An information criterion finds what is worth a look. What is named has to predict parts of the drive that it was not fitted to
-(:mod:`dynssm_ros.identification.confirmation`).
+(:mod:`dynssm_ros.identification.search.confirmation`).
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from functools import partial
 
 import numpy as np
 
-from dynssm_ros.identification.candidates import Candidate, Responses, ScoredCandidate, ScoreTest
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.confirmation import Confirmation, LeaveOneOut
-from dynssm_ros.identification.problem import Fit, IdentificationProblem
-from dynssm_ros.identification.recordings import CrossValidation
-from dynssm_ros.identification.size_search import CandidateStart, SizeSearch
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem
+from dynssm_ros.identification.problem.recordings import CrossValidation
+from dynssm_ros.identification.search.candidates import Candidate, Responses, ScoredCandidate, ScoreTest
+from dynssm_ros.identification.search.confirmation import Confirmation, LeaveOneOut
+from dynssm_ros.identification.search.size_search import CandidateStart, SizeSearch
 from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION

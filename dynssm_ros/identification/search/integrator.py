@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynssm_ros.identification.candidates import candidates
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.levels import ONE_RECORDING, Levels
-from dynssm_ros.identification.problem import Fit, IdentificationProblem, closest
-from dynssm_ros.identification.recordings import CrossValidation
-from dynssm_ros.identification.selection import Search, Selection
-from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, closest
+from dynssm_ros.identification.problem.levels import ONE_RECORDING, Levels
+from dynssm_ros.identification.problem.recordings import CrossValidation
+from dynssm_ros.identification.problem.windows import SimulationWindows
+from dynssm_ros.identification.search.candidates import candidates
+from dynssm_ros.identification.search.selection import Search, Selection
 from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.vehicle.effects.actuators import SteeringLag

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.identification.windows import SimulationWindows
+from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _FOLDS = 10

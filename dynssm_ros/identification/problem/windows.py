@@ -13,7 +13,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.identification.car import CarBatch, CarEstimate
+from dynssm_ros.identification.problem.car import CarBatch, CarEstimate
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Hold

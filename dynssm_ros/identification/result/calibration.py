@@ -22,9 +22,9 @@ from scipy import optimize
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.identification.car import CarEstimate
-from dynssm_ros.identification.problem import Fit, IdentificationProblem, closest
-from dynssm_ros.identification.windows import RecordedRows, SimulationWindows, fit_windows, recorded_rows
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, closest
+from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows, fit_windows, recorded_rows
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.lap_position import first_lap, lap_context
