@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from dynssm_ros import calibrate, diagnose, extract
 from dynssm_ros.evaluation.regimes import liveliest
-from dynssm_ros.identification.diagnosis import Diagnosis
+from dynssm_ros.identification.result.diagnosis import Diagnosis
 
 CARS = {"recalibrated": "#d55e00", "extended": "#0072b2"}
 LEGEND = {"recalibrated": "best fit without a cause", "extended": "with the named causes"}

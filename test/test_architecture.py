@@ -167,3 +167,15 @@ for name in {wanted!r}:
 """
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=False)
     assert result.returncode == 0, result.stderr
+
+
+def test_identification_poses_then_searches_then_reports() -> None:
+    order = ("problem", "search", "result")
+    for module, path in modules():
+        parts = module.split(".")[1:]
+        if parts[:1] == ["identification"] and len(parts) > 2:
+            above = order[order.index(parts[1]) + 1 :]
+            prefixes = tuple(f"{PACKAGE}.identification.{room}" for room in above)
+            assert not [
+                name for name, _ in imports(path.read_text(encoding="utf-8"), module) if name.startswith(prefixes)
+            ]

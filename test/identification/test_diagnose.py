@@ -12,7 +12,7 @@ import pytest
 from benchmarks.hidden_causes.cases import Case, record, size
 from benchmarks.hidden_causes.outcomes import judge
 from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.identification import windows
+from dynssm_ros.identification.problem import windows
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.fit import IdentificationProblem
 from dynssm_ros.identification.problem.recordings import RecordingSet

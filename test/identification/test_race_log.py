@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dynssm_ros.identification import windows
+from dynssm_ros.identification.problem import windows
 from dynssm_ros.identification.result.calibration import calibrate
 from dynssm_ros.identification.result.diagnose import diagnose
 from dynssm_ros.identification.result.diagnosis import RECALIBRATED
