@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -16,7 +15,6 @@ from dynssm_ros.reporting.evaluation_figures import NO_MODEL, PALETTE, STYLE, SY
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _MARKERS = "osD^vPX*<>"
-_DPI = 130
 
 
 def against_persistence(relative: Mapping[str, Mapping[str, Vector]]) -> Figure:
@@ -46,11 +44,6 @@ def against_persistence(relative: Mapping[str, Mapping[str, Vector]]) -> Figure:
         axes[1].set_xlabel("one-step RMSE over that of persistence (dashed: as good as no model)")
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Writes a figure of the pages as PNG, its outermost labels whole; equal figures are equal files."""
-    figure.savefig(path, format="png", dpi=_DPI, bbox_inches="tight", metadata={"Software": None})
 
 
 def against_the_full_model(full: Sequence[SeedSpread], ablations: Mapping[str, Sequence[SeedSpread]]) -> Figure:

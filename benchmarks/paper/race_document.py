@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
+from benchmarks.page import render, save_figure
 from benchmarks.paper.document import MADE_BY
-from benchmarks.paper.figures import save
 from benchmarks.paper.plan import MID_RANGE, Race
 from benchmarks.paper.race_figures import lap_over_speed_scale
 from benchmarks.paper.reference import ClosedLoop
@@ -49,8 +50,7 @@ def write_races(results: Results, root: Path, path: Path) -> None:
                 shutil.copyfile(root / race_key(name) / f"{figure}.png", aside)
     for names in _sweeps(results):
         pictures[names[-1]]["speed_scale"] = f"{path.stem}_{names[0]}_pace.png"
-        with replacing(path.with_name(pictures[names[-1]]["speed_scale"])) as aside:
-            save(_over_pace(results, names), aside)
+        save_figure(_over_pace(results, names), path.with_name(pictures[names[-1]]["speed_scale"]), tight=True)
     with replacing(path) as aside:
         aside.write_text(signed(races_markdown(results, pictures), results.plan), encoding="utf-8")
 
@@ -92,50 +92,28 @@ def races_markdown(results: Results, pictures: Mapping[str, Mapping[str, str]]) 
         results: of a run.
         pictures: addresses of the figures by race and kind.
     """
-    return "\n\n".join(part.strip() for part in _parts(results, pictures)) + "\n"
+    return render(
+        "results_race",
+        captions=_CAPTIONS,
+        made_by=MADE_BY,
+        protocol=results.made.protocol,
+        quick=results.made.quick,
+        races=[_race(results, name, pictures.get(name, {})) for name in results.plan.races],
+    )
 
 
-def _parts(results: Results, pictures: Mapping[str, Mapping[str, str]]) -> Iterator[str]:
-    yield "# Results in closed loop"
-    yield MADE_BY
-    if results.made.quick:
-        yield "> **Not results:** a quick run to try everything out."
-    lines = [
-        *(f"{name}: {value}" for name, value in results.made.protocol.items()),
-        "Controller: the same for every model of a race (`dynssm_ros/control`); a model sets the coefficients and a "
-        "correction for the whole horizon, once per control step. Start: on the line, actuators at zero; until its window is "
-        "full a model drives with its nominal coefficients.",
-        "A violation is the car's centre of gravity outside the borders at any sample. A lap that was not completed has no "
-        "time.",
-        "Control step: model and plan together, the processor's time on one core; other steps of the run used the other "
-        "cores meanwhile.",
-        "Models are trained with seed 0 on what `benchmarks/paper/plan.yaml` says; `make paper` repeats it all.",
-    ]
-    yield "\n".join(f"- {line}" for line in lines)
-    for name, race in results.plan.races.items():
-        yield f"## {race.title}"
-        yield race.text
-        if name not in results.races:
-            yield f"*Not measured*: {results.reasons.get(race_key(name), 'not run')}."
-            continue
-        driven = results.races[name]
-        yield _course(race, driven)
-        yield race_table(race, driven, _published(results, race)).markdown()
-        yield " ".join(filter(None, [_said(driven["models"]), claimed(results, race, driven["models"])]))
-        for figure, address in pictures.get(name, {}).items():
-            yield f"![{_CAPTIONS[figure]}: {race.title}]({address})"
-
-
-def _course(race: Race, driven: Entry) -> str:
-    """What was driven, in a line."""
-    parts = [
-        f"{driven['track']}, {driven['track_length_m']:.4g} m",
-        f"plant {driven['plant']}" + (f" with {_effects(race)}" if race.effects else ""),
-        f"{driven['objective']} of the {driven['line']} line, which takes {driven['line_lap_time_s']:.3f} s at its own speed"
-        + (f" ({race.speed_scale:g} of it)" if race.speed_scale != 1 else ""),
-        f"{driven['horizon']} steps ahead",
-    ]
-    return "; ".join(parts) + "."
+def _race(results: Results, name: str, pictures: Mapping[str, str]) -> dict[str, Any]:
+    """What the page says of a race."""
+    race, driven = results.plan.races[name], results.races.get(name)
+    about: dict[str, Any] = {"title": race.title, "text": race.text, "speed_scale": race.speed_scale, "driven": driven}
+    if driven is None:
+        return about | {"why": results.reasons.get(race_key(name), "not run")}
+    return about | {
+        "effects": _effects(race),
+        "table": race_table(race, driven, _published(results, race)).markdown(),
+        "remarks": " ".join(filter(None, [_said(driven["models"]), claimed(results, race, driven["models"])])),
+        "pictures": pictures,
+    }
 
 
 def _effects(race: Race) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
-from benchmarks.paper.figures import save
+from benchmarks.page import save_figure
 from benchmarks.paper.plan import MID_RANGE, Race
 from benchmarks.paper.steps import Step, in_data, named_track
 from dynssm_ros.control.prediction_model import PredictionModel
@@ -70,7 +70,7 @@ class DriveLaps(Step):
             folder.mkdir()
             write_json(folder / NUMBERS, race_json(races))
             for figure in race.figures:
-                save(getattr(race_figures, figure)(races), folder / f"{figure}.png")
+                save_figure(getattr(race_figures, figure)(races), folder / f"{figure}.png", tight=True)
 
     def _line(self) -> str | Path:
         return self.race.line if self.race.line in get_args(LineKind) else in_data(self.data, self.race.line)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,23 +13,17 @@ from dynssm_ros.runtime.registry import UNTRAINED
 
 _WITHOUT_A_NETWORK = ("ridge", "rls", "gp", "on_track")
 _ALIKE = 0.02  # errors that differ by less are called equal
-_EXACT = 1e-5  # of the error of persistence: below are roundings in single precision
+EXACT = 1e-5  # of the error of persistence: below are roundings in single precision
 _ERRORS = ("one step", "path")
 
 
-def summary(results: Results) -> Iterator[str]:
-    """The half page; nothing if nothing was measured."""
+def summary(results: Results) -> dict[str, Any] | None:
+    """Table and lines of the half page; ``None`` if nothing was measured."""
     measured = [c for c in results.comparisons if c.car.full in c.models and _simple(c, results)]
     if not measured:
-        return
-    yield "## In short"
-    yield (
-        "The model that ships against the best simple one and the best published one of each study. *One step* is the "
-        "geometric mean over the three states of its one-step RMSE over theirs, *path* its ADE over theirs; below 1 it is "
-        f"ahead. Errors below {_EXACT:g} of those of persistence are roundings and count as that."
-    )
-    yield _table(measured, results).markdown()
-    yield "\n".join(f"- {line}" for line in (*_wins(measured, results), *_networks(results), *_parts(measured)))
+        return None
+    lines = [*_wins(measured, results), *_networks(results), *_parts(measured)]
+    return {"table": _table(measured, results).markdown(), "lines": lines}
 
 
 def errors(comparison: Comparison, model: str) -> dict[str, float]:
@@ -37,7 +32,7 @@ def errors(comparison: Comparison, model: str) -> dict[str, float]:
     if "persistence" not in comparison.models:
         return own
     least = _errors(comparison, "persistence")
-    return {error: float(np.maximum(own[error], _EXACT * least[error])) for error in _ERRORS}
+    return {error: float(np.maximum(own[error], EXACT * least[error])) for error in _ERRORS}
 
 
 def _errors(comparison: Comparison, model: str) -> dict[str, float]:
