@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -74,7 +75,7 @@ class CarEstimate:
         precision[:-1, :-1] = np.linalg.inv(self.vehicle.known_correlation)
         return precision
 
-    @property
+    @cached_property
     def limits(self) -> tuple[Vector, Vector]:
         """The least and the largest of :attr:`moved`."""
         vehicle, known, scales = self.vehicle, prior_std(self.vehicle), _scaling(self.vehicle)
@@ -87,7 +88,7 @@ class CarEstimate:
         mass = np.log([_LIGHTEST, 1.0 / _LIGHTEST]) / self.mass_std if self.mass_std else np.array([-1.0, 1.0])
         return np.append(bounds[0], mass[0]), np.append(bounds[1], mass[1])
 
-    @property
+    @cached_property
     def theta(self) -> Coefficients:
         """The coefficients, inside their bounds."""
         step = np.clip(self.moved, *self.limits)[:-1] * prior_std(self.vehicle)
@@ -95,7 +96,7 @@ class CarEstimate:
         grown = nominal * np.exp(np.where(scales, step / np.where(scales, nominal, 1.0), 0.0))
         return Coefficients(*np.where(scales, grown, nominal + step).tolist())
 
-    @property
+    @cached_property
     def constants(self) -> VehicleConstants:
         """Mass and geometry."""
         factor = float(np.exp(self.mass_std * np.clip(self.moved, *self.limits)[-1]))

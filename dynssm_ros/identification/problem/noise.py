@@ -121,16 +121,26 @@ def fit_noise(spread: NoiseResponse, errors: Vector, start: Vector, floor: Vecto
 
 
 def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Vector) -> Vector:
-    """Fisher scoring in the logarithms of the variances, within their bounds."""
-    count = np.bincount(spread.group, minlength=len(spread.G)).astype(float)
-    moment = np.stack([errors[spread.group == m].T @ errors[spread.group == m] for m in range(len(spread.G))])
-    bases = np.stack([_covariance(spread.G, one) for one in np.eye(_VARIANCES)])
+    """Fisher scoring in the logarithms of the variances, within their bounds.
+
+    With ``C = W diag(v_k of each column) W'``, ``W = (I, G)``, the traces of Fisher's information are sums of squares of
+    ``W' C^-1 W``, so that no covariance of a single variance is formed.
+    """
+    G, groups = spread.G, range(len(spread.G))
+    count = np.bincount(spread.group, minlength=len(G)).astype(float)
+    moment = np.stack([errors[spread.group == m].T @ errors[spread.group == m] for m in groups])
+    # which variance each column of W has, as an indicator (columns, 9)
+    rows, channel = G.shape[1], np.eye(3)
+    of_column = np.zeros((rows + G.shape[2], _VARIANCES))
+    of_column[:rows, 0:3] = np.tile(channel, (rows // 3, 1))
+    of_column[rows : rows + 3, 6:9] = channel
+    of_column[rows + 3 :, 3:6] = np.tile(channel, (rows // 3, 1))
     low = np.log(floor)
     high = low + _RANGE
 
     def likelihood(log_v: Vector) -> tuple[float, Vector]:
         """Twice the negative logarithm of the likelihood, and the covariances' inverses."""
-        C = np.tensordot(np.exp(log_v), bases, 1)
+        C = _covariance(G, np.exp(log_v))
         root = np.linalg.cholesky(C)
         inverse = np.linalg.inv(C)
         log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
@@ -139,13 +149,16 @@ def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Ve
     log_v = np.clip(np.log(start), low, high)
     value, inverse = likelihood(log_v)
     for _ in range(_ROUNDS):
-        shares = np.exp(log_v)[:, None, None, None] * (inverse @ bases)  # sum to one
-        fitted = inverse @ moment
-        of_each = shares.reshape(_VARIANCES, -1)  # a matrix product is many times faster than einsum over all indices
-        slope = np.einsum("m,kmii->k", count, shares) - of_each @ np.swapaxes(fitted, 1, 2).ravel()
-        curvature = (shares * count[:, None, None]).reshape(_VARIANCES, -1) @ np.swapaxes(shares, 2, 3).reshape(
-            _VARIANCES, -1
-        ).T
+        slope, curvature = np.zeros(_VARIANCES), np.zeros((_VARIANCES, _VARIANCES))
+        for m in groups:
+            across = inverse[m] @ G[m]
+            weighed = np.concatenate([inverse[m], across], axis=1)  # C^-1 W
+            inner = np.concatenate([weighed, np.concatenate([across.T, G[m].T @ across], axis=1)])  # W' C^-1 W
+            explained = np.einsum("ic,ic->c", weighed, moment[m] @ weighed)
+            slope += of_column.T @ (count[m] * np.diagonal(inner) - explained)
+            curvature += count[m] * of_column.T @ (inner**2) @ of_column
+        v = np.exp(log_v)
+        slope, curvature = v * slope, np.outer(v, v) * curvature
         free = ~((log_v <= low) & (slope > 0) | (log_v >= high) & (slope < 0))
         step = np.zeros(_VARIANCES)
         step[free] = -np.linalg.solve(curvature[np.ix_(free, free)] + _FLAT * np.eye(free.sum()), slope[free])
