@@ -144,7 +144,7 @@ def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Ve
         root = np.linalg.cholesky(C)
         inverse = np.linalg.inv(C)
         log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        return float(count @ log_det + np.einsum("mij,mij->", inverse, moment)), inverse
+        return float(count @ log_det + np.einsum("mij,mij->", inverse, moment)), np.asarray(inverse, dtype=np.float64)
 
     log_v = np.clip(np.log(start), low, high)
     value, inverse = likelihood(log_v)
