@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import re
 import resource
 import subprocess
@@ -200,9 +199,8 @@ def record(file: Path) -> None:
             arguments = golden.arguments.format(folder=folder).split()
             begin = _cpu_seconds()
             run = subprocess.run(  # noqa: S603 - our own command
-                [sys.executable, "-m", "dynssm_ros.cli.main", *arguments], capture_output=True, text=True, check=False,
-                env=os.environ | {"DYNSSM_PLUGINS": "benchmarks.rivals"},
-            )  # fmt: skip
+                [sys.executable, "-m", "dynssm_ros.cli.main", *arguments], capture_output=True, text=True, check=False
+            )
             if run.returncode:
                 raise SystemExit(f"{golden.name}: {run.stderr[-2000:]}")
             results[golden.name] = {
