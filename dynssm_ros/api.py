@@ -115,8 +115,9 @@ def simulate(
         duration = 60.0
     style = Style(aggressiveness, variation)
     return simulate(
-        car, course, duration, laps, plant, seed, style, line_of(line, car, course), noise=noise, progress=on_progress
-    )
+        car, course, duration, laps, plant, seed=seed, style=style, line=line_of(line, car, course), noise=noise,
+        progress=on_progress,
+    )  # fmt: skip
 
 
 def inspect(

@@ -150,5 +150,5 @@ class HorizonModel:
         state, effect_states = car.step(now, applied, at.theta, at.effect_states, context=at.context)
         state = State(*(value + by for value, by in zip(state, at.correction, strict=True)))
         share = 0.5 if self._travel == "middle" else 0.0
-        pose = advance_pose(ca, at.pose, now, state, car.T_s, share)
+        pose = advance_pose(ca, at.pose, now, state, car.T_s, share=share)
         return ca.vertcat(*pose, *state, *applied, *(effect_states[name] for name in car.effect_states))

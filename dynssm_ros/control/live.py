@@ -124,6 +124,7 @@ class LiveController:
         reference: Reference,
         track: Track,
         settings: Settings,
+        *,
         max_age: float = 0.5,
         max_gap: float = 0.2,
         delay: float = 0.0,

@@ -222,7 +222,7 @@ class _Drive:
         )
         self.pilot = Controller(model, vehicle.inputs, course.reference, track, settings, clock=time.thread_time)
         rolling = LowSpeedRolling(vehicle, plant_type(course.plant).step(vehicle))
-        self._car = make_plant(vehicle, course.plant, pose, state, (rolling,), track.centre)
+        self._car = make_plant(vehicle, course.plant, pose, state, last=(rolling,), line=track.centre)
         self._course = course
         self._feedback = Applied(0.0, 0.0)
         self._sensors = Sensors(course.sensing, vehicle.sampling_time)

@@ -164,5 +164,5 @@ class Settings:
 def _slip(share: float, B: float, C: float, E: float) -> float:
     """Slip angle (rad) at which tyres give ``share`` of what they can."""
     slip = np.linspace(0.0, 1.0, 1001)
-    force = lateral_force(np, B, C, 1.0, E, 0.0, slip)
+    force = lateral_force(np, slip, B=B, C=C, D=1.0, E=E, S_v=0.0)
     return float(slip[np.argmax(force >= share * np.max(force))])

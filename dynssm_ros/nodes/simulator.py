@@ -134,7 +134,7 @@ class SimulatorNode(Node):
         if self._driver == "external":
             return drive_by_commands(self._vehicle, self._track, self._plant, self._commands.command)
         line = line_of(self._line, self._vehicle, self._track)
-        return drive(self._vehicle, self._track, self._plant, self._seed, self._style, line)
+        return drive(self._vehicle, self._track, plant=self._plant, seed=self._seed, style=self._style, line=line)
 
     def _on_command(self, message: JointState) -> None:
         values = self._decoder.decode(message)

@@ -162,7 +162,7 @@ def driven_coefficients(race: Race) -> dict[str, Any]:
         B, C, D, E = (getattr(nominal, f"{name}_{axle}") for name in "BCDE")
         S_h, S_v = (getattr(nominal, f"S_{name}{axle}") for name in "hv")
         shift = getattr(driven, f"alpha_{axle}") - getattr(plain, f"alpha_{axle}")
-        force = lateral_force(np, B, C, D, E, S_v, getattr(driven, f"alpha_{axle}"))
+        force = lateral_force(np, getattr(driven, f"alpha_{axle}"), B=B, C=C, D=D, E=E, S_v=S_v)
         told = np.abs(force) > 0.1 * D
         load = getattr(driven, f"F_z{axle}") / driven.F_z0
         found[f"S_h{axle}"] = S_h + shift

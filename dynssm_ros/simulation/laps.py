@@ -104,6 +104,7 @@ class Run:
 def drive(
     vehicle: Vehicle,
     track: Track,
+    *,
     plant: PlantKind = "euler",
     seed: int = 0,
     style: Style = DEFAULT_STYLE,
@@ -116,7 +117,7 @@ def drive(
     """
     line = line or track.centre
     room = max(0.0, float(np.min(track.clearance(line.points))))
-    driver = Driver(vehicle, line, vehicle_limits(vehicle), style, seed, room)
+    driver = Driver(vehicle, line, vehicle_limits(vehicle), style, seed=seed, room=room)
     (x, y), theta = line.position(0.0, driver.offset(0.0)), float(line.heading(0.0))
     v_x = 0.7 * driver.speed(0.0)
     state = State(v_x, 0.0, v_x * float(line.curvature(0.0)))
@@ -142,6 +143,7 @@ def simulate(
     duration: float | None = None,
     laps: float | None = None,
     plant: PlantKind = "euler",
+    *,
     seed: int = 0,
     style: Style = DEFAULT_STYLE,
     line: ClosedLine | None = None,
@@ -170,7 +172,7 @@ def simulate(
     if (duration is None) == (laps is None) or goal is None or not goal > 0:
         raise SimulationError(f"duration {duration}, laps {laps}; expected one of them, positive")
     samples: list[Sample] = []
-    for sample in drive(vehicle, track, plant, seed, style, line):
+    for sample in drive(vehicle, track, plant=plant, seed=seed, style=style, line=line):
         samples.append(sample)
         done = sample.time if laps is None else (sample.s - samples[0].s) / track.length
         if progress is not None:

@@ -82,6 +82,7 @@ class SingleTrackPlant:
         integrator: Integrator,
         pose: Pose,
         state: State,
+        *,
         first: Sequence[StageEffect] = (),
         last: Sequence[StageEffect] = (),
         line: ClosedLine | None = None,
@@ -199,7 +200,7 @@ class EulerPlant:
         self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], line: ClosedLine | None
     ) -> Plant:
         """The single-track car."""
-        return SingleTrackPlant(vehicle, self.integrator, pose, state, self.first(vehicle), last, line)
+        return SingleTrackPlant(vehicle, self.integrator, pose, state, first=self.first(vehicle), last=last, line=line)
 
 
 class Rk4Plant(EulerPlant):
@@ -252,6 +253,7 @@ def make_plant(
     kind: PlantKind,
     pose: Pose,
     state: State,
+    *,
     last: Sequence[StageEffect] = (),
     line: ClosedLine | None = None,
 ) -> Plant:

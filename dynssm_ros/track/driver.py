@@ -45,7 +45,7 @@ class Driver:
     """Drives one car along one line, with ``room`` metres to either side. The same seed gives the same drive."""
 
     def __init__(
-        self, vehicle: Vehicle, line: ClosedLine, limits: Limits, style: Style, seed: int = 0, room: float = 0.0
+        self, vehicle: Vehicle, line: ClosedLine, limits: Limits, style: Style, *, seed: int = 0, room: float = 0.0
     ) -> None:
         self.line = line
         self._slower = 0.3 * style.variation

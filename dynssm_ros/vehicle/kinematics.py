@@ -40,7 +40,7 @@ def axle_direction(xp: Any, axle: Array, v_x: Array, v_y: Array, omega: Array) -
     return xp.arctan2(v_y + axle * omega, v_x)
 
 
-def advance_pose(xp: Any, pose: Pose, before: State, after: State, T_s: float, share: float = 0.5) -> Pose:
+def advance_pose(xp: Any, pose: Pose, before: State, after: State, T_s: float, *, share: float = 0.5) -> Pose:
     """The pose after a step of ``T_s`` (s) in which the velocities change from ``before`` to ``after``.
 
     Args:

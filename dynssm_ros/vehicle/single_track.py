@@ -250,7 +250,7 @@ def accelerations(xp: Any, q: Motion) -> None:
     q.omega_dot = q.M_z / q.theta.I_z
 
 
-def lateral_force(xp: Any, B: Array, C: Array, D: Array, E: Array, S_v: Array, alpha: Array) -> Array:
+def lateral_force(xp: Any, alpha: Array, *, B: Array, C: Array, D: Array, E: Array, S_v: Array) -> Array:
     """Magic formula: lateral force (N) of an axle at its nominal load and slip angle ``alpha`` (rad), Eq. (10) to (13).
 
     ``S_v + D sin(C atan(B a - E (B a - atan(B a))))``; the slip angle contains its shift S_h.
@@ -261,12 +261,12 @@ def lateral_force(xp: Any, B: Array, C: Array, D: Array, E: Array, S_v: Array, a
 
 def front_force(xp: Any, th: Coefficients, alpha: Array) -> Array:
     """Lateral force (N) of the front axle at its nominal load."""
-    return lateral_force(xp, th.B_f, th.C_f, th.D_f, th.E_f, th.S_vf, alpha)
+    return lateral_force(xp, alpha, B=th.B_f, C=th.C_f, D=th.D_f, E=th.E_f, S_v=th.S_vf)
 
 
 def rear_force(xp: Any, th: Coefficients, alpha: Array) -> Array:
     """Lateral force (N) of the rear axle at its nominal load."""
-    return lateral_force(xp, th.B_r, th.C_r, th.D_r, th.E_r, th.S_vr, alpha)
+    return lateral_force(xp, alpha, B=th.B_r, C=th.C_r, D=th.D_r, E=th.E_r, S_v=th.S_vr)
 
 
 def cornering_stiffness(th: Coefficients) -> tuple[Array, Array]:
