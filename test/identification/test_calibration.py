@@ -76,7 +76,7 @@ def test_the_published_orca_car_is_recovered_exactly_and_holds_on_another_track(
 def test_simulated_laps_give_the_coefficients_back_over_any_horizon(
     club: Recording, orca: Vehicle, horizon: float
 ) -> None:
-    found = calibrate(club, mid_range(orca), horizon, starts=2)
+    found = calibrate(club, mid_range(orca), horizon=horizon, starts=2)
     np.testing.assert_allclose(found.theta, orca.nominal, atol=1e-6 * (orca.upper - orca.lower).max(), rtol=1e-4)
     assert found.horizon == pytest.approx(horizon, abs=0.021)
     assert found.rmse_after.max() < 1e-7

@@ -64,4 +64,4 @@ def test_where_a_lap_starts_comes_from_a_track_and_how_the_road_bends_from_a_lap
     patchy = AV21.with_effect("grip_patch", {"factor": 0.7})
     with pytest.raises(ConfigurationError, match="needs the signal s"):
         calibrate(laps, patchy, starts=1)
-    assert np.isfinite(calibrate(laps, patchy, 0.2, integrator="rk4", starts=1, line=road.centre).theta).all()
+    assert np.isfinite(calibrate(laps, patchy, horizon=0.2, integrator="rk4", starts=1, line=road.centre).theta).all()

@@ -236,7 +236,7 @@ def test_left_out_parts_are_predicted_by_the_others() -> None:
 @pytest.mark.parametrize("plant", ["euler", "rk4"])
 def test_the_integrator_is_that_of_the_data(plant: str) -> None:
     given = windows(plant)
-    found = search_causes(given, CarEstimate.of(ORCA), quarters(given), None, lambda words: None)
+    found = search_causes(given, CarEstimate.of(ORCA), quarters(given))
     assert found.problem.windows.integrator == plant
     assert [one.candidate.effect for one in found.selection.chosen] == []
     assert np.isfinite(found.selection.fit.objective)
@@ -246,7 +246,7 @@ def test_the_integrator_is_that_of_the_data(plant: str) -> None:
 def test_the_integrator_is_that_of_the_file_where_the_data_do_not_say(stated: str | None) -> None:
     given = windows("rk4", (0.2, 0.2, 1.0))
     car = CarEstimate.of(ORCA.model_copy(update={"integrator": stated}))
-    found = search_causes(given, car, quarters(given), None, lambda words: None)
+    found = search_causes(given, car, quarters(given))
     assert found.problem.windows.integrator == (stated or "rk4")
 
 
@@ -270,7 +270,7 @@ def test_another_yaw_inertia_is_not_taken_for_euler_steps() -> None:
         simulate(car, load_track("road_course"), duration=60.0, plant="rk4", noise=(0.01, 0.01, 0.002))
     )
     given = fit_windows(recording, recorded_rows(recording, recording_context(recording)), 0.5, 0.0)
-    found = search_causes(given, known, quarters(given), None, lambda words: None, ("tire_relaxation", "yaw_rate_lag"))
+    found = search_causes(given, known, quarters(given), exclude=("tire_relaxation", "yaw_rate_lag"))
     assert found.problem.windows.integrator == "rk4"
     assert [one.candidate.effect for one in found.selection.chosen] == ["yaw_inertia"]
     assert found.selection.fit.car.effects["yaw_inertia"]["factor"] == pytest.approx(0.65, abs=0.05)
@@ -289,7 +289,7 @@ def test_inputs_that_changed_between_the_rows_go_on_a_line() -> None:
         {name: values[::4] for name, values in recording.columns.items()},
     )
     given = fit_windows(every, recorded_rows(every, recording_context(every)), 0.3, 0.0)
-    found = search_causes(given, CarEstimate.of(ORCA), quarters(given), None, lambda words: None)
+    found = search_causes(given, CarEstimate.of(ORCA), quarters(given))
     windows = found.problem.windows
     assert (windows.integrator, windows.hold) == ("rk4", "first")
     held = IdentificationProblem(replace(windows, hold="zero"), CarEstimate.of(ORCA), found.problem.tempering)

@@ -207,6 +207,7 @@ class IdentificationProblem:
         car: CarEstimate,
         free: Free,
         near: Fit | None = None,
+        *,
         rounds: int = _ROUNDS,
         rough: bool = False,
         noise: Noise | None = None,

@@ -305,7 +305,7 @@ def _spread_evenly(starts: Indices, number: Indices) -> Indices:
 
 
 def held_out_windows(
-    recording: Recording, data: RecordedRows, steps: int, long: int, min_speed: float, held_out: Mask
+    recording: Recording, data: RecordedRows, *, steps: int, long: int, min_speed: float, held_out: Mask
 ) -> SimulationWindows:
     """Overlapping simulations of ``long`` steps for measuring, on the rows ``held_out``; ``steps``: of those of the fit.
 

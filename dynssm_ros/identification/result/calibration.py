@@ -74,6 +74,7 @@ class Calibration:
 def calibrate(
     recording: Recording,
     vehicle: Vehicle,
+    *,
     horizon: float | None = None,
     min_speed: float | None = None,
     integrator: Integrator | None = None,

@@ -48,6 +48,7 @@ _HELD = {"zero": "held", "first": "a line from sample to sample"}
 def diagnose(
     recordings: Recording | Sequence[Recording],
     vehicle: Vehicle,
+    *,
     horizon: float = _HORIZON,
     holdout: float = _HOLDOUT,
     min_speed: float | None = None,
@@ -87,7 +88,16 @@ def diagnose(
     if unknown := sorted(set(exclude) - set(EFFECTS)):
         raise ConfigurationError(f"exclude {', '.join(unknown)}: no such effect; expected some of {', '.join(EFFECTS)}")
     levels = _driven_alike(at)
-    found = search_causes(at.fitted, at.car, at.left_out, integrator, on_progress, exclude, levels, pool)
+    found = search_causes(
+        at.fitted,
+        at.car,
+        at.left_out,
+        integrator=integrator,
+        on_progress=on_progress,
+        exclude=exclude,
+        levels=levels,
+        pool=pool,
+    )
     problem, windows = found.problem, found.problem.windows
     on_progress("measuring the improvement on held-out laps")
     selection, without, left, improvement = gated(
@@ -256,7 +266,7 @@ def _prepare(
     source = ", ".join(recording.info.source)
     require_context(vehicle.active_effects, data.context, f"recording {source}")
     fitted = fit_windows(recording, data, steps * recording.T_s, speed, together.held_out)
-    unseen = held_out_windows(recording, data, steps, 2 * asked, speed, together.held_out)
+    unseen = held_out_windows(recording, data, steps=steps, long=2 * asked, min_speed=speed, held_out=together.held_out)
     protocol = {
         "Recording": source,
         "Commands": recording.info.commands,

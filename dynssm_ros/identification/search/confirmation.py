@@ -141,7 +141,8 @@ def _without(problem: IdentificationProblem, near: Fit, out: Mask) -> _Predicted
     """What a fit without some windows says of these."""
     rest, unseen = problem.select(~out), problem.select(out)
     start = replace(near, errors=near.errors[~out], jacobian=near.jacobian[~out])
-    found = rest.fit(near.car, near.free, start, _ROUNDS, rough=True, noise=Noise(rest.spread, near.noise.v))
+    noise = Noise(rest.spread, near.noise.v)
+    found = rest.fit(near.car, near.free, start, rounds=_ROUNDS, rough=True, noise=noise)
     errors = unseen.errors(found.car)
     return _Predicted(unseen.log_likelihood(errors, Noise(unseen.spread, near.noise.v)), errors[:, -3:] ** 2)
 

@@ -8,7 +8,7 @@ be closer to the data with either by chance, so that the choice is made anew wit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.identification.search.candidates import candidates
 from dynssm_ros.identification.search.selection import Search, Selection
 from dynssm_ros.parallel import IN_TURN, Pool
+from dynssm_ros.progress import OnProgress
 from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.vehicle.effects.actuators import SteeringLag
 from dynssm_ros.vehicle.effects.inertia import YawInertia
@@ -60,8 +61,9 @@ def search_causes(
     windows: SimulationWindows,
     car: CarEstimate,
     left_out: CrossValidation,
-    integrator: Integrator | None,
-    on_progress: Callable[[str], None],
+    *,
+    integrator: Integrator | None = None,
+    on_progress: OnProgress = lambda words: None,
     exclude: Collection[str] = (),
     levels: Levels = ONE_RECORDING,
     pool: Pool = IN_TURN,
@@ -84,7 +86,7 @@ def search_causes(
     def search(windows: SimulationWindows, start: Fit | None = None) -> SearchResult:
         problem = IdentificationProblem(windows, known)
         found, impossible = candidates(problem, known, exclude, levels)
-        searching = Search(problem, car, found, left_out, on_progress, pool)
+        searching = Search(problem, car, found, left_out, on_progress=on_progress, pool=pool)
         return SearchResult(problem, searching, searching.run(start), impossible)
 
     on_progress("choosing how the model steps")

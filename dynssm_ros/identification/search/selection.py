@@ -149,6 +149,7 @@ class Search:
         car: CarEstimate,
         found: Sequence[Candidate],
         left_out: CrossValidation,
+        *,
         on_progress: OnProgress = lambda words: None,
         pool: Pool = IN_TURN,
     ) -> None:

@@ -65,7 +65,7 @@ class SizeSearch:
         best, objective = cars[int(np.argmin(reached))], min(reached)
         promised, paid = scored.improvement / self.tempering, self.price * len(candidate.parameters)
         if promised > paid and near.objective - objective < _KEPT_PROMISE * promised:
-            fit = some.fit(self._sized(scored, 0.0), free, near, _TRIAL_ROUNDS, rough=True)
+            fit = some.fit(self._sized(scored, 0.0), free, near, rounds=_TRIAL_ROUNDS, rough=True)
             if fit.objective < objective:
                 best, objective = fit.car, fit.objective
         return CandidateStart(candidate, best, near.objective - objective - paid)
