@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from dynssm_ros.api import disambiguated
+from dynssm_ros.api.inputs import disambiguated
 from dynssm_ros.arrays import Vector
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.errors import UserError

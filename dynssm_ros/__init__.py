@@ -14,21 +14,18 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.4.0"
 
 if TYPE_CHECKING:
-    from dynssm_ros.api import (
-        calibrate,
-        diagnose,
-        evaluate,
-        extract,
-        extract_season,
-        load_model,
-        race,
-        recorded,
-        replay,
-        review_season,
-        simulate,
-        sweep,
-        train,
-    )
+    from dynssm_ros.api.calibrate import calibrate
+    from dynssm_ros.api.diagnose import diagnose
+    from dynssm_ros.api.evaluate import evaluate
+    from dynssm_ros.api.extract import extract
+    from dynssm_ros.api.inputs import load_model
+    from dynssm_ros.api.inspect import inspect
+    from dynssm_ros.api.race import race
+    from dynssm_ros.api.replay import replay
+    from dynssm_ros.api.season import extract_season, review_season
+    from dynssm_ros.api.simulate import recorded, simulate
+    from dynssm_ros.api.sweep import sweep
+    from dynssm_ros.api.train import train
     from dynssm_ros.learning.models.registry import register_model
     from dynssm_ros.signals.recording import Recording
     from dynssm_ros.signals.season import Season

@@ -16,6 +16,18 @@ class ConfigurationError(UserError):
     """A YAML file (vehicle, signal map, model, artifact) is missing, malformed or out of bounds."""
 
 
+class SettingError(ConfigurationError):
+    """Settings that do not fit each other or the data.
+
+    Attributes:
+        names: fields of settings that the text names; the command line shows them as its options.
+    """
+
+    def __init__(self, text: str, *names: str) -> None:
+        super().__init__(text)
+        self.names = names
+
+
 class BagError(UserError):
     """A bag cannot be read, or its messages are not what the signal map expects."""
 

@@ -142,7 +142,7 @@ def _at(function: Callable[[Item], Result], place: int, item: Item) -> tuple[int
 
 @contextmanager
 def _processes(workers: Workers) -> Iterator[tuple[type[Exception], ...]]:
-    require(f"--jobs {workers.jobs}", "scale")
+    require(f"jobs {workers.jobs}", "scale")
     from joblib import parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -152,7 +152,7 @@ def _processes(workers: Workers) -> Iterator[tuple[type[Exception], ...]]:
 
 @contextmanager
 def _ray(workers: Workers) -> Iterator[tuple[type[Exception], ...]]:
-    require("--backend ray", "ray")
+    require("backend ray", "ray")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports its use to its makers otherwise
     import ray
     from joblib import parallel_config, register_parallel_backend
@@ -176,7 +176,7 @@ def _ray(workers: Workers) -> Iterator[tuple[type[Exception], ...]]:
 
 @contextmanager
 def _dask(workers: Workers) -> Iterator[tuple[type[Exception], ...]]:
-    require("--backend dask", "dask")
+    require("backend dask", "dask")
     from distributed import KilledWorker
     from joblib import parallel_config, register_parallel_backend
     from joblib._dask import DaskDistributedBackend

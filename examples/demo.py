@@ -80,12 +80,12 @@ def _drive(car: Vehicle, track: str, duration: float, seed: int, out: Path) -> R
 
     with progress_bar(f"1 simulate {track}") as progress:
         run = api.simulate(
-            car, track, duration, plant="rk4", seed=seed, aggressiveness=0.85, variation=0.6, noise=NOISE,
+            car, track, duration=duration, plant="rk4", seed=seed, aggressiveness=0.85, variation=0.6, noise=NOISE,
             effects=HIDDEN, on_progress=progress,
         )  # fmt: skip
         write_run(run, bag)
     with progress_bar(f"2 extract {track}") as progress:
-        recording = api.extract(bag, SIGNALS, 1 / car.sampling_time, on_progress=progress)
+        recording = api.extract(bag, SIGNALS, rate=1 / car.sampling_time, on_progress=progress)
     recording.save(out / f"{track}.parquet")
     console.print(
         f"{track}: {run.laps:.1f} laps, {len(recording)} rows, top speed {run.state[:, 0].max():.2f} m/s, seed {seed}"

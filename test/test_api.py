@@ -1,24 +1,39 @@
-"""The Python API: its examples run as written, and importing it costs nothing."""
+"""The Python API: its examples run as written, importing it costs nothing, and each option is declared once."""
 
 from __future__ import annotations
 
 import doctest
+import importlib
+import inspect
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
+from typer.main import get_command
 
 import dynssm_ros
 from dynssm_ros import api
+from dynssm_ros.api.settings import Settings
+from dynssm_ros.cli.main import app
+from dynssm_ros.cli.options import option_of
+from dynssm_ros.errors import SettingError
 
-NAMES = [name for name in api.__dict__ if not name.startswith("_") and callable(getattr(api, name))]
 FINDER = doctest.DocTestFinder(exclude_empty=True)
 EXAMPLES = {
-    test.name.removeprefix("dynssm_ros.api."): test
-    for test in FINDER.find(api, "dynssm_ros.api", globs=dict(vars(api)))
+    name: test
+    for name in api.__all__
+    for test in FINDER.find(getattr(api, name), name, module=False, globs=dict(vars(api)))
     if test.examples
+}
+COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
+SCHEMAS: dict[str, type[Settings]] = {
+    name: schema
+    for name in COMMANDS
+    for schema in [getattr(importlib.import_module(f"dynssm_ros.api.{name}"), f"{name.capitalize()}Settings", None)]
+    if schema is not None
 }
 
 
@@ -30,8 +45,8 @@ def test_the_example_of_a_function_runs(name: str, tmp_path: Path, monkeypatch: 
 
 
 def test_every_public_function_has_an_example() -> None:
-    functions = {name for name in dynssm_ros.__all__ if getattr(dynssm_ros, name).__module__ == "dynssm_ros.api"}
-    assert functions == set(EXAMPLES)
+    assert {*api.__all__} == {*EXAMPLES}
+    assert {*api.__all__} - {"inspect"} <= {*dynssm_ros.__all__}
 
 
 def test_the_names_are_there_and_importing_the_package_loads_nothing_heavy() -> None:
@@ -51,3 +66,35 @@ def test_the_names_are_there_and_importing_the_package_loads_nothing_heavy() -> 
     assert done.stdout.strip() == "[]"
     with pytest.raises(AttributeError, match="no attribute 'magic'"):
         _ = dynssm_ros.magic
+
+
+def test_all_commands_but_inspect_have_settings() -> None:
+    assert {*COMMANDS} - {*SCHEMAS} == {"inspect"}
+
+
+@pytest.mark.parametrize("name", sorted(SCHEMAS))
+def test_an_option_is_a_field_and_a_keyword(name: str) -> None:
+    schema, options = SCHEMAS[name], {each.name: each for each in COMMANDS[name].params}
+    function = getattr(api, {"season": "review_season"}.get(name, name))
+    parameters = inspect.signature(function).parameters
+    for field, about in schema.model_fields.items():
+        assert about.description, f"{name}: {field} has no help"
+        assert option_of(field, about).split("/")[0] in options[field].opts, f"{name}: {field} is no option"
+        assert parameters[field].kind is inspect.Parameter.KEYWORD_ONLY, f"{name}: {field} is no keyword"
+    with pytest.raises(SettingError, match="no setting 'horizont'; expected one of"):
+        function(*["x"] * sum(each.default is each.empty for each in parameters.values()), horizont=1.0)
+    with pytest.raises(ValidationError, match="frozen"):
+        setattr(schema(), next(iter(schema.model_fields)), None)
+
+
+def test_what_a_setting_may_be_is_checked_and_named_as_it_was_given(
+    dynssm, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SettingError, match=r"^holdout: .*less than or equal to 0.9"):
+        api.calibrate("laps.parquet", "orca", holdout=2.0)
+    status, _, err = dynssm(
+        "calibrate", "laps.parquet", "--vehicle", "orca", "--out", tmp_path / "x.yaml", "--holdout", 2
+    )
+    assert status == 1
+    assert "--holdout" in err
+    assert len(err.strip().splitlines()) == 1

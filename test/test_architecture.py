@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,8 +21,8 @@ FLOORS = (  # lowest first; a room imports itself and the floors below, never an
     {"runtime", "simulation"},
     {"identification", "learning"},
     {"control", "evaluation"},
-    {"reporting"},
-    {"nodes"},
+    {"reporting", "nodes"},
+    {"api"},
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
@@ -34,7 +35,7 @@ GROUND = {
     "parallel",
     "progress",
 }  # for all rooms, so they import none
-TOP = {"__init__", "api"}  # the Python API: over all rooms but those that call it
+TOP = {"__init__"}  # the names of the Python API
 
 ROS = {
     "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "launch", "launch_ros", "nav_msgs",
@@ -46,6 +47,7 @@ OWNERS = {
     "optuna": {"evaluation"}, "sklearn": {"identification"}, "typer": {"cli"}, "rich": {"cli", "reporting"},
 }  # fmt: skip
 OWNERS |= {module: {"nodes"} for module in ROS}
+MOST_BY_POSITION, LONGEST_FILE = 5, 450
 
 
 def imports(source: str, module: str, is_package: bool = False) -> Iterator[tuple[str, int]]:
@@ -61,10 +63,10 @@ def imports(source: str, module: str, is_package: bool = False) -> Iterator[tupl
 
 
 def floor_of(module: str) -> int:
-    """The floor of a module; those beside the rooms are below all, the API below the nodes and the command line."""
+    """The floor of a module; those beside the rooms are below all, the package itself is above them."""
     room = [*module.split("."), "__init__"][1]
     if room in TOP:
-        return FLOOR["nodes"]
+        return FLOOR["cli"]
     return FLOOR.get(room, -1)
 
 
@@ -179,3 +181,53 @@ def test_identification_poses_then_searches_then_reports() -> None:
             assert not [
                 name for name, _ in imports(path.read_text(encoding="utf-8"), module) if name.startswith(prefixes)
             ]
+
+
+def test_no_file_is_in_a_circle_of_imports() -> None:
+    """Counted is every import, wherever it stands, but not that of the version from the package itself."""
+    paths = dict(modules())
+    graph: dict[str, set[str]] = {}
+    for module, path in paths.items():
+        named = {name for name, _ in imports(path.read_text(encoding="utf-8"), module, path.name == "__init__.py")}
+        meant = {name if name in paths else name.rpartition(".")[0] for name in named}
+        graph[module] = (meant & paths.keys()) - {module, PACKAGE}
+    graphlib.TopologicalSorter(graph).prepare()
+
+
+def by_position(function: ast.FunctionDef | ast.AsyncFunctionDef, in_class: bool) -> int:
+    """Parameters that a call may give by position, ``self`` and ``cls`` left out."""
+    names = [each.arg for each in (*function.args.posonlyargs, *function.args.args)]
+    return len(names) - (in_class and names[:1] in (["self"], ["cls"]))
+
+
+def with_many_by_position(source: str) -> list[str]:
+    """Public functions and methods with more than ``MOST_BY_POSITION`` parameters by position."""
+    found: list[str] = []
+
+    def walk(node: ast.AST, in_class: bool) -> None:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.ClassDef) and not child.name.startswith("_"):
+                walk(child, True)
+            elif isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                public = child.name == "__init__" or not child.name.startswith("_")
+                if public and by_position(child, in_class) > MOST_BY_POSITION:
+                    found.append(f"{child.name} in line {child.lineno}")
+
+    walk(ast.parse(source), False)
+    return found
+
+
+def test_what_comes_after_the_inputs_is_given_by_name() -> None:
+    found = [f"{path}: {each}" for _, path in modules() for each in with_many_by_position(path.read_text("utf-8"))]
+    assert not found, "\n".join(found)
+
+
+def test_many_parameters_by_position_are_caught() -> None:
+    assert with_many_by_position("def f(a, b, c, d, e, g): ...\nclass A:\n    def m(self, a, b, c, d, e, f): ...")
+    assert not with_many_by_position("def f(a, b, c, d, e, *, g): ...\nclass A:\n    def m(self, a, b, c, d, e): ...")
+    assert not with_many_by_position("def _f(a, b, c, d, e, g): ...")
+
+
+def test_files_are_no_longer_than_a_reader_holds() -> None:
+    long = [str(path) for _, path in modules() if path.read_text("utf-8").count("\n") > LONGEST_FILE]
+    assert not long, "\n".join(long)

@@ -101,7 +101,7 @@ def test_a_new_signal_map_reads_the_cars_own_topics(tmp_path: Path) -> None:
             bag.write("/drive", when, point(at, pair(40.0, 5.0, 0.0)))
             inner = types["geometry_msgs/msg/Twist"](vector(2.0 + 0.001 * k, 0.1, 0.0), vector(0.0, 0.0, 0.5))
             bag.write("/state", when + 1000, twist(at, inner))
-    recording = dynssm_ros.extract(tmp_path / "bag", RECIPES / "my_car.yaml", 50.0)
+    recording = dynssm_ros.extract(tmp_path / "bag", RECIPES / "my_car.yaml", rate=50.0)
     np.testing.assert_allclose(recording["r_fb"], 0.4)
     np.testing.assert_allclose(recording["delta_fb"], np.deg2rad(5.0), rtol=1e-8)
     assert recording["v_x"][0] == pytest.approx(2.0, abs=0.01)

@@ -219,7 +219,7 @@ def measured(log: tuple[str, float, float], data: Path) -> Recording:
         bag, signals, rate = data / "av21" / "putnam_park_run4_2", "av21", 25.0
     else:
         bag, signals, rate = data / "dart" / name, "default", 50.0
-    recording = dynssm_ros.extract(bag, signals, rate, commands="none")
+    recording = dynssm_ros.extract(bag, signals, rate=rate, commands="none")
     seconds = (recording.time - recording.time[0]) / 1e9
     kept = (seconds >= start) & (seconds < end)
     v_x, omega = recording["v_x"], recording["omega"]

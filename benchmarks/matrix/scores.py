@@ -11,7 +11,7 @@ import numpy as np
 
 import dynssm_ros
 from benchmarks.matrix.scored_cells import Cell, Training, test_drive, training_drive
-from dynssm_ros.api import with_offline
+from dynssm_ros.api.inputs import with_offline
 from dynssm_ros.evaluation.open_loop import evaluate
 from dynssm_ros.files import write_json
 from dynssm_ros.runtime.baselines import Persistence, SingleTrack, SingleTrackEwma

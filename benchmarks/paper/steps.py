@@ -265,7 +265,7 @@ class Evaluate(Step):
         tests = {}
         for name, part in self.tests.items():
             recording = _load(root, part, self.commands)
-            tests[name] = self._scores(evaluate(recording, models, name, stride=self.stride, calls=1))
+            tests[name] = self._scores(evaluate(recording, models, name=name, stride=self.stride, calls=1))
         write_json(root / self.key, {"tests": tests})
 
     def _scores(self, evaluation: Evaluation) -> dict[str, Any]:

@@ -9,66 +9,32 @@ import typer
 from rich.table import Table
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import CommandsOption, JsonOption, VehicleOption, WhereOption, console, progress_bar
+from dynssm_ros.api.calibrate import CalibrateSettings
+from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.cli.options import JsonOption, RecordingsArgument, VehicleOption, with_settings
 from dynssm_ros.files import write_json
-from dynssm_ros.signals.season import recording_files
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS, save_vehicle
-from dynssm_ros.vehicle.integrators import Integrator
 
 if TYPE_CHECKING:
     from dynssm_ros.identification.result.calibration import Calibration
 
 
+@with_settings(CalibrateSettings)
 def calibrate(
-    recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of one car, or a season.", metavar="R.parquet...")
-    ],
+    recordings: RecordingsArgument,
     vehicle: VehicleOption,
     out: Annotated[Path, typer.Option(help="Vehicle file to write.", dir_okay=False)],
-    horizon: Annotated[
-        float | None,
-        typer.Option(
-            help="Length of the simulations that are compared with the laps (s).",
-            min=0.0,
-            show_default="0.5, less for short recordings",
-        ),
-    ] = None,
-    integrator: Annotated[
-        Integrator | None,
-        typer.Option(help="Steps of the model.", show_default="rk4, unless euler is clearly closer to the laps"),
-    ] = None,
-    min_speed: Annotated[
-        float | None,
-        typer.Option(help="Leave out slower rows (m/s).", min=0.0, show_default="the vehicle file's minimum_speed"),
-    ] = None,
-    holdout: Annotated[
-        float, typer.Option(help="Leave the last fraction of each recording out.", min=0.0, max=0.9)
-    ] = 0.0,
-    starts: Annotated[int, typer.Option(help="Starting points of the search.", min=1)] = 3,
-    seed: Annotated[int, typer.Option(help="Of the random starting points.", min=0)] = 0,
-    track: Annotated[
-        str | None,
-        typer.Option(
-            help="Track along which the places of the vehicle's effects are counted: built-in name or file.",
-            show_default="none; how the road bends is seen from the first full lap",
-        ),
-    ] = None,
-    commands: CommandsOption = None,
+    settings: CalibrateSettings,
     json: JsonOption = None,
-    where: WhereOption = None,
 ) -> None:
     """Fit the nominal parameters of a vehicle to measured laps, within their bounds."""
-    logs = recording_files(recordings, where)
     with progress_bar("calibrating") as progress:
-        result = api.calibrate(
-            logs, vehicle, horizon, min_speed, holdout, integrator, starts, seed, commands, progress, track
-        )
-    source = ", ".join(str(path) for path in recordings) + (f" where {where}" if where else "")
+        result = api.calibrate(recordings, vehicle, settings=settings, on_progress=progress)
     save_vehicle(
         result.vehicle,
         out,
-        f"Calibrated on {source} (simulations of {result.horizon:g} s, {result.vehicle.integrator} steps, "
-        f"{result.rows} rows, seed {seed}).",
+        f"Calibrated on {', '.join(map(str, recordings))} (simulations of {result.horizon:g} s, "
+        f"{result.vehicle.integrator} steps, {result.rows} rows, seed {settings.seed}).",
     )
     if json is not None:
         write_json(json, as_json(result))

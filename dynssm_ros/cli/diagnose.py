@@ -1,4 +1,4 @@
-"""``dynssm diagnose``: what the simulation gets wrong, the cause, the extended vehicle file, the gain."""
+"""``dynssm diagnose``: what the simulation gets wrong, the cause, the extended vehicle file, the improvement."""
 
 from __future__ import annotations
 
@@ -9,30 +9,20 @@ from typing import Annotated
 import typer
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import (
-    AddressOption,
-    BackendOption,
-    CommandsOption,
-    JobsOption,
-    JsonOption,
-    MinSpeedOption,
-    VehicleOption,
-    WhereOption,
-    console,
-    progress_bar,
-    write_results,
-)
+from dynssm_ros.api.diagnose import DiagnoseSettings
+from dynssm_ros.cli.console import console, progress_bar, write_results
+from dynssm_ros.cli.options import JsonOption, VehicleOption, with_settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
-from dynssm_ros.parallel import Workers
-from dynssm_ros.signals.season import recording_files
 from dynssm_ros.vehicle import save_vehicle
-from dynssm_ros.vehicle.integrators import Integrator
 
 
+@with_settings(DiagnoseSettings)
 def diagnose(
+    *,
     vehicle: VehicleOption,
     out: Annotated[Path, typer.Option(help="Folder for vehicle.yaml, report.html and results.json.", file_okay=False)],
+    settings: DiagnoseSettings,
     recordings: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -43,37 +33,11 @@ def diagnose(
     reference: Annotated[
         list[Path] | None, typer.Option(help="Recording as R.parquet, beside those that are suspect; repeat for more.")
     ] = None,
-    horizon: Annotated[float, typer.Option(help="Time that is simulated from a measured state on (s).", min=0.0)] = 0.5,
-    holdout: Annotated[
-        float,
-        typer.Option(help="Share at the end that only measures the gain; whole laps if there are three.", max=0.8),
-    ] = 0.25,
-    min_speed: MinSpeedOption = None,
-    integrator: Annotated[
-        Integrator | None,
-        typer.Option(help="How the model steps.", show_default="the file's, else rk4; others if clearly closer"),
-    ] = None,
-    track: Annotated[
-        str | None,
-        typer.Option(
-            help="Track along which places are counted: built-in name or file, in the recording's coordinates.",
-            show_default="the first full lap in the recording",
-        ),
-    ] = None,
-    exclude: Annotated[
-        list[str] | None,
-        typer.Option(help="Effect that is impossible there, such as crosswind in a hall; repeat for more."),
-    ] = None,
     suspect: Annotated[
         list[Path] | None,
         typer.Option(help="Recording in which something may have changed since the others; repeat for more."),
     ] = None,
-    commands: CommandsOption = None,
     json: JsonOption = None,
-    where: WhereOption = None,
-    jobs: JobsOption = None,
-    backend: BackendOption = "processes",
-    address: AddressOption = None,
 ) -> None:
     """Find out what the simulation gets wrong about measured laps, and why; write the vehicle file that has it."""
     require("diagnose", "train", "report")
@@ -81,13 +45,11 @@ def diagnose(
 
     if not (given := [*(recordings or ()), *(reference or ())]):
         raise ConfigurationError("no recording given; expected R.parquet or --reference R.parquet")
-    given = recording_files(given, where)
     with progress_bar("diagnosing") as progress:
         steps = itertools.count(1)
         result = api.diagnose(
-            given, vehicle, horizon, holdout, min_speed, integrator, track, commands,
-            lambda words: progress(min(next(steps), 39), 40, words), exclude or (), suspect or (),
-            Workers(jobs, backend, address),
+            given, vehicle, settings=settings, suspect=suspect or (),
+            on_progress=lambda words: progress(min(next(steps), 39), 40, words),
         )  # fmt: skip
     path = out / "vehicle.yaml"
     about = f"{result.car.vehicle.name}, extended by a diagnosis of {result.protocol['Recording']}: {result.verdict}."

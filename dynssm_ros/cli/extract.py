@@ -8,67 +8,50 @@ from typing import Annotated
 import typer
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import (
-    AddressOption,
-    BackendOption,
-    CommandsOption,
-    JobsOption,
-    SignalsOption,
-    console,
-    progress_bar,
-)
+from dynssm_ros.api.extract import ExtractSettings
+from dynssm_ros.api.season import ExtractSeasonSettings
+from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.cli.options import SignalsOption, with_settings
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.parallel import HERE, Workers
 from dynssm_ros.signals.season import Season, Session
 from dynssm_ros.signals.standard import recording_to_bag
 
 
+@with_settings(ExtractSeasonSettings)
 def extract(
     bags: Annotated[
         list[Path],
         typer.Argument(help="rosbag2 folders or .mcap/.db3 files, in the order of driving.", metavar="BAG..."),
     ],
     signals: SignalsOption,
-    rate: Annotated[float, typer.Option(help="Rate of the uniform time grid (Hz).", min=1.0, max=1000.0)],
     out: Annotated[
         Path, typer.Option(help="Recording to write (R.parquet); or folder of a season, one recording for each bag.")
     ],
+    settings: ExtractSeasonSettings,
     bag: Annotated[
         Path | None,
         typer.Option(
             help="Also write the grid as a rosbag2 with the standard topics, to play it without its own types."
         ),
     ] = None,
-    commands: CommandsOption = None,
-    drop_bad: Annotated[
-        bool,
-        typer.Option("--drop-bad", help="Leave out samples that are not finite or out of order instead of stopping."),
-    ] = False,
-    car: Annotated[str | None, typer.Option(help="Of a season: which car drove.")] = None,
-    track: Annotated[str | None, typer.Option(help="Of a season: where.")] = None,
-    jobs: JobsOption = None,
-    backend: BackendOption = "processes",
-    address: AddressOption = None,
 ) -> None:
     """Turn race logs into a recording: named SI signals on a uniform time grid. Or into a season of recordings."""
-    workers = Workers(jobs, backend, address)
     if out.suffix != ".parquet":
-        if car is None or track is None or bag is not None:
+        if settings.car is None or settings.track is None or bag is not None:
             raise ConfigurationError(
                 f"--out {out}: a season's folder needs --car and --track and takes no --bag; expected those, or R.parquet"
             )
         with progress_bar("extracting") as progress:
-            season, new = api.extract_season(
-                bags, out, car, track, signals, rate, commands, drop_bad, workers, progress
-            )
+            season, new = api.extract_season(bags, out, signals, settings=settings, on_progress=progress)
         _say_season(season, new, bags)
         return
-    if (car, track, workers) != (None, None, HERE):
+    one = ExtractSettings(**{name: getattr(settings, name) for name in ExtractSettings.model_fields})
+    if settings != ExtractSeasonSettings(**dict(one)):
         raise ConfigurationError(
             f"--out {out}: --car, --track, --jobs, --backend and --address are of a season; expected a folder"
         )
     with progress_bar("reading") as progress:
-        recording = api.extract(list(bags), signals, rate, commands, drop_bad, progress)
+        recording = api.extract(bags, signals, settings=one, on_progress=progress)
     if bag is not None:
         recording_to_bag(recording, bag)
     recording.save(out)
@@ -76,7 +59,7 @@ def extract(
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     segments = int(recording.segment[-1]) + 1
     console.print(
-        f"{out}: {len(recording)} rows at {rate:g} Hz, {recording.duration:.1f} s in {segments} "
+        f"{out}: {len(recording)} rows at {one.rate:g} Hz, {recording.duration:.1f} s in {segments} "
         f"segment{'s' if segments > 1 else ''}, commands: {recording.info.commands}",
         markup=False,
         soft_wrap=True,

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import JsonOption, console, progress_bar
+from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.cli.options import JsonOption
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
 from dynssm_ros.files import replacing, write_json
@@ -44,7 +45,7 @@ def inspect(
             write_json(json, season.to_json())
         return
     with progress_bar("reading") as progress:
-        found = api.inspect(bag, vehicle, progress)
+        found = api.inspect(bag, vehicle, on_progress=progress)
     console.print(topic_table(found).brief.rich())
     for note in found.notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)

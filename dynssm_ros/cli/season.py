@@ -8,40 +8,26 @@ from typing import Annotated
 import typer
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import (
-    AddressOption,
-    BackendOption,
-    JobsOption,
-    JsonOption,
-    VehicleOption,
-    WhereOption,
-    console,
-    progress_bar,
-    write_results,
-)
+from dynssm_ros.api.season import SeasonSettings
+from dynssm_ros.cli.console import console, progress_bar, write_results
+from dynssm_ros.cli.options import JsonOption, VehicleOption, with_settings
 from dynssm_ros.extras import require
-from dynssm_ros.parallel import Workers
 
 
+@with_settings(SeasonSettings)
 def season(
-    folder: Annotated[Path, typer.Argument(help="Season, as `extract` writes it.", metavar="SEASON")],
+    *,
+    folder: Annotated[
+        Path, typer.Argument(help="Season, as `extract` writes it, or a folder in it.", metavar="SEASON")
+    ],
     vehicle: VehicleOption,
     out: Annotated[Path, typer.Option(help="Folder for report.html and results.json.", file_okay=False)],
+    settings: SeasonSettings,
     model: Annotated[
         list[str] | None,
         typer.Option(help="Model folder to score beside the simple models; repeat for more.", metavar="NAME_OR_DIR"),
     ] = None,
-    stretch: Annotated[
-        float | None,
-        typer.Option(
-            help="Length of the stretches that coefficients are of (s).", min=10.0, show_default="whole sessions"
-        ),
-    ] = None,
-    jobs: JobsOption = None,
-    backend: BackendOption = "processes",
-    address: AddressOption = None,
     json: JsonOption = None,
-    where: WhereOption = None,
 ) -> None:
     """Review a season: each model in each session, coefficients over time, causes that come and go, alarms."""
     require("season", "train", "race", "report")
@@ -49,12 +35,10 @@ def season(
     from dynssm_ros.reporting.season_report import alarm_table, season_report, session_table
 
     with progress_bar("reviewing") as progress:
-        reviews = api.review_season(
-            folder, model or [], vehicle, out, where, stretch, Workers(jobs, backend, address), progress
-        )
-    raised = alarms(reviews)
+        reviews = api.review_season(folder, model or [], vehicle, out, settings=settings, on_progress=progress)
+    raised, stretch = alarms(reviews), settings.stretch
     protocol = {
-        "Season": str(folder) + (f" where {where}" if where else ""),
+        "Season": str(folder),
         "Vehicle": vehicle,
         "Models": ", ".join(model or []) or "the simple ones alone",
         "Coefficients": "of whole sessions" if stretch is None else f"of stretches of {stretch:g} s",

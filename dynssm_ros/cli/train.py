@@ -8,47 +8,30 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import CommandsOption, VehicleOption, WhereOption, console, errors, progress_bar
+from dynssm_ros.api.train import TrainSettings
+from dynssm_ros.cli.console import console, errors, progress_bar
+from dynssm_ros.cli.options import ModelFileOption, RecordingsArgument, VehicleOption, with_settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import missing_libraries
-from dynssm_ros.signals.season import recording_files
 
 if TYPE_CHECKING:
     from dynssm_ros.learning.stages import Trained
 
 
+@with_settings(TrainSettings)
 def train(
-    recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of one car, or a season.", metavar="R.parquet...")
-    ],
+    recordings: RecordingsArgument,
     vehicle: VehicleOption,
     out: Annotated[Path, typer.Option(help="Model folder to write.", file_okay=False)],
-    model: Annotated[
-        str, typer.Option(help="Model: name of a shipped one (dynssm, rls, ridge, ...) or a file.")
-    ] = "dynssm",
-    holdout: Annotated[
-        float,
-        typer.Option(help="Leave the last fraction of each recording out, for `evaluate --holdout`.", min=0.0, max=0.9),
-    ] = 0.0,
-    commands: CommandsOption = None,
-    seed: Annotated[int | None, typer.Option(help="Instead of the model file's.", min=0)] = None,
-    epochs: Annotated[int | None, typer.Option(help="Instead of the model file's, in each stage.", min=1)] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    memory: Annotated[
-        float | None,
-        typer.Option(
-            help="What the rows may take (MB): if they take more, a sample of each recording is trained on.",
-            show_default="any",
-        ),
-    ] = None,
-    where: WhereOption = None,
+    settings: TrainSettings,
+    model: ModelFileOption = "dynssm",
 ) -> None:
     """Train a model on recordings and write its folder: card, weights, ONNX, metrics, loss picture."""
     with progress_bar("training") as progress:
         try:
             trained, artifact = api.train(
-                recording_files(recordings, where), model, vehicle, out, holdout, commands, seed, epochs, device, progress,
-                None if missing_libraries("report") else _draw_losses, memory,
+                recordings, model, vehicle, out, settings=settings, on_progress=progress,
+                picture=None if missing_libraries("report") else _draw_losses,
             )  # fmt: skip
         except KeyboardInterrupt:
             folder = out.absolute()

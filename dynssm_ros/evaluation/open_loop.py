@@ -132,6 +132,7 @@ def _minimum_speed(models: Iterable[WindowModel]) -> float:
 def evaluate(
     recording: Recording,
     models: Mapping[str, WindowModel],
+    *,
     name: str = "",
     split: str = "whole recording",
     min_speed: float | None = None,

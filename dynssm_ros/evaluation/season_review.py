@@ -98,6 +98,7 @@ def review(
     key: str,
     models: Mapping[str, WindowModel],
     vehicle: Vehicle,
+    *,
     stretch: float | None = None,
 ) -> Review:
     """Looks at a session.

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from dynssm_ros.arrays import Indices
-from dynssm_ros.errors import ConfigurationError, RecordingError
+from dynssm_ros.errors import ConfigurationError, RecordingError, SettingError
 from dynssm_ros.learning.dataset import normalisation, split_ends, split_windows
 from dynssm_ros.learning.earned_layer import LayerBase, earned_layer
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
@@ -209,7 +209,7 @@ def check_device(device: str) -> None:
     """
     available = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
     if device not in available:
-        raise ConfigurationError(f"--device {device}: not available here; expected {' or '.join(available)}")
+        raise SettingError(f"device {device}: not available here; expected {' or '.join(available)}", "device")
 
 
 def _training_ends(recording: Recording, config: ModelConfig, vehicle: Vehicle) -> Indices:

@@ -17,13 +17,11 @@ from typing import Any
 from pydantic import Field, ValidationError
 
 from dynssm_ros.configuration import StrictModel, describe
-from dynssm_ros.errors import ConfigurationError, RecordingError
+from dynssm_ros.errors import RecordingError
 from dynssm_ros.files import write_json
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.signals.where import condition
 
 MANIFEST, FILE = "_season.json", "recording.parquet"
-_ASKED = ("car", "track", "session", "rate", "start", "rows", "seconds", "segments")  # by ``--where``
 
 
 class Session(StrictModel):
@@ -100,28 +98,26 @@ class Season:
         car, track, session = place
         return self.path / f"car={car}" / f"track={track}" / f"session={session}" / FILE
 
-    def chosen(self, where: str | None = None) -> list[Session]:
-        """Sessions with a recording that meet a condition (see :mod:`dynssm_ros.signals.where`), in the order of driving.
+    def chosen(self, folder: str | Path | None = None) -> list[Session]:
+        """Sessions with a recording, all or those in a folder of the season, in the order of driving.
 
         Raises:
-            ConfigurationError: the condition is none.
-            RecordingError: no session meets it.
+            RecordingError: there is none.
         """
-        fits = condition(where, _ASKED) if where else None
+        within = Path(folder or self.path).resolve()
         there = [each for each in self.sessions.values() if not each.failure]
-        found = [each for each in there if fits is None or fits(each.model_dump())]
+        found = [each for each in there if self.file(each.place).resolve().is_relative_to(within)]
         if not found:
-            asked = f" --where {where!r}" if where else ""
-            raise RecordingError(f"{self.path}{asked}: none of {len(there)} sessions; `dynssm inspect` lists them")
+            raise RecordingError(f"{folder or self.path}: none of {len(there)} sessions; `dynssm inspect` lists them")
         return sorted(found, key=lambda each: (each.start, each.place))
 
-    def files(self, where: str | None = None) -> list[Path]:
+    def files(self, folder: str | Path | None = None) -> list[Path]:
         """Where the recordings of :meth:`chosen` sessions lie."""
-        return [self.file(session.place) for session in self.chosen(where)]
+        return [self.file(session.place) for session in self.chosen(folder)]
 
-    def recordings(self, where: str | None = None) -> Iterator[Recording]:
+    def recordings(self, folder: str | Path | None = None) -> Iterator[Recording]:
         """The recordings of :meth:`chosen` sessions, one by one."""
-        return map(Recording.load, self.files(where))
+        return map(Recording.load, self.files(folder))
 
 
 def address(bag: Path) -> str:
@@ -134,15 +130,29 @@ def is_season(path: str | Path) -> bool:
     return (Path(path) / MANIFEST).is_file()
 
 
-def recording_files(paths: Sequence[str | Path], where: str | None = None) -> list[Path]:
-    """Recordings as they are, and in place of each season's folder those of its sessions that ``where`` is about.
+def season_part(folder: str | Path) -> tuple[Season, list[Session]]:
+    """The season that a folder is or is a part of, and its sessions in there, in the order of driving.
 
     Raises:
-        ConfigurationError: the condition is none, or there is no season that it could be about.
-        RecordingError: no session meets it.
+        RecordingError: there is no session with a recording.
     """
-    if where and not any(map(is_season, paths)):
-        raise ConfigurationError(
-            f"--where {where!r}: chooses sessions of a season's folder; expected one, not a recording"
-        )
-    return [file for path in paths for file in (Season.load(path).files(where) if is_season(path) else [Path(path)])]
+    path = Path(folder)
+    root = next((each for each in (path, *path.resolve().parents) if is_season(each)), path)
+    season = Season.load(root)
+    return season, season.chosen(path)
+
+
+def recording_files(paths: Sequence[str | Path]) -> list[Path]:
+    """Recordings as they are, and in place of each folder of a season those of its sessions.
+
+    Raises:
+        RecordingError: a folder has no session with a recording.
+    """
+    found = []
+    for path in map(Path, paths):
+        if path.is_dir():
+            season, sessions = season_part(path)
+            found += [season.file(session.place) for session in sessions]
+        else:
+            found.append(path)
+    return found

@@ -9,7 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from dynssm_ros import __version__
-from dynssm_ros.errors import ConfigurationError, UserError
+from dynssm_ros.errors import ConfigurationError, SettingError, UserError
 from dynssm_ros.files import content_key, digest, files_in, require_replaceable
 from dynssm_ros.parallel import HERE, Workers, each
 from dynssm_ros.progress import Progress
@@ -56,9 +56,9 @@ def logs_of(
         f"{bag.resolve().parent.name}-{name}" if names.count(name) > 1 else name
         for bag, name in zip(bags, names, strict=True)
     ]
-    for what, name in (("--car", car), ("--track", track), *(("session", name) for name in names)):
+    for what, name in (("car", car), ("track", track), *(("session", name) for name in names)):
         if not _NAME.fullmatch(name):
-            raise ConfigurationError(f"{what} '{name}': expected letters, digits and . _ + - alone")
+            raise SettingError(f"{what} '{name}': expected letters, digits and . _ + - alone", what)
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise ConfigurationError(f"session '{twice}': two bags of that name; expected different names or folders")

@@ -54,7 +54,8 @@ def test_a_wrong_car_becomes_the_right_one(dynssm: Run, laps: Path, tmp_path: Pa
         out_json,
     ]
     status, out, err = dynssm("calibrate", laps, *arguments)
-    assert (status, err) == (0, "")
+    assert status == 0, err
+    assert not [line for line in err.splitlines() if not line.startswith("calibrating:")]  # slow machines say how far
     found, truth = load_vehicle(car), load_vehicle("orca")
     np.testing.assert_allclose(found.nominal, truth.nominal, rtol=1e-3)
     assert f"{car} written" in out.replace("\n", "")

@@ -19,8 +19,8 @@ def model(tmp_path_factory):
 
 def raced(model, effects=None, **options):
     return dynssm_ros.race(
-        "orca", "club_b", ["true", "single_track", model], "double_track", "progress", laps=2, speed_scale=0.9,
-        effects=effects, noise=NOISE, pose_noise=POSE_NOISE, delay=0.02, **options,
+        "orca", "club_b", ["true", "single_track", model], plant="double_track", objective="progress", laps=2,
+        speed_scale=0.9, effects=effects, noise=NOISE, pose_noise=POSE_NOISE, delay=0.02, **options,
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Seasons: logs to a data set, again after a change, and what ``--where`` chooses."""
+"""Seasons: logs to a data set, again after a change, and the sessions of its folders."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from dynssm_ros.errors import ConfigurationError, RecordingError, UserError
 from dynssm_ros.parallel import Backend, Workers
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.signals.season import MANIFEST, Season, is_season
+from dynssm_ros.signals.season import MANIFEST, Season, is_season, recording_files, season_part
 from dynssm_ros.signals.season_extraction import Log, extract_season, logs_of
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.simulation.laps import simulate, write_run
@@ -200,37 +200,17 @@ def test_others_read_it_as_a_partitioned_data_set(bags: list[Path], tmp_path: Pa
     assert rows == sum(season.sessions["orca", "club", name].rows for name in ("run_1", "run_2"))
 
 
-@pytest.mark.parametrize(
-    ("where", "expected"),
-    [
-        ("session == 'run_1'", ["run_1"]),
-        ("track == 'club' and seconds > 3.5", ["run_1", "run_2"]),
-        ("session in ['run_0', 'run_2'] and not rows < 0", ["run_0", "run_2"]),
-        ("(session == 'run_0' or session == 'run_2') and 3.5 < seconds <= 10", ["run_2"]),
-        ("start >= '1970-01-01'", ["run_0", "run_1", "run_2"]),
-    ],
-)
-def test_sessions_are_chosen_by_a_condition(bags: list[Path], tmp_path: Path, where: str, expected: list[str]) -> None:
-    season, _ = extract_season(logs(bags), tmp_path / "season")
-    assert sorted(session.session for session in season.chosen(where)) == expected
-
-
-@pytest.mark.parametrize(
-    ("where", "reason"),
-    [
-        ("track = 'club'", "not understood"),
-        ("driver == 'me'", "'driver' is no field; expected one of car, track, session, rate"),
-        ("__import__('os').system('true')", "Call is not part of a condition"),
-        ("track", "no comparison"),
-        ("track > 3", "expected texts with texts, numbers with numbers"),
-    ],
-)
-def test_what_is_no_condition_is_refused(bags: list[Path], tmp_path: Path, where: str, reason: str) -> None:
-    season, _ = extract_season(logs(bags[:1]), tmp_path / "season")
-    with pytest.raises(ConfigurationError, match=reason.replace("(", r"\(")):
-        season.chosen(where)
-    with pytest.raises(RecordingError, match="none of 1 sessions"):
-        season.chosen("track == 'monza'")
+def test_a_folder_in_a_season_stands_for_its_sessions(bags: list[Path], tmp_path: Path) -> None:
+    """So do files, as a shell's ``season/car=*/track=club/*/*.parquet`` gives them."""
+    extract_season(logs(bags[1:], "club"), tmp_path / "season")
+    season, _ = extract_season(logs(bags[:1], "oval"), tmp_path / "season")
+    oval, club = (season.path / "car=orca" / f"track={track}" for track in ("oval", "club"))
+    assert [session.session for session in season_part(club)[1]] == ["run_1", "run_2"]
+    assert recording_files([oval, *club.glob("*/*.parquet")]) == [*oval.glob("*/*"), *club.glob("*/*")]
+    assert recording_files([season.path]) == season.files()
+    (season.path / "car=av21").mkdir()
+    with pytest.raises(RecordingError, match="none of 3 sessions"):
+        recording_files([season.path / "car=av21"])
 
 
 def test_what_is_no_season_is_not_replaced_and_names_are_unique(bags: list[Path], tmp_path: Path) -> None:
@@ -306,10 +286,11 @@ def test_the_commands_take_a_season(
     assert status == 0
     assert len(json.loads((tmp_path / "listed.json").read_text())["sessions"]) == 5
     evaluating = ("evaluate", "--model", "single_track", "--vehicle", "orca", "--out", tmp_path / "report")
-    status, said = run(capsys, monkeypatch, *evaluating, season, "--where", "session != 'run_0'")
+    club = season / "car=orca" / "track=club"
+    status, said = run(
+        capsys, monkeypatch, *evaluating, club / "session=run_1", club / "session=run_2" / "recording.parquet"
+    )
     assert status == 0, said
     text = (tmp_path / "report" / "results.md").read_text()
     assert "run_1, run_2" in text
-    assert "run_0" not in text.replace("session != 'run_0'", "")
-    status, said = run(capsys, monkeypatch, *evaluating, bags[0], "--where", "session == 'run_0'")
-    assert (status, "chooses sessions of a season's folder" in said) == (1, True)
+    assert "run_0" not in text

@@ -1,0 +1,91 @@
+"""Evaluation: what models are worth on recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dynssm_ros.api.inputs import Log, PathLike, centre_line, joined, open_models, opened, several, with_offline
+from dynssm_ros.api.settings import (
+    MIN_SPEED_HELP,
+    MIN_SPEED_OTHERWISE,
+    CommandsSettings,
+    WorkerSettings,
+    keywords,
+    setting,
+)
+from dynssm_ros.extras import require
+from dynssm_ros.progress import Progress
+from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
+
+if TYPE_CHECKING:
+    from dynssm_ros.evaluation.open_loop import Evaluation
+    from dynssm_ros.runtime.contract import WindowModel
+
+
+class EvaluateSettings(CommandsSettings, WorkerSettings):
+    """Settings of :func:`evaluate`."""
+
+    holdout: float | None = setting(
+        None,
+        "Score only this last fraction of the recording, as one block.",
+        otherwise="the whole recording",
+        gt=0.0,
+        le=1.0,
+    )
+    min_speed: float | None = setting(None, MIN_SPEED_HELP, otherwise=MIN_SPEED_OTHERWISE)
+    horizon: float = setting(PATH_HORIZON_S, "Length of the rollouts (s).", ge=0.0)
+    stride: int = setting(1, "Start a rollout at every n-th row.", ge=1)
+    track: Any = setting(
+        None,
+        "Track along which errors are placed: built-in name or file, in the recording's coordinates.",
+        otherwise="the first full lap in the recording",
+    )
+
+
+@keywords(EvaluateSettings)
+def evaluate(
+    recordings: Log | Sequence[Log],
+    models: Sequence[WindowModel | PathLike] | Mapping[str, WindowModel],
+    vehicle: Vehicle | PathLike | None = None,
+    *,
+    settings: EvaluateSettings,
+    name: str = "",
+    on_progress: Progress | None = None,
+) -> Evaluation:
+    """Scores models on recordings: one-step errors, rollouts, displacement, coverage, latency.
+
+    Args:
+        recordings: to score on, of one car, in the order of driving; online layers learn on from one to the next.
+        models: folders, names of baselines, or models.
+        vehicle: of the single-track baselines.
+        settings: all keywords as one object.
+        name: of the recording, for people; that of its file, or its sources, if not given.
+        on_progress: called with predictions made.
+
+    Example:
+        >>> laps = recorded(simulate("orca", "club", duration=10.0))
+        >>> scores = evaluate(laps, ["persistence", "single_track"], "orca").scores
+        >>> bool(scores["single_track"].rmse[0] < 1e-9)
+        True
+    """
+    require("evaluate", "race")
+    from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
+    from dynssm_ros.track.lap_position import first_lap
+
+    s, known = settings, models if isinstance(models, Mapping) else open_models(models, vehicle)
+    car = next((model.vehicle for model in known.values() if model.vehicle is not None), None)
+    log = joined(opened(recordings, car))
+    line = first_lap(log) if s.track is None else centre_line(s.track, log)
+    log = log.with_commands(s.commands or shared_commands(known))
+    split = "whole recording"
+    if s.holdout is not None:
+        log, split = log.split_last(s.holdout)[1], f"last {100 * s.holdout:.3g} % of the recording, as one block"
+    if not name:
+        name = ", ".join(Path(each).name for each in several(recordings) if isinstance(each, (str, Path)))
+    return evaluate(
+        log, with_offline(known), name=name, split=split, min_speed=s.min_speed, horizon_s=s.horizon, stride=s.stride,
+        line=line, progress=on_progress, workers=s.workers,
+    )  # fmt: skip

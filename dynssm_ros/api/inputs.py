@@ -1,0 +1,146 @@
+"""Inputs of the verbs: vehicles, signal maps, recordings and tracks by name, by path, or as the object."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dynssm_ros.errors import DataWarning, SettingError
+from dynssm_ros.runtime.plausibility import implausible_rows
+from dynssm_ros.signals.recording import Recording, concatenate
+from dynssm_ros.signals.season import recording_files
+from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
+from dynssm_ros.vehicle import Vehicle, load_vehicle
+
+if TYPE_CHECKING:
+    from dynssm_ros.runtime.contract import WindowModel
+    from dynssm_ros.track.tracks import Track
+
+PathLike = str | Path
+Log = Recording | PathLike
+"""A recording, the Parquet file of one, or the folder of a season or of a part of it."""
+
+
+def load_model(name_or_dir: PathLike, vehicle: Vehicle | PathLike | None = None) -> WindowModel:
+    """Opens a trained model's folder, or one of the baselines ``persistence``, ``single_track``, ``single_track_ewma`` and
+    ``single_track_ekf``.
+
+    Example:
+        >>> model = load_model("single_track", "orca")
+        >>> model.H, model.T_s
+        (1, 0.02)
+    """
+    from dynssm_ros.runtime.registry import load_model
+
+    return load_model(name_or_dir, None if vehicle is None else vehicle_in_windows(vehicle))
+
+
+def open_models(
+    models: Sequence[WindowModel | PathLike], vehicle: Vehicle | PathLike | None = None
+) -> dict[str, WindowModel]:
+    """Models by their names; where two have the same one, what was given disambiguates."""
+    opened = {str(m): load_model(m, vehicle) if isinstance(m, (str, Path)) else m for m in models}
+    return disambiguated(opened, lambda model: model.name)
+
+
+def with_offline(models: Mapping[str, WindowModel]) -> dict[str, WindowModel]:
+    """Models, each that has an online layer followed by itself without it."""
+    from dynssm_ros.runtime.contract import without_online
+
+    both: dict[str, WindowModel] = {}
+    for label, model in models.items():
+        both[label] = model
+        if model.online is not None:
+            both[f"{label} (offline)"] = without_online(model)
+    return both
+
+
+def disambiguated(opened: Mapping[str, Any], name: Callable[[Any], str]) -> dict[str, Any]:
+    """What was opened, by name; where several have the same one, by what was given."""
+    called = [name(each) for each in opened.values()]
+    return {given if called.count(name(each)) > 1 else name(each): each for given, each in opened.items()}
+
+
+def vehicle_of(vehicle: Vehicle | PathLike) -> Vehicle:
+    """The car."""
+    return vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+
+
+def vehicle_in_windows(vehicle: Vehicle | PathLike) -> Vehicle:
+    """The car as a model of windows can have it; a :class:`DataWarning` names effects that are left out."""
+    car = vehicle_of(vehicle)
+    for effect in car.active_effects:
+        if effect.needs:
+            warnings.warn(
+                f"vehicle {car.name}: {effect.NAME} reads {', '.join(effect.needs)}, which windows of rows do not tell, "
+                "so that it is left to the online layer",
+                DataWarning, stacklevel=3,
+            )  # fmt: skip
+    return car.in_windows
+
+
+def signal_map_of(signals: SignalMap | PathLike, commands: Commands | None = None) -> SignalMap:
+    """The signal map, with another source of the commands if given."""
+    signal_map = signals if isinstance(signals, SignalMap) else load_signal_map(signals)
+    return signal_map.with_commands(commands)
+
+
+def track_of(track: Track | PathLike) -> Track:
+    """The track."""
+    from dynssm_ros.track.tracks import Track, load_track
+
+    return track if isinstance(track, Track) else load_track(track)
+
+
+def opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
+    """Recordings, all of a season's folder; a :class:`DataWarning` names what of them the car cannot have done."""
+    found = []
+    for log in files(logs):
+        recording = log if isinstance(log, Recording) else Recording.load(log)
+        if car is not None and math.isclose(car.sampling_time, recording.T_s):  # else the command ends with that
+            for words in implausible_rows(recording, car):
+                warnings.warn(f"{name_of(log)}: {words}", DataWarning, stacklevel=3)
+        found.append(recording)
+    return found
+
+
+def joined(recordings: Sequence[Recording], commands: Commands | None = None, holdout: float = 0.0) -> Recording:
+    """Recordings one after the other, each without its last fraction ``holdout``."""
+    return concatenate([each.with_commands(commands).split_last(holdout)[0] for each in recordings])
+
+
+def files(logs: Log | Sequence[Log]) -> Iterator[Log]:
+    """Recordings or their files, those of seasons one by one."""
+    for log in several(logs):
+        yield from [log] if isinstance(log, Recording) else recording_files([log])
+
+
+def several(logs: Log | Sequence[Log]) -> list[Log]:
+    """One or more recordings as a list."""
+    return [logs] if isinstance(logs, (Recording, str, Path)) else list(logs)
+
+
+def name_of(log: Log) -> str:
+    """A recording's sources, or its path."""
+    return ", ".join(log.info.source) if isinstance(log, Recording) else str(log)
+
+
+def centre_line(track: Track | PathLike, log: Recording) -> Any:
+    """The centre line of a track on which the recording was driven."""
+    import numpy as np
+
+    road = track_of(track)
+    if not log.has_pose:
+        raise SettingError(f"track {track}: the recording holds no positions (x, y) to place on it", "track")
+    _, lateral = road.project(np.stack([log["x"], log["y"]], axis=1))
+    away, width = float(np.median(np.abs(lateral))), float(np.mean(road.width_left + road.width_right))
+    if away > width:
+        raise SettingError(
+            f"track {track}: the recording lies {away:.3g} m (median) from its centre line; expected the same "
+            f"coordinates, so at most the track's width of {width:.3g} m",
+            "track",
+        )
+    return road.centre

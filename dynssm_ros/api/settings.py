@@ -1,0 +1,140 @@
+"""Settings of the verbs: each option is one field of one class, with unit, range, default and help.
+
+A function of the API takes its inputs by position and the fields of its class as keywords; the command line makes its
+options from the same fields.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from functools import wraps
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BeforeValidator, Field, ValidationError
+from typing_extensions import Self
+
+from dynssm_ros.configuration import StrictModel, describe
+from dynssm_ros.errors import SettingError
+from dynssm_ros.parallel import Backend, Workers
+from dynssm_ros.signals.signal_map import Commands
+from dynssm_ros.vehicle.effects import parse_effect
+
+Result = TypeVar("Result")
+
+
+def setting(
+    default: Any, description: str, *, option: str = "", otherwise: str = "", milliseconds: bool = False, **limits: Any
+) -> Any:
+    """A field of a settings class.
+
+    Args:
+        default: value if not given.
+        description: what it is, with its unit; the help text of the option.
+        option: name of the option, if not that of the field.
+        otherwise: what holds if not given, in words.
+        milliseconds: the option is in ms where the field is in s.
+        limits: ``ge``, ``gt``, ``le``, ``lt``.
+    """
+    shown: dict[str, Any] = {"option": option, "otherwise": otherwise, "milliseconds": milliseconds}
+    return Field(default, description=description, json_schema_extra=shown, **limits)
+
+
+class Settings(StrictModel):
+    """Base of all settings."""
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> Self:
+        """The settings of keywords.
+
+        Raises:
+            SettingError: no such keyword, or a value out of its range.
+        """
+        for name in given:
+            if name not in cls.model_fields:
+                raise SettingError(f"no setting '{name}'; expected one of {', '.join(cls.model_fields)}")
+        try:
+            return cls.model_validate(dict(given))
+        except ValidationError as error:
+            raise SettingError(describe(error), str(error.errors()[0]["loc"][0])) from error
+
+
+class CommandsSettings(Settings):
+    """The protocol of the command inputs."""
+
+    commands: Commands | None = setting(
+        None, "Source of the command inputs; the signal map's or recording's own if not given."
+    )
+
+
+class WorkerSettings(Settings):
+    """Where independent pieces of work are done."""
+
+    jobs: int | None = setting(None, "Pieces of work at a time; all that a cluster has if not given, else one.", ge=1)
+    backend: Backend = setting("processes", "Where they are done: processes here, or a Ray or Dask cluster.")
+    address: str | None = setting(
+        None,
+        "Of the cluster: Ray's auto or ray://HOST:10001, Dask's tcp://HOST:8786.",
+        otherwise="one is started here, for as long as the work takes",
+    )
+
+    @property
+    def workers(self) -> Workers:
+        """These workers."""
+        return Workers(self.jobs, self.backend, self.address)
+
+
+def _three_numbers(given: Any) -> Any:
+    if not isinstance(given, str):
+        return given
+    try:
+        v_x, v_y, omega = (float(part) for part in given.split(","))
+    except ValueError as error:
+        raise ValueError("expected three numbers, as in 0.02,0.01,0.002") from error
+    if not all(0 <= std < float("inf") for std in (v_x, v_y, omega)):
+        raise ValueError("expected finite numbers of at least 0")
+    return v_x, v_y, omega
+
+
+def _effects(given: Any) -> Any:
+    return given if isinstance(given, Mapping) else dict(map(parse_effect, given or ()))
+
+
+StandardDeviations = Annotated[tuple[float, float, float], BeforeValidator(_three_numbers)]
+"""Of three channels; the text ``0.02,0.01,0.002`` serves too."""
+Effects = Annotated[dict[str, dict[str, float]], BeforeValidator(_effects)]
+"""Parameters by effect; texts ``NAME:k=v,...`` serve too."""
+EFFECTS_HELP = "Physics that no model knows of; repeatable."
+NOISE_HELP = "Standard deviations of the measured v_x,v_y,omega (m/s, m/s, rad/s)."
+PLANT_HELP = "euler: one step per T_s, as in the published data; rk4: steps of 1 ms; double_track: four wheels."
+MIN_SPEED_HELP = "Leave out stretches below this speed (m/s)."
+MIN_SPEED_OTHERWISE = "the vehicle file's minimum_speed"
+
+
+def keywords(schema: type[Settings]) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
+    """Lets a function that takes ``settings`` take the fields of ``schema`` as keywords as well.
+
+    ``inspect.signature`` and ``help`` show the fields. A keyword beside ``settings`` goes before it.
+    """
+
+    def decorated(function: Callable[..., Result]) -> Callable[..., Result]:
+        own = inspect.signature(function)
+        inputs = [parameter for parameter in own.parameters.values() if parameter.name != "settings"]
+
+        @wraps(function)
+        def call(*given: Any, settings: Settings | None = None, **named: Any) -> Result:
+            mine = {name: named.pop(name) for name in list(named) if name in own.parameters}
+            known = {} if settings is None else {name: getattr(settings, name) for name in settings.model_fields_set}
+            return function(*given, settings=schema.of(known | named), **mine)
+
+        fields = [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.annotation)
+            for name, field in schema.model_fields.items()
+        ]
+        whole = own.parameters["settings"].replace(default=None)
+        call.__signature__ = own.replace(parameters=[*inputs, *fields, whole])  # type: ignore[attr-defined]
+        described = "\n".join(f"    {name}: {field.description}" for name, field in schema.model_fields.items())
+        call.__doc__ = f"{inspect.cleandoc(function.__doc__ or '')}\n\nKeyword Args:\n{described}\n"
+        return call
+
+    return decorated
