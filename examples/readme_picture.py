@@ -61,9 +61,9 @@ def draw(found: Diagnosis) -> Figure:
     recalibrated, extended = (improvement.rmse[name][improvement.horizon] for name in CARS)
     share = 100.0 * extended / recalibrated
     bars.bar(np.arange(3), 100.0, 0.37, color=CARS["recalibrated"])
-    drawn = bars.bar(np.arange(3) + 0.4, share, 0.37, color=CARS["extended"])
-    bars.bar_label(drawn, [f"{value - 100.0:+.0f} %" for value in share], padding=2)
-    bars.set_xticks(np.arange(3) + 0.2, ["$v_x$", "$v_y$", "yaw rate"])
+    drawn = bars.bar(np.arange(3) + 0.42, share, 0.37, color=CARS["extended"])
+    bars.bar_label(drawn, [f"{value - 100.0:+.0f} %" for value in share], padding=2, fontsize=8)
+    bars.set_xticks(np.arange(3) + 0.21, ["$v_x$", "$v_y$", "yaw rate"])
     bars.set(ylim=(0, 112), yticks=[], title=f"Error {improvement.horizons[improvement.horizon]:.2g} s ahead")
     for panel in (over_time, bars):
         panel.spines[["top", "right"]].set_visible(False)
