@@ -134,7 +134,9 @@ def keywords(schema: type[Settings]) -> Callable[[Callable[..., Result]], Callab
         whole = own.parameters["settings"].replace(default=None)
         call.__signature__ = own.replace(parameters=[*inputs, *fields, whole])  # type: ignore[attr-defined]
         described = "\n".join(f"    {name}: {field.description}" for name, field in schema.model_fields.items())
-        call.__doc__ = f"{inspect.cleandoc(function.__doc__ or '')}\n\nKeyword Args:\n{described}\n"
+        before, args, after = inspect.cleandoc(function.__doc__ or "").partition("\nArgs:\n")
+        given, blank, rest = after.partition("\n\n")
+        call.__doc__ = f"{before}{args}{given}\n{described}{blank}{rest}"
         return call
 
     return decorated

@@ -224,7 +224,7 @@ def test_what_is_no_season_is_not_replaced_and_names_are_unique(bags: list[Path]
     shutil.copytree(bags[0], tmp_path / "day" / "run_0")
     same = logs_of([bags[0], tmp_path / "day" / "run_0"], "orca", "club", MAP, rate=50.0, drop_bad=False)
     assert [log.session for log in same] == ["bags-run_0", "day-run_0"]
-    with pytest.raises(ConfigurationError, match="--track 'a/b': expected letters"):
+    with pytest.raises(ConfigurationError, match=r"^track 'a/b': expected letters"):
         logs_of(bags, "orca", "a/b", MAP, rate=50.0, drop_bad=False)
 
 

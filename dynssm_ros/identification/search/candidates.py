@@ -73,7 +73,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class ScoredCandidate:
-    """How much a candidate would improvement, by linearised errors.
+    """How much a candidate would improve the fit, by linearised errors.
 
     Attributes:
         candidate: what was tried.
