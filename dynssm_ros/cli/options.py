@@ -12,10 +12,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
-from annotated_types import Ge, Le
 from pydantic.fields import FieldInfo
 
 from dynssm_ros.api.settings import Settings
@@ -102,16 +101,20 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
     help_text = field.description or ""
     if shown["milliseconds"]:
         help_text, default = help_text.replace("(s)", "(ms)"), 1e3 * default
-    limits = {type(each): each for each in field.metadata}
     option = typer.Option(
         option_of(name, field),
         help=help_text,
         show_default=shown["otherwise"] or True,
-        min=limits[Ge].ge if Ge in limits else None,
-        max=limits[Le].le if Le in limits else None,
+        min=_limit(field, "ge"),
+        max=_limit(field, "le"),
         metavar="NAME[:k=v,...]" if shown["option"] == "--effect" else None,
     )
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])
+
+
+def _limit(field: FieldInfo, name: Literal["ge", "le"]) -> float | None:
+    """The least or largest value of a field, as pydantic keeps it."""
+    return next((getattr(each, name) for each in field.metadata if hasattr(each, name)), None)
 
 
 def _kind(field: FieldInfo) -> tuple[Any, Any]:
