@@ -119,7 +119,7 @@ def test_a_track_that_was_not_driven_is_refused(dynssm, laps, tmp_path):
         (("--model", "single_track"), "needs --vehicle"),
         (("--model", "single_track", "--vehicle", "av21_paper"), "extract the bag at 25 Hz"),
         (("--model", "persistence", "--min-speed", "90"), "at 90 m/s or more"),
-        (("--model", "persistence", "--holdout", "-1"), "--holdout -1: expected a fraction"),
+        (("--model", "persistence", "--holdout", "-1"), "--holdout: Input should be greater than 0 (got -1.0)"),
         (("--model", "persistence", "--commands", "topics"), "commands 'topics' asked for"),
         (("--model", "persistence", "--track", "nowhere"), "track 'nowhere' is neither a file nor a built-in name"),
         (("--model", "persistence", "--track", "club"), "--track club: the recording holds no positions (x, y)"),
