@@ -43,7 +43,10 @@ def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
         (["--model", "true", "--objective", "glory"], "Invalid value for '--objective'"),
         (["--model", "single_track", "--effect", "rocket"], "unknown effect 'rocket'"),
         (["--model", "true", "--delay", "1000"], "delay 1 s: expected 0 to 0.4 s"),
-        (["--model", "true", "--pose-noise", "1,2"], "--pose-noise 1,2; expected three numbers"),
+        (
+            ["--model", "true", "--pose-noise", "1,2"],
+            "--pose-noise: expected three numbers, as in 0.02,0.01,0.002 (got '1,2')",
+        ),
     ],
 )
 def test_what_cannot_be_raced_is_one_line(dynssm, tmp_path, arguments, complaint):

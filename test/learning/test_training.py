@@ -377,7 +377,7 @@ def test_another_sampling_time_is_refused(
 
 def test_a_device_that_is_not_there_is_refused() -> None:
     check_device("cpu")
-    with pytest.raises(ConfigurationError, match="--device tpu: not available here; expected cpu"):
+    with pytest.raises(ConfigurationError, match=r"^device tpu: not available here; expected cpu"):
         check_device("tpu")
 
 
