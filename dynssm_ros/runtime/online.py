@@ -197,15 +197,17 @@ class Along:
             ends: row numbers, ascending. The layer learns a step once the row after it is one of them.
         """
         state = self._state
-        known = [state.learned(np.zeros_like(state.mean)).at(np.arange(0))]  # also where there are no rows
+        one = state.learned(np.zeros_like(state.mean))
+        known = Learned(*(np.empty((len(ends), *part.shape[1:])) for part in one))
         for k, row in enumerate(ends.tolist()):
             if self._last is not None and self._last[0] == row - 1:
                 state.update(*self._last[1:])
             else:
                 state.interrupt()
             self._last = row, Seen(seen.features[k].copy(), seen.physics[k]), rows[k], increments[k]
-            known.append(state.learned(seen.features[k]))
-        return Learned.joined(known)
+            for column, now in zip(known, state.learned(seen.features[k]), strict=True):
+                column[k] = now[0]
+        return known
 
 
 class OnlineState:
