@@ -16,7 +16,7 @@ from typer.main import get_command
 
 import dynssm_ros
 from dynssm_ros import api
-from dynssm_ros.api.settings import Settings
+from dynssm_ros.api.settings import VerbSettings
 from dynssm_ros.cli.main import app
 from dynssm_ros.cli.options import option_of
 from dynssm_ros.errors import SettingError
@@ -29,11 +29,11 @@ EXAMPLES = {
     if test.examples
 }
 COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
-SCHEMAS: dict[str, type[Settings]] = {
-    name: schema
-    for name in COMMANDS
-    for schema in [getattr(importlib.import_module(f"dynssm_ros.api.{name}"), f"{name.capitalize()}Settings", None)]
-    if schema is not None
+COMMAND_OF = {"review_season": "season", "extract_season": "extract"}
+SCHEMAS: dict[str, type[VerbSettings]] = {
+    name: getattr(importlib.import_module(function.__module__), function.__wrapped__.__annotations__["settings"])
+    for name, function in ((name, getattr(api, name)) for name in api.__all__)
+    if "settings" in inspect.signature(function).parameters
 }
 
 
@@ -69,13 +69,13 @@ def test_the_names_are_there_and_importing_the_package_loads_nothing_heavy() -> 
 
 
 def test_all_commands_but_inspect_have_settings() -> None:
-    assert {*COMMANDS} - {*SCHEMAS} == {"inspect"}
+    assert {*COMMANDS} - {COMMAND_OF.get(name, name) for name in SCHEMAS} == {"inspect"}
 
 
 @pytest.mark.parametrize("name", sorted(SCHEMAS))
 def test_an_option_is_a_field_and_a_keyword(name: str) -> None:
-    schema, options = SCHEMAS[name], {each.name: each for each in COMMANDS[name].params}
-    function = getattr(api, {"season": "review_season"}.get(name, name))
+    schema, function = SCHEMAS[name], getattr(api, name)
+    options = {each.name: each for each in COMMANDS[COMMAND_OF.get(name, name)].params}
     parameters = inspect.signature(function).parameters
     for field, about in schema.model_fields.items():
         assert about.description, f"{name}: {field} has no help"
@@ -98,3 +98,16 @@ def test_what_a_setting_may_be_is_checked_and_named_as_it_was_given(
     assert status == 1
     assert "--holdout" in err
     assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("noise", [(-1.0, 0.0, 0.0), "0,nan,0", (0.1, 0.1), 0.1])
+def test_noise_is_three_finite_numbers_as_text_and_as_numbers(noise: object) -> None:
+    with pytest.raises(SettingError, match=r"^noise: expected (three|finite) numbers"):
+        api.simulate("orca", "club", noise=noise)
+
+
+@pytest.mark.parametrize(
+    "effects", ["drag:coefficient=0.001", ["drag:coefficient=0.001"], {"drag": {"coefficient": 0.001}}]
+)
+def test_effects_are_named_by_texts_and_by_values(effects: object) -> None:
+    assert SCHEMAS["simulate"].of({"effects": effects}).effects == {"drag": {"coefficient": 0.001}}

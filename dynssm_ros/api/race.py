@@ -11,8 +11,8 @@ from dynssm_ros.api.settings import (
     NOISE_HELP,
     PLANT_HELP,
     Effects,
-    Settings,
     StandardDeviations,
+    VerbSettings,
     keywords,
     setting,
 )
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from dynssm_ros.track.tracks import Track
 
 
-class RaceSettings(Settings):
+class RaceSettings(VerbSettings):
     """Settings of :func:`race`."""
 
     plant: str = setting("rk4", PLANT_HELP)

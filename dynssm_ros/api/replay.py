@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dynssm_ros.api.inputs import PathLike, signal_map_of
-from dynssm_ros.api.settings import Settings, keywords, setting
+from dynssm_ros.api.settings import VerbSettings, keywords, setting
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.signal_map import SignalMap
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from dynssm_ros.signals.history import Refusal
 
 
-class ReplaySettings(Settings):
+class ReplaySettings(VerbSettings):
     """Settings of :func:`replay`."""
 
     with_inputs: bool = setting(False, "Also copy the topics of the bag, to look at them together.")

@@ -40,7 +40,7 @@ def setting(
     return Field(default, description=description, json_schema_extra=shown, **limits)
 
 
-class Settings(StrictModel):
+class VerbSettings(StrictModel):
     """Base of all settings."""
 
     @classmethod
@@ -59,7 +59,7 @@ class Settings(StrictModel):
             raise SettingError(describe(error), str(error.errors()[0]["loc"][0])) from error
 
 
-class CommandsSettings(Settings):
+class CommandsSettings(VerbSettings):
     """The protocol of the command inputs."""
 
     commands: Commands | None = setting(
@@ -67,7 +67,7 @@ class CommandsSettings(Settings):
     )
 
 
-class WorkerSettings(Settings):
+class WorkerSettings(VerbSettings):
     """Where independent pieces of work are done."""
 
     jobs: int | None = setting(None, "Pieces of work at a time; all that a cluster has if not given, else one.", ge=1)
@@ -85,11 +85,9 @@ class WorkerSettings(Settings):
 
 
 def _three_numbers(given: Any) -> Any:
-    if not isinstance(given, str):
-        return given
     try:
-        v_x, v_y, omega = (float(part) for part in given.split(","))
-    except ValueError as error:
+        v_x, v_y, omega = (float(part) for part in (given.split(",") if isinstance(given, str) else given))
+    except (TypeError, ValueError) as error:
         raise ValueError("expected three numbers, as in 0.02,0.01,0.002") from error
     if not all(0 <= std < float("inf") for std in (v_x, v_y, omega)):
         raise ValueError("expected finite numbers of at least 0")
@@ -97,7 +95,9 @@ def _three_numbers(given: Any) -> Any:
 
 
 def _effects(given: Any) -> Any:
-    return given if isinstance(given, Mapping) else dict(map(parse_effect, given or ()))
+    if isinstance(given, Mapping):
+        return given
+    return dict(map(parse_effect, [given] if isinstance(given, str) else given or ()))
 
 
 StandardDeviations = Annotated[tuple[float, float, float], BeforeValidator(_three_numbers)]
@@ -111,7 +111,7 @@ MIN_SPEED_HELP = "Leave out stretches below this speed (m/s)."
 MIN_SPEED_OTHERWISE = "the vehicle file's minimum_speed"
 
 
-def keywords(schema: type[Settings]) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
+def keywords(schema: type[VerbSettings]) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
     """Lets a function that takes ``settings`` take the fields of ``schema`` as keywords as well.
 
     ``inspect.signature`` and ``help`` show the fields. A keyword beside ``settings`` goes before it.
@@ -122,7 +122,7 @@ def keywords(schema: type[Settings]) -> Callable[[Callable[..., Result]], Callab
         inputs = [parameter for parameter in own.parameters.values() if parameter.name != "settings"]
 
         @wraps(function)
-        def call(*given: Any, settings: Settings | None = None, **named: Any) -> Result:
+        def call(*given: Any, settings: VerbSettings | None = None, **named: Any) -> Result:
             mine = {name: named.pop(name) for name in list(named) if name in own.parameters}
             known = {} if settings is None else {name: getattr(settings, name) for name in settings.model_fields_set}
             return function(*given, settings=schema.of(known | named), **mine)

@@ -10,8 +10,8 @@ from dynssm_ros.api.settings import (
     NOISE_HELP,
     PLANT_HELP,
     Effects,
-    Settings,
     StandardDeviations,
+    VerbSettings,
     keywords,
     setting,
 )
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from dynssm_ros.track.tracks import Track
 
 
-class SimulateSettings(Settings):
+class SimulateSettings(VerbSettings):
     """Settings of :func:`simulate`."""
 
     duration: float | None = setting(None, "Time to drive (s).", otherwise="60, if there are no laps either")

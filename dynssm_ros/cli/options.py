@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 import typer
 from pydantic.fields import FieldInfo
 
-from dynssm_ros.api.settings import Settings
+from dynssm_ros.api.settings import VerbSettings
 from dynssm_ros.errors import ConfigurationError, SettingError
 
 RecordingsArgument = Annotated[
@@ -38,7 +38,7 @@ CourseOption = Annotated[
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Also write the result as JSON.", dir_okay=False)]
 
 
-def with_settings(schema: type[Settings]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def with_settings(schema: type[VerbSettings]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Gives a command an option for each field of ``schema``, and their values as its parameter ``settings``."""
 
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
@@ -70,7 +70,7 @@ def with_settings(schema: type[Settings]) -> Callable[[Callable[..., None]], Cal
 
 
 @contextmanager
-def as_options(schema: type[Settings]) -> Iterator[None]:
+def as_options(schema: type[VerbSettings]) -> Iterator[None]:
     """Errors that name settings name the options instead."""
     try:
         yield
