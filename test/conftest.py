@@ -36,6 +36,21 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(REPOSITORY / "config" / "fastdds.xml"))
 
 
+@pytest.hookimpl(trylast=True)  # once those that are not wanted are gone
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts live tests at the beginning of each half, which is what each of two workers starts with.
+
+    They run in real time, two at once, and not beside calculations that would keep their messages waiting.
+    """
+    live = [item for item in items if item.get_closest_marker("live")]
+    others = [item for item in items if not item.get_closest_marker("live")]
+    cut = len(live) // 2
+    while 0 < cut < len(live) and live[cut].path == live[cut - 1].path:  # a file's nodes are started once
+        cut += 1
+    half = max(len(items) // 2 - cut, 0)
+    items[:] = [*live[:cut], *others[:half], *live[cut:], *others[half:]]
+
+
 @pytest.fixture(scope="session")
 def data() -> Path:
     """The folder of real measurements, which is not part of the repository."""

@@ -87,7 +87,7 @@ def test_effects_of_the_vehicle_are_part_of_the_model(drive: Drive, orca: Vehicl
     car = orca.with_effect("steering_offset", {"offset": 0.03}).with_effect("rear_grip", {"factor": 0.8})
     recording = drive(car, 1500, steering=0.09)
     assert calibrate(recording, mid_range(car), starts=1).rmse_after.max() < 1e-6
-    assert calibrate(recording, orca).rmse_before.max() > 1e-2
+    assert calibrate(recording, orca, starts=1).rmse_before.max() > 1e-2  # of the file, whatever is fitted
 
 
 @pytest.mark.parametrize(("plant", "chosen"), [("euler", "euler"), ("rk4", "rk4")])
