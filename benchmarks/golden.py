@@ -29,7 +29,7 @@ TOLERANCE = 1e-9
 SIGNALS = r"(v_x|v_y|omega|r_fb|delta_fb|r_cmd|delta_cmd|x|y|theta)/(mean|signature)$"
 ERRORS = r"models/\w+/(rmse/\w+|max_error/\w+|ade|fde|parameters|flops|coverage_90/\w+)$"
 LAPS = r"models/\w+/(lap_time_s|violation|mean_v_x|mean_abs_v_y|mean_abs_omega|steering_total_variation|steps)$"
-CAUSES = r"verdict|causes\[|gain/|improvement/|noticeable/|minimum_detectable|(nominal|value)$"
+CAUSES = r"verdict|causes\[|improvement/|minimum_detectable|(nominal|value)$"
 MESSAGES = (
     r"(prediction/(pose/pose/position/[xy]|twist/twist/(linear/[xy]|angular/z))|parameters.*\])/(mean|signature)$"
 )

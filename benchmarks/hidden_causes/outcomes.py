@@ -78,13 +78,13 @@ class Outcome:
         return self.all if len(self.hidden) > 1 else self.first
 
 
-def judge(case: Case, causes: Sequence[Cause], noticeable: Mapping[str, float] | None = None) -> Outcome:
+def judge(case: Case, causes: Sequence[Cause], minimum_detectable: Mapping[str, float] | None = None) -> Outcome:
     """Compares what was found with what was hidden.
 
     Args:
         case: what was hidden.
         causes: what was named.
-        noticeable: how far off neutral each effect that is not named would have to be to be named, as the diagnosis says.
+        minimum_detectable: how far off neutral each effect that is not named would have to be to be named.
     """
     hidden = set(case.hidden)
     reach = [{cause.effect, *cause.alternatives} for cause in causes]
@@ -104,7 +104,7 @@ def judge(case: Case, causes: Sequence[Cause], noticeable: Mapping[str, float] |
         {cause.effect: cause.delta_bic for cause in causes},
         {cause.effect: dict(cause.std) for cause in causes},
     )
-    least = noticeable or {}
+    least = minimum_detectable or {}
     amount = {name: EFFECTS[name].amount(case.hidden[name]) for name in outcome.missed}
     return replace(outcome, too_small=tuple(name for name, size in amount.items() if size < least.get(name, 0.0)))
 

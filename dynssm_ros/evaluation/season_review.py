@@ -64,7 +64,7 @@ class Found(StrictModel):
     effect: str
     values: dict[str, float]
     std: dict[str, float]
-    gain: float = Field(description="share of the error on held-out rows that is gone by it")
+    improvement: float = Field(description="share of the error on held-out rows that is gone by it")
 
 
 class Review(StrictModel):
@@ -172,7 +172,7 @@ def another_day(vehicle: Vehicle) -> Vehicle:
 
 def _found(cause: Cause) -> Found:
     std = {name: value for name, value in cause.std.items() if np.isfinite(value)}
-    return Found(effect=cause.effect, values=cause.values, std=std, gain=cause.heldout_gain)
+    return Found(effect=cause.effect, values=cause.values, std=std, improvement=cause.heldout_improvement)
 
 
 def _parts(recording: Recording, stretch: float | None) -> Iterator[tuple[float, Recording]]:

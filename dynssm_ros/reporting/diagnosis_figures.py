@@ -136,7 +136,7 @@ def _bend(known: Mapping[str, Vector], lap: Vector) -> Vector | None:
 
 
 @styled
-def gain_by_horizon(improvement: Improvement) -> Figure:
+def improvement_by_horizon(improvement: Improvement) -> Figure:
     """Errors of each car at each horizon, a panel per channel."""
     figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
     axes = figure.subplots(1, 3)

@@ -38,7 +38,7 @@ def as_text(diagnosis: Diagnosis) -> str:
     for number, cause in enumerate(diagnosis.found, 1):
         lines += ["", f"{number}. {cause.effect}{_where(cause)}: {size_in_words(cause)}; {_share_in_words(cause)}"]
         lines += [f"   {line}" for words in _about(cause) for line in textwrap.wrap(words, _WIDTH)]
-    lines += ["", *gain_in_words(diagnosis)]
+    lines += ["", *improvement_in_words(diagnosis)]
     for words in (
         *moved_in_words(diagnosis),
         left_in_words(diagnosis),
@@ -65,7 +65,7 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def _share_in_words(cause: Cause) -> str:
     """Its share of the error in a few words."""
-    return f"{'small, ' if cause.small else ''}{percent(cause.heldout_gain)} of the error on held-out laps"
+    return f"{'small, ' if cause.small else ''}{percent(cause.heldout_improvement)} of the error on held-out laps"
 
 
 def _where(cause: Cause) -> str:
@@ -109,12 +109,12 @@ def formula_in_words(formula: Formula) -> str:
         f" {'-' if c < 0 else '+'} {text(abs(c))}{'' if name == '1' else f' {name}'}"
         for name, c in formula.terms.items()
     )
-    parts = int((formula.gain > 0).sum())
+    parts = int((formula.improvement > 0).sum())
     time = "; t since the start of the recording" if any("t" in name.split() for name in formula.terms) else ""
     return (
         f"d{formula.channel}/dt may lack{terms} (SI units; throttle and steering as applied{time}): on parts of the drive "
-        f"that were left out that takes {percent(formula.share)} of the squared error, in {parts} of {len(formula.gain)} "
-        "parts."
+        f"that were left out that takes {percent(formula.share)} of the squared error, in {parts} of "
+        f"{len(formula.improvement)} parts."
     )
 
 
@@ -157,12 +157,12 @@ def size_in_words(cause: Cause) -> str:
 def evidence_in_words(cause: Cause) -> str:
     """How sure the cause is, and what it takes away."""
     held_out = (
-        f"it takes away {percent(cause.heldout_gain)} of the error on held-out laps"
-        if cause.heldout_gain > 0
-        else f"on held-out laps it takes nothing away ({percent(cause.heldout_gain)})"
+        f"it takes away {percent(cause.heldout_improvement)} of the error on held-out laps"
+        if cause.heldout_improvement > 0
+        else f"on held-out laps it takes nothing away ({percent(cause.heldout_improvement)})"
     )
     confirmed = cause.confirmation
-    units = confirmed.gain
+    units = confirmed.improvement
     strong = f"above {DECISIVE_DELTA_BIC:.0f} is very strong"
     return (
         f"on parts of the drive that were left out the logarithm of the predictive likelihood is better by "
@@ -182,7 +182,7 @@ def alternatives_in_words(cause: Cause) -> str:
     return f"The data fit {' or '.join(cause.alternatives)} as well. To tell them apart, drive ({ways})."
 
 
-def gain_in_words(diagnosis: Diagnosis) -> list[str]:
+def improvement_in_words(diagnosis: Diagnosis) -> list[str]:
     """Errors before and after, by channel."""
     improvement = diagnosis.improvement
     at = improvement.horizon
@@ -231,7 +231,7 @@ def _causes(diagnosis: Diagnosis) -> Table:
             cause.confirmation.total,
             cause.confirmation.std,
             *(100 * float(share) for share in cause.confirmation.share),
-            100 * cause.heldout_gain,
+            100 * cause.heldout_improvement,
             ", ".join(cause.alternatives) or "nothing else",
         ]
         for cause in diagnosis.found
@@ -252,14 +252,14 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
                 EFFECTS[cause.effect](**cause.values),
             ),
         )
-    yield from _gained(diagnosis)
+    yield from _improved(diagnosis)
     yield from _shown(diagnosis)
     yield from _found(diagnosis)
     if diagnosis.notes:
         yield Section("Limits", " ".join(f"{note[0].upper()}{note[1:]}." for note in diagnosis.notes))
 
 
-def _gained(diagnosis: Diagnosis) -> Iterator[Section]:
+def _improved(diagnosis: Diagnosis) -> Iterator[Section]:
     improvement = diagnosis.improvement
     yield Section(
         "Simulated and measured",
@@ -273,8 +273,8 @@ def _gained(diagnosis: Diagnosis) -> Iterator[Section]:
         f"selection saw: the car {GIVEN}, its nominal values {RECALIBRATED} without any cause, and {EXTENDED} by the "
         "causes. Intervals are from a bootstrap over blocks in time. What is systematic the signals and the place on the "
         "lap predict, on parts of the data to which that was not fitted.",
-        diagnosis_figures.gain_by_horizon(improvement),
-        _gain_table(diagnosis),
+        diagnosis_figures.improvement_by_horizon(improvement),
+        _improvement_table(diagnosis),
     )
     yield Section(
         "Systematic error and noise",
@@ -329,7 +329,7 @@ def _found(diagnosis: Diagnosis) -> Iterator[Section]:
         "the nominal values must be known well enough not to take it up. Where the bounds of the effect do not reach that "
         "far, it cannot be judged.",
         None,
-        _noticeable_table(diagnosis),
+        _detectable_table(diagnosis),
     )
     yield Section(
         "Nominal values",
@@ -340,7 +340,7 @@ def _found(diagnosis: Diagnosis) -> Iterator[Section]:
     )
 
 
-def _gain_table(diagnosis: Diagnosis) -> Table:
+def _improvement_table(diagnosis: Diagnosis) -> Table:
     improvement = diagnosis.improvement
     columns = (
         Column("channel"), Column("ahead", "s"), *(Column(name, group="error") for name in improvement.rmse),
@@ -380,7 +380,7 @@ def _systematic_table(diagnosis: Diagnosis) -> Table:
     return Table(columns, rows)
 
 
-def _noticeable_table(diagnosis: Diagnosis) -> Table:
+def _detectable_table(diagnosis: Diagnosis) -> Table:
     columns = (Column("effect"), Column("noticed from"), Column("unit"), Column("judged"))
     rows: list[list[Value]] = []
     for effect, size in sorted(

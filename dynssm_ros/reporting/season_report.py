@@ -182,7 +182,7 @@ def causes(reviews: Sequence[Review]) -> Figure:
     for k, each in enumerate(reviews):
         for cause in each.causes:
             row = names.index(cause.effect)
-            axes.scatter(k, row, s=20 + 500 * max(cause.gain, 0.0), color=PALETTE[0], alpha=0.55, lw=0)
+            axes.scatter(k, row, s=20 + 500 * max(cause.improvement, 0.0), color=PALETTE[0], alpha=0.55, lw=0)
             axes.annotate(
                 _size(cause), (k, row), (13, 0), textcoords="offset points", va="center", fontsize=7, color=MEASURED
             )

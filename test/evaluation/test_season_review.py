@@ -46,7 +46,7 @@ def a_review(
         accuracy={"dynssm": Accuracy(ade=ade, rmse=none), "single_track": Accuracy(ade=simple, rmse=none)},
         stretches=(Stretch(start="", coefficients=coefficients),),
         verdict="effects" if cause else "none",
-        causes=(Found(effect=cause, values={"factor": 0.9}, std={}, gain=0.5),) if cause else (),
+        causes=(Found(effect=cause, values={"factor": 0.9}, std={}, improvement=0.5),) if cause else (),
     )  # fmt: skip
 
 

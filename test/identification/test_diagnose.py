@@ -95,7 +95,7 @@ def test_the_extended_car_errs_less_on_held_out_rows(lagging: tuple[Recording, V
     (cause,) = found.causes
     hidden = size("steering_lag", np.random.default_rng(1))["time_constant"]
     assert cause.values["time_constant"] == pytest.approx(hidden, abs=4 * cause.std["time_constant"])
-    assert cause.heldout_gain > 0.02
+    assert cause.heldout_improvement > 0.02
     assert found.improvement.reduction[found.improvement.horizon, 2] > 0.1
     low, high = found.improvement.interval[:, found.improvement.horizon]
     assert (
@@ -132,14 +132,14 @@ def test_the_json_is_that_of_the_contract(lagging: tuple[Recording, Vehicle, Dia
     assert set(cause) == {"effect", "parameters", "evidence", "on_bound", "alternatives", "only_in", "level", "small"}
     assert set(cause["parameters"]["time_constant"]) == {"value", "std", "unit"}
     assert cause["parameters"]["time_constant"]["unit"] == "s"
-    assert set(cause["evidence"]) == {"delta_bic", "heldout_gain", "left_out"}
-    assert set(cause["evidence"]["left_out"]) == {"gain", "std", "units", "error_gone"}
-    assert cause["evidence"]["left_out"]["gain"] > cause["evidence"]["left_out"]["std"]
+    assert set(cause["evidence"]) == {"delta_bic", "heldout_improvement", "left_out"}
+    assert set(cause["evidence"]["left_out"]) == {"improvement", "std", "units", "error_gone"}
+    assert cause["evidence"]["left_out"]["improvement"] > cause["evidence"]["left_out"]["std"]
     assert content["moved"] == {}
-    assert {"horizon_s", "before", "after", "reduction"} <= set(content["gain"])
+    assert {"horizon_s", "before", "after", "reduction"} <= set(content["improvement"])
     for part in ("before", "after", "reduction"):
-        assert list(content["gain"][part]) == ["v_x", "v_y", "omega"]
-    assert content["gain"]["horizon_s"] >= 0.5
+        assert list(content["improvement"][part]) == ["v_x", "v_y", "omega"]
+    assert content["improvement"]["horizon_s"] >= 0.5
     assert content["vehicle"] == "out/vehicle.yaml"
 
 
@@ -151,9 +151,9 @@ def test_what_takes_little_off_every_channel_is_small_unless_what_was_known_tell
 
     def taking(share: float, heldout: float, known: float = 0.0) -> Cause:
         confirmation = replace(cause.confirmation, share=np.array([0.0, share, -0.1]), known=known)
-        return replace(cause, confirmation=confirmation, heldout_gain=heldout)
+        return replace(cause, confirmation=confirmation, heldout_improvement=heldout)
 
-    told = float(cause.confirmation.gain.sum())
+    told = float(cause.confirmation.improvement.sum())
     assert taking(0.05, 0.005).small
     assert not any(one.small for one in (taking(0.07, 0.005), taking(0.05, 0.02), taking(0.05, 0.005, told + 1.0)))
     little = replace(found, found=(taking(0.05, 0.005),))

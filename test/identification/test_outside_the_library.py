@@ -85,7 +85,7 @@ def test_a_term_that_no_effect_has_is_proposed_as_a_formula() -> None:
     assert "v_x^2 v_y" in yaw.terms
     assert yaw.terms["v_x^2 v_y"] > 0
     assert yaw.share > 0.3
-    assert (yaw.gain > 0).all()
+    assert (yaw.improvement > 0).all()
     assert "domega/dt may lack" in as_text(found)
     assert "v_x^2 v_y" in diagnosis_report(found).html()
     (told,) = (

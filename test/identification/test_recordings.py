@@ -187,7 +187,7 @@ def test_a_place_that_was_passed_once_is_found_where_all_of_it_agrees() -> None:
     assert cause.effect == "grip_patch"
     assert cause.values["factor"] == pytest.approx(0.85, abs=max(0.005, 3 * cause.std["factor"]))
     assert cause.values["centre"] == pytest.approx(0.35, abs=0.02)
-    assert len(cause.confirmation.gain) == 4
+    assert len(cause.confirmation.improvement) == 4
     assert cause.confirmation.least > 1.0
     assert any(note.startswith("grip_patch was seen in one pass of most places") for note in found.notes)
 
@@ -218,7 +218,7 @@ def test_what_one_of_three_days_has_is_named_with_it_and_not_written(driven: Dri
     )
     causes = {cause.effect: cause for cause in found.causes}
     assert set(causes) == {"yaw_rate_lag", "odometry_misalignment"}
-    assert len(causes["yaw_rate_lag"].confirmation.gain) == 3
+    assert len(causes["yaw_rate_lag"].confirmation.improvement) == 3
     turning = causes["odometry_misalignment"]
     assert turning.only_in == ("yaw_rate_lag+odometry_misalignment/rk4/road_course/25Hz/9404",)
     assert turning.values["angle"] == pytest.approx(-0.007, abs=5e-4)

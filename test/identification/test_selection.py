@@ -57,8 +57,8 @@ def quarters(given: SimulationWindows) -> CrossValidation:
 def test_a_pair_is_found_the_stronger_first_and_with_its_sizes() -> None:
     found = search(steering_offset={"offset": 0.03}, drive_gain={"factor": 1.15}).run()
     assert {one.candidate.effect for one in found.chosen} == {"steering_offset", "drive_gain"}
-    gains = [one.gain for one in found.chosen]
-    assert gains == sorted(gains, reverse=True)
+    improvements = [one.confirmed_improvement for one in found.chosen]
+    assert improvements == sorted(improvements, reverse=True)
     assert min(one.delta_bic for one in found.chosen) > DECISIVE_DELTA_BIC
     assert found.fit.car.effects["steering_offset"]["offset"] == pytest.approx(0.03, rel=0.1)
     assert found.fit.car.effects["drive_gain"]["factor"] == pytest.approx(1.15, rel=0.05)
@@ -112,7 +112,7 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     everywhere = Confirmation(np.array([3.0, 4.0, 5.0, -1.0]), 4.0, 0.0, np.zeros(3))
     strong = Refined(FEW[0], fit, 100.0, 90.0, everywhere, 5.0)
     assert _pays(strong)
-    once = replace(everywhere, gain=np.array([20.0, -1.0, -2.0, -0.5]))
+    once = replace(everywhere, improvement=np.array([20.0, -1.0, -2.0, -0.5]))
     assert not _pays(replace(strong, confirmation=once))
     assert not _pays(replace(strong, confirmation=replace(everywhere, std=12.0)))
     assert not _pays(replace(strong, delta_bic=DECISIVE_DELTA_BIC))
@@ -160,16 +160,16 @@ def test_what_was_known_decides_where_left_out_parts_tell_nothing() -> None:
     level = Confirmation(np.array([1.0, -1.0, 0.5, -0.5]), 2.0, 5.0, np.zeros(3))
     assert level.holds
     assert not replace(level, known=3.0).holds
-    assert not replace(level, gain=np.array([-1.0, -1.0, -0.5, -0.5])).holds
+    assert not replace(level, improvement=np.array([-1.0, -1.0, -0.5, -0.5])).holds
 
 
 def test_what_was_known_takes_nothing_from_what_left_out_parts_tell() -> None:
-    """Where one quarter of the drive goes to the limit, its gain makes the standard error large."""
+    """Where one quarter of the drive goes to the limit, its improvement makes the standard error large."""
     confirmed = Confirmation(np.array([44.0, 1.0, 3.0, 3.0]), 41.0, 0.0, np.zeros(3))
     assert confirmed.holds
     assert replace(confirmed, known=61.0).holds
-    assert not replace(confirmed, known=61.0, gain=np.array([24.0, 1.0, 3.0, 3.0])).holds
-    assert not replace(confirmed, known=61.0, gain=np.array([54.0, -1.0, -1.0, -1.0])).holds
+    assert not replace(confirmed, known=61.0, improvement=np.array([24.0, 1.0, 3.0, 3.0])).holds
+    assert not replace(confirmed, known=61.0, improvement=np.array([54.0, -1.0, -1.0, -1.0])).holds
 
 
 def test_a_gain_that_is_hardly_evidence_tells_nothing_apart() -> None:
@@ -225,11 +225,11 @@ def test_left_out_parts_are_predicted_by_the_others() -> None:
     log_likelihood = (
         problem.log_likelihood(fit.errors, fit.noise) - problem.log_likelihood(without.errors, without.noise)
     ).sum()
-    assert found.gain.sum() == pytest.approx(log_likelihood, rel=0.3)
+    assert found.improvement.sum() == pytest.approx(log_likelihood, rel=0.3)
     assert found.holds
-    assert len(found.gain) == 4
+    assert len(found.improvement) == 4
     nothing = LeaveOneOut(problem, quarters(given)).compare(fit, fit)
-    np.testing.assert_array_equal(nothing.gain, 0.0)
+    np.testing.assert_array_equal(nothing.improvement, 0.0)
     assert nothing.alike or nothing.std == 0.0
 
 

@@ -14,7 +14,12 @@ from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBR
 from dynssm_ros.identification.result.improvement import Improvement, measure_improvement
 from dynssm_ros.identification.result.minimum_effect import minimum_detectable
 from dynssm_ros.identification.search.candidates import Candidate
-from dynssm_ros.reporting.diagnosis_figures import cause_pictures, errors_over, gain_by_horizon, simulated_and_measured
+from dynssm_ros.reporting.diagnosis_figures import (
+    cause_pictures,
+    errors_over,
+    improvement_by_horizon,
+    simulated_and_measured,
+)
 from dynssm_ros.reporting.diagnosis_report import (
     as_text,
     diagnosis_report,
@@ -139,10 +144,16 @@ def test_a_pattern_names_signals_and_the_place(improvement: Improvement) -> None
 
 def test_the_json_measures_from_both_cars(lagging: Lagging) -> None:
     content = lagging[2].to_json("vehicle.yaml")
-    assert set(content["gain"]) >= {"before", "recalibrated", "after", "reduction", "reduction_from_recalibrated"}
+    assert set(content["improvement"]) >= {
+        "before",
+        "recalibrated",
+        "after",
+        "reduction",
+        "reduction_from_recalibrated",
+    }
     assert set(content["systematic"]) == {"before", "recalibrated", "after", "gone"}
-    assert "steering_lag" not in content["noticeable"]
-    assert content["noticeable"]["steering_offset"] > 0
+    assert "steering_lag" not in content["minimum_detectable"]
+    assert content["minimum_detectable"]["steering_offset"] > 0
 
 
 def test_the_report_shows_one_step_and_the_horizon_over_time_place_and_signals(lagging: Lagging) -> None:
@@ -157,7 +168,7 @@ def test_the_report_shows_one_step_and_the_horizon_over_time_place_and_signals(l
 def test_figures_have_a_row_for_one_step_and_one_for_the_horizon(improvement: Improvement) -> None:
     axes = errors_over("speed (m/s)", improvement.windows.data.rows[0, improvement.windows.starts], improvement).axes
     assert [a.get_ylabel() for a in axes[::3]] == ["0.04 s ahead", "0.4 s ahead"]
-    assert len(gain_by_horizon(improvement).axes) == 3
+    assert len(improvement_by_horizon(improvement).axes) == 3
     lines = simulated_and_measured(improvement).axes[1].lines
     assert [line.get_label() for line in lines] == ["measured", GIVEN, RECALIBRATED, EXTENDED]
     x, y = (np.asarray(v) for v in lines[-1].get_data())
@@ -171,7 +182,7 @@ def test_each_cause_has_a_picture_of_how_much_where_and_when(lagging: Lagging) -
     with_it = found.improvement.errors["extended"][:, found.improvement.horizon]
     assert cause.without.shape == with_it.shape
     ratio = np.sqrt((with_it**2).mean(axis=0) / (cause.without**2).mean(axis=0))
-    assert cause.heldout_gain == pytest.approx(1.0 - np.sqrt((ratio**2).mean()))
+    assert cause.heldout_improvement == pytest.approx(1.0 - np.sqrt((ratio**2).mean()))
     figure = cause_pictures(windows, cause.without, with_it, EFFECTS[cause.effect](**cause.values))
     size, there, over = (panel for panel in figure.axes if panel.get_label() != "<colorbar>")
     np.testing.assert_allclose([bar.get_height() for bar in size.patches[3:]], ratio)

@@ -197,12 +197,13 @@ def _passed_once(left_out: CrossValidation, chosen: Iterable[Candidate]) -> Iter
 def _not_confirmed(doubtful: Refined | None) -> Iterator[str]:
     """What would explain most of what is left, if left-out parts of the drive agreed."""
     if doubtful is not None and doubtful.confirmation is not None:
-        effect, gain = doubtful.candidate.effect, doubtful.confirmation.gain
+        effect, units = doubtful.candidate.effect, doubtful.confirmation.improvement
         values = ", ".join(f"{name} {value:.3g}" for name, value in doubtful.fit.car.effects[effect].items())
         yield (
             f"{effect} ({values}) would explain most of what is left (information criterion {doubtful.delta_bic:.0f}), but "
             f"not where parts of the drive are left out: there the logarithm of the likelihood changes by "
-            f"{', '.join(f'{one:+.0f}' for one in gain)}. Nothing of it is kept. What would tell: {EFFECTS[effect].MANOEUVRE}"
+            f"{', '.join(f'{one:+.0f}' for one in units)}. Nothing of it is kept. What would tell: "
+            f"{EFFECTS[effect].MANOEUVRE}"
         )
 
 
@@ -300,7 +301,7 @@ def _cause(one: Refined, without: Without, selection: Selection, recordings: Rec
         known,
         one.improvement,
         float(one.delta_bic),
-        without.gain,
+        without.improvement,
         one.confirmation,
         one.bounded,
         tuple(selection.alternatives[effect]),

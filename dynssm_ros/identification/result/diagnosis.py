@@ -39,7 +39,7 @@ class Cause:
         std: standard deviations of those that were fitted.
         improvement: decrease of twice the negative log-likelihood by it.
         delta_bic: what is left when its parameters are paid for.
-        heldout_gain: share of the error on the held-out rows that is gone by it.
+        heldout_improvement: share of the error on the held-out rows that is gone by it.
         confirmation: what it gains on parts of the fitted rows that were left out.
         on_bound: its parameters that the data push against a bound: they are at least that far off.
         alternatives: effects that explain the data as well.
@@ -53,7 +53,7 @@ class Cause:
     std: dict[str, float]
     improvement: float
     delta_bic: float
-    heldout_gain: float
+    heldout_improvement: float
     confirmation: Confirmation
     on_bound: tuple[str, ...]
     alternatives: tuple[str, ...]
@@ -68,7 +68,7 @@ class Cause:
         It takes little off the error of each channel, on parts that were left out and on held-out rows. What a recalibration
         would make up for is told by what was known, and by how far the coefficients would have to be off, not by the error.
         """
-        little = float(self.confirmation.share.max()) < SMALL_SHARE and self.heldout_gain < _SMALL_GAIN
+        little = float(self.confirmation.share.max()) < SMALL_SHARE and self.heldout_improvement < _SMALL_GAIN
         return little and not self.confirmation.rests_on_known
 
 
@@ -149,7 +149,7 @@ class Diagnosis:
             "verdict": self.verdict,
             "causes": [_cause_to_json(cause) for cause in self.causes],
             "small_effects": [_cause_to_json(cause) for cause in self.small_effects],
-            "gain": {
+            "improvement": {
                 "horizon_s": float(improvement.horizons[at]),
                 "before": rmse[GIVEN],
                 "recalibrated": rmse[RECALIBRATED],
@@ -165,7 +165,7 @@ class Diagnosis:
                 "after": by_channel(improvement.explained_variance[EXTENDED][at].share),
                 "gone": by_channel(improvement.systematic_gone(GIVEN)[at]),
             },
-            "noticeable": {
+            "minimum_detectable": {
                 effect: size if np.isfinite(size) else None for effect, size in self.minimum_detectable.items()
             },
             "moved": {
@@ -177,7 +177,7 @@ class Diagnosis:
                     "channel": formula.channel,
                     "terms": formula.terms,
                     "share": formula.share,
-                    "units": formula.gain.tolist(),
+                    "units": formula.improvement.tolist(),
                     "std": formula.std,
                 }
                 for formula in self.formulas
@@ -197,11 +197,11 @@ def _cause_to_json(cause: Cause) -> dict[str, Any]:
         },
         "evidence": {
             "delta_bic": cause.delta_bic,
-            "heldout_gain": cause.heldout_gain,
+            "heldout_improvement": cause.heldout_improvement,
             "left_out": {
-                "gain": cause.confirmation.total,
+                "improvement": cause.confirmation.total,
                 "std": cause.confirmation.std,
-                "units": cause.confirmation.gain.tolist(),
+                "units": cause.confirmation.improvement.tolist(),
                 "error_gone": by_channel(cause.confirmation.share),
             },
         },

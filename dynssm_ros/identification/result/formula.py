@@ -38,21 +38,21 @@ class Formula:
         channel: of whose derivative it is a part, one of ``STATE_SIGNALS``.
         terms: coefficients by product of signals, in SI units.
         share: of the squared error of parts that were left out, that it takes.
-        gain: by part, what it takes of the squared error there, in units of its variance, ``(U,)``.
-        std: standard error of the sum of :attr:`gain`, from stretches of a simulation of the fit.
+        improvement: by part, what it takes of the squared error there, in units of its variance, ``(U,)``.
+        std: standard error of the sum of :attr:`improvement`, from stretches of a simulation of the fit.
     """
 
     channel: str
     terms: dict[str, float]
     share: float
-    gain: Vector
+    improvement: Vector
     std: float
 
     @property
     def holds(self) -> bool:
         """Whether it carries over to what it was not fitted to: surely, and more than by the parts' standard error."""
-        total = float(self.gain.sum())
-        return total > max(_SURE * self.std, standard_error(self.gain)) and self.share > _LEAST
+        total = float(self.improvement.sum())
+        return total > max(_SURE * self.std, standard_error(self.improvement)) and self.share > _LEAST
 
 
 class _Missing(NamedTuple):
@@ -136,12 +136,12 @@ def _formula(missing: _Missing, channel: int) -> Formula | None:
     more = same[len(order) - 1] - same[: len(order)]
     few = next(n for n, each in enumerate(more) if each.sum() <= standard_error(sums_of(each, missing.block)))
     coefficients = spread * _fitted(X, y, order)[:, few] / scale
-    gain = sums_of(gained[best], missing.fold)
+    improvement = sums_of(gained[best], missing.fold)
     return Formula(
         STATE_SIGNALS[channel],
         {names[k]: float(coefficients[k]) for k in order[: few + 1]},
-        float(gain.sum() / (y**2).sum()),
-        gain,
+        float(improvement.sum() / (y**2).sum()),
+        improvement,
         standard_error(sums_of(gained[best], missing.block)),
     )
 

@@ -46,11 +46,11 @@ class Without(NamedTuple):
 
     Attributes:
         errors: on the held-out rows at the horizon, ``(W, 3)`` (m/s, m/s, rad/s).
-        gain: share of them that the cause takes away, as a mean of the channels.
+        improvement: share of them that the cause takes away, as a mean of the channels.
     """
 
     errors: Vector
-    gain: float
+    improvement: float
 
 
 class Left(NamedTuple):
@@ -94,8 +94,8 @@ def gated(found: SearchResult, given: CarEstimate, at: HeldOut, notes: list[str]
     while True:
         without, left = _without_each(selection, found.search, at), _left_behind(found.problem, selection)
         strange = [one.candidate.effect for one in selection.chosen if not one.is_met]
-        worst = min(zip(without, selection.candidates, strict=True), key=lambda pair: pair[0].gain, default=None)
-        if worst is not None and worst[0].gain <= -_NO_WORSE:
+        worst = min(zip(without, selection.candidates, strict=True), key=lambda pair: pair[0].improvement, default=None)
+        if worst is not None and worst[0].improvement <= -_NO_WORSE:
             notes.append(_not_kept(worst[1].effect))
             selection = found.search.reject(worst[1].effect)
         elif strange and left.is_there:

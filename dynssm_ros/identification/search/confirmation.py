@@ -42,15 +42,15 @@ class Confirmation:
     """What a cause gains on units that were left out.
 
     Attributes:
-        gain: logarithm of the predictive likelihood with it less that without it, by unit, ``(U,)``; what hangs together
-            counts once.
+        improvement: logarithm of the predictive likelihood with it less that without it, by unit, ``(U,)``; correlated
+            errors count once.
         std: standard error of their sum.
         known: the same of the nominal values under what was known of them: what it spares them to be moved.
         share: of the squared error at the end of the simulations that is gone, by channel, ``(3,)``.
-        least: standard errors that the gain must be more than.
+        least: standard errors that the improvement must be more than.
     """
 
-    gain: Vector
+    improvement: Vector
     std: float
     known: float
     share: Vector
@@ -59,31 +59,31 @@ class Confirmation:
     @property
     def total(self) -> float:
         """Of all units, and of what was known."""
-        return float(self.gain.sum()) + self.known
+        return float(self.improvement.sum()) + self.known
 
     @property
     def rests_on_known(self) -> bool:
         """Whether what was known of the nominal values tells more for it than the left-out units."""
-        return self.known > float(self.gain.sum())
+        return self.known > float(self.improvement.sum())
 
     @property
     def holds(self) -> bool:
-        """Whether the gain is more than :attr:`least` standard errors, and there in half of the units or more.
+        """Whether the improvement is more than :attr:`least` standard errors, and there in half of the units or more.
 
         More mass, say, predicts no better than less drive and less drag. What tells them apart is that the car was weighed:
         then it is enough that nothing speaks against the cause elsewhere.
         """
-        elsewhere, least = float(self.gain.sum()), self.least * self.std
+        elsewhere, least = float(self.improvement.sum()), self.least * self.std
         if self.total <= least:
             return False
-        repeats = 2 * int((self.gain > 0).sum()) >= len(self.gain)
+        repeats = 2 * int((self.improvement > 0).sum()) >= len(self.improvement)
         if repeats and (elsewhere > least or not self.rests_on_known):
             return True
         return self.rests_on_known and elsewhere > -self.std and self.known > _KNOWN * self.std
 
     @property
     def alike(self) -> bool:
-        """Whether the two cannot be told apart: the gain is within its standard error, or too little to tell anything."""
+        """Whether the two cannot be told apart: the improvement is within its standard error, or too little."""
         return self.total < max(self.std, _HARDLY)
 
 
@@ -108,12 +108,12 @@ class LeaveOneOut:
         number = self._problem.windows.number
         told = np.isin(number, only_in) if only_in else np.ones(len(number), dtype=bool)
         by_window = ((after.likelihood - before.likelihood) / self._problem.tempering)[told]
-        gain, by_block = (sums_of(by_window, n[told]) for n in (folds.unit, self._problem.block))
+        by_unit, by_block = (sums_of(by_window, n[told]) for n in (folds.unit, self._problem.block))
         known = (self._problem.surprise(without) - self._problem.surprise(fit)) / 2.0
         left = after.error[told].sum(axis=0) / np.maximum(before.error[told].sum(axis=0), 1e-300)
         passed_once = self._left_out.has_places_once and folds is self._left_out.places
         least = _ONE_OF_MANY if only_in or passed_once else 1.0
-        return Confirmation(gain, max(standard_error(gain), standard_error(by_block)), known, 1.0 - left, least)
+        return Confirmation(by_unit, max(standard_error(by_unit), standard_error(by_block)), known, 1.0 - left, least)
 
     def _folds(self, without: Fit, fit: Fit, only_in: tuple[int, ...]) -> Folds:
         """What is left out in turn to tell two fits apart."""

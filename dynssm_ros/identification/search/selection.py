@@ -88,7 +88,7 @@ class Refined:
         return self.confirmation is not None and self.confirmation.holds
 
     @property
-    def gain(self) -> float:
+    def confirmed_improvement(self) -> float:
         """Logarithm of the predictive likelihood that it gains, nothing where it is not confirmed."""
         return self.confirmation.total if self.confirmation is not None and self.is_confirmed else 0.0
 
@@ -194,12 +194,12 @@ class Search:
         """Backward elimination: the weakest of ``chosen`` is dropped while it does not pay beside the others."""
         while True:
             found = [self._confirm(self._without(chosen, c), self._against(chosen, c)) for c in chosen]
-            weakest = min(found, key=lambda r: (r.gain, r.delta_bic), default=None)
+            weakest = min(found, key=lambda r: (r.confirmed_improvement, r.delta_bic), default=None)
             if weakest is None or _pays(weakest):
                 break
             chosen = tuple(c for c in chosen if c != weakest.candidate)
         fit = self.fit(chosen) if chosen else self.base
-        found = sorted(found, key=lambda r: -r.gain)
+        found = sorted(found, key=lambda r: -r.confirmed_improvement)
         others = {r.candidate.effect: self._alternatives(chosen, r.candidate) for r in found}
         doubtful = self._unconfirmed(chosen, fit)
         return Selection(self.base, fit, found, others, self.tried, self._study.inflation(fit), doubtful)
@@ -260,12 +260,12 @@ class Search:
         return self._ranked[key]
 
     def _best(self, before: tuple[Candidate, ...]) -> Refined | None:
-        """The candidate that gains most; of those that cannot be told from it the most ordinary one.
+        """The candidate that improves most; of those that cannot be told from it the most ordinary one.
 
         That is one within its bounds, then one that all recordings have, then one that acts at all places, then one as it is
         met in real cars.
         """
-        found = sorted(self._confirmed(before), key=lambda r: -r.gain)
+        found = sorted(self._confirmed(before), key=lambda r: -r.confirmed_improvement)
         alike = [r for r in found if r is found[0] or self._left_out.compare(r.fit, found[0].fit).alike]
         return min(alike, key=lambda r: r.strangeness, default=None)
 
