@@ -32,11 +32,8 @@ def promised() -> dict[str, float]:
     return dict(healthy.minimum_detectable)
 
 
-@pytest.mark.parametrize(
-    "effect",
-    ["steering_lag", "drag"]
-    + [pytest.param(e, marks=pytest.mark.slow) for e in ("yaw_inertia", "downforce", "front_grip", "steering_curve")],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ["steering_lag", "drag", "yaw_inertia", "downforce", "front_grip", "steering_curve"])
 def test_an_effect_of_the_least_size_is_named_and_a_third_of_it_is_not(promised: dict[str, float], effect: str) -> None:
     name, parameter = next(iter(EFFECTS[effect].PARAMETERS.items()))
     for times, named in ((1.4, True), (0.33, False)):

@@ -41,6 +41,7 @@ _EXPLAINED = 2.0  # how many times less errors count that hang together, up to w
 _SEARCHED, _POLISHED_ON = 1000, 4000  # rows with which starting points are judged, and the best is made better
 _SEARCH_PRIOR, _POLISHED = 0.1, 3  # weight of what is known before, at first; rounds that find it
 _INSIDE = 1e-6  # of the range, that a starting point keeps from its bounds
+_DIFFERENCE = 2.0**-26  # of the range, with which derivatives are taken
 _WEIGHT_SHOWN = 0.25  # least weight of a coefficient in a direction that the data do not determine
 _ON_BOUND = 1e-6  # of the range in units of a fit
 
@@ -216,14 +217,26 @@ def _nearest_start(
     def fitted(
         some: SimulationWindows, start: Vector, prior: float, tolerance: float, evaluations: int
     ) -> optimize.OptimizeResult:
-        def residuals(p: Vector) -> Vector:
-            car = given.at(lower + p * width)
-            return np.concatenate([(some.errors(car)[:, 0] / scale).ravel(), prior * car.moved])
-
         inside = np.clip(start, _INSIDE, 1.0 - _INSIDE)
+
+        def residuals_of(points: Vector) -> Vector:
+            cars = [given.at(lower + p * width) for p in points]
+            errors = some.errors_of(cars)[:, :, 0] / scale
+            return np.concatenate(
+                [errors.reshape(len(cars), -1), prior * np.array([car.moved for car in cars])], axis=1
+            )
+
+        def derivatives(p: Vector) -> Vector:
+            moved = p + np.diag(np.where(p + _DIFFERENCE > 1.0, -_DIFFERENCE, _DIFFERENCE))
+            at = residuals_of(np.vstack([p, moved]))
+            return np.asarray((at[1:] - at[0]).T / (np.diag(moved) - p))
+
+        def residuals(p: Vector) -> Vector:
+            return np.asarray(residuals_of(p[None])[0])
+
         return optimize.least_squares(
-            residuals, inside, bounds=(0.0, 1.0), loss="soft_l1", x_scale="jac", ftol=tolerance, xtol=tolerance,
-            gtol=tolerance, max_nfev=evaluations,
+            residuals, inside, derivatives, bounds=(0.0, 1.0), loss="soft_l1", x_scale="jac", ftol=tolerance,
+            xtol=tolerance, gtol=tolerance, max_nfev=evaluations,
         )  # fmt: skip
 
     found = []
@@ -233,7 +246,7 @@ def _nearest_start(
     best = min(found, key=lambda fit: float(fit.cost))
     left = float(np.median(np.abs(best.fun[: 3 * len(few)])))
     for _ in range(_POLISHED):
-        best = fitted(many, best.x, left, 1e-12, 300)
+        best = fitted(many, best.x, left, 1e-8, 60)
         left = float(np.median(np.abs(best.fun[: 3 * len(many)])))
     return given.at(lower + best.x * width)
 
