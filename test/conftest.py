@@ -7,6 +7,7 @@ import fcntl
 import hashlib
 import io
 import os
+import pickle
 import shutil
 import sys
 import tempfile
@@ -256,14 +257,19 @@ def laps() -> Callable[..., tuple[Any, Any]]:
 
 
 @pytest.fixture(scope="session")
-def lagging(laps: Callable[..., tuple[Any, Any]]) -> tuple[Any, Any, Any]:
+def lagging(laps: Callable[..., tuple[Any, Any]], kept: Kept) -> tuple[Any, Any, Any]:
     """A recording of a car whose steering lags, the vehicle file that does not know it, and the diagnosis."""
-    from dynssm_ros.identification.result.diagnose import diagnose
-    from dynssm_ros.track.tracks import load_track
 
-    recording, vehicle = laps("steering_lag")
-    line = load_track("road_course").centre
-    return recording, vehicle, diagnose(recording, vehicle, integrator="euler", line=line)
+    def make(folder: Path) -> None:
+        from dynssm_ros.identification.result.diagnose import diagnose
+        from dynssm_ros.track.tracks import load_track
+
+        recording, vehicle = laps("steering_lag")
+        line = load_track("road_course").centre
+        found = diagnose(recording, vehicle, integrator="euler", line=line)
+        (folder / "all.pickle").write_bytes(pickle.dumps((recording, vehicle, found)))
+
+    return pickle.loads((kept("lagging", make) / "all.pickle").read_bytes())  # what this machine has just written
 
 
 @pytest.fixture(scope="session")

@@ -15,6 +15,7 @@ from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
+from dynssm_ros.vehicle.effects import EFFECTS
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -73,7 +74,9 @@ def test_a_wrong_car_becomes_the_right_one(dynssm: Run, laps: Path, tmp_path: Pa
 
 def test_a_coefficient_on_its_bound_is_told_and_marked(dynssm: Run, laps: Path, tmp_path: Path) -> None:
     car = wrong_car(tmp_path, I_z=(4e-5, 5e-5))
-    status, out, _ = dynssm("calibrate", laps, "--vehicle", car, "--starts", 1, "--out", tmp_path / "car.yaml")
+    status, out, _ = dynssm(
+        "calibrate", laps, "--vehicle", car, "--starts", 1, "--integrator", "euler", "--out", tmp_path / "car.yaml"
+    )
     assert status == 0
     line = next(line for line in out.splitlines() if line.startswith("on a bound: "))
     assert "I_z" in line
@@ -94,7 +97,8 @@ def test_a_straight_drive_says_what_it_cannot_determine(dynssm: Run, laps: Path,
     columns["v_y"], columns["omega"] = 1e-4 * rng.standard_normal(N), 1e-3 * rng.standard_normal(N)
     straight = tmp_path / "straight.parquet"
     Recording(recording.info, recording.time, recording.segment, columns).save(straight)
-    status, out, _ = dynssm("calibrate", straight, "--vehicle", "orca", "--starts", 1, "--out", tmp_path / "car.yaml")
+    quick = ("--starts", 1, "--integrator", "euler")
+    status, out, _ = dynssm("calibrate", straight, "--vehicle", "orca", *quick, "--out", tmp_path / "car.yaml")
     assert status == 0
     open_lines = [line for line in out.splitlines() if line.startswith("not determined by these data: ")]
     assert len(open_lines) >= 4
@@ -126,10 +130,19 @@ def test_rows_that_the_car_cannot_have_driven_are_named_in_a_line(
     recording = Recording.load(laps)
     omega = np.where(np.arange(len(recording)) == 40, 500.0, recording["omega"])
     replace(recording, columns=recording.columns | {"omega": omega}).save(laps)
-    models = {"train": ("--model", "rls"), "evaluate": ("--model", "persistence", "--model", "single_track")}
-    status, _, words = dynssm(
-        command, laps, "--vehicle", "orca", *models.get(command, ()), "--out", tmp_path / "out.yaml"
-    )
+    tiny = tmp_path / "tiny.yaml"
+    tiny.write_text("base: dynssm_paper_orca\nname: tiny\nphysics: {nominal: vehicle}\nresidual: null\n")
+    quick = {
+        "calibrate": ("--starts", 1, "--integrator", "euler"),
+        "train": ("--model", tiny, "--epochs", 1),
+        "evaluate": ("--model", "persistence", "--model", "single_track"),
+        "diagnose": (
+            "--integrator",
+            "euler",
+            *(word for name in EFFECTS if name != "drag" for word in ("--exclude", name)),
+        ),
+    }[command]
+    status, _, words = dynssm(command, laps, "--vehicle", "orca", *quick, "--out", tmp_path / "out.yaml")
     assert status == 0, words
     warned = [line for line in words.splitlines() if line.startswith("warning: ")]
     assert len(warned) == 1

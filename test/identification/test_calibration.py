@@ -76,7 +76,7 @@ def test_the_published_orca_car_is_recovered_exactly_and_holds_on_another_track(
 def test_simulated_laps_give_the_coefficients_back_over_any_horizon(
     club: Recording, orca: Vehicle, horizon: float
 ) -> None:
-    found = calibrate(club, mid_range(orca), horizon=horizon, starts=1)
+    found = calibrate(club, mid_range(orca), horizon=horizon, integrator="euler", starts=1)
     np.testing.assert_allclose(found.theta, orca.nominal, atol=1e-6 * (orca.upper - orca.lower).max(), rtol=1e-4)
     assert found.horizon == pytest.approx(horizon, abs=0.021)
     assert found.rmse_after.max() < 1e-7
@@ -228,6 +228,7 @@ def test_progress_counts_the_starting_points_of_each_integrator_and_the_last_fit
     assert calls == [(1, 5), (2, 5), (3, 5), (4, 5), (5, 5)]
 
 
+@pytest.mark.slow
 def test_a_model_that_lacks_something_says_how_little_it_knows_of_other_drives() -> None:
     """A tyre that gains less force than load makes the yaw inertia depend on how the car is driven, and its error says so."""
     car = load_vehicle("av21").unmeasured()

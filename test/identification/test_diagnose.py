@@ -83,6 +83,7 @@ def test_two_causes_are_both_named(laps: Laps) -> None:
     assert {cause.effect for cause in found.causes} == {"odometry_lever_arm", "drag"}
 
 
+@pytest.mark.slow
 def test_a_finely_integrated_plant_is_told_from_euler_steps() -> None:
     recording, vehicle = record(Case({"yaw_rate_bias": {"bias": 0.02}}, 2, "rk4", 45.0))
     found = diagnose(recording, vehicle, line=LINE)

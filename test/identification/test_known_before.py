@@ -23,7 +23,7 @@ NOISE = (0.01, 0.01, 0.03)
 
 def laps(seed: int, duration: float = 40.0) -> Recording:
     car = ORCA.with_effect("steering_offset", {"offset": 0.03})
-    return as_recording(simulate(car, load_track("club"), duration, plant="rk4", seed=seed, noise=NOISE))
+    return as_recording(simulate(car, load_track("club"), duration, plant="euler", seed=seed, noise=NOISE))
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def recording() -> Recording:
 
 @pytest.fixture(scope="module")
 def calibrated(recording: Recording) -> Vehicle:
-    return calibrate(recording, ORCA, horizon=0.3, integrator="rk4", starts=1).vehicle
+    return calibrate(recording, ORCA, horizon=0.3, integrator="euler", starts=1).vehicle
 
 
 def test_a_calibration_notes_its_laps_and_what_was_known_before(recording: Recording, calibrated: Vehicle) -> None:
@@ -45,15 +45,15 @@ def test_a_calibration_notes_its_laps_and_what_was_known_before(recording: Recor
     assert [before.coefficients[name].std for name in COEFFICIENTS] == [
         ORCA.coefficients[name].std for name in COEFFICIENTS
     ]
-    assert before.integrator == calibrated.integrator == "rk4"
+    assert before.integrator == calibrated.integrator == "euler"
 
 
 def test_the_same_laps_make_a_calibration_no_surer(recording: Recording, calibrated: Vehicle) -> None:
-    again = calibrate(recording, calibrated, horizon=0.3, integrator="rk4", starts=1)
+    again = calibrate(recording, calibrated, horizon=0.3, integrator="euler", starts=1)
     first = np.array([calibrated.coefficients[name].std for name in COEFFICIENTS], dtype=float)
     np.testing.assert_allclose(again.std, first, rtol=0.05)
     np.testing.assert_allclose(again.theta, calibrated.nominal, atol=0.1 * first.max(), rtol=0.05)
-    other = calibrate(laps(2), calibrated, horizon=0.3, integrator="rk4", starts=1)
+    other = calibrate(laps(2), calibrated, horizon=0.3, integrator="euler", starts=1)
     assert np.median(other.std / first) < 0.9, "other laps do tell something new"
     assert other.vehicle.before is not None
     assert set(other.vehicle.before.laps) > set(recording.fingerprints)
@@ -98,7 +98,7 @@ def test_a_vehicle_file_keeps_it(calibrated: Vehicle, tmp_path: Path) -> None:
 
 def test_a_diagnosis_is_the_same_before_and_after_a_calibration(recording: Recording, calibrated: Vehicle) -> None:
     shipped, after = (
-        diagnose(recording, car, horizon=0.3, integrator="rk4", exclude=OTHERS) for car in (ORCA, calibrated)
+        diagnose(recording, car, horizon=0.3, integrator="euler", exclude=OTHERS) for car in (ORCA, calibrated)
     )
     assert [cause.effect for cause in shipped.causes] == ["steering_offset"]
     assert [(c.effect, c.values, c.std) for c in after.causes] == [(c.effect, c.values, c.std) for c in shipped.causes]

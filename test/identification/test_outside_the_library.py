@@ -48,6 +48,7 @@ def spoiled() -> Callable[[Spoil], Diagnosis]:
     return diagnosed
 
 
+@pytest.mark.slow
 def test_grip_that_grows_does_not_stand_for_a_scale_that_drifts(spoiled: Callable[[Spoil], Diagnosis]) -> None:
     found = spoiled(drifting_scale)
     assert (found.verdict, found.causes) == ("unexplained", ())
@@ -75,6 +76,7 @@ class FinnedPlant(Rk4Plant):
         return (Fin(),)
 
 
+@pytest.mark.slow
 def test_a_term_that_no_effect_has_is_proposed_as_a_formula() -> None:
     register_plant("finned", FinnedPlant())
     car = load_vehicle("av21")
