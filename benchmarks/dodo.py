@@ -36,7 +36,7 @@ from doit.tools import config_changed
 
 from benchmarks.hidden_causes.cases import TRUTHS, cases
 from benchmarks.hidden_causes.outcomes import matrix, rates
-from benchmarks.hidden_causes.page import hidden_causes_page
+from benchmarks.hidden_causes.page import confusion, hidden_causes_page
 from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
 from benchmarks.matrix import raced_cells, races, races_page, scored_cells, scores, scores_page
 from benchmarks.matrix.ablations import ablations_page
@@ -51,7 +51,6 @@ from benchmarks.tasks import doit_config, split_available, tasks
 from dynssm_ros import __version__
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
-from dynssm_ros.reporting.diagnosis_figures import confusion
 from dynssm_ros.runtime.artifact import CARD
 
 GROUP = get_var("group", "")

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
 from benchmarks.hidden_causes import foreign, multi_body
 from benchmarks.hidden_causes.cases import OFF, Case, Hidden
 from benchmarks.hidden_causes.outcomes import Outcome, by_size, rates
 from benchmarks.page import render
+from dynssm_ros.reporting.evaluation_figures import WIDTH, sheet, styled
 from dynssm_ros.vehicle.effects import EFFECTS
 
 GOALS = {
@@ -78,3 +83,25 @@ def _with_values(effects: Hidden) -> str:
         f"{name} " + ", ".join(f"{key} {value:.3g}" for key, value in values.items())
         for name, values in effects.items()
     )
+
+
+@styled
+def confusion(hidden: Sequence[str], named: Sequence[str], count: npt.NDArray[np.intp]) -> Figure:
+    """Which effect was named first where which was hidden.
+
+    Args:
+        hidden: labels of the rows.
+        named: labels of the columns.
+        count: cases, shape ``(len(hidden), len(named))``.
+    """
+    figure, panel = sheet(0.72 * WIDTH + 1.2)
+    share = count / np.maximum(count.sum(axis=1, keepdims=True), 1)
+    panel.imshow(share, cmap="Blues", vmin=0, vmax=1.2)
+    for i, j in np.argwhere(count > 0):
+        ink = "white" if share[i, j] > 0.5 else "black"
+        panel.text(j, i, str(count[i, j]), ha="center", va="center", fontsize=8, color=ink)
+    panel.set_xticks(range(len(named)), named, rotation=90, fontsize=8)
+    panel.set_yticks(range(len(hidden)), hidden, fontsize=8)
+    panel.set(xlabel="named first", ylabel="hidden")
+    panel.grid(visible=False)
+    return figure

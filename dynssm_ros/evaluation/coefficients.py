@@ -56,10 +56,10 @@ def coefficient_unit(name: str) -> str:
     return "" if unit == "1" else unit
 
 
-def coefficient_label(name: str) -> str:
-    """Name of a coefficient with its unit."""
+def coefficient_label(name: str, symbol: str = "") -> str:
+    """Name of a coefficient, or another ``symbol`` for it, with its unit."""
     unit = coefficient_unit(name)
-    return f"{name} ({unit})" if unit else name
+    return f"{symbol or name} ({unit})" if unit else symbol or name
 
 
 class CoefficientTally:

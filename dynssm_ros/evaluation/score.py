@@ -104,9 +104,11 @@ class Group:
     """The scores of one model, trained with one seed or with several; a row of the tables.
 
     Attributes:
+        name: of the model, or its label.
         scores: one for each training; not empty.
     """
 
+    name: str
     scores: tuple[Score, ...]
 
     @property
@@ -155,7 +157,8 @@ def grouped(scores: Mapping[str, Score]) -> dict[str, Group]:
     for label, score in scores.items():
         siblings = [other for other in scores.values() if other.model.name == score.model.name]
         joined = len(siblings) > 1 and _differ_by_seed_only(siblings)
-        groups[score.model.name if joined else label] = Group(tuple(siblings) if joined else (score,))
+        name = score.model.name if joined else label
+        groups[name] = Group(name, tuple(siblings) if joined else (score,))
     return groups
 
 

@@ -20,8 +20,8 @@ from dynssm_ros.control.race import Race
 from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.evaluation.coefficients import coefficient_label
 from dynssm_ros.files import replacing
-from dynssm_ros.reporting.evaluation_figures import MEASURED, STYLE, model_colours
-from dynssm_ros.reporting.race_figures import driven_coefficients, widths
+from dynssm_ros.reporting.evaluation_figures import MEASURED, STYLE
+from dynssm_ros.reporting.race_figures import draw_borders, driven_coefficients, race_lines
 from dynssm_ros.track.racing_line import CAR_WIDTH
 from dynssm_ros.vehicle import COEFFICIENTS
 
@@ -101,10 +101,8 @@ class _Curve:
 
 def _cars(races: Sequence[Race], axes: Axes, changed: Mask) -> list[_Car]:
     """The track, marked where it is ``changed``, and the cars on it."""
-    course, colours = races[0].course, model_colours([race.name for race in races])
-    track = course.track
-    for border in (track.left_border, track.right_border):
-        axes.plot(*np.concatenate([border, border[:1]]).T, color=MEASURED, lw=1.0)
+    course, track = races[0].course, races[0].course.track
+    draw_borders(axes, track)
     extent = np.ptp(np.concatenate([track.left_border, track.right_border]), axis=0)
     if changed.any() and not changed.all():
         x, y = np.where(changed[:, None], track.centre.position(track.centre.s), np.nan).T
@@ -112,10 +110,9 @@ def _cars(races: Sequence[Race], axes: Axes, changed: Mask) -> list[_Car]:
     wheelbase = course.vehicle.constants.l_f + course.vehicle.constants.l_r
     size = max(_LENGTH * wheelbase, _SMALLEST * float(np.max(extent)))
     cars = []
-    for race, width in zip(races, widths(len(races)), strict=True):
-        colour = colours[race.name]
-        (trail,) = axes.plot([], [], color=colour, lw=1.5 * width, label=race.name)
-        body = Polygon(np.zeros((4, 2)), closed=True, facecolor=colour, edgecolor="white", lw=0.5, zorder=3)
+    for race, style in race_lines(races):
+        (trail,) = axes.plot([], [], color=style["color"], lw=1.5 * style["lw"], label=race.name)
+        body = Polygon(np.zeros((4, 2)), closed=True, facecolor=style["color"], edgecolor="white", lw=0.5, zorder=3)
         axes.add_patch(body)
         cars.append(_Car(race, body, trail, size))
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
@@ -125,20 +122,21 @@ def _cars(races: Sequence[Race], axes: Axes, changed: Mask) -> list[_Car]:
 
 def _curves(races: Sequence[Race], strips: Sequence[Axes], name: str, time: Vector, truth: Vector) -> list[_Curve]:
     """The coefficient ``name`` as planned with, beside its ``truth`` over ``time`` (s), then speed and room."""
-    colours = model_colours([race.name for race in races])
-    strips[0].set_title(f"{coefficient_label(name)} planned with; dashed: of the car", loc="left", fontsize=9)
-    strips[1].set_title("speed (m/s)", loc="left", fontsize=9)
-    strips[2].set_title("from the car's centre to the border (m)", loc="left", fontsize=9)
+    of_the_car = f"{coefficient_label(name)} planned with; dashed: of the car"
+    for strip, title in zip(
+        strips, (of_the_car, "speed (m/s)", "from the car's centre to the border (m)"), strict=True
+    ):
+        strip.set_title(title, loc="left", fontsize=9)
     strips[2].set_xlabel("time (s)")
     strips[2].axhline(0.0, color=MEASURED, lw=0.8)
     for strip in strips[:2]:
         strip.tick_params(labelbottom=False)
     curves = []
-    for race, width in zip(races, widths(len(races)), strict=True):
+    for race, style in race_lines(races):
         room = race.course.track.room(race.s, race.lateral)
         shown = (_planned(race, name), np.hypot(*race.state[:, :2].T), room)
         for strip, values in zip(strips, shown, strict=True):
-            (line,) = strip.plot(race.time, values, color=colours[race.name], lw=width)
+            (line,) = strip.plot(race.time, values, **style)
             curves.append(_Curve(line, race.time, values))
     (line,) = strips[0].plot(time, truth, color=MEASURED, lw=1.0, ls="--", zorder=1)
     for strip in strips:

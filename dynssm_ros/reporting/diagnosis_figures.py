@@ -1,4 +1,4 @@
-"""Figures of a diagnosis and of the hidden-cause benchmark."""
+"""Figures of a diagnosis."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from dynssm_ros.reporting.evaluation_figures import (
     NO_MODEL,
     PALETTE,
     SYMBOLS,
-    UNITS,
     WIDTH,
+    label,
+    legend_above,
+    sheet,
     styled,
 )
 from dynssm_ros.reporting.tables import text
@@ -48,13 +50,12 @@ def simulated_and_measured(improvement: Improvement) -> Figure:
         if start >= starts[-1] + windows.steps:
             starts.append(int(start))
     runs = replace(windows, starts=np.array(starts))
-    figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
-    axes = figure.subplots(3, 1, sharex=True)
+    figure, axes = sheet(5.4, 3, sharex=True)
     whole = np.arange(starts[0], starts[-1] + windows.steps + 1)
     here = runs.starts[:, None] + np.arange(windows.steps + 1)
     for c, (panel, channel) in enumerate(zip(axes, STATE_SIGNALS, strict=True)):
         panel.plot(whole * T_s, rows[c, whole], color=MEASURED, lw=2.2, alpha=0.75, label="measured")
-        panel.set_ylabel(f"{SYMBOLS[channel]} ({UNITS[channel]})")
+        panel.set_ylabel(label(channel))
         low, high = np.ptp(rows[c, whole]) * np.array([-0.4, 0.4]) + [rows[c, whole].min(), rows[c, whole].max()]
         panel.set_ylim(low, high)
     for (name, car), colour in zip(improvement.cars.items(), _COLOURS, strict=True):
@@ -66,8 +67,7 @@ def simulated_and_measured(improvement: Improvement) -> Figure:
             panel.plot(t.ravel(), path[..., c].ravel(), color=colour, lw=1.0, label=name)
     axes[-1].set_xlabel("time (s)")
     figure.align_ylabels()
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure
+    return legend_above(figure, axes[0])
 
 
 @styled
@@ -82,7 +82,8 @@ def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector,
     """
     lap = np.linspace(0.0, 1.0, _PLACES)
     known = windows.data.context
-    profile = effect.along_lap(lap, _bend(known, lap))
+    bend = np.interp(lap, known["s"] / known["lap_length"], known["bend"], period=1.0) if "bend" in known else None
+    profile = effect.along_lap(lap, bend)
     figure = Figure(figsize=(WIDTH, 4.6 if profile else 2.8), layout="constrained")
     grid = figure.add_gridspec(2 if profile else 1, 3, height_ratios=[2.6, 1.4] if profile else None)
     size, there, over = (figure.add_subplot(grid[0, k]) for k in range(3))
@@ -120,26 +121,18 @@ def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector,
     over.set_xlabel("time (s)")
     over.set_title("when: error gone, 1 = the mean error")
     if profile:
-        label, values = profile
+        what, values = profile
         along = figure.add_subplot(grid[1, :])
         length = float(np.asarray(known["lap_length"]).flat[0]) if "lap_length" in known else 1.0
         along.plot(lap * length, values, color=_COLOURS[2])
-        along.set(xlabel="position on the lap (m)", ylabel=label)
+        along.set(xlabel="position on the lap (m)", ylabel=what)
     return figure
-
-
-def _bend(known: Mapping[str, Vector], lap: Vector) -> Vector | None:
-    """How sharply the road bends at places ``(n,)`` (fractions of the lap); ``None`` if the recording does not tell."""
-    if "bend" not in known:
-        return None
-    return np.asarray(np.interp(lap, known["s"] / known["lap_length"], known["bend"], period=1.0))
 
 
 @styled
 def improvement_by_horizon(improvement: Improvement) -> Figure:
     """Errors of each car at each horizon, a panel per channel."""
-    figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
-    axes = figure.subplots(1, 3)
+    figure, axes = sheet(2.9, 1, 3)
     places = np.arange(len(improvement.horizons))
     width = 0.8 / len(improvement.rmse)
     for c, (panel, channel) in enumerate(zip(axes, STATE_SIGNALS, strict=True)):
@@ -151,18 +144,16 @@ def improvement_by_horizon(improvement: Improvement) -> Figure:
                 if value > _LONGEST * others:
                     panel.text(x, _LONGEST * others, text(float(value)), ha="center", va="bottom", fontsize=8)
         panel.set_xticks(places, [f"{ahead:.4g} s" for ahead in improvement.horizons])
-        panel.set_title(f"{SYMBOLS[channel]} ({UNITS[channel]})", pad=14)
+        panel.set_title(label(channel), pad=14)
         panel.grid(axis="x", visible=False)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
-    return figure
+    return legend_above(figure, axes[0], ncols=3)
 
 
 @styled
 def evidence(tried: Mapping[str, float], named: Sequence[str]) -> Figure:
     """Improvement of each effect alone, the largest at the top; named causes are coloured."""
     ordered = sorted(tried.items(), key=lambda item: item[1])
-    figure = Figure(figsize=(WIDTH, 0.8 + 0.22 * max(len(ordered), 1)), layout="constrained")
-    panel = figure.subplots()
+    figure, panel = sheet(0.8 + 0.22 * max(len(ordered), 1))
     colours = [PALETTE[0] if name in named else NO_MODEL for name, _ in ordered]
     panel.barh(range(len(ordered)), [max(value, 1e-3) for _, value in ordered], color=colours)
     panel.set_yticks(range(len(ordered)), [name for name, _ in ordered])
@@ -176,36 +167,30 @@ def evidence(tried: Mapping[str, float], named: Sequence[str]) -> Figure:
 @styled
 def errors_over_time(improvement: Improvement) -> Figure:
     """Errors one step and the horizon ahead over time, of the recalibrated and of the extended car."""
-    figure = Figure(figsize=(WIDTH, 5.0), layout="constrained")
-    axes = figure.subplots(3, 2, sharex=True)
+    figure, axes = sheet(5.0, 3, 2, sharex=True)
     order = np.argsort(improvement.windows.time)
-    t = improvement.windows.time[order]
-    for (name, values), colour in zip(list(improvement.errors.items())[1:], _COLOURS[1:], strict=True):
-        for column, h in enumerate((0, improvement.horizon)):
-            for c in range(3):
-                axes[c, column].plot(t, values[order, h, c], color=colour, lw=0.8, label=name)
-    for column, h in enumerate((0, improvement.horizon)):
-        axes[0, column].set_title(f"{improvement.horizons[h]:.4g} s ahead")
-        axes[2, column].set_xlabel("time (s)")
-        for c, channel in enumerate(STATE_SIGNALS):
-            axes[c, column].axhline(0.0, color=MEASURED, lw=0.8)
-            axes[c, column].set_ylabel(f"{SYMBOLS[channel]} error ({UNITS[channel]})")
+    for column, h in zip(axes.T, (0, improvement.horizon), strict=True):
+        for c, (panel, channel) in enumerate(zip(column, STATE_SIGNALS, strict=True)):
+            for (name, values), colour in zip(list(improvement.errors.items())[1:], _COLOURS[1:], strict=True):
+                panel.plot(improvement.windows.time[order], values[order, h, c], color=colour, lw=0.8, label=name)
+            panel.axhline(0.0, color=MEASURED, lw=0.8)
+            panel.set_ylabel(label(channel, " error"))
+        column[0].set_title(f"{improvement.horizons[h]:.4g} s ahead")
+        column[-1].set_xlabel("time (s)")
     figure.align_ylabels()
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
-    return figure
+    return legend_above(figure, axes[0, 0], ncols=2)
 
 
 @styled
-def errors_over(label: str, x: Vector, improvement: Improvement) -> Figure:
+def errors_over(abscissa: str, x: Vector, improvement: Improvement) -> Figure:
     """Mean and spread of the errors against something, one step and the horizon ahead, a column per channel.
 
     Args:
-        label: of the abscissa.
+        abscissa: what ``x`` is, with its unit.
         x: abscissa of each simulation, shape ``(W,)``.
         improvement: whose errors are shown.
     """
-    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
-    axes = figure.subplots(2, 3, sharex=True)
+    figure, axes = sheet(4.6, 2, 3, sharex=True)
     bins = _binned(x)
     centre = [x[b].mean() for b in bins]
     for row, h in enumerate((0, improvement.horizon)):
@@ -222,12 +207,11 @@ def errors_over(label: str, x: Vector, improvement: Improvement) -> Figure:
             panel.set_ylim(-1.25 * reach, 1.25 * reach) if reach > 0 else None
             panel.axhline(0.0, color=MEASURED, lw=0.8)
             if row == 0:
-                panel.set_title(f"{SYMBOLS[channel]} error ({UNITS[channel]})")
+                panel.set_title(label(channel, " error"))
             else:
-                panel.set_xlabel(label)
+                panel.set_xlabel(abscissa)
         axes[row, 0].set_ylabel(f"{improvement.horizons[h]:.4g} s ahead")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
-    return figure
+    return legend_above(figure, axes[0, 0], ncols=3)
 
 
 def _binned(x: Vector) -> list[npt.NDArray[np.intp]]:
@@ -238,26 +222,3 @@ def _binned(x: Vector) -> list[npt.NDArray[np.intp]]:
     bins = [np.flatnonzero(number == k) for k in range(_BINS)]
     filled = [b for b in bins if len(b) >= _FEWEST]
     return filled or [np.arange(len(x))]
-
-
-@styled
-def confusion(hidden: Sequence[str], named: Sequence[str], count: npt.NDArray[np.intp]) -> Figure:
-    """Confusion matrix.
-
-    Args:
-        hidden: labels of the rows.
-        named: labels of the columns.
-        count: cases, shape ``(len(hidden), len(named))``.
-    """
-    figure = Figure(figsize=(WIDTH, 0.72 * WIDTH + 1.2), layout="constrained")
-    panel = figure.subplots()
-    share = count / np.maximum(count.sum(axis=1, keepdims=True), 1)
-    panel.imshow(share, cmap="Blues", vmin=0, vmax=1.2)
-    for i, j in np.argwhere(count > 0):
-        ink = "white" if share[i, j] > 0.5 else "black"
-        panel.text(j, i, str(count[i, j]), ha="center", va="center", fontsize=8, color=ink)
-    panel.set_xticks(range(len(named)), named, rotation=90, fontsize=8)
-    panel.set_yticks(range(len(hidden)), hidden, fontsize=8)
-    panel.set(xlabel="named first", ylabel="hidden")
-    panel.grid(visible=False)
-    return figure

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Cause, Diagnosis
 from dynssm_ros.identification.result.formula import Formula
+from dynssm_ros.identification.result.improvement import Improvement
 from dynssm_ros.identification.result.residuals import ExplainedVariance
 from dynssm_ros.identification.search.selection import DECISIVE_DELTA_BIC
 from dynssm_ros.reporting import diagnosis_figures
 from dynssm_ros.reporting.evaluation_figures import UNITS
-from dynssm_ros.reporting.page import Report, Section
-from dynssm_ros.reporting.tables import Column, Table, Value, percent, text
+from dynssm_ros.reporting.page import Prose, Report, Section
+from dynssm_ros.reporting.tables import Column, ColumnOf, Table, percent, text
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS
 from dynssm_ros.vehicle.effects import EFFECTS
@@ -36,7 +37,8 @@ def as_text(diagnosis: Diagnosis) -> str:
     """The result for a terminal: cause, size, evidence, improvement, what to do, what is left."""
     lines = [headline(diagnosis)]
     for number, cause in enumerate(diagnosis.found, 1):
-        lines += ["", f"{number}. {cause.effect}{_where(cause)}: {size_in_words(cause)}; {_share_in_words(cause)}"]
+        share = f"{'small, ' if cause.small else ''}{percent(cause.heldout_improvement)} of the error on held-out laps"
+        lines += ["", f"{number}. {cause.effect}{_where(cause)}: {size_in_words(cause)}; {share}"]
         lines += [f"   {line}" for words in _about(cause) for line in textwrap.wrap(words, _WIDTH)]
     lines += ["", *improvement_in_words(diagnosis)]
     for words in (
@@ -61,11 +63,6 @@ def headline(diagnosis: Diagnosis) -> str:
         "unexplained": "Something is wrong that no effect of the library explains.",
     }[diagnosis.verdict]
     return f"{words} Sure but small, within the structure of the model: {small}." if small else words
-
-
-def _share_in_words(cause: Cause) -> str:
-    """Its share of the error in a few words."""
-    return f"{'small, ' if cause.small else ''}{percent(cause.heldout_improvement)} of the error on held-out laps"
 
 
 def _where(cause: Cause) -> str:
@@ -161,25 +158,14 @@ def evidence_in_words(cause: Cause) -> str:
         if cause.heldout_improvement > 0
         else f"on held-out laps it takes nothing away ({percent(cause.heldout_improvement)})"
     )
-    confirmed = cause.confirmation
-    units = confirmed.improvement
-    strong = f"above {DECISIVE_DELTA_BIC:.0f} is very strong"
+    confirmed, units = cause.confirmation, cause.confirmation.improvement
+    shares = zip(STATE_SIGNALS, confirmed.share, strict=True)
+    gone = ", ".join(f"{percent(max(float(share), 0.0))} ({channel})" for channel, share in shares)
     return (
         f"on parts of the drive that were left out the logarithm of the predictive likelihood is better by "
-        f"{confirmed.total:.0f} ± {confirmed.std:.0f}, in {int((units > 0).sum())} of {len(units)} parts, and "
-        f"of the squared error {_shares(confirmed.share)} is gone; the information criterion is better by "
-        f"{cause.delta_bic:.0f} ({strong}); {held_out}"
+        f"{confirmed.total:.0f} ± {confirmed.std:.0f}, in {int((units > 0).sum())} of {len(units)} parts, and of the squared error {gone} is gone; the information criterion is better by {cause.delta_bic:.0f} "
+        f"(above {DECISIVE_DELTA_BIC:.0f} is very strong); {held_out}"
     )
-
-
-def _shares(share: Vector) -> str:
-    return ", ".join(f"{percent(max(float(s), 0.0))} ({c})" for c, s in zip(STATE_SIGNALS, share, strict=True))
-
-
-def alternatives_in_words(cause: Cause) -> str:
-    """What the data cannot tell from a cause, and how to tell them apart."""
-    ways = "; ".join(f"{name}: {EFFECTS[name].MANOEUVRE}" for name in (cause.effect, *cause.alternatives))
-    return f"The data fit {' or '.join(cause.alternatives)} as well. To tell them apart, drive ({ways})."
 
 
 def improvement_in_words(diagnosis: Diagnosis) -> list[str]:
@@ -215,90 +201,47 @@ def _about(cause: Cause) -> Iterator[str]:
     yield f"Evidence: {evidence_in_words(cause)}."
     yield f"What to do: {effect.ADVICE}"
     if cause.alternatives:
-        yield alternatives_in_words(cause)
+        ways = "; ".join(f"{name}: {EFFECTS[name].MANOEUVRE}" for name in (cause.effect, *cause.alternatives))
+        yield f"The data fit {' or '.join(cause.alternatives)} as well. To tell them apart, drive ({ways})."
 
 
 def _causes(diagnosis: Diagnosis) -> Table:
-    columns = (
-        Column("cause"), Column("size"), Column("better by", group="left-out parts"), Column("±", group="left-out parts"),
-        *(Column(channel, "%", "squared error gone there") for channel in STATE_SIGNALS),
-        Column("less", "%", "held-out error"), Column("the data fit as well"),
-    )  # fmt: skip
-    rows: list[list[Value]] = [
-        [
-            cause.effect + _where(cause),
-            size_in_words(cause),
-            cause.confirmation.total,
-            cause.confirmation.std,
-            *(100 * float(share) for share in cause.confirmation.share),
-            100 * cause.heldout_improvement,
-            ", ".join(cause.alternatives) or "nothing else",
-        ]
-        for cause in diagnosis.found
-    ]
-    return Table(columns, rows)
+    return Table.of(
+        diagnosis.found,
+        (Column("cause"), lambda cause: cause.effect + _where(cause)),
+        (Column("size"), size_in_words),
+        (Column("better by", group="left-out parts"), lambda cause: cause.confirmation.total),
+        (Column("±", group="left-out parts"), lambda cause: cause.confirmation.std),
+        (
+            [Column(channel, "%", "squared error gone there") for channel in STATE_SIGNALS],
+            lambda cause: [100 * float(share) for share in cause.confirmation.share],
+        ),
+        (Column("less", "%", "held-out error"), lambda cause: 100 * cause.heldout_improvement),
+        (Column("the data fit as well"), lambda cause: ", ".join(cause.alternatives) or "nothing else"),
+    )
 
 
 def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
     improvement = diagnosis.improvement
+    windows, horizon = improvement.windows, improvement.horizons[improvement.horizon]
+    prose = Prose(
+        "diagnosis", given=GIVEN, recalibrated=RECALIBRATED, extended=EXTENDED, horizon=horizon,
+        longest=improvement.horizons[-1], left=left_in_words(diagnosis),
+        formulas=" ".join(map(formula_in_words, diagnosis.formulas)), moved=" ".join(moved_in_words(diagnosis)),
+    )  # fmt: skip
     for cause in diagnosis.found:
-        yield Section(
-            cause.effect + _where(cause),
-            " ".join((f"{size_in_words(cause)}.", *_about(cause))),
-            diagnosis_figures.cause_pictures(
-                improvement.windows,
-                cause.without,
-                improvement.errors[EXTENDED][:, improvement.horizon],
-                EFFECTS[cause.effect](**cause.values),
-            ),
-        )
-    yield from _improved(diagnosis)
-    yield from _shown(diagnosis)
-    yield from _found(diagnosis)
-    if diagnosis.notes:
-        yield Section("Limits", " ".join(f"{note[0].upper()}{note[1:]}." for note in diagnosis.notes))
-
-
-def _improved(diagnosis: Diagnosis) -> Iterator[Section]:
-    improvement = diagnosis.improvement
-    yield Section(
-        "Simulated and measured",
-        f"A lively stretch of the held-out laps. Each simulation starts at a measured state and runs free for "
-        f"{improvement.horizons[-1]:.4g} s, with the measured throttle and steering.",
-        diagnosis_figures.simulated_and_measured(improvement),
+        effect, with_it = EFFECTS[cause.effect](**cause.values), improvement.errors[EXTENDED][:, improvement.horizon]
+        pictures = diagnosis_figures.cause_pictures(windows, cause.without, with_it, effect)
+        about = " ".join((f"{size_in_words(cause)}.", *_about(cause)))
+        yield prose.section("cause", pictures, cause=cause.effect + _where(cause), about=about)
+    yield prose.section("simulated", diagnosis_figures.simulated_and_measured(improvement))
+    yield prose.section(
+        "improvement", diagnosis_figures.improvement_by_horizon(improvement), _improvement_table(improvement)
     )
-    yield Section(
-        "Improvement on held-out laps",
-        "Root mean square error of simulations that start at measured states of laps that neither the fit nor the "
-        f"selection saw: the car {GIVEN}, its nominal values {RECALIBRATED} without any cause, and {EXTENDED} by the "
-        "causes. Intervals are from a bootstrap over blocks in time. What is systematic the signals and the place on the "
-        "lap predict, on parts of the data to which that was not fitted.",
-        diagnosis_figures.improvement_by_horizon(improvement),
-        _improvement_table(diagnosis),
-    )
-    yield Section(
-        "Systematic error and noise",
-        "The same errors in two parts: what the signals and the place on the lap predict, and the rest, which is noise "
-        "or what the signals do not show. By place alone is what repeats lap after lap. Gone is the share of the "
-        f"systematic squared error of the car {GIVEN} that the extended one does not make. {left_in_words(diagnosis)} "
-        + " ".join(map(formula_in_words, diagnosis.formulas)),
-        None,
-        _systematic_table(diagnosis),
-    )
-
-
-def _shown(diagnosis: Diagnosis) -> Iterator[Section]:
-    improvement = diagnosis.improvement
-    windows = improvement.windows
-    rows = windows.data.rows
-    yield Section(
-        "Errors over time",
-        "Predicted minus measured on the held-out laps, one step and "
-        f"{improvement.horizons[improvement.horizon]:.4g} s ahead.",
-        diagnosis_figures.errors_over_time(improvement),
-    )
+    yield prose.section("systematic", table=_systematic_table(improvement))
+    yield prose.section("over_time", diagnosis_figures.errors_over_time(improvement))
     # what was going on half the way into the simulation
-    at = windows.starts + round(improvement.horizons[improvement.horizon] / windows.data.T_s / 2)
+    rows, at = windows.data.rows, windows.starts + round(horizon / windows.data.T_s / 2)
     against = {
         "speed (m/s)": rows[0, at],
         "lateral acceleration (m/s²)": rows[0, at] * rows[2, at],
@@ -308,109 +251,101 @@ def _shown(diagnosis: Diagnosis) -> Iterator[Section]:
     if windows.data.on_one_lap:
         against["position on the lap (m)"] = windows.data.context["s"][at]
     for label, values in against.items():
-        yield Section(
-            f"Errors against {label.split(' (')[0]}",
-            "Mean and spread in bins: where the mean is off zero by more than the line's wiggling, the error is "
-            f"systematic. The car {GIVEN} may leave the panel.",
-            diagnosis_figures.errors_over(label, values, improvement),
-        )
+        shown = diagnosis_figures.errors_over(label, values, improvement)
+        yield prose.section("against", shown, signal=label.split(" (")[0])
+    named = [cause.effect for cause in diagnosis.found]
+    yield prose.section("evidence", diagnosis_figures.evidence(diagnosis.selection.tried, named))
+    yield prose.section("detectable", table=_detectable_table(diagnosis))
+    yield prose.section("nominal", table=_nominal_table(diagnosis))
+    if diagnosis.notes:
+        yield prose.section("limits", notes=" ".join(f"{note[0].upper()}{note[1:]}." for note in diagnosis.notes))
 
 
-def _found(diagnosis: Diagnosis) -> Iterator[Section]:
-    yield Section(
-        "Evidence by effect",
-        "How much each effect, alone, would improve the fit of the recalibrated car. Named causes are coloured. Effects "
-        "that leave like traces share the evidence; the causes named explain it best together.",
-        diagnosis_figures.evidence(diagnosis.selection.tried, [cause.effect for cause in diagnosis.found]),
-    )
-    yield Section(
-        "What these laps would show",
-        "How far off neutral each effect that was not named would have to be to be named: the driving must excite it, and "
-        "the nominal values must be known well enough not to take it up. Where the bounds of the effect do not reach that "
-        "far, it cannot be judged.",
-        None,
-        _detectable_table(diagnosis),
-    )
-    yield Section(
-        "Nominal values",
-        "What the fit makes of them. Moved: by how many of the standard deviations that the vehicle file states. "
-        + " ".join(moved_in_words(diagnosis)),
-        None,
-        _nominal_table(diagnosis),
-    )
+_CHANNEL_AND_HORIZON: tuple[ColumnOf, ...] = (
+    (Column("channel"), lambda at: f"{at.channel} ({UNITS[at.channel]})"),
+    (Column("ahead", "s"), lambda at: f"{at.ahead:.4g}"),
+)
 
 
-def _improvement_table(diagnosis: Diagnosis) -> Table:
-    improvement = diagnosis.improvement
-    columns = (
-        Column("channel"), Column("ahead", "s"), *(Column(name, group="error") for name in improvement.rmse),
-        *(
-            Column(title, "%", f"less than {name}")
-            for name in (GIVEN, RECALIBRATED) for title in ("share", "from", "to")
+class _At(NamedTuple):
+    """A channel at a horizon: a row of tables, and the place ``[k, c]`` of its values."""
+
+    channel: str
+    ahead: float
+    place: tuple[int, int]
+
+
+def _channels_and_horizons(improvement: Improvement) -> list[_At]:
+    horizons = [*enumerate(improvement.horizons)]
+    return [_At(channel, ahead, (k, c)) for c, channel in enumerate(STATE_SIGNALS) for k, ahead in horizons]
+
+
+def _improvement_table(improvement: Improvement) -> Table:
+    less = {
+        name: (improvement.reduction_from(name), *improvement.interval_from(name)) for name in (GIVEN, RECALIBRATED)
+    }
+    return Table.of(
+        _channels_and_horizons(improvement),
+        *_CHANNEL_AND_HORIZON,
+        (
+            [Column(name, group="error") for name in improvement.rmse],
+            lambda at: [float(values[at.place]) for values in improvement.rmse.values()],
         ),
-    )  # fmt: skip
-    less = [(improvement.reduction_from(name), *improvement.interval_from(name)) for name in (GIVEN, RECALIBRATED)]
-    rows: list[list[Value]] = []
-    for c, channel in enumerate(STATE_SIGNALS):
-        for k, ahead in enumerate(improvement.horizons):
-            values = [float(values[k, c]) for values in improvement.rmse.values()]
-            shares = [round(100 * float(v[k, c])) for one in less for v in one]
-            rows.append([f"{channel} ({UNITS[channel]})", f"{ahead:.4g}", *values, *shares])
-    return Table(columns, rows)
+        (
+            [Column(title, "%", f"less than {name}") for name in less for title in ("share", "from", "to")],
+            lambda at: [round(100 * float(share[at.place])) for shares in less.values() for share in shares],
+        ),
+    )
 
 
-def _systematic_table(diagnosis: Diagnosis) -> Table:
-    improvement = diagnosis.improvement
-    columns = (
-        Column("channel"), Column("ahead", "s"),
-        *(Column(title, "", name) for name in improvement.rmse for title in ("systematic", "rest")),
-        Column("gone", "%", "systematic"),
-        *(Column(name, "%", "systematic by place alone") for name in (GIVEN, EXTENDED)),
-    )  # fmt: skip
-    gone = improvement.systematic_gone(GIVEN)
-    rows: list[list[Value]] = []
-    for c, channel in enumerate(STATE_SIGNALS):
-        for k, ahead in enumerate(improvement.horizons):
-            parts: list[Value] = []
-            for name, values in improvement.rmse.items():
-                share = float(improvement.explained_variance[name][k].share[c])
-                parts += [float(values[k, c] * np.sqrt(part)) for part in (share, 1.0 - share)]
-            place = [100 * float(improvement.explained_variance[name][k].by_place[c]) for name in (GIVEN, EXTENDED)]
-            rows.append([f"{channel} ({UNITS[channel]})", f"{ahead:.4g}", *parts, 100 * float(gone[k, c]), *place])
-    return Table(columns, rows)
+def _systematic_table(improvement: Improvement) -> Table:
+    gone, explained = improvement.systematic_gone(GIVEN), improvement.explained_variance
+
+    def parts(at: _At) -> list[float]:
+        k, c = at.place
+        shares = {name: float(explained[name][k].share[c]) for name in improvement.rmse}
+        return [
+            float(values[k, c] * np.sqrt(part))
+            for name, values in improvement.rmse.items()
+            for part in (shares[name], 1.0 - shares[name])
+        ]
+
+    return Table.of(
+        _channels_and_horizons(improvement),
+        *_CHANNEL_AND_HORIZON,
+        ([Column(title, "", name) for name in improvement.rmse for title in ("systematic", "rest")], parts),
+        (Column("gone", "%", "systematic"), lambda at: 100 * float(gone[at.place])),
+        (
+            [Column(name, "%", "systematic by place alone") for name in (GIVEN, EXTENDED)],
+            lambda at: [100 * float(explained[name][at.place[0]].by_place[at.place[1]]) for name in (GIVEN, EXTENDED)],
+        ),
+    )
 
 
 def _detectable_table(diagnosis: Diagnosis) -> Table:
-    columns = (Column("effect"), Column("noticed from"), Column("unit"), Column("judged"))
-    rows: list[list[Value]] = []
-    for effect, size in sorted(
-        diagnosis.minimum_detectable.items(), key=lambda item: item[1] / EFFECTS[item[0]].magnitude().span
-    ):
-        about = EFFECTS[effect].magnitude()
-        rows.append([effect, size, "" if about.unit == "1" else about.unit, "yes" if size <= about.span else "no"])
-    return Table(columns, rows)
+    about = {effect: EFFECTS[effect].magnitude() for effect in diagnosis.minimum_detectable}
+    sizes = diagnosis.minimum_detectable
+    return Table.of(
+        sorted(sizes, key=lambda effect: sizes[effect] / about[effect].span),
+        (Column("effect"), str),
+        (Column("noticed from"), lambda effect: sizes[effect]),
+        (Column("unit"), lambda effect: "" if about[effect].unit == "1" else about[effect].unit),
+        (Column("judged"), lambda effect: "yes" if sizes[effect] <= about[effect].span else "no"),
+    )
 
 
 def _nominal_table(diagnosis: Diagnosis) -> Table:
     given, found = diagnosis.car.vehicle, diagnosis.vehicle
-    columns = (
-        Column("coefficient"),
-        Column("given"),
-        Column("refitted"),
-        Column("std"),
-        Column("moved"),
-        Column("unit"),
+    was = {name: coefficient.nominal for name, coefficient in given.coefficients.items()} | {"m": given.constants.m}
+    now = {name: coefficient.nominal for name, coefficient in found.coefficients.items()} | {"m": found.constants.m}
+    std = {name: coefficient.std for name, coefficient in found.coefficients.items()}
+    names = [*COEFFICIENTS, "m"]
+    return Table.of(
+        names,
+        (Column("coefficient"), str),
+        (Column("given"), was.get),
+        (Column("refitted"), now.get),
+        (Column("std"), std.get),
+        (Column("moved"), lambda name: float(np.round(diagnosis.car.moved[names.index(name)], 2))),
+        (Column("unit"), lambda name: COEFFICIENT_UNITS.get(name, "kg")),
     )
-    rows: list[list[Value]] = [
-        [
-            name,
-            given.coefficients[name].nominal,
-            found.coefficients[name].nominal,
-            found.coefficients[name].std,
-            float(np.round(diagnosis.car.moved[k], 2)),
-            COEFFICIENT_UNITS[name],
-        ]
-        for k, name in enumerate(COEFFICIENTS)
-    ]
-    rows.append(["m", given.constants.m, found.constants.m, None, float(np.round(diagnosis.car.moved[17], 2)), "kg"])
-    return Table(columns, rows)

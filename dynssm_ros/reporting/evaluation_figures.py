@@ -7,9 +7,9 @@ Nothing here touches pyplot's global state, so figures can be drawn in any threa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
-from typing import Any, ParamSpec
+from typing import Any, ParamSpec, TypeVar
 
 import matplotlib as mpl
 import numpy as np
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter, ScalarFormatter
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.evaluation.coefficients import coefficient_unit, range_used, resting
+from dynssm_ros.evaluation.coefficients import coefficient_label, range_used, resting
 from dynssm_ros.evaluation.metrics import explained
 from dynssm_ros.evaluation.regimes import liveliest
 from dynssm_ros.reporting.tables import percent, text
@@ -28,6 +28,7 @@ from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 SYMBOLS = {"v_x": "$v_x$", "v_y": "$v_y$", "omega": r"$\omega$"}
 UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
 MEASURED = "#1a1a1a"
+OUTSIDE = "#e9e9e9"  # of the bounds
 NO_MODEL = "#9a9a9a"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#332288", "#882255", "#999933")
 WIDTH = 9.6  # inches; the width of a report's text
@@ -50,6 +51,7 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.3,
 }
+Drawn = TypeVar("Drawn")
 _P = ParamSpec("_P")
 
 
@@ -64,10 +66,34 @@ def styled(draw: Callable[_P, Figure]) -> Callable[_P, Figure]:
     return in_style
 
 
+def sheet(height: float, rows: int = 1, columns: int = 1, **grid: Any) -> tuple[Figure, Any]:
+    """A figure as wide as a report's text, and its panel or array of panels, as ``Figure.subplots`` gives them."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, **grid)
+
+
+def legend_above(figure: Figure, panel: Axes, ncols: int = 4) -> Figure:
+    """Explains what is drawn in one panel above all of them."""
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside upper left", ncols=ncols)
+    return figure
+
+
+def label(channel: str, what: str = "") -> str:
+    """A channel of the state, or ``what`` of it, with its unit."""
+    return f"{SYMBOLS[channel]}{what} ({UNITS[channel]})"
+
+
 def model_colours(names: list[str]) -> dict[str, str]:
     """A colour for each model, grey for persistence."""
     others = [name for name in names if name != "persistence"]
     return {"persistence": NO_MODEL} | {name: PALETTE[k % len(PALETTE)] for k, name in enumerate(others)}
+
+
+def model_lines(models: Mapping[str, Drawn]) -> Iterator[tuple[str, Drawn, dict[str, Any]]]:
+    """Name and values of each model, and the style of its lines; the first model lies on top."""
+    colours = model_colours(list(models))
+    for depth, (name, values) in enumerate(models.items()):
+        yield name, values, {"color": colours[name], "zorder": 3 - 0.1 * depth, "label": name}
 
 
 @styled
@@ -83,27 +109,23 @@ def predicted_and_measured(
         seconds: length of the stretch.
     """
     shown = liveliest(time, measured, seconds)
-    colours = model_colours(list(predicted))
-    figure = Figure(figsize=(WIDTH, 6.2), layout="constrained")
-    axes = figure.subplots(3, 2, sharex=True)
+    figure, axes = sheet(6.2, 3, 2, sharex=True)
     t = time[shown]
     for k, channel in enumerate(STATE_SIGNALS):
         values, errors = axes[k]
         values.plot(t, measured[shown, k], color=MEASURED, lw=2.2, alpha=0.75, label="measured")
-        for depth, (name, states) in enumerate(predicted.items()):  # the first model lies on top
-            style: dict[str, Any] = {"color": colours[name], "lw": 1.0, "zorder": 3 - 0.1 * depth}
-            values.plot(t, states[shown, k], label=name, **style)
-            errors.plot(t, states[shown, k] - measured[shown, k], **style)
+        for _, states, style in model_lines(predicted):
+            values.plot(t, states[shown, k], lw=1.0, **style)
+            errors.plot(t, states[shown, k] - measured[shown, k], lw=1.0, **style)
         errors.axhline(0.0, color=MEASURED, lw=0.8)
-        values.set_ylabel(f"{SYMBOLS[channel]} ({UNITS[channel]})")
-        errors.set_ylabel(f"{SYMBOLS[channel]} error ({UNITS[channel]})")
+        values.set_ylabel(label(channel))
+        errors.set_ylabel(label(channel, " error"))
     axes[0, 0].set_title("Predicted one step ahead, and measured")
     axes[0, 1].set_title("Error: predicted minus measured")
     for bottom in axes[2]:
         bottom.set_xlabel("time (s)")
     figure.align_ylabels()
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure
+    return legend_above(figure, axes[0, 0])
 
 
 @styled
@@ -117,8 +139,7 @@ def increments(current: Vector, measured: Vector, predicted: Mapping[str, Vector
     """
     shown = {name: states for name, states in predicted.items() if name != "persistence"} or dict(predicted)
     colours = model_colours(list(predicted))
-    figure = Figure(figsize=(WIDTH, 0.5 + 2.6 * len(shown)), layout="constrained")
-    axes = figure.subplots(len(shown), 3, squeeze=False)
+    figure, axes = sheet(0.5 + 2.6 * len(shown), len(shown), 3, squeeze=False)
     truth = measured - current
     every = slice(None, None, max(1, len(truth) // 4000))
     for row, (name, states) in zip(axes, shown.items(), strict=True):
@@ -128,16 +149,8 @@ def increments(current: Vector, measured: Vector, predicted: Mapping[str, Vector
             limit = max(float(np.percentile(np.abs(truth[:, k]), 99.7)), 1e-12) * 1.05
             panel.plot([-limit, limit], [-limit, limit], color=MEASURED, lw=0.8)
             panel.axhline(0.0, color=NO_MODEL, lw=0.8, ls="--")
-            panel.plot(
-                truth[every, k],
-                (states - current)[every, k],
-                ".",
-                color=colours[name],
-                ms=2.5,
-                alpha=0.35,
-                mew=0,
-                rasterized=True,
-            )
+            dots: dict[str, Any] = {"color": colours[name], "ms": 2.5, "alpha": 0.35, "mew": 0, "rasterized": True}
+            panel.plot(truth[every, k], (states - current)[every, k], ".", **dots)
             panel.set(xlim=(-limit, limit), ylim=(-limit, limit))
             worth = f"{percent(share[k])} explained" if share[k] > 0 else "none explained"
             panel.set_title(f"{SYMBOLS[channel]}: {worth}", fontsize=9.5)
@@ -159,8 +172,7 @@ def relative_errors(rmse: Mapping[str, Vector], std: Mapping[str, Vector], persi
     """
     names = [name for name in rmse if name != "persistence"] or list(rmse)
     colours = model_colours(names)
-    figure = Figure(figsize=(WIDTH, 1.3 + 0.26 * len(names) * 3), layout="constrained")
-    panel = figure.subplots()
+    figure, panel = sheet(1.3 + 0.26 * len(names) * 3)
     thickness = 0.8 / len(names)
     longest = 1.0
     small: dict[str, Any] = {"fontsize": 8.5, "bbox": {"facecolor": "white", "lw": 0, "pad": 0.8}}
@@ -188,8 +200,7 @@ def relative_errors(rmse: Mapping[str, Vector], std: Mapping[str, Vector], persi
     panel.set(xlim=(0, 1.12 * longest), ylim=(2.5, -0.7), xlabel="one-step RMSE relative to persistence")
     panel.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
     panel.grid(axis="y", visible=False)
-    figure.legend(loc="outside upper left", ncols=4)
-    return figure
+    return legend_above(figure, panel)
 
 
 @styled
@@ -201,97 +212,82 @@ def rollout_growth(time: Vector, errors: Mapping[str, Vector], std: Mapping[str,
         errors: by model name, mean over the seeds of the RMSE of the states and of the displacement, each ``(n, 4)``.
         std: their standard deviation over the seeds, 0 for a single one; drawn as a band.
     """
-    colours = model_colours(list(errors))
-    figure = Figure(figsize=(WIDTH, 5.4), layout="constrained")
-    axes = figure.subplots(2, 2, sharex=True).ravel()
-    for depth, (name, values) in enumerate(errors.items()):  # the first model lies on top
-        shown = np.where(np.isfinite(values), values, np.nan)
-        style: dict[str, Any] = {"color": colours[name], "zorder": 3 - 0.1 * depth}
-        for k, panel in enumerate(axes):
-            panel.plot(time, shown[:, k], marker="o", ms=3, label=name, **style)
-            if std[name][:, k].any():
-                low, high = shown[:, k] - std[name][:, k], shown[:, k] + std[name][:, k]
-                panel.fill_between(time, low, high, alpha=0.2, lw=0, **style)
-    for panel, channel in zip(axes, STATE_SIGNALS, strict=False):
-        panel.set_title(f"{SYMBOLS[channel]}: RMSE ({UNITS[channel]})")
-    axes[3].set_title("Displacement: mean distance (m)")
-    for k, panel in enumerate(axes):
+    figure, axes = sheet(5.4, 2, 2, sharex=True)
+    titles = [*(label(channel, ": RMSE") for channel in STATE_SIGNALS), "Displacement: mean distance (m)"]
+    for k, (panel, title) in enumerate(zip(axes.flat, titles, strict=True)):
+        for name, values, style in model_lines(errors):
+            shown, spread = np.where(np.isfinite(values[:, k]), values[:, k], np.nan), std[name][:, k]
+            panel.plot(time, shown, marker="o", ms=3, **style)
+            if spread.any():
+                panel.fill_between(time, shown - spread, shown + spread, alpha=0.2, lw=0, **style | {"label": ""})
+        panel.set_title(title)
         panel.set_xlim(left=0.0)
         panel.set_ylim(0.0, room({name: values[:, k] for name, values in errors.items()}))
-    for panel in axes[2:]:
+    for panel in axes[1]:
         panel.set_xlabel("time ahead (s)")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure
+    return legend_above(figure, axes[0, 0])
 
 
 @styled
-def adapted_parameters(
-    x: Vector, theta: Vector, vehicle: Vehicle | None = None, x_label: str = "time (s)", colour: str = PALETTE[0]
-) -> Figure:
+def adapted_parameters(time: Vector, theta: Vector, vehicle: Vehicle) -> Figure:
     """Adapted coefficients along the run; what lies outside the admissible range is shaded.
 
     Args:
-        x: abscissa of each row, for instance time or distance driven, shape ``(N,)``; steps back or holes cut the line.
+        time: of each row (s), shape ``(N,)``; steps back or holes cut the line.
         theta: coefficients, shape ``(N, 17)``.
-        vehicle: gives range and nominal value; without it the axes follow the values.
-        x_label: what ``x`` is, with its unit.
-        colour: of the lines.
+        vehicle: gives range and nominal value.
     """
-    figure = Figure(figsize=(WIDTH, 9.6), layout="constrained")
-    axes = figure.subplots(6, 3, sharex=True).ravel()
-    every = slice(None, None, max(1, len(x) // MAX_POINTS))
-    abscissa, values = _cut_at_holes(x[every], theta[every])
+    figure, axes = sheet(9.6, 6, 3, sharex=True)
+    axes = axes.ravel()
+    every = slice(None, None, max(1, len(time) // MAX_POINTS))
+    abscissa, values = _cut_at_holes(time[every], theta[every])
     for k, name in enumerate(COEFFICIENTS):
         panel: Axes = axes[k]
-        if vehicle is not None:
-            lower, upper = vehicle.lower[k], vehicle.upper[k]
-            margin = 0.12 * (upper - lower)
-            panel.axhspan(lower - margin, lower, color="#e9e9e9", lw=0, label="outside the bounds")
-            panel.axhspan(upper, upper + margin, color="#e9e9e9", lw=0)
-            panel.axhline(vehicle.nominal[k], color=MEASURED, lw=0.8, ls="--", label="nominal value")
-            panel.set_ylim(lower - margin, upper + margin)
-        panel.plot(abscissa, values[:, k], color=colour, lw=1.0, label="adapted")
-        panel.set_title(_coefficient_label(name))
+        lower, upper = vehicle.lower[k], vehicle.upper[k]
+        margin = 0.12 * (upper - lower)
+        panel.axhspan(lower - margin, lower, color=OUTSIDE, lw=0, label="outside the bounds")
+        panel.axhspan(upper, upper + margin, color=OUTSIDE, lw=0)
+        panel.axhline(vehicle.nominal[k], color=MEASURED, lw=0.8, ls="--", label="nominal value")
+        panel.set_ylim(lower - margin, upper + margin)
+        panel.plot(abscissa, values[:, k], color=PALETTE[0], lw=1.0, label="adapted")
+        panel.set_title(coefficient_label(name, _symbol(name)))
         panel.locator_params(axis="y", nbins=4)
     for spare in axes[len(COEFFICIENTS) :]:
         spare.set_axis_off()
     for lowest in axes[-3:]:
-        lowest.set_xlabel(x_label)
+        lowest.set_xlabel("time (s)")
     axes[-1].legend(*axes[0].get_legend_handles_labels(), loc="upper left")
     return figure
 
 
 @styled
-def parameter_usage(theta: Vector, vehicle: Vehicle, colour: str = PALETTE[0]) -> Figure:
+def parameter_usage(theta: Vector, vehicle: Vehicle) -> Figure:
     """How much of its admissible range each coefficient uses, and whether it rests on a bound.
 
     Args:
         theta: adapted coefficients, shape ``(N, 17)``.
         vehicle: gives range and nominal value.
-        colour: of the bars.
     """
     low, q1, median, q3, high = np.percentile(range_used(theta, vehicle), [1, 25, 50, 75, 99], axis=0)
     at_bound = resting(theta, vehicle).mean(axis=0)
     places = np.arange(len(COEFFICIENTS))
-    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
-    panel = figure.subplots()
-    panel.barh(places, high - low, 0.3, left=low, color=colour, alpha=0.35, label="1 % to 99 % of the time")
-    panel.barh(places, q3 - q1, 0.6, left=q1, color=colour, label="middle half of the time")
+    figure, panel = sheet(5.2)
+    panel.barh(places, high - low, 0.3, left=low, color=PALETTE[0], alpha=0.35, label="1 % to 99 % of the time")
+    panel.barh(places, q3 - q1, 0.6, left=q1, color=PALETTE[0], label="middle half of the time")
     panel.plot(median, places, "|", color="white", ms=8, mew=1.5)
     panel.plot(range_used(vehicle.nominal, vehicle), places, "D", color=MEASURED, ms=4.5, mfc="white", label="nominal")
     for place, share in zip(places, at_bound, strict=True):
         if share > 0.01:
             panel.annotate(f"{percent(share)} of the time on a bound", (1.03, place), va="center", fontsize=8.5)
-    panel.axvspan(-0.02, 0.0, color="#e9e9e9", lw=0)
-    panel.axvspan(1.0, 1.02, color="#e9e9e9", lw=0)
+    panel.axvspan(-0.02, 0.0, color=OUTSIDE, lw=0)
+    panel.axvspan(1.0, 1.02, color=OUTSIDE, lw=0)
     panel.set_yticks(places, [_symbol(name) for name in COEFFICIENTS])
     panel.set(xlim=(-0.02, 1.02 if at_bound.max() <= 0.01 else 1.3), ylim=(len(COEFFICIENTS) - 0.4, -0.6))
     panel.set_xticks(np.linspace(0, 1, 6))
     panel.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
     panel.set_xlabel("position inside the admissible range")
     panel.grid(axis="y", visible=False)
-    figure.legend(loc="outside upper left", ncols=3)
-    return figure
+    return legend_above(figure, panel, ncols=3)
 
 
 @styled
@@ -306,19 +302,17 @@ def latency_histogram(samples: Mapping[str, Vector], unit: str = "µs", what: st
     colours = model_colours(list(samples))
     everything = np.concatenate(list(samples.values()))
     edges = np.geomspace(everything.min() * 0.95, everything.max() * 1.05, 70)
-    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
-    panel = figure.subplots()
+    figure, panel = sheet(3.2)
     for name, values in samples.items():
         p50, p99 = np.percentile(values, [50, 99])
-        label = f"{name}: p50 {text(float(p50))} {unit}, p99 {text(float(p99))} {unit}"
-        panel.hist(values, edges.tolist(), color=colours[name], alpha=0.75, label=label)
+        words = f"{name}: p50 {text(float(p50))} {unit}, p99 {text(float(p99))} {unit}"
+        panel.hist(values, edges.tolist(), color=colours[name], alpha=0.75, label=words)
         panel.axvline(p50, color=colours[name], lw=1.0)
         panel.axvline(p99, color=colours[name], lw=1.0, ls=":")
     panel.set_xscale("log")
     panel.xaxis.set_major_formatter(ScalarFormatter())
     panel.set(xlabel=f"{what} ({unit})", ylabel="calls")
-    figure.legend(loc="outside upper left", ncols=2)
-    return figure
+    return legend_above(figure, panel, ncols=2)
 
 
 @styled
@@ -331,27 +325,21 @@ def regime_errors(labels: Sequence[str], what: str, rmse: Mapping[str, Vector], 
         rmse: by model name, mean over the seeds, each ``(R, 3)``.
         std: its standard deviation over the seeds, 0 for a single one; drawn as whiskers.
     """
-    colours = model_colours(list(rmse))
-    figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
-    axes = figure.subplots(1, 3)
+    figure, axes = sheet(2.9, 1, 3)
     places = np.arange(len(labels))
-    for depth, (name, values) in enumerate(rmse.items()):  # the first model lies on top
-        shown = np.where(np.isfinite(values), values, np.nan)
-        shift = 0.06 * (depth - (len(rmse) - 1) / 2)
-        for k, panel in enumerate(axes):
-            panel.errorbar(
-                places + shift, shown[:, k], np.where(std[name][:, k] > 0, std[name][:, k], np.nan), marker="o", ms=3.5,
-                lw=0.8, elinewidth=1.2, capsize=2.5, color=colours[name], label=name, zorder=3 - 0.1 * depth,
-            )  # fmt: skip
+    bars: dict[str, Any] = {"marker": "o", "ms": 3.5, "lw": 0.8, "elinewidth": 1.2, "capsize": 2.5}
     for k, (panel, channel) in enumerate(zip(axes, STATE_SIGNALS, strict=True)):
-        panel.set_title(f"{SYMBOLS[channel]}: RMSE ({UNITS[channel]})")
+        for depth, (name, values, style) in enumerate(model_lines(rmse)):
+            shown = np.where(np.isfinite(values[:, k]), values[:, k], np.nan)
+            whiskers = np.where(std[name][:, k] > 0, std[name][:, k], np.nan)
+            panel.errorbar(places + 0.06 * (depth - (len(rmse) - 1) / 2), shown, whiskers, **bars, **style)
+        panel.set_title(label(channel, ": RMSE"))
         panel.set_xticks(places, labels)
         panel.set_xlabel(what)
         panel.set_xlim(-0.5, len(labels) - 0.5)
         panel.set_ylim(0.0, room({name: values[:, k] for name, values in rmse.items()}))
         panel.grid(axis="x", visible=False)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure
+    return legend_above(figure, axes[0])
 
 
 def _cut_at_holes(x: Vector, values: Vector) -> tuple[Vector, Vector]:
@@ -380,11 +368,6 @@ def _symbol(name: str) -> str:
     return f"${stem}_{{{index}}}$"
 
 
-def _coefficient_label(name: str) -> str:
-    unit = coefficient_unit(name)
-    return f"{_symbol(name)} ({unit})" if unit else _symbol(name)
-
-
 @styled
 def loss_components(history: Mapping[str, Sequence[float]], best_epoch: int) -> Figure:
     """The terms of the training objective over the epochs, the paper's loss figure.
@@ -394,8 +377,8 @@ def loss_components(history: Mapping[str, Sequence[float]], best_epoch: int) -> 
         best_epoch: the epoch whose weights were kept.
     """
     terms = [key.removeprefix("train/") for key, values in history.items() if key.startswith("train/") and any(values)]
-    figure = Figure(figsize=(WIDTH, 2.0 * len(terms) + 0.6), layout="constrained")
-    axes = figure.subplots(len(terms), 1, sharex=True, squeeze=False)[:, 0]
+    figure, axes = sheet(2.0 * len(terms) + 0.6, len(terms), sharex=True, squeeze=False)
+    axes = axes[:, 0]
     for axis, term in zip(axes, terms, strict=True):
         for part, colour in (("train", PALETTE[0]), ("validation", PALETTE[1])):
             values = history[f"{part}/{term}"]

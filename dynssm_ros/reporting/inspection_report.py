@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from dynssm_ros.reporting.evaluation_figures import MAX_POINTS, MEASURED, PALETTE, WIDTH, styled
+from dynssm_ros.reporting.evaluation_figures import MAX_POINTS, MEASURED, PALETTE, WIDTH, sheet, styled
 from dynssm_ros.reporting.inspection_tables import signal_table, topic_table
 from dynssm_ros.reporting.page import Report, Section
 from dynssm_ros.signals.inspection import Inspection
@@ -39,8 +39,8 @@ def signals_over_time(found: Inspection) -> Figure:
     """The suggested signals, one panel for each quantity that is there."""
     panels = {title: [one for one in names if one in found.signals] for title, names in _PANELS.items()}
     panels = {title: names for title, names in panels.items() if names}
-    figure = Figure(figsize=(WIDTH, 0.4 + 1.35 * len(panels)), layout="constrained")
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    figure, axes = sheet(0.4 + 1.35 * len(panels), len(panels), sharex=True, squeeze=False)
+    axes = axes[:, 0]
     for panel, (title, names) in zip(axes, panels.items(), strict=True):
         for k, name in enumerate(names):
             one = found.signals[name]

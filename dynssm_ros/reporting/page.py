@@ -16,6 +16,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import matplotlib as mpl
+import yaml
 from jinja2 import Environment, StrictUndefined
 from matplotlib.figure import Figure
 
@@ -65,18 +66,43 @@ class Report:
         """The report as HTML text."""
         environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
         environment.filters["svg_uri"] = svg_uri
-        source = files(__package__).joinpath("templates/report.html.j2").read_text(encoding="utf-8")
         made = f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC"
         protocol = dict(self.protocol) | {
             "Made": f"{made} by dynssm_ros {__version__}, Python {platform.python_version()}, {platform.machine()}"
         }
-        return environment.from_string(source).render(report=self, protocol=protocol)
+        return environment.from_string(_template("report.html.j2")).render(report=self, protocol=protocol)
 
     def save(self, path: str | Path) -> None:
         """Writes the HTML file, atomically."""
         text = self.html()
         with replacing(path) as aside:
             aside.write_text(text, encoding="utf-8")
+
+
+class Prose:
+    """Titles and texts of a page's sections and protocol, from ``templates/PAGE.yaml``.
+
+    Args:
+        page: name of that file.
+        values: fill the ``{names}`` in its texts.
+    """
+
+    def __init__(self, page: str, **values: object) -> None:
+        self._texts = yaml.safe_load(_template(f"{page}.yaml"))
+        self._values = values
+
+    def section(self, name: str, figure: Figure | None = None, table: Table | None = None, **more: object) -> Section:
+        """The section of a name, its texts filled with ``more`` values too."""
+        title, text = (words.format(**self._values, **more) for words in self._texts[name])
+        return Section(title, text, figure, table)
+
+    def protocol(self, **more: object) -> dict[str, str]:
+        """How what is reported was obtained, by name."""
+        return {name: words.format(**self._values, **more) for name, words in self._texts["protocol"].items()}
+
+
+def _template(name: str) -> str:
+    return files(__package__).joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def svg_uri(figure: Figure) -> str:

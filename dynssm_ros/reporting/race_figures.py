@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -16,16 +15,23 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.control.race import Race
 from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.evaluation.coefficients import coefficient_label
-from dynssm_ros.reporting.evaluation_figures import MEASURED, SYMBOLS, UNITS, WIDTH, model_colours, styled
+from dynssm_ros.reporting.evaluation_figures import (
+    MEASURED,
+    WIDTH,
+    label,
+    legend_above,
+    model_colours,
+    sheet,
+    styled,
+)
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State
 from dynssm_ros.vehicle.single_track import Motion, lateral_force
 
 _ENLARGED = 6.0  # where the paths part is enlarged if it is smaller than the track by this factor
 _STAMPS = 0.5  # s between the time stamps on the map
-_MOVED = (
-    1e-3  # share of its bounds that a coefficient must move, and of a state's range that must be added, to be shown
-)
+_MOVED = 1e-3  # of its bounds that a coefficient must move, and of a state's range that must be added, to be shown
 _LEARNED = 4  # coefficients in the figure of a car that learns
 _ANSWERS = 6  # coefficients at most in a figure of hidden effects
 
@@ -41,11 +47,11 @@ def trajectories(races: Sequence[Race]) -> Figure:
     across, up = np.ptp(races[0].course.track.centre.points, axis=0)
     enlarged = side * _ENLARGED < np.hypot(across, up)
     height = (0.6 if enlarged else 0.9) * min(up / across, 1.0)
-    figure = Figure(figsize=(WIDTH, WIDTH * max(height, 0.35) + 0.9), layout="constrained")
+    size = WIDTH * max(height, 0.35) + 0.9
     if not enlarged:
-        plan = figure.subplots()
+        figure, plan = sheet(size)
     else:
-        plan, near = figure.subplots(1, 2, width_ratios=(2, 1))
+        figure, (plan, near) = sheet(size, 1, 2, width_ratios=(2, 1))
         _draw_paths(near, races)
         near.set(xlim=place[0] + np.array([-side, side]) / 2, ylim=place[1] + np.array([-side, side]) / 2)
         near.set_title("where the paths part most", fontsize=9)
@@ -57,8 +63,7 @@ def trajectories(races: Sequence[Race]) -> Figure:
         plan.annotate(
             f"{round(float(races[0].time[k]), 2):g} s", (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7
         )
-    figure.legend(*plan.get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure
+    return legend_above(figure, plan)
 
 
 def _parting(races: Sequence[Race]) -> tuple[Vector, float]:
@@ -71,25 +76,32 @@ def _parting(races: Sequence[Race]) -> tuple[Vector, float]:
 
 
 def _draw_paths(axes: Axes, races: Sequence[Race]) -> None:
-    course, colours = races[0].course, model_colours([race.name for race in races])
-    for border in (course.track.left_border, course.track.right_border):
-        axes.plot(*np.concatenate([border, border[:1]]).T, color=MEASURED, lw=1.0)
+    course = races[0].course
+    draw_borders(axes, course.track)
     line = course.reference.line.points
-    axes.plot(
-        *np.concatenate([line, line[:1]]).T, color="#777777", lw=0.8, ls="--", label=f"{course.reference.name} line"
-    )
-    T_s = course.vehicle.sampling_time
-    every = max(1, round(stamp_period(races) / T_s))
-    for race, width in zip(races, widths(len(races)), strict=True):
-        axes.plot(*race.pose[:, :2].T, color=colours[race.name], lw=width, label=race.name)
-        marks = race.pose[::every]
-        axes.plot(*marks[:, :2].T, "o", color=colours[race.name], mec="white", mew=0.5, ms=4, zorder=3)
+    axes.plot(*_closed(line).T, color="#777777", lw=0.8, ls="--", label=f"{course.reference.name} line")
+    every = max(1, round(stamp_period(races) / course.vehicle.sampling_time))
+    for race, style in race_lines(races):
+        axes.plot(*race.pose[:, :2].T, label=race.name, **style)
+        axes.plot(*race.pose[::every, :2].T, "o", color=style["color"], mec="white", mew=0.5, ms=4, zorder=3)
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
 
 
-def widths(count: int) -> list[float]:
-    """Of the lines of ``count`` models: those drawn first are wider, so that cars that drive alike are all seen."""
-    return [float(width) for width in np.linspace(min(count, 3), 1.0, count)]
+def draw_borders(axes: Axes, track: Track) -> None:
+    """Both borders of a track."""
+    for border in (track.left_border, track.right_border):
+        axes.plot(*_closed(border).T, color=MEASURED, lw=1.0)
+
+
+def _closed(line: Vector) -> Vector:
+    return np.concatenate([line, line[:1]])
+
+
+def race_lines(races: Sequence[Race]) -> list[tuple[Race, dict[str, Any]]]:
+    """Races with the style of their lines: those drawn first are wider, so that cars that drive alike are all seen."""
+    colours, widths = model_colours([race.name for race in races]), np.linspace(min(len(races), 3), 1.0, len(races))
+    styles = ({"color": colours[race.name], "lw": float(width)} for race, width in zip(races, widths, strict=True))
+    return list(zip(races, styles, strict=True))
 
 
 def stamp_period(races: Sequence[Race]) -> float:
@@ -100,21 +112,23 @@ def stamp_period(races: Sequence[Race]) -> float:
 @styled
 def profiles(races: Sequence[Race]) -> Figure:
     """State and commands over the position on the track."""
-    rows = [(f"{SYMBOLS[c]} ({UNITS[c]})", k, "state") for k, c in enumerate(STATE_SIGNALS)]
+    rows = [(label(c), k, "state") for k, c in enumerate(STATE_SIGNALS)]
     rows += [("throttle", 0, "command"), ("steering (rad)", 1, "command")]
-    return _panels(races, [(label, [getattr(race, what)[:, k] for race in races]) for label, k, what in rows])
+    return _panels(races, [(name, [getattr(race, what)[:, k] for race in races]) for name, k, what in rows])
 
 
 @styled
 def forces(races: Sequence[Race]) -> Figure:
     """Axle and drive forces over the position on the track: as each model estimates them, and the driven car's own."""
     along = compared_forces(races)
-    estimated, driven = [_estimated(race) for race in races], _motion(along)
+    # with the coefficients that a model planned with; the plant's own model knows its effects
+    estimated = [_motion(r) if r.name == TRUE else _motion(r, with_effects=False, theta=r.theta) for r in races]
+    driven = _motion(along)
     rows = {"F_fy": "$F_{fy}$ (N)", "F_ry": "$F_{ry}$ (N)", "F_d": "$F_d$ (N)"}
     return _panels(
         races,
-        [(label, [getattr(each, name) for each in estimated]) for name, label in rows.items()],
-        {label: getattr(driven, name) for name, label in rows.items()},
+        [(symbol, [getattr(each, name) for each in estimated]) for name, symbol in rows.items()],
+        {symbol: getattr(driven, name) for name, symbol in rows.items()},
         along,
     )
 
@@ -122,11 +136,6 @@ def forces(races: Sequence[Race]) -> Figure:
 def compared_forces(races: Sequence[Race]) -> Race:
     """The race whose forces are shown as they were: the longest one, not of the plant's own model, which has no others."""
     return max(races, key=lambda race: (race.name != TRUE, race.s[-1] - race.s[0]))
-
-
-def _estimated(race: Race) -> Motion:
-    """The equations of motion with the coefficients that a model planned with; the plant's own knows its effects."""
-    return _motion(race) if race.name == TRUE else _motion(race, with_effects=False, theta=race.theta)
 
 
 def _motion(race: Race, with_effects: bool = True, theta: Vector | None = None) -> Motion:
@@ -181,14 +190,16 @@ def coefficients(races: Sequence[Race]) -> Figure:
     """
     longest = max(races, key=lambda race: race.s[-1] - race.s[0])
     vehicle, driven = longest.course.vehicle, driven_coefficients(longest)
-    told = [race.theta[_first_change(race.theta) if driven else 0 :] for race in races]
+    # from where a model begins to speak: its first row is repeated before
+    begins = [int(np.argmax(np.any(race.theta != race.theta[0], axis=1))) if driven else 0 for race in races]
+    told = [race.theta[begin:] for race, begin in zip(races, begins, strict=True)]
     moves = np.max([np.ptp(theta, axis=0) for theta in told], axis=0) / (vehicle.upper - vehicle.lower)
     moving = [k for k, name in enumerate(COEFFICIENTS) if moves[k] > _MOVED or name in driven]
     if driven:
         moving = sorted(moving, key=lambda k: (COEFFICIENTS[k] not in driven, -moves[k]))[:_ANSWERS]
     rows = [(coefficient_label(COEFFICIENTS[k]), [race.theta[:, k] for race in races]) for k in moving]
     rows += [
-        (f"{SYMBOLS[c]} added ({UNITS[c]})", [race.correction[:, k] for race in races])
+        (label(c, " added"), [race.correction[:, k] for race in races])
         for k, c in enumerate(STATE_SIGNALS)
         if not moving
         or any(np.max(np.abs(race.correction[:, k])) > _MOVED * np.ptp(race.state[:, k]) for race in races)
@@ -203,11 +214,11 @@ def learning(races: Sequence[Race]) -> Figure:
     colours = model_colours([race.name for race in races])
     known = {name for race in races for name in _learned_most(race)}
     names = [name for name in COEFFICIENTS if name in known]
-    figure = Figure(figsize=(WIDTH, 0.8 + 1.9 * (2 + -(-len(names) // 2))), layout="constrained")
-    panels = figure.subplots(2 + -(-len(names) // 2), 2, sharex=True, squeeze=False)
-    labels = ("lap time (s)", "share of the limits", "margin used", "grip of the sections")
-    for panel, label in zip(panels.flat, labels, strict=False):
-        panel.set_ylabel(label)
+    rows = 2 + -(-len(names) // 2)
+    figure, panels = sheet(0.8 + 1.9 * rows, rows, 2, sharex=True, squeeze=False)
+    titles = ("lap time (s)", "share of the limits", "margin used", "grip of the sections")
+    for panel, title in zip(panels.flat, titles, strict=False):
+        panel.set_ylabel(title)
     for race in races:
         colour, laps = colours[race.name], np.arange(1, len(race.learned) + 1)
         panels[0, 0].plot(laps, [lap.time for lap in race.learned], "o-", ms=4, color=colour, label=race.name)
@@ -232,8 +243,7 @@ def learning(races: Sequence[Race]) -> Figure:
     for bottom in panels[-1]:
         bottom.set_xlabel("lap")
         bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure
+    return legend_above(figure, panels[0, 0])
 
 
 def _learned_most(race: Race) -> list[str]:
@@ -246,16 +256,8 @@ def _learned_most(race: Race) -> list[str]:
 @styled
 def evidence(races: Sequence[Race]) -> Figure:
     """How much of each model was planned with, over the distance driven."""
-    rows: list[tuple[str, list[Any]]] = [
-        ("coefficients used", [1.0 - race.weights[:, 0] for race in races]),
-        ("additions used", [race.weights[:, 2] for race in races]),
-    ]
-    return _panels(races, rows)
-
-
-def _first_change(theta: npt.NDArray[np.float64]) -> int:
-    """The first row that is not the first one repeated: where a model begins to speak; 0 if it never does."""
-    return int(np.argmax(np.any(theta != theta[0], axis=1)))
+    used = [1.0 - race.weights[:, 0] for race in races]
+    return _panels(races, [("coefficients used", used), ("additions used", [race.weights[:, 2] for race in races])])
 
 
 def _panels(
@@ -265,17 +267,15 @@ def _panels(
     along: Race | None = None,
 ) -> Figure:
     """A panel per row, over the distance driven; dashed lines by the label of the row, of the race ``along``."""
-    colours = model_colours([race.name for race in races])
     columns = 1 if len(rows) <= 6 else 2
     lines = -(-len(rows) // columns)
-    figure = Figure(figsize=(WIDTH, 0.6 + 1.35 * lines), layout="constrained")
-    axes = figure.subplots(lines, columns, sharex=True, squeeze=False)
-    for panel, (label, values) in zip(axes.T.flat, rows, strict=False):
-        for race, series, width in zip(races, values, widths(len(races)), strict=True):
-            panel.plot(race.s - race.s[0], series, color=colours[race.name], lw=width, label=race.name)
-        if along is not None and label in (dashed or {}):
-            panel.plot(along.s - along.s[0], (dashed or {})[label], color=MEASURED, lw=1.0, ls="--", zorder=1)
-        panel.set_ylabel(label)
+    figure, axes = sheet(0.6 + 1.35 * lines, lines, columns, sharex=True, squeeze=False)
+    for panel, (title, values) in zip(axes.T.flat, rows, strict=False):
+        for (race, style), series in zip(race_lines(races), values, strict=True):
+            panel.plot(race.s - race.s[0], series, label=race.name, **style)
+        if along is not None and dashed is not None and title in dashed:
+            panel.plot(along.s - along.s[0], dashed[title], color=MEASURED, lw=1.0, ls="--", zorder=1)
+        panel.set_ylabel(title)
     for spare in list(axes.T.flat)[len(rows) :]:
         spare.set_visible(False)
     for column in axes.T:
@@ -283,5 +283,4 @@ def _panels(
         bottom.set_xlabel("driven along the centre line (m)")
         bottom.tick_params(labelbottom=True)
     figure.align_ylabels()
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure
+    return legend_above(figure, axes[0, 0])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dynssm_ros.control.race import Course, Race
-from dynssm_ros.reporting.page import Report, Section
+from dynssm_ros.reporting.page import Prose, Report
 from dynssm_ros.reporting.race_figures import (
     coefficients,
     compared_forces,
@@ -20,7 +20,7 @@ from dynssm_ros.reporting.race_figures import (
     stamp_period,
     trajectories,
 )
-from dynssm_ros.reporting.tables import Column, Table, Value
+from dynssm_ros.reporting.tables import Column, Table
 
 VIOLATION = "A violation is the car's centre of gravity outside the borders at any sample."
 
@@ -53,94 +53,42 @@ def race_json(races: Sequence[Race]) -> dict[str, Any]:
 
 def race_table(races: Sequence[Race]) -> Table:
     """One row per model."""
-    columns = (
-        Column("model", brief=True),
-        Column("lap", "s", best="min", brief=True),
-        Column("violation", brief=True),
-        Column("outside", "m"),
-        Column("v_x", "m/s", "mean", "max", brief=True),
-        Column("|v_y|", "m/s", "mean"),
-        Column("|ω|", "rad/s", "mean"),
-        Column("steering variation", "rad"),
-        Column("p50", "ms", "control step", brief=True),
-        Column("p99", "ms", "control step", brief=True),
-        Column("infeasible", "", "plans"),
-        Column("late", "", "plans"),
-        Column("missing", "", "plans", brief=True),
+    found = {race.name: race.to_json() for race in races}
+    means = ("mean_v_x", "mean_abs_v_y", "mean_abs_omega")
+    return Table.of(
+        races,
+        (Column("model", brief=True), lambda race: race.name),
+        (Column("lap", "s", best="min", brief=True), lambda race: found[race.name]["lap_time_s"]),
+        (Column("violation", brief=True), lambda race: "yes" if race.outside > 0 else "no"),
+        (Column("outside", "m"), lambda race: race.outside),
+        (
+            (
+                Column("v_x", "m/s", "mean", "max", brief=True),
+                Column("|v_y|", "m/s", "mean"),
+                Column("|ω|", "rad/s", "mean"),
+            ),
+            lambda race: [found[race.name][mean] for mean in means],
+        ),
+        (Column("steering variation", "rad"), lambda race: found[race.name]["steering_total_variation"]),
+        (Column("p50", "ms", "control step", brief=True), lambda race: found[race.name]["solve_ms"]["p50"]),
+        (Column("p99", "ms", "control step", brief=True), lambda race: found[race.name]["solve_ms"]["p99"]),
+        (Column("infeasible", "", "plans"), lambda race: race.infeasible),
+        (Column("late", "", "plans"), lambda race: race.late),
+        (Column("missing", "", "plans", brief=True), lambda race: race.infeasible + race.late),
+        caption=VIOLATION,
     )
-    return Table(columns, [_row(race) for race in races], VIOLATION)
-
-
-def _row(race: Race) -> list[Value]:
-    figures = race.to_json()
-    return [
-        race.name,
-        figures["lap_time_s"],
-        "yes" if figures["violation"] else "no",
-        figures["outside_m"],
-        figures["mean_v_x"],
-        figures["mean_abs_v_y"],
-        figures["mean_abs_omega"],
-        figures["steering_total_variation"],
-        figures["solve_ms"]["p50"],
-        figures["solve_ms"]["p99"],
-        race.infeasible,
-        race.late,
-        race.infeasible + race.late,
-    ]
 
 
 def race_report(races: Sequence[Race]) -> Report:
     """The race as a page."""
     course = races[0].course
-    sections = [
-        Section(
-            "Trajectories",
-            f"The path of each model between the borders, with a mark every {stamp_period(races):g} s; the line that the "
-            "controller follows is dashed.",
-            trajectories(races),
-        ),
-        Section(
-            "State and commands", "Velocities and what the controller commanded, over the position on the lap.",
-            profiles(races),
-        ),
-        Section(
-            "Forces", "Lateral forces of front and rear axle and the drive force at the states and commands that were "
-            "driven, as each model estimates them with its coefficients. Dashed are the driven car's own, with "
-            f"{compared_forces(races).name}.",
-            forces(races),
-        ),
-        Section(
-            "Coefficients",
-            "What the controller planned with, step by step: the coefficients that a model moves, and what is added to the "
-            "stepped velocities, by the model and, if offset-free, for what it mispredicts. Where the driven car has effects "
-            "that amount to a change of a coefficient, the dashed line is what it comes to with them.",
-            coefficients(races),
-        ),
-    ]  # fmt: skip
+    prose = Prose("race", period=stamp_period(races), compared=compared_forces(races).name)
+    figures = {"learning": learning} if any(race.learned for race in races) else {}
+    figures |= {"trajectories": trajectories, "profiles": profiles, "forces": forces, "coefficients": coefficients}
     if course.settings.evidence and any(race.weights[:, 0].min() < 1.0 for race in races):
-        sections.append(
-            Section(
-                "Evidence",
-                "How much of each model was planned with. Without evidence it is the calibrated car (0). A model's "
-                "coefficients, and what it adds beside them, count as soon as they have predicted the last horizons better.",
-                evidence(races),
-            )
-        )
-    if any(race.learned for race in races):
-        sections.insert(
-            0,
-            Section(
-                "Faster every lap",
-                "Lap times. The share of the file's car's accelerations that each lap was driven with: mean over its "
-                "sections, the least and the largest. How close the car came to a border: 1 is a wheel on it, and from 0.75 "
-                "on a section is driven slower. The grip of the sections over that of the coefficients beside it. The "
-                "coefficients that were calibrated on the laps before, with two standard deviations; the dashed line is what "
-                "the effects of the driven car come to.",
-                learning(races),
-            ),
-        )
-    return Report(f"Race on {course.track.name}", summary(races), sections, _protocol(course), race_table(races))
+        figures["evidence"] = evidence
+    sections = [prose.section(name, draw(races)) for name, draw in figures.items()]
+    return Report(f"Race on {course.track.name}", summary(races), sections, _protocol(course, prose), race_table(races))
 
 
 def summary(races: Sequence[Race]) -> str:
@@ -163,25 +111,32 @@ def _laps(course: Course) -> str:
     return "a lap" if course.laps == 1 else f"{course.laps} laps"
 
 
-def _protocol(course: Course) -> dict[str, str]:
-    settings, effects = course.settings, course.vehicle.effects
-    weights = ", ".join(f"{name} {value:g}" for name, value in asdict(settings.weights).items())
-    return {
-        "Track": f"{course.track.name}, {course.track.length:.4g} m, {_laps(course)}",
-        "Plant": f"{course.vehicle.name}, {course.plant}"
-        + (f", with {', '.join(entry.name for entry in effects)}" if effects else ""),
-        "Start": f"{_start(course)}, actuators at zero; the first lap counts from there. Until its window is full a model "
-        "drives with its nominal coefficients",
-        "Line": f"{course.reference.name}, {course.reference.line.length:.4g} m, {course.reference.lap_time:.3f} s at its "
-        f"own speed, {course.reference.full_throttle_time:.3f} s with no more than full throttle",
-        "Controller": f"{settings.objective}, {settings.N} steps of {course.vehicle.sampling_time:g} s, late after "
-        f"{1e3 * settings.deadline:g} ms; weights {weights}, in wheelbases and units of {settings.scale.time:.3g} s; what a "
-        f"model mispredicts is {_FOLLOWED[settings.follows]}; what it adapts is "
-        f"planned with {'where it was better over the last horizons' if settings.evidence else 'as it is'}",
-        "Measured": _measured(course),
-        "Time": "of a control step: model and plan together, the processor's time on one core",
-        "Violation": VIOLATION,
-    }
+def _protocol(course: Course, prose: Prose) -> dict[str, str]:
+    settings, effects, line = course.settings, course.vehicle.effects, course.reference
+    speed = course.starting()[1].v_x
+    return prose.protocol(
+        track=course.track.name,
+        length=course.track.length,
+        laps=_laps(course),
+        vehicle=course.vehicle.name,
+        plant=course.plant,
+        effects=f", with {', '.join(entry.name for entry in effects)}" if effects else "",
+        start="standing" if speed == 0 else f"rolling at {speed:.3g} m/s",
+        line=line.name,
+        line_length=line.line.length,
+        lap_time=line.lap_time,
+        full_throttle_time=line.full_throttle_time,
+        objective=settings.objective,
+        horizon=settings.N,
+        T_s=course.vehicle.sampling_time,
+        deadline_ms=1e3 * settings.deadline,
+        weights=", ".join(f"{name} {value:g}" for name, value in asdict(settings.weights).items()),
+        time_unit=settings.scale.time,
+        followed=_FOLLOWED[settings.follows],
+        adapted="where it was better over the last horizons" if settings.evidence else "as it is",
+        measured=_measured(course),
+        violation=VIOLATION,
+    )
 
 
 _FOLLOWED = {
@@ -191,19 +146,11 @@ _FOLLOWED = {
 
 def _measured(course: Course) -> str:
     """What comes between the car and its controller."""
-    sensing = course.sensing
-    if not any((*sensing.noise, *sensing.pose_noise)):
-        noise = "without noise"
-    else:
+    sensing, noise = course.sensing, "without noise"
+    if any((*sensing.noise, *sensing.pose_noise)):
         velocities, pose = (", ".join(f"{std:g}" for std in part) for part in (sensing.noise, sensing.pose_noise))
         noise = (
             f"with white noise of {velocities} (m/s, m/s, rad/s) and {pose} (m, m, rad), seed {sensing.seed}, which the "
             "controller filters"
         )
-    late = f", {1e3 * course.delay:g} ms late, which the controller knows" if course.delay else ""
-    return noise + late
-
-
-def _start(course: Course) -> str:
-    speed = course.starting()[1].v_x
-    return "standing" if speed == 0 else f"rolling at {speed:.3g} m/s"
+    return noise + (f", {1e3 * course.delay:g} ms late, which the controller knows" if course.delay else "")

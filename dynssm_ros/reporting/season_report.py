@@ -9,11 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from dynssm_ros.evaluation.coefficients import coefficient_unit
-from dynssm_ros.evaluation.season_review import Alarm, Estimate, Found, Review, expected
-from dynssm_ros.reporting.evaluation_figures import MEASURED, PALETTE, WIDTH, model_colours, styled
-from dynssm_ros.reporting.page import Report, Section
-from dynssm_ros.reporting.tables import Column, Table, Value
+from dynssm_ros.evaluation.coefficients import coefficient_label
+from dynssm_ros.evaluation.season_review import Alarm, Estimate, Review, expected
+from dynssm_ros.reporting.evaluation_figures import MEASURED, PALETTE, model_colours, sheet, styled
+from dynssm_ros.reporting.page import Prose, Report
+from dynssm_ros.reporting.tables import Column, Table
 from dynssm_ros.vehicle import COEFFICIENTS
 
 _PANELS = 9  # coefficients that are drawn: those that varied most
@@ -23,77 +23,63 @@ _ALARM = "#D55E00"
 
 def season_report(reviews: Sequence[Review], alarms: Sequence[Alarm], protocol: Mapping[str, str]) -> Report:
     """The report of a season, of reviews in the order of driving."""
-    sections = [
-        Section("Alarms", "What was not as in the sessions before, in the order of driving.", table=alarm_table(alarms))
-    ]
+    prose = Prose("season")
+    sections = [prose.section("alarms", table=alarm_table(alarms))]
     if _models(reviews):
-        text = "Mean displacement of 0.6 s rollouts. Tracks differ, so compare models, not sessions."
-        sections.append(Section("Models", text, errors(reviews)))
+        sections.append(prose.section("models", errors(reviews)))
     if any(each.stretches for each in reviews):
-        text = (
-            "Calibrated on each session alone, with bands of two standard deviations; a ring is an alarm. Shown are those "
-            "that varied most beyond their bands. What one tyre coefficient gains another may lose: judge by what moved "
-            "together."
-        )
-        sections.append(Section("Coefficients", text, coefficients(reviews, alarms)))
+        sections.append(prose.section("coefficients", coefficients(reviews, alarms)))
     if any(each.causes for each in reviews):
-        text = (
-            "What the simulation gets wrong in each session, by its diagnosis; the area is the share of the error on "
-            "held-out laps that the cause takes away, the number its first parameter. What stays from session to session "
-            "belongs into the vehicle file."
-        )
-        sections.append(Section("Causes", text, causes(reviews)))
+        sections.append(prose.section("causes", causes(reviews)))
     failed = [f"{each.session}: {words}." for each in reviews for words in each.failures]
     if failed:
-        sections.append(Section("Not done", " ".join(failed)))
+        sections.append(prose.section("not_done", failures=" ".join(failed)))
     hours = sum(each.seconds for each in reviews) / 3600
-    cars, tracks = ({getattr(each, name) for each in reviews} for name in ("car", "track"))
+    cars, tracks = (", ".join(sorted({getattr(each, name) for each in reviews})) for name in ("car", "track"))
     summary = (
-        f"{len(reviews)} sessions, {hours:.1f} h of {_listed(cars)} on {_listed(tracks)}. "
+        f"{len(reviews)} sessions, {hours:.1f} h of {cars} on {tracks}. "
         f"Alarms: {len(alarms)}, in {len({id(alarm.review) for alarm in alarms})} of them."
     )
     return Report("Season", summary, sections, protocol, session_table(reviews, alarms))
 
 
-def _listed(names: set[str]) -> str:
-    return ", ".join(sorted(names))
-
-
 def alarm_table(alarms: Sequence[Alarm]) -> Table:
     """One row per alarm."""
-    columns = (Column("session", brief=True), Column("start"), Column("alarm", brief=True))
-    rows: list[list[Value]] = [[alarm.review.session, _when(alarm.review), alarm.words] for alarm in alarms]
-    return Table(columns, rows, "" if rows else "None.")
+    return Table.of(
+        alarms,
+        (Column("session", brief=True), lambda alarm: alarm.review.session),
+        (Column("start"), lambda alarm: _when(alarm.review)),
+        (Column("alarm", brief=True), lambda alarm: alarm.words),
+        caption="" if alarms else "None.",
+    )
 
 
 def session_table(reviews: Sequence[Review], alarms: Sequence[Alarm]) -> Table:
     """One row per session, a column per model."""
-    models = _models(reviews)
-    several = len({each.car for each in reviews}) > 1
-    columns = (
-        Column("session", brief=True),
-        Column("start"),
-        *([Column("car")] if several else []),
-        Column("track", brief=True),
-        Column("length", "s"),
-        *(Column(model, "m", "ADE", brief=True) for model in models),
-        Column("best"),
-        Column("causes", brief=True),
-        Column("alarms", brief=True),
+    models, cars = _models(reviews), {each.car for each in reviews}
+
+    def best(each: Review) -> str | None:
+        return min(each.accuracy, key=lambda model: each.accuracy[model].ade, default=None)
+
+    return Table.of(
+        reviews,
+        (Column("session", brief=True), lambda each: each.session),
+        (Column("start"), _when),
+        ([Column("car")] if len(cars) > 1 else [], lambda each: [each.car] if len(cars) > 1 else []),
+        (Column("track", brief=True), lambda each: each.track),
+        (Column("length", "s"), lambda each: round(each.seconds)),
+        ([Column(model, "m", "ADE", brief=True) for model in models], lambda each: [_ade(each, one) for one in models]),
+        (Column("best"), best),
+        (
+            Column("causes", brief=True),
+            lambda each: ", ".join(cause.effect for cause in each.causes) or each.verdict or None,
+        ),
+        (Column("alarms", brief=True), lambda each: sum(alarm.review is each for alarm in alarms)),
     )
-    rows: list[list[Value]] = []
-    for each in reviews:
-        ade = {model: each.accuracy[model].ade if model in each.accuracy else None for model in models}
-        known = {model: value for model, value in ade.items() if value is not None}
-        rows.append(
-            [
-                each.session, _when(each), *([each.car] if several else []), each.track, round(each.seconds), *ade.values(),
-                min(known, key=lambda model: known[model]) if known else None,
-                ", ".join(cause.effect for cause in each.causes) or each.verdict or None,
-                sum(alarm.review is each for alarm in alarms),
-            ]
-        )  # fmt: skip
-    return Table(columns, rows)
+
+
+def _ade(review: Review, model: str) -> float | None:
+    return review.accuracy[model].ade if model in review.accuracy else None
 
 
 def _when(review: Review) -> str:
@@ -107,12 +93,11 @@ def _models(reviews: Sequence[Review]) -> list[str]:
 @styled
 def errors(reviews: Sequence[Review]) -> Figure:
     """ADE of each model over the sessions."""
-    figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = sheet(3.4)
     models = _models(reviews)
     colours = model_colours(models)
     for model in models:
-        ade = [each.accuracy[model].ade if model in each.accuracy else np.nan for each in reviews]
+        ade = np.array([_ade(each, model) for each in reviews], dtype=float)
         axes.plot(ade, "o-", ms=4, lw=0.8, color=colours[model], label=model)
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -130,8 +115,7 @@ def coefficients(reviews: Sequence[Review], alarms: Sequence[Alarm]) -> Figure:
     names = sorted(COEFFICIENTS, key=lambda name: -_variation(reviews, name))[:_PANELS]
     names = [name for name in COEFFICIENTS if name in names]
     rows = -(-len(names) // 3)
-    figure = Figure(figsize=(WIDTH, 0.7 + 1.9 * rows), layout="constrained")
-    grid = figure.subplots(rows, 3, squeeze=False, sharex=True)
+    figure, grid = sheet(0.7 + 1.9 * rows, rows, 3, squeeze=False, sharex=True)
     cars = sorted({each.car for each in reviews})
     for axes, name in zip(grid.flat, names, strict=False):
         for colour, car in zip(PALETTE, cars, strict=False):
@@ -143,8 +127,7 @@ def coefficients(reviews: Sequence[Review], alarms: Sequence[Alarm]) -> Figure:
             moved = any(alarm.review is each and alarm.subject == name for alarm in alarms)
             if moved and each.stretches:
                 axes.plot(k, each.stretches[0].coefficients[name].value, "o", ms=11, mfc="none", mec=_ALARM, mew=1.6)
-        unit = coefficient_unit(name)
-        axes.set_title(f"{name} ({unit})" if unit else name)
+        axes.set_title(coefficient_label(name))
         _sessions_below(axes, reviews, few=6)
     for axes in grid.flat[len(names) :]:
         axes.set_visible(False)
@@ -177,23 +160,16 @@ def _variation(reviews: Sequence[Review], name: str) -> float:
 def causes(reviews: Sequence[Review]) -> Figure:
     """Which cause is named in which session."""
     names = [*dict.fromkeys(cause.effect for each in reviews for cause in each.causes)]
-    figure = Figure(figsize=(WIDTH, 1.2 + 0.42 * len(names)), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = sheet(1.2 + 0.42 * len(names))
     for k, each in enumerate(reviews):
         for cause in each.causes:
-            row = names.index(cause.effect)
+            row, size = names.index(cause.effect), "".join(f"{value:.3g}" for value in [*cause.values.values()][:1])
             axes.scatter(k, row, s=20 + 500 * max(cause.improvement, 0.0), color=PALETTE[0], alpha=0.55, lw=0)
-            axes.annotate(
-                _size(cause), (k, row), (13, 0), textcoords="offset points", va="center", fontsize=7, color=MEASURED
-            )
+            axes.annotate(size, (k, row), (13, 0), textcoords="offset points", va="center", fontsize=7, color=MEASURED)
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.3, -0.6)
     _sessions_below(axes, reviews)
     return figure
-
-
-def _size(cause: Found) -> str:
-    return f"{next(iter(cause.values.values())):.3g}" if cause.values else ""
 
 
 def _sessions_below(axes: Axes, reviews: Sequence[Review], few: int = _NAMED) -> None:

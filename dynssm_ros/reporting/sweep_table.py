@@ -28,21 +28,24 @@ def verdict(sweep: Sweep) -> str:
 
 def trial_table(sweep: Sweep) -> Table:
     """All trials, the best first."""
-    columns = (
-        Column("trial", brief=True),
-        *(Column(name.rpartition(".")[2], "", name.rpartition(".")[0]) for name in sweep.distributions),
-        Column("ADE", "m", best="min", brief=True),
-        Column("v_x", "m/s", "one-step RMSE", "min", brief=True),
-        Column("v_y", "m/s", "one-step RMSE", "min", brief=True),
-        Column("ω", "rad/s", "one-step RMSE", "min", brief=True),
-    )
-    trials = sorted(sweep.trials, key=lambda trial: trial.errors.ade if trial.errors else np.inf)
-    return Table(
-        columns, [_row(trial, list(sweep.distributions)) for trial in trials], "Trial 0 is the model file as it was."
-    )
+    names = list(sweep.distributions)
 
+    def settings(trial: Trial) -> list[Value]:
+        chosen = [trial.settings[name] for name in names]
+        return [str(each) if isinstance(each, bool) else each for each in chosen]
 
-def _row(trial: Trial, names: list[str]) -> list[Value]:
-    errors: list[Value] = [trial.errors.ade, *trial.errors.rmse] if trial.errors else [None] * 4
-    settings = [trial.settings[name] for name in names]
-    return [trial.number, *(str(each) if isinstance(each, bool) else each for each in settings), *errors]
+    return Table.of(
+        sorted(sweep.trials, key=lambda trial: trial.errors.ade if trial.errors else np.inf),
+        (Column("trial", brief=True), lambda trial: trial.number),
+        ([Column(name.rpartition(".")[2], "", name.rpartition(".")[0]) for name in names], settings),
+        (
+            [
+                Column("ADE", "m", best="min", brief=True),
+                Column("v_x", "m/s", "one-step RMSE", "min", brief=True),
+                Column("v_y", "m/s", "one-step RMSE", "min", brief=True),
+                Column("ω", "rad/s", "one-step RMSE", "min", brief=True),
+            ],
+            lambda trial: [trial.errors.ade, *trial.errors.rmse] if trial.errors else [None] * 4,
+        ),
+        caption="Trial 0 is the model file as it was.",
+    )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import rich.box
 import rich.table
@@ -45,6 +45,10 @@ class Column:
         return f"{self.group} {self.heading}".strip()
 
 
+ColumnOf = tuple[Column | Sequence[Column], Callable[[Any], Any]]
+"""A column, or several side by side, and what gives its value, or theirs, of a row's item."""
+
+
 @dataclass(frozen=True)
 class Cell:
     """A value as shown.
@@ -75,6 +79,16 @@ class Table:
     columns: tuple[Column, ...]
     rows: Sequence[Sequence[Value]]
     caption: str = ""
+
+    @classmethod
+    def of(cls, items: Iterable[Any], *columns: ColumnOf, caption: str = "") -> Table:
+        """A row for each of ``items``."""
+        rows: list[list[Value]] = []
+        for item in items:
+            parts = ([value(item)] if isinstance(column, Column) else value(item) for column, value in columns)
+            rows.append([value for part in parts for value in part])
+        heads = ([column] if isinstance(column, Column) else column for column, _ in columns)
+        return cls(tuple(column for head in heads for column in head), rows, caption)
 
     @property
     def cells(self) -> list[list[Cell]]:

@@ -6,14 +6,22 @@ As those of :mod:`~dynssm_ros.reporting.evaluation_figures`, which gives the sty
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.reporting.evaluation_figures import MEASURED, SYMBOLS, UNITS, WIDTH, model_colours, room, styled
+from dynssm_ros.reporting.evaluation_figures import (
+    MEASURED,
+    WIDTH,
+    label,
+    legend_above,
+    model_lines,
+    room,
+    sheet,
+    styled,
+)
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lap_position import rms_along
 
@@ -32,8 +40,7 @@ def error_map(x: Vector, y: Vector, errors: Vector, smooth: int = 1) -> Figure:
     """
     width, height = float(np.ptp(x)), float(np.ptp(y))
     shape = np.clip(height / max(width, 1e-9), 0.25, 2.0)
-    figure = Figure(figsize=(WIDTH, 1.3 + 0.29 * WIDTH * shape), layout="constrained")
-    axes = figure.subplots(1, 3, sharex=True, sharey=True)
+    figure, axes = sheet(1.3 + 0.29 * WIDTH * shape, 1, 3, sharex=True, sharey=True)
     smooth = min(smooth, len(x))
     known = np.nan_to_num(errors, nan=0.0, posinf=0.0, neginf=0.0)
     for k, (panel, channel) in enumerate(zip(axes, STATE_SIGNALS, strict=True)):
@@ -44,7 +51,7 @@ def error_map(x: Vector, y: Vector, errors: Vector, smooth: int = 1) -> Figure:
             x[order], y[order], c=size[order], s=7, cmap="viridis_r", vmin=0.0, vmax=top, lw=0, rasterized=True
         )
         bar = figure.colorbar(dots, ax=panel, location="top", extend="max", shrink=0.9, aspect=28)
-        bar.set_label(f"{SYMBOLS[channel]} error ({UNITS[channel]})")
+        bar.set_label(label(channel, " error"))
         bar.locator = MaxNLocator(4)
         bar.update_ticks()
         panel.set_aspect("equal")
@@ -64,7 +71,6 @@ def trajectories(time: Vector, measured: Vector, predicted: Mapping[str, Vector]
         predicted: ``P`` paths of ``n`` steps by model name, each ``(P, n + 1, 2)``; path ``k`` leaves from position
             ``k * n``.
     """
-    colours = model_colours(list(predicted))
     pieces, points, _ = next(iter(predicted.values())).shape
     rows = np.arange(pieces)[:, None] * (points - 1) + np.arange(points)
     tangent = np.gradient(measured, axis=0)
@@ -84,13 +90,11 @@ def trajectories(time: Vector, measured: Vector, predicted: Mapping[str, Vector]
     sideways.tick_params(labelbottom=False)
     plan.plot(*measured.T, color=MEASURED, lw=2.2, alpha=0.75, label="measured")
     plan.plot(*measured[rows[:, 0]].T, ".", color=MEASURED, ms=4)
-    for depth, (name, stray) in enumerate(strays.items()):  # the first model lies on top
-        style: dict[str, Any] = {"color": colours[name], "lw": 1.1, "zorder": 3 - 0.1 * depth, "label": name}
-        drawn = _joined(measured[rows] + factor * stray)
-        plan.plot(*drawn.T, **style)
-        at = _joined(time[rows][..., None])[:, 0]
-        sideways.plot(at, _joined(across[name][..., None]), **style)
-        along.plot(at, _joined(ahead[name][..., None]), **style)
+    at = _joined(time[rows][..., None])[:, 0]
+    for name, stray, style in model_lines(strays):
+        plan.plot(*_joined(measured[rows] + factor * stray).T, lw=1.1, **style)
+        sideways.plot(at, _joined(across[name][..., None]), lw=1.1, **style)
+        along.plot(at, _joined(ahead[name][..., None]), lw=1.1, **style)
     for panel, values in ((sideways, across), (along, ahead)):
         limit = room({name: np.abs(each) for name, each in values.items()})
         panel.set_ylim(-limit, limit)
@@ -102,8 +106,7 @@ def trajectories(time: Vector, measured: Vector, predicted: Mapping[str, Vector]
     sideways.set_title("Predicted path to the left of the measured one (m)")
     along.set_title("Predicted path ahead of the measured one (m)")
     along.set_xlabel("time (s)")
-    figure.legend(*plan.get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure
+    return legend_above(figure, plan)
 
 
 @styled
@@ -119,10 +122,8 @@ def errors_along_lap(
         length: of the lap (m).
         bins: stretches of equal length; a point is the root mean square over one.
     """
-    colours = model_colours(list(errors))
     centres = (np.arange(bins) + 0.5) * length / bins
-    figure = Figure(figsize=(WIDTH, 6.6), layout="constrained")
-    top, *panels = figure.subplots(4, 1, sharex=True, height_ratios=[0.7, 1, 1, 1])
+    figure, (top, *panels) = sheet(6.6, 4, sharex=True, height_ratios=[0.7, 1, 1, 1])
     top.plot(centres, rms_along(position, speed[:, None], length, bins), color=MEASURED, lw=1.3)
     top.set_ylabel("speed (m/s)")
     along = {
@@ -130,15 +131,14 @@ def errors_along_lap(
         for name, values in errors.items()
     }
     for k, (panel, channel) in enumerate(zip(panels, STATE_SIGNALS, strict=True)):
-        for depth, (name, values) in enumerate(along.items()):  # the first model lies on top
-            panel.plot(centres, values[:, k], color=colours[name], lw=1.2, label=name, zorder=3 - 0.1 * depth)
-        panel.set_ylabel(f"{SYMBOLS[channel]} error ({UNITS[channel]})")
+        for _, values, style in model_lines(along):
+            panel.plot(centres, values[:, k], lw=1.2, **style)
+        panel.set_ylabel(label(channel, " error"))
         panel.set_ylim(0.0, room({name: values[:, k] for name, values in along.items()}))
     panels[-1].set_xlabel("position on the lap (m)")
     panels[-1].set_xlim(0.0, length)
     figure.align_ylabels()
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
-    return figure
+    return legend_above(figure, panels[0])
 
 
 def _joined(paths: Vector) -> Vector:

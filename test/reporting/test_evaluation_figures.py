@@ -78,10 +78,10 @@ def test_adapted_parameters_shade_what_is_outside_the_bounds(drawn):
     assert axes[-1].get_title(loc="left") == "$I_{z}$ (kg m²)"
 
 
-def test_adapted_parameters_need_no_vehicle_and_cut_lines_at_gaps(drawn):
+def test_lines_of_adapted_parameters_are_cut_at_gaps(drawn):
     time = 0.02 * np.r_[0:50, 100:150]
-    axes = drawn(figures.adapted_parameters(time, np.ones((100, 17))))
-    assert np.isnan(axes[0].get_lines()[0].get_ydata()).sum() == 1
+    axes = drawn(figures.adapted_parameters(time, np.ones((100, 17)), load_vehicle("orca")))
+    assert np.isnan(axes[0].get_lines()[-1].get_ydata()).sum() == 1
 
 
 def test_parameter_usage_names_coefficients_that_rest_on_a_bound(drawn):
