@@ -163,7 +163,8 @@ def evidence_in_words(cause: Cause) -> str:
     gone = ", ".join(f"{percent(max(float(share), 0.0))} ({channel})" for channel, share in shares)
     return (
         f"on parts of the drive that were left out the logarithm of the predictive likelihood is better by "
-        f"{confirmed.total:.0f} ± {confirmed.std:.0f}, in {int((units > 0).sum())} of {len(units)} parts, and of the squared error {gone} is gone; the information criterion is better by {cause.delta_bic:.0f} "
+        f"{confirmed.total:.0f} ± {confirmed.std:.0f}, in {int((units > 0).sum())} of {len(units)} parts, and "
+        f"of the squared error {gone} is gone; the information criterion is better by {cause.delta_bic:.0f} "
         f"(above {DECISIVE_DELTA_BIC:.0f} is very strong); {held_out}"
     )
 
