@@ -1,7 +1,5 @@
-"""A casadi function whose arguments and results stay in numpy's memory.
-
-Calling it with casadi's own matrices costs more than the small functions of a control step themselves. Casadi stores
-matrices by columns.
+"""Casadi functions whose arguments and results stay in numpy's memory; casadi's own matrices cost more than small
+functions do.
 """
 
 from __future__ import annotations
@@ -14,14 +12,11 @@ from dynssm_ros.arrays import Vector
 
 
 class Buffered:
-    """A function in memory of its own. It is not to be called by two threads at once.
+    """A casadi ``function`` with dense arguments and results, in memory of its own. Not to be called by two threads at
+    once.
 
-    Args:
-        function: with dense arguments and results.
-
-    Attributes:
-        given: its arguments, flat, to be filled in place; zeros at first.
-        results: likewise what it returned last.
+    ``given`` are its flat arguments, to be filled in place; zeros at first. ``results`` are those of the last
+    evaluation. Matrices are stored by columns.
     """
 
     def __init__(self, function: Any) -> None:
@@ -40,12 +35,7 @@ class Buffered:
 
 
 class BufferedRows:
-    """A function of column vectors, evaluated for ``n`` rows at once.
-
-    Args:
-        function: with dense results.
-        n: rows.
-    """
+    """A function of column vectors with dense results, evaluated for ``n`` rows at once."""
 
     def __init__(self, function: Any, n: int) -> None:
         self._buffered = Buffered(function.map(n) if n > 1 else function)
@@ -53,9 +43,8 @@ class BufferedRows:
         self._results = [array.reshape(n, -1) for array in self._buffered.results]
 
     def __call__(self, *given: Vector) -> list[Vector]:
-        """The results, ``(n, size)`` each, of arguments ``(n, size)``, or ``(size,)`` for all rows alike.
-
-        A matrix of a row is stored by columns, as casadi has it.
+        """The results, ``(n, size)`` each, matrices stored by columns, of arguments ``(n, size)``, or ``(size,)`` for
+        all rows alike.
         """
         for array, values in zip(self._given, given, strict=True):
             array[...] = values
@@ -76,12 +65,7 @@ class QuadraticProgram(NamedTuple):
 
 
 class QuadraticSolver:
-    """Solves dense quadratic programs of one size by an active set.
-
-    Args:
-        variables: size of ``z``.
-        rows: of ``A``.
-    """
+    """Solves dense quadratic programs with ``z`` of size ``variables`` and ``rows`` rows of ``A`` by an active set."""
 
     def __init__(self, variables: int, rows: int) -> None:
         import casadi as ca  # takes a while, and most of the command line does without

@@ -1,9 +1,7 @@
-"""Margins that grow along the horizon with what the model has mispredicted lately.
+"""Margins that grow along the horizon with what the model has mispredicted lately: tightened constraints.
 
-Stochastic model predictive control with tightened constraints: a bound that is to hold with a stated probability is moved
-inwards by a multiple of the standard deviation of what it bounds. The deviations are not taken from a model of the
-uncertainty, which would be as wrong as the model. They are those of the last horizons, step by step, between what was
-predicted and what came (:mod:`dynssm_ros.control.evidence`).
+A bound is moved inwards by a multiple of the standard deviation of what it bounds: the deviation, step by step, between
+what the last horizons predicted and what came (:mod:`dynssm_ros.control.evidence`).
 
 Hewing, Kabzan, Zeilinger, "Cautious model predictive control using Gaussian process regression", 2019.
 """
@@ -24,10 +22,8 @@ _REMEMBERED = 20  # horizons that the deviations are of
 class Margins(NamedTuple):
     """By how much bounds are moved inwards after each step of a horizon."""
 
-    lateral: Vector
-    """Distance from the borders (m), ``(N,)``."""
-    slip: Vector
-    """Slip angles of front and rear axle (rad), ``(N, 2)``."""
+    lateral: Vector  # distance from the borders (m), (N,)
+    slip: Vector  # angles of front and rear axle (rad), (N, 2)
 
     @classmethod
     def none(cls, N: int) -> Margins:
@@ -36,12 +32,7 @@ class Margins(NamedTuple):
 
 
 class Caution:
-    """Mean squares of what several predictions were wrong by, for each step of the horizon.
-
-    Args:
-        sources: predictions side by side.
-        N: steps.
-    """
+    """Mean squared errors of ``sources`` predictions side by side, for each of the ``N`` steps of the horizon."""
 
     def __init__(self, sources: int, N: int) -> None:
         self._squares = np.zeros((sources, N, 3))
@@ -52,12 +43,12 @@ class Caution:
         self._squares[:] = self._count[:] = 0.0
 
     def update(self, source: Indices, step: Indices, lateral: Vector, slip: Vector) -> None:
-        """Takes errors of ``n`` predictions.
+        """Takes the errors of ``n`` predictions, all of shape ``(n,)`` but ``slip``.
 
         Args:
-            source: which predicted, ``(n,)``.
-            step: of its horizon, 0 the first, ``(n,)``; no pair of both twice.
-            lateral: beside the measured path (m), ``(n,)``.
+            source: which predicted.
+            step: of its horizon, 0 the first; no pair of both twice.
+            lateral: beside the measured path (m).
             slip: of the slip angles of front and rear axle (rad), ``(n, 2)``.
         """
         errors = np.column_stack([lateral, slip])

@@ -1,7 +1,4 @@
-"""The driver of a car in closed loop: what is measured becomes a command that can always be sent.
-
-Races and the controller node use the same class, so that what a race shows is what runs live.
-"""
+"""The driver of a car in closed loop, in races and in the controller node: what is measured becomes a command."""
 
 from __future__ import annotations
 
@@ -36,51 +33,39 @@ _KNOWN = (*STATES[:3], *CONTEXT)  # what effects may read
 
 
 class Decision(NamedTuple):
-    """What one control step came to.
+    """What one control step came to."""
 
-    Attributes:
-        command: absolute throttle and steering to apply from now on: finite, within the limits and the steering rate.
-        plan: whose first step that is.
-        adapted: what was planned with: what the model said as far as it has earned it, and what was found to be missing.
-        caution: by which it stays away from the borders at the end of the horizon (m).
-        weights: of :data:`~dynssm_ros.control.evidence.SOURCES` in that, ``(3,)``.
-        seconds: that it took, model and plan together, by the controller's clock; see :meth:`Controller.learn`.
-    """
-
-    command: Applied
-    plan: Plan
-    adapted: Adapted
-    caution: float
-    weights: Vector
-    seconds: float
+    command: Applied  # absolute throttle and steering from now on: finite, within limits and steering rate
+    plan: Plan  # whose first step that is
+    adapted: Adapted  # what was planned with: what the model has earned, and what was found to be missing
+    caution: float  # by which it stays away from the borders at the end of the horizon (m)
+    weights: Vector  # of evidence.SOURCES in that, (3,)
+    seconds: float  # of model and plan together, by the controller's clock; see Controller.learn
 
     @property
     def theta(self) -> Vector:
-        """Coefficients of the horizon's first step, shape ``(17,)``."""
+        """Coefficients of the horizon's first step, ``(17,)``."""
         return self.adapted.first.theta
 
     @property
     def correction(self) -> Vector:
-        """Likewise the correction (m/s, m/s, rad/s), shape ``(3,)``."""
+        """Likewise the correction (m/s, m/s, rad/s), ``(3,)``."""
         return self.adapted.first.correction
 
 
 class _Sent(NamedTuple):
     """What was sent at a measurement."""
 
-    t: float
-    """Of the measurement (s)."""
+    t: float  # of the measurement (s)
     increments: Vector
-    said: Sequence[Adapted]
-    """By each of :data:`~dynssm_ros.control.evidence.SOURCES`."""
-    is_sound: bool
-    """Whether the measurement is finite."""
+    said: Sequence[Adapted]  # by each of SOURCES
+    is_sound: bool  # whether the measurement is finite
 
 
 class Controller:
-    """A model and the controller of one car on one track. It remembers the window that the model reads and its last plan.
+    """A model and the controller of one car on one track, with the window that the model reads and the last plan.
 
-    It is to be asked once per T_s, and to :meth:`learn` once the command is out. A step without a plan in time is driven by
+    It is asked once per T_s, and to :meth:`learn` once the command is out. A step without a plan in time is driven by
     the plan before, moved on, and counted.
 
     Args:
@@ -139,11 +124,8 @@ class Controller:
         self._sent: _Sent | None = None  # at the last measurement, till it is learned from
 
     def follow(self, reference: Reference, theta: Callable[[Vector], Vector]) -> None:
-        """From now on follows the same line at another speed, with other coefficients of the calibrated car.
-
-        Args:
-            reference: the line.
-            theta: its coefficients ``(N, 17)`` at places along the track (m), ``(N,)``.
+        """From now on follows the same line at another speed, with coefficients ``theta`` ``(N, 17)`` of places along
+        the track (m), ``(N,)``, for the calibrated car.
         """
         self._nmpc.follow(reference)
         self._theta = theta
@@ -166,19 +148,16 @@ class Controller:
     def step(self, t: float, pose: Pose, seen: State, feedback: Applied, age: int = 0) -> Decision:
         """One control step.
 
-        What is measured is filtered (:class:`StateEstimator`). From an older measurement the present follows by the model,
-        under the commands that were sent since.
+        The measurement is filtered (:class:`StateEstimator`). From an older one the present follows by the model, under
+        the commands that were sent since. What is not finite counts as measured as it was planned.
 
         Args:
             t: time since the start of the drive (s).
             pose: where the car was measured to be (m, m, rad).
             seen: its measured velocities (m/s, m/s, rad/s).
             feedback: what its actuators do now.
-            age: steps of T_s since the measurement, less than :data:`MOST_LATE`. While it grows, as after the start, the
-                measurement counts as the one before.
-
-        Returns:
-            What to send. It is safe whatever came in: what is not finite counts as measured as it was planned.
+            age: steps of T_s since the measurement, less than :data:`MOST_LATE`. While it grows, as after the start,
+                the measurement counts as the one before.
         """
         began = self._clock()
         self.learn()
@@ -216,8 +195,8 @@ class Controller:
     def learn(self) -> None:
         """Takes what was sent at the last measurement as evidence, and hands it to the model.
 
-        The command does not wait for it, as in the preparation phase of a real-time iteration: it is to be called once the
-        command is out. The next step does what is left of it, and counts the time.
+        To be called once the command is out, which does not wait for it; else the next step does it and counts the
+        time.
         """
         if self._sent is None:
             return
@@ -245,17 +224,10 @@ class Controller:
         return Adapted(self._theta(self._track.project(ahead)[0]), self._model.calibrated.correction)
 
     def _expect(self, t: float, plan: Plan, command: Applied, sent: Vector, adapted: Adapted) -> Vector:
-        """Completes the window's last row, and predicts the next measurement.
-
-        Args:
-            t: of the last measurement (s).
-            plan: for the present.
-            command: its first one.
-            sent: increments since the measurement.
-            adapted: what was planned with.
+        """Completes the window's last row, and predicts the next measurement from the last one, at ``t`` (s).
 
         Returns:
-            The increments that were sent at the measurement.
+            The increments that were sent at that measurement.
         """
         past = plan.x[0]
         if len(sent) and self._past is not None:

@@ -1,11 +1,8 @@
-"""What a model does not say of the car, followed from step to step: offset-free model predictive control.
+"""Offset-free model predictive control: what a model does not say of the car, followed from step to step.
 
-The error of each one-step prediction moves an estimate of a constant disturbance of the velocities, which is then added to
-the model over the whole horizon. A model without error is left as it is; one with a constant error loses it.
-
-How fast the estimate follows is found from the data, as in :mod:`dynssm_ros.control.state_estimator`: estimates of several
-rates run side by side, and the one that has expected the last errors best is added, unless nothing does as well. So noise
-alone adds nothing, and a patch of little grip is felt within a few steps.
+The error of each one-step prediction moves an estimate of a constant disturbance of the velocities, which is added to
+the model over the whole horizon. Estimates of several rates run side by side; the one that has expected the last errors
+best is added, unless nothing does as well. So noise alone adds nothing.
 
 Pannocchia, Rawlings, "Disturbance models for offset-free model-predictive control", AIChE Journal 49, 2003.
 """
@@ -18,9 +15,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.control.innovations import Innovations
 from dynssm_ros.control.nmpc import Adapted
 from dynssm_ros.control.settings import Settings
+from dynssm_ros.control.state_estimator import Observers
 
 SETTLING = 1.0
 """Time after which 63 % of a constant disturbance are found if it is asked for, in units of the car's time."""
@@ -34,23 +31,21 @@ class Disturbance:
     """An estimate of what is to be added to a model's step in ``v_x, v_y, omega`` (m/s, m/s, rad/s).
 
     Args:
-        shares: of the error of each prediction by which estimates move, the preferred one first; 0: it stays at nothing.
-        largest: error of ``v_x, v_y, omega`` up to which a prediction counts, shape ``(3,)``; what is beyond is no error of a
-            model, but of the measurement.
+        shares: of the error of each prediction by which estimates move, the preferred one first; 0: it stays at
+            nothing.
+        largest: error up to which a prediction counts, ``(3,)``; more is an error of the measurement.
         forget: share by which each error replaces the mean of those before, in the comparison of the estimates.
     """
 
     def __init__(self, shares: Sequence[float], largest: Vector, forget: float = 1.0) -> None:
-        self._shares = np.array(shares)[:, None]
+        self._observers = Observers(shares, forget, _CLEARLY, _WARM_UP)
         self._largest = largest
-        self._innovations = Innovations(forget, _CLEARLY, _WARM_UP)
         self.forget()
 
     @classmethod
     def of(cls, settings: Settings, T_s: float) -> Disturbance:
-        """With the controller's settings; an error counts up to what all the grip of the car makes in a step of T_s (s).
-
-        It follows as :attr:`Settings.follows` says.
+        """As :attr:`Settings.follows` says; an error counts up to what all the grip of the car makes in a step of T_s
+        (s).
         """
         length, time = settings.scale.length, settings.scale.time
         velocity = length / time**2 * T_s
@@ -62,8 +57,7 @@ class Disturbance:
         """Begins anew, as after a gap in what was measured: at nothing."""
         self.value = np.zeros(3)
         """The estimate, shape ``(3,)``."""
-        self._estimates = np.zeros((len(self._shares), 3))
-        self._innovations.reset(len(self._shares), 3)
+        self._observers.reset(self.value)
         self.interrupted()
 
     def interrupted(self) -> None:
@@ -83,12 +77,6 @@ class Disturbance:
         if self._expected is not None:
             error = seen - self._expected
             if np.all(np.abs(error) <= self._largest):
-                self._follow(error + self.value)
+                self._observers.correct(error + self.value)  # the model's own
+                self.value = self._observers.estimate
         self.interrupted()
-
-    def _follow(self, error: Vector) -> None:
-        """Takes the error of the model itself, shape ``(3,)``."""
-        innovations = error - self._estimates
-        self._innovations.update(innovations)
-        self._estimates = self._estimates + self._shares * innovations
-        self.value = self._estimates[self._innovations.best, np.arange(3)]

@@ -1,11 +1,10 @@
-"""What a model adapts is planned with only where it has predicted better than the calibrated car, over whole horizons.
+"""What a model adapts is planned with only where it has predicted better than the calibrated car, over whole
+horizons.
 
-A plan rests on where the car will be at the end of the horizon, and not on the next row. So every few steps the car is
-predicted from where it was measured, once by the calibrated car, once with the adapted coefficients, once with what the model
-adds to them as well. The commands are those that were sent. Both the predicted and the measured path follow from their
-velocities, so that neither the noise of a pose nor its kinematics matter. At the end of the horizon they are compared.
-Without evidence, and where the calibrated car has been as good lately, the calibrated car is planned with. What each of them
-mispredicts is followed, and counts as part of it (:mod:`dynssm_ros.control.disturbance`).
+Every few steps the car is predicted from where it was measured, under the commands that were sent, by each of
+:data:`SOURCES`. At the end of the horizon these paths are compared with the measured one; all follow from velocities,
+so the noise of a pose does not matter. Without evidence the calibrated car is planned with. What each mispredicts is
+followed, and counts as part of it (:mod:`dynssm_ros.control.disturbance`).
 
 Choosing by what was predicted before it was seen is prequential model selection (Dawid 1984).
 """
@@ -18,7 +17,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Mask, Vector
+from dynssm_ros.arrays import Vector
 from dynssm_ros.control.caution import Caution, Margins
 from dynssm_ros.control.horizon_model import VELOCITIES
 from dynssm_ros.control.nmpc import Adapted
@@ -42,24 +41,13 @@ Following = Callable[[Vector, Vector, Adapted, float], Vector]
 class _Rollouts(NamedTuple):
     """Predictions under way to the end of their horizons, ``n`` of them, three from each start: one of each source."""
 
-    states: Vector
-    """``(n, size)``."""
-    paths: Vector
-    """Poses on the way, from the predicted velocities, ``(n, 3)``."""
-    measured: Vector
-    """Poses on the way, from the measured ones, ``(n, 3)``."""
-    said: Adapted
-    """What they are predicted with, ``(n, 17)`` and ``(n, 3)``."""
-    distances: Vector
-    """From the measured path so far, summed over the steps (m), ``(n,)``."""
-    left: Vector
-    """Steps to the end, ``(n,)``."""
-
-    def at(self, chosen: Mask) -> _Rollouts:
-        """Some of them."""
-        said = Adapted(self.said.theta[chosen], self.said.correction[chosen])
-        states, paths, measured = (part[chosen] for part in (self.states, self.paths, self.measured))
-        return _Rollouts(states, paths, measured, said, self.distances[chosen], self.left[chosen])
+    states: Vector  # (n, size)
+    paths: Vector  # poses on the way, from the predicted velocities, (n, 3)
+    measured: Vector  # likewise from the measured ones, (n, 3)
+    theta: Vector  # what they are predicted with, (n, 17)
+    correction: Vector  # likewise, (n, 3)
+    distances: Vector  # from the measured path, summed over the steps so far (m), (n,)
+    left: Vector  # steps to the end, (n,)
 
 
 class Evidence:
@@ -115,13 +103,10 @@ class Evidence:
         return self._caution.margins(self.weights)
 
     def sent(self, state: Vector, increments: Vector, said: Sequence[Adapted], t: float) -> None:
-        """Takes the next measured state, and what was sent there.
+        """Takes the next state as estimated from its measurement, ``(size,)``, and the ``increments`` ``(2,)`` sent
+        there at ``t`` (s).
 
-        Args:
-            state: estimated from the measurement, ``(size,)``.
-            increments: of the inputs, from there on, ``(2,)``.
-            said: at that state by each of :data:`SOURCES`.
-            t: time (s).
+        ``said`` is at that state by each of :data:`SOURCES`.
         """
         if self._under_way is not None and self._sent is not None:
             self._under_way = self._advanced(self._under_way, state)
@@ -134,23 +119,14 @@ class Evidence:
         """What is under way, with one more from ``state`` for each source."""
         n, old = len(SOURCES), self._under_way
         starts = np.tile(state, (n, 1))
-        new = _Rollouts(starts, np.zeros((n, 3)), np.zeros((n, 3)), said, np.zeros(n), np.full(n, float(self._steps)))
-        if old is None:
-            return new
-        return _Rollouts(
-            np.concatenate([old.states, new.states]),
-            np.concatenate([old.paths, new.paths]),
-            np.concatenate([old.measured, new.measured]),
-            Adapted(*(np.concatenate(parts) for parts in zip(old.said, new.said, strict=True))),
-            np.concatenate([old.distances, new.distances]),
-            np.concatenate([old.left, new.left]),
-        )
+        new = _Rollouts(starts, np.zeros((n, 3)), np.zeros((n, 3)), *said, np.zeros(n), np.full(n, float(self._steps)))
+        return new if old is None else _Rollouts(*map(np.concatenate, zip(old, new, strict=True)))
 
     def _advanced(self, rollouts: _Rollouts, measured: Vector) -> _Rollouts:
         """All one step further; those at their end are compared with what was measured, and dropped."""
         assert self._sent is not None
         before, increments, t = self._sent
-        states = self._following(rollouts.states, increments, rollouts.said, t)
+        states = self._following(rollouts.states, increments, Adapted(rollouts.theta, rollouts.correction), t)
         paths = self._moved(rollouts.paths, rollouts.states, states)
         reached = self._moved(rollouts.measured, before[None], measured[None])
         away = paths - reached
@@ -162,7 +138,7 @@ class Evidence:
         done = moved.left <= 0
         if done.any():
             self._comparison.add(moved.distances[done][0], moved.distances[done])
-        return moved.at(~done)
+        return _Rollouts(*(part[~done] for part in moved))
 
     def _watch(self, left: Vector, states: Vector, measured: Vector, away: Vector, heading: Vector) -> None:
         """Takes what predictions with ``left`` steps to go were wrong by after the next one."""

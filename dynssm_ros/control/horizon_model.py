@@ -42,10 +42,11 @@ class _Symbols(NamedTuple):
 
 
 class HorizonModel:
-    """One step of ``car`` and its Jacobians, for all steps of a horizon at once.
+    """One step of ``car`` and its Jacobians, for all ``N`` steps of a horizon at once.
 
-    The velocities move by the single-track step plus the correction, the pose by the velocities. In the middle of a step
-    these are the mean of its ends.
+    The velocities move by the single-track step plus the correction, the pose by the velocities. States ``x`` are in
+    the order of ``STATES`` and the car's effect states; ``u`` are increments of throttle and steering; ``p`` is
+    coefficients, correction and context.
 
     Args:
         car: what is stepped.
@@ -74,12 +75,8 @@ class HorizonModel:
         )
 
     def step(self, x: Vector, u: Vector, p: Vector) -> Vector:
-        """The states one step on, shape ``(size,)`` or ``(n, size)``.
-
-        Args:
-            x: state in the order of ``STATES`` and the car's effect states, shape ``(size,)`` or ``(n, size)``.
-            u: increments of throttle and steering, shape ``(2,)`` or ``(n, 2)``.
-            p: coefficients, correction and context, shape ``(PARAMETERS,)`` or ``(n, PARAMETERS)``.
+        """The states one step on, shaped as ``x``, which is ``(size,)`` or ``(n, size)``; ``u`` ``(2,)`` or ``(n, 2)``,
+        ``p`` alike.
         """
         count = len(np.atleast_2d(x))
         if count not in self._steps:
@@ -87,15 +84,11 @@ class HorizonModel:
         return self._steps[count](x, u, p)[0].reshape(x.shape)
 
     def linearised(self, x: Vector, u: Vector, p: Vector) -> tuple[Vector, Vector, Vector]:
-        """All steps at their own point: the states after them and the Jacobians by state and input.
-
-        Args:
-            x: states before the steps, shape ``(N, size)``.
-            u: increments, shape ``(N, 2)``.
-            p: parameters of the steps, shape ``(N, PARAMETERS)``.
+        """All steps at their own points ``x`` ``(N, size)``, ``u`` ``(N, 2)``, ``p`` ``(N, PARAMETERS)``.
 
         Returns:
-            Shapes ``(N, size)``, ``(N, size, size)``, ``(N, size, 2)``.
+            The states after them and the Jacobians by state and input: ``(N, size)``, ``(N, size, size)``, ``(N, size,
+                2)``.
         """
         following, by_x, by_u = self._stages(x, u, p)
         return (
@@ -105,14 +98,8 @@ class HorizonModel:
         )
 
     def slip_angles(self, x: Vector, p: Vector) -> tuple[Vector, Vector]:
-        """Slip angles of front and rear axle (rad) as the model has them, effects and shifts included.
-
-        Args:
-            x: states, shape ``(N, size)``.
-            p: parameters, shape ``(N, PARAMETERS)``.
-
-        Returns:
-            Shapes ``(N, 2)``, and ``(N, 2, size)`` of the Jacobian by the state.
+        """Slip angles of front and rear axle (rad) of ``x`` ``(N, size)`` with effects and shifts, ``(N, 2)``; Jacobian
+        ``(N, 2, size)``.
         """
         slips, by_x = self._slips(x, p)
         return slips, by_x.reshape(self.N, self.size, 2).transpose(0, 2, 1)

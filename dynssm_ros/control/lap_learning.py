@@ -1,23 +1,20 @@
 """Faster every lap: how fast the line is driven next follows from the laps that were driven.
 
-The line's speed has a share of the car's accelerations for each section of the lap. It begins at a safe share. After a
-lap a section is driven a step faster, if the car stayed away from the borders there and was not slower than before. It is
-two steps below the safe share, where a car that was not known well had to begin. From the second lap on it is two steps,
-up to the limits of the file's car, where the car stayed far away. A section that came too close to a border, and the one
-before it, go back below what they were driven with, and stay there. So does, once, one where the rear slipped nearly as
-far as it may, if the controller follows the line's speed: one that goes as far as it can does so at any speed of the
-line. A front axle that slips as far is well used. A section that was slower than it has been goes back to what was
-fastest, and that counts no longer if it is slower there as well.
+The line's speed has a share of the car's accelerations for each section of the lap, which begins at a safe share. After
+a lap:
 
-After each lap the coefficients are calibrated on the last ones, and the grip of each section beside them. No share goes
-beyond what they allow with what is not known of them: the cornering limit that most cars within their covariance reach,
-over that of the file's car, bounds the shares. The grip of the sections counts if a new lap is predicted clearly better
-with that of the laps before than without. If the coefficients of the laps before predict it clearly better than the
-model's own, the calibrated car is planned with them, along the whole horizon. What was too close before then counts no
-longer.
+- A section is driven a step faster, if the car stayed away from the borders and was not slower than before; two steps
+while below the safe share, and from the second lap on where the car stayed far away.
+- A section that came too close to a border, and the one before it, stay below what they were driven with. So does,
+once, one where the rear slipped nearly as far as it may, if the controller tracks the line's speed.
+- A section that was slower than it has been goes back to what was fastest.
 
-Learning from lap to lap by what a lap measured against the best one is the idea of Rosolia and Borrelli, "Learning model
-predictive control for iterative tasks", 2018, without their terminal set.
+The coefficients are calibrated on the last laps, and the grip of each section beside them. The cornering limit that
+most cars within their covariance reach, over that of the file's car, bounds the shares. The grip of the sections counts
+if it predicts a new lap clearly better. If the coefficients predict it clearly better than the model's own, the
+calibrated car is planned with them, and what was too close before counts no longer.
+
+Rosolia, Borrelli, "Learning model predictive control for iterative tasks", 2018, without their terminal set.
 """
 
 from __future__ import annotations
@@ -64,47 +61,31 @@ _GRIP_STD, _CHANGE = 0.1, 0.02  # of a section's grip before any lap, and to dif
 
 @dataclass(frozen=True)
 class LapLog:
-    """A lap as it was measured.
+    """A lap as it was measured."""
 
-    Attributes:
-        time: of each row (s), ``(n,)``; the last is the first of the next lap.
-        s: along the centre line, counted on (m), ``(n,)``.
-        room: from the car's centre to the nearer border (m), ``(n,)``.
-        caution: standard deviation of where the car is at the end of a horizon (m), ``(n,)``.
-        velocities: ``v_x, v_y, omega`` as the controller knew them, ``(n, 3)``.
-        rows: with the columns ``WINDOW_COLUMNS``, ``(n, 7)``.
-    """
-
-    time: Vector
-    s: Vector
-    room: Vector
-    caution: Vector
-    velocities: Vector
-    rows: Vector
+    time: Vector  # of each row (s), (n,); the last is the first of the next lap
+    s: Vector  # along the centre line, counted on (m), (n,)
+    room: Vector  # from the car's centre to the nearer border (m), (n,)
+    caution: Vector  # standard deviation of where the car is at the end of a horizon (m), (n,)
+    velocities: Vector  # v_x, v_y, omega as the controller knew them, (n, 3)
+    rows: Vector  # with the columns WINDOW_COLUMNS, (n, 7)
 
 
 @dataclass(frozen=True)
 class LearnedLap:
     """What a lap has shown.
 
-    Attributes:
-        time: of the lap (s).
-        shares: that it was driven with, ``(sections,)``.
-        allowed: shares that the coefficients allowed, ``(sections,)``.
-        margin_used: half the car's width over the least room less caution; 1: a wheel may have been on the border. The first
-            lap counts without caution, which is only being learned.
-        grip: of each section over that of these coefficients, ``(sections,)``; 1 as long as that is not believed.
-        vehicle: with the coefficients, and what was known of them, before the lap.
-        planned: whether the controller planned with them.
+    ``margin_used`` is half the car's width over the least room less caution; 1: a wheel may have been on the border.
+    The first lap counts without caution, which is only being learned.
     """
 
-    time: float
-    shares: Vector
-    allowed: Vector
+    time: float  # of the lap (s)
+    shares: Vector  # that it was driven with, (sections,)
+    allowed: Vector  # shares that the coefficients allowed, (sections,)
     margin_used: float
-    grip: Vector
-    vehicle: Vehicle
-    planned: bool
+    grip: Vector  # of each section over that of these coefficients, (sections,); 1 as long as that is not believed
+    vehicle: Vehicle  # with the coefficients, and what was known of them, before the lap
+    planned: bool  # whether the controller planned with them
 
     def to_json(self) -> dict[str, Any]:
         """For programs."""
@@ -193,8 +174,7 @@ class LapLearner:
     def _known_at(self, s: Vector, grip: Vector) -> Vector:
         """The calibrated coefficients with the grip of the sections, at places (m), ``(N, 17)``."""
         here = np.interp(s, self._centres, grip, period=self._edges[-1])
-        found: Vector = self._known.nominal * np.where(_PEAK, here[:, None], 1.0)
-        return found
+        return np.asarray(self._known.nominal * np.where(_PEAK, here[:, None], 1.0))
 
     def learn(self, lap: LapLog) -> None:
         """Takes a lap that was driven with :attr:`reference`."""
@@ -225,8 +205,7 @@ class LapLearner:
         lower = np.minimum(self._ceiling, driven - _STEP / 2)
         self._ceiling = np.where(close & ~is_new, lower, self._ceiling)
         far = (used < _LITTLE) & (len(self.laps) > 1)  # the first lap counts without caution
-        soon = np.where(far, 1.0, self._safe)
-        raised = np.clip(soon, driven + _STEP, driven + 2 * _STEP)
+        raised = np.clip(np.where(far, 1.0, self._safe), driven + _STEP, driven + 2 * _STEP)
         faster = np.minimum(np.where(close, driven, raised), self._ceiling)
         self._shares = np.where(slower, np.minimum(self._best_share, self._ceiling), faster)
         self._logs = [*self._logs, lap][-_REMEMBERED:]
@@ -235,10 +214,8 @@ class LapLearner:
         self._allowed = self._allowance()
 
     def _believe(self, lap: LapLog) -> bool:
-        """Chooses what to plan with, by how well it predicts a lap that it had no part in.
-
-        Returns:
-            Whether that is the calibrated coefficients for the first time, or again.
+        """Chooses what to plan with, by how well it predicts a lap that it had no part in. Returns whether that is the
+        calibrated coefficients for the first time, or again.
         """
         if not self._logs:
             return False
@@ -327,8 +304,8 @@ class LapLearner:
 
     def _section(self, s: Vector) -> npt.NDArray[np.intp]:
         """In which section places (m) are."""
-        found: npt.NDArray[np.intp] = np.searchsorted(self._edges, s % self._edges[-1], "right") - 1
-        return found.clip(0, len(self._shares) - 1)
+        found = np.searchsorted(self._edges, s % self._edges[-1], "right") - 1
+        return np.asarray(found.clip(0, len(self._shares) - 1))
 
     def _possible_limits(self) -> Sequence[tuple[Vector, Vector]]:
         """Speeds and cornering limits of cars within the covariance of the coefficients; the known car's first."""

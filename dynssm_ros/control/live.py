@@ -1,13 +1,12 @@
-"""The controller of a car that does not wait: plans for the instant at which the command will act, and tells how it goes.
+"""The controller of a car that does not wait: plans for the instant at which the command will act, and tells how it
+goes.
 
-The odometry of an instant is answered while the car drives on, under the commands that were sent before; the answer acts
-one T_s later, or more where odometry comes late. So each step first carries the measured state to that instant, by what is
-known of the car, and plans from there. The command is stamped with that instant, which is how recordings pair
-commands with states.
+The answer to an odometry message acts one T_s later, or more where odometry comes late. So each step first carries the
+measured state to that instant, under the commands that were sent before, and plans from there. The command is stamped
+with that instant.
 
-From far below the line's speed, as from standstill or after a spin, a short horizon sees no way that leads back to the line.
-So pure pursuit drives until the car is up to speed. Nothing is proved of the predictor by then: the calibrated car carries
-the state.
+From far below the line's speed, as from standstill or after a spin, a short horizon sees no way back to the line. So
+pure pursuit drives until the car is up to speed; the calibrated car carries the state.
 """
 
 from __future__ import annotations
@@ -75,11 +74,8 @@ class Laps:
     def passed(self, t: float, x: float, y: float, together: bool = True) -> None:
         """Takes the car at ``x, y`` (m) at ``t`` (s, of any origin).
 
-        Args:
-            t: time.
-            x: place.
-            y: place.
-            together: whether nothing is missing since the time before; if not it is looked for on the whole track.
+        If something is missing since the time before, it is not ``together`` with that and is looked for on the whole
+        track.
         """
         together = together and not math.isnan(self.s)
         at, self.lateral = (float(value) for value in self._track.project([x, y], self.s if together else None))
@@ -176,16 +172,11 @@ class LiveController:
         self._memory: Vector | None = None
 
     def step(self, stamp: int, pose: Pose, seen: State) -> Applied | Refusal | None:
-        """Answers an odometry message.
-
-        Args:
-            stamp: of the message (ns).
-            pose: where the car is (m, m, rad; the heading may be wrapped).
-            seen: its velocities (m/s, m/s, rad/s).
+        """Answers the odometry message of ``stamp`` (ns), with a heading that may be wrapped.
 
         Returns:
             The command from ``stamp + answered_after`` on, finite and within the limits; why the message is refused; or
-            nothing if it is too early for a new plan.
+                nothing if it is too early for a new plan.
         """
         if not all(abs(value) < _LARGEST for value in (*pose, *seen)):
             return Refusal.NOT_FINITE

@@ -1,8 +1,8 @@
-"""Manoeuvres to plan from where the last plan may be caught in a local optimum.
+"""Manoeuvres to plan from where the last plan may be caught in a local optimum: the starting points of a multistart
+method.
 
-With the front wheels at more slip than their tyres make use of, a little less steering turns the car more and not less, and
-faster. So no small change of a plan leads out of a turn that has become too tight, where a large one does: steering to the
-other side at once. A few such manoeuvres are driven ahead by the model, as the starting points of a multistart method.
+With the front wheels beyond the slip that their tyres make use of, no small change of a plan leads out of a turn that
+has become too tight, where a large one does, such as steering to the other side at once.
 
 Ugray et al., "Scatter search and local NLP solvers: a multistart framework for global optimization", 2007.
 """
@@ -25,13 +25,10 @@ COUNT = len(_STEERING) * len(_BRAKES)
 
 
 def manoeuvres(now: Applied, limits: InputLimits, N: int, T_s: float) -> Vector:
-    """Increments of throttle (fraction) and steering (rad) over ``N`` steps, shape ``(COUNT, N, 2)``.
+    """Increments of throttle (fraction) and steering (rad) over ``N`` steps of ``T_s`` (s) within ``limits``, ``(COUNT,
+    N, 2)``.
 
-    Args:
-        now: what the actuators do.
-        limits: of the actuators, within which they stay.
-        N: steps.
-        T_s: sampling time (s).
+    ``now`` is what the actuators do.
     """
     increments = np.zeros((COUNT, N, 2))
     right, left = limits.steering

@@ -1,15 +1,13 @@
-"""Nonlinear model predictive control of a car on a track, one quadratic program per control step (real-time iteration).
+"""Nonlinear model predictive control of a car on a track, one quadratic program per control step (real-time
+iteration).
 
-The plan of the step before, moved on by one step, is where dynamics, borders and reference are linearised (multiple
-shooting: its gaps are closed by the program). The states are then eliminated, so that what is left to optimise are the
-``2 N`` increments of throttle and steering and a slack per soft constraint: a dense program for an active-set solver.
+The plan of the step before, moved on, is where dynamics, borders and reference are linearised (multiple shooting). The
+states are then eliminated: left to optimise are the ``2 N`` increments of throttle and steering and a slack per soft
+constraint. :mod:`dynssm_ros.control.program` has what is minimised, and what bounds it.
 
-What is minimised, and what bounds it, is in :mod:`dynssm_ros.control.program`.
-
-A plan that steers to the stop and still goes beyond a soft bound may be a local optimum that a car should not stay in. Then
-it is improved by a second program, and beside it a few other manoeuvres are driven ahead by the model
-(:mod:`dynssm_ros.control.manoeuvres`). The best of them is the plan if the model, driven and not linearised, says that it is
-clearly better.
+A plan that steers to the stop and still goes beyond a soft bound may be a local optimum. Then it is improved by a
+second program, and a few other manoeuvres are driven ahead by the model. The best is the plan if the model, not
+linearised, says that it is clearly better.
 
 Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control", 2005.
 """
@@ -46,32 +44,23 @@ _CLEARLY = 0.2  # share of its cost by which a plan is to be undercut
 class Adapted(NamedTuple):
     """What a model says of the steps of the horizon."""
 
-    theta: Vector
-    """Coefficients, shape ``(17,)`` for all steps or ``(N, 17)``."""
-    correction: Vector
-    """Added to the stepped ``v_x, v_y, omega`` (m/s, m/s, rad/s), shape ``(3,)`` or ``(N, 3)``."""
+    theta: Vector  # coefficients, (17,) for all steps or (N, 17)
+    correction: Vector  # added to the stepped v_x, v_y, omega (m/s, m/s, rad/s), (3,) or (N, 3)
 
     @property
     def first(self) -> Adapted:
-        """What it says of the first step, shapes ``(17,)`` and ``(3,)``."""
+        """What it says of the first step, ``(17,)`` and ``(3,)``."""
         return Adapted(*(part if part.ndim == 1 else part[0] for part in self))
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A horizon.
+    """A horizon."""
 
-    Attributes:
-        x: states in the order of ``STATES`` and the car's effect states, shape ``(N + 1, size)``.
-        u: increments of throttle (fraction) and steering (rad), shape ``(N, 2)``.
-        status: whether it was solved, or why it is the plan of the step before, moved on.
-        beyond: how far a step goes at most beyond a border (wheelbases) or a bound on the slip (rad).
-    """
-
-    x: Vector
-    u: Vector
-    status: Status = "solved"
-    beyond: float = 0.0
+    x: Vector  # states in the order of STATES and the car's effect states, (N + 1, size)
+    u: Vector  # increments of throttle (fraction) and steering (rad), (N, 2)
+    status: Status = "solved"  # whether it was solved, or why it is the plan before, moved on
+    beyond: float = 0.0  # how far a step goes at most beyond a border (wheelbases) or a bound on the slip (rad)
 
     def shifted(self) -> Plan:
         """The same plan one step later; the last step is repeated with the inputs held."""
@@ -79,15 +68,8 @@ class Plan:
 
 
 class Nmpc:
-    """The controller of one car on one track; it remembers its last plan.
-
-    Args:
-        model: the car inside.
-        limits: of the actuators.
-        reference: the line.
-        track: whose borders hold.
-        settings: how it works.
-        clock: time now (s), of any origin, by which a plan is late.
+    """The controller of one car on one track; it remembers its last plan. A plan is late by ``clock``, the time now
+    (s).
     """
 
     def __init__(
@@ -130,18 +112,15 @@ class Nmpc:
         began: float | None = None,
         margins: Margins | None = None,
     ) -> Plan:
-        """Plans from ``now`` on.
+        """Plans from ``now`` on. The plan is finite and within the actuators' limits, whatever came in; what is not
+        finite in ``now`` is taken as it was planned.
 
         Args:
-            now: present state in the order of ``STATES`` and the car's effect states, shape ``(size,)``.
-            adapted: what the model says; see :class:`Adapted`.
+            now: present state in the order of ``STATES`` and the car's effect states, ``(size,)``.
+            adapted: what the model says.
             t: time since the start of the drive (s), for effects that read it.
             began: when the control step began, by the clock, to which the deadline counts; now if not given.
             margins: by which borders and bounds on the slip are moved inwards; none if not given.
-
-        Returns:
-            The plan whose first step is to be driven, from ``now`` with what is not finite in it replaced by what was
-            planned. It is finite and within the actuators' limits, whatever came in.
         """
         began = self._clock() if began is None else began
         margins = Margins.none(self.settings.N) if margins is None else margins
@@ -163,13 +142,10 @@ class Nmpc:
         return plan
 
     def following(self, x: Vector, u: Vector, adapted: Adapted, t: float = 0.0) -> Vector:
-        """The states one T_s after ``x`` with the increments ``u``, by the model and not linearised; see :meth:`plan`.
+        """The states one T_s after ``x``, ``(size,)`` or ``(n, size)``, with the increments ``u`` ``(2,)``, by the
+        model and not linearised.
 
-        Args:
-            x: ``(size,)``, or ``(n, size)``.
-            u: of throttle (fraction) and steering (rad), ``(2,)``.
-            adapted: what holds for them: of a horizon, whose first step it is, or for ``n`` states one each.
-            t: time since the start of the drive (s).
+        ``adapted`` is of a horizon, whose first step it is, or for ``n`` states one each; ``t`` as of :meth:`plan`.
         """
         first = slice(0, 1) if x.ndim == 1 else slice(None)
         parts = [np.atleast_2d(part)[first] for part in adapted]
@@ -254,13 +230,7 @@ class Nmpc:
         return (plan, again)[own]
 
     def _driven(self, now: Vector, u: Vector, p: Vector) -> Vector:
-        """Where increments lead by the model, not linearised: states ``(M, N + 1, size)``.
-
-        Args:
-            now: the present state, ``(size,)``.
-            u: sequences of increments, ``(M, N, 2)``.
-            p: parameters of the steps, ``(N, PARAMETERS)``.
-        """
+        """Where increments ``u`` ``(M, N, 2)`` lead by the model, not linearised: states ``(M, N + 1, size)``."""
         x = np.empty((len(u), len(p) + 1, len(now)))
         x[:, 0] = now
         for k, parameters in enumerate(p):
@@ -280,10 +250,8 @@ class Nmpc:
 
 
 def _condensed(x: Vector, u: Vector, following: Vector, by_x: Vector, by_u: Vector) -> tuple[Vector, Vector]:
-    """Eliminates the states: they are ``offset + slope @ increments``.
-
-    Returns:
-        Shapes ``(N + 1, size)`` and ``(N + 1, size, 2 N)``.
+    """Eliminates the states: they are ``offset + slope @ increments``, of ``(N + 1, size)`` and ``(N + 1, size, 2
+    N)``.
     """
     N, size = len(u), x.shape[1]
     gaps = following - np.einsum("kij,kj->ki", by_x, x[:-1]) - np.einsum("kij,kj->ki", by_u, u)

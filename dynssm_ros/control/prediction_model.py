@@ -22,28 +22,21 @@ class PredictionModel(Protocol):
     """What the controller asks of a model."""
 
     name: str
-    car: CarModel
-    """The physics that its coefficients are for."""
-    H: int
-    """Rows of history that it reads; 0: none."""
-    calibrated: Adapted
-    """The car without what the model says of the present: what drives while that has earned nothing."""
+    car: CarModel  # the physics that its coefficients are for
+    H: int  # rows of history that it reads; 0: none
+    calibrated: Adapted  # the car without what the model says: what drives while that has earned nothing
 
     def read(self, rows: Vector, previous: Plan | None) -> Adapted:
         """Coefficients and correction for the horizon.
 
         Args:
-            rows: history with the columns ``WINDOW_COLUMNS``, the present last, shape ``(k, 7)``. The command in the
-                last row is the one that the last plan has for now.
+            rows: history with the columns ``WINDOW_COLUMNS``, the present last, ``(k, 7)``; its last command is the
+                last plan's for now.
             previous: the last plan as it stands now; ``None`` at the start.
         """
 
     def learn(self, rows: Vector) -> None:
-        """Takes the history once the command in its last row is the one that was sent; once for each row.
-
-        Args:
-            rows: as of :meth:`read`.
-        """
+        """Takes the history once the command in its last row is the one that was sent; once for each row."""
 
     def interrupt(self) -> None:
         """The next row is not one T_s after the last one."""
@@ -73,16 +66,15 @@ class Fixed:
 class Adaptive:
     """A model that reads a history window and predicts the next state.
 
-    Its coefficients, and what it adds to the single-track step with them, hold over the horizon; a model without
-    coefficients corrects the nominal car. Until the window is full the nominal car drives, without a correction.
+    Its coefficients, and what it adds to the single-track step with them, hold over the horizon. The nominal car drives
+    until the window is full, and as the physics of a model without coefficients.
 
     Args:
         model: the model. Its online layer, if it has one, learns from row to row.
         vehicle: the car as it is known.
-        along_horizon: reads the model anew at each step of the last plan instead, as if that had been driven.
-        as_is: steps the model's own physics in any case. Else only if its training has calibrated that. A model of other
-            physics, such as one without load transfer, is stepped as the car is known, which then drives where the model has
-            earned nothing; what it says beyond that is added, as in the controller node.
+        along_horizon: reads the model anew at each step of the last plan, as if that had been driven.
+        as_is: steps the model's own physics in any case, and not only if its training has calibrated that. Else the car
+            is stepped as it is known, and what the model says beyond that is added, as in the controller node.
     """
 
     def __init__(self, model: WindowModel, vehicle: Vehicle, along_horizon: bool = False, as_is: bool = False) -> None:
@@ -154,12 +146,8 @@ class Adaptive:
 
 
 def stepped(car: CarModel, rows: Vector, theta: Vector) -> Vector:
-    """Next states of ``car`` (m/s, m/s, rad/s), shape ``(k, 3)``.
-
-    Args:
-        car: what is stepped.
-        rows: with the columns ``WINDOW_COLUMNS``, shape ``(k, 7)``.
-        theta: coefficients, shape ``(17,)`` or ``(k, 17)``.
+    """Next states of ``car`` (m/s, m/s, rad/s), ``(k, 3)``, from ``rows`` ``(k, 7)`` with the columns
+    ``WINDOW_COLUMNS`` and ``theta`` ``(17,)`` or ``(k, 17)``.
     """
     return np.reshape(_step(car, rows.T, np.transpose(theta)), (3, -1)).T
 

@@ -1,11 +1,10 @@
 """The quadratic program of a control step: what is minimised, and what bounds it.
 
-Actuator limits are hard; the borders, the slip of both axles, and the speed at the end of the horizon where the objective
-asks for it are soft with a linear penalty, so that a program is feasible wherever the car is.
+Actuator limits are hard; the borders, the slip of both axles, and the speed at the end of the horizon where the
+objective asks for it are soft with a linear penalty, so that every program is feasible.
 
-Tracking follows a reference time: the place where a car that keeps the line's own time would be now. One that is behind is
-asked to catch up, one that is ahead to wait. The reference is at most ``lag_bound`` away (MPCC: a bound on the lag error),
-so that time that cannot be made up for is given up.
+Tracking follows the place where a car that keeps the line's own time would be now, at most ``lag_bound`` away (MPCC: a
+bound on the lag error), so that time that cannot be made up for is given up.
 """
 
 from __future__ import annotations
@@ -31,12 +30,9 @@ _ROAD_LEFT, _SLIP_LEFT = 0.5, 0.5  # shares of the road and of the slip's bound 
 class Whereabouts(NamedTuple):
     """Where the car is."""
 
-    on_track: float
-    """Along the track's centre line (m)."""
-    on_line: float
-    """Along the line that is followed (m)."""
-    scheduled: float
-    """Likewise where it would be by the reference time (m)."""
+    on_track: float  # along the track's centre line (m)
+    on_line: float  # along the line that is followed (m)
+    scheduled: float  # likewise where it would be by the reference time (m)
 
 
 _ORIGIN = Whereabouts(0.0, 0.0, 0.0)
@@ -44,15 +40,9 @@ _ORIGIN = Whereabouts(0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class HorizonProgram:
-    """The program of one car on one track, now.
+    """The program of one car on one track, now, which is ``at`` a place.
 
-    Attributes:
-        model: the car inside.
-        limits: of the actuators.
-        reference: the line.
-        track: whose borders hold.
-        settings: weights, bounds and scale.
-        at: where the car is.
+    ``margins`` move borders and bounds on the slip inwards. ``p`` are parameters of the steps, ``(N, PARAMETERS)``.
     """
 
     model: HorizonModel
@@ -88,8 +78,8 @@ class HorizonProgram:
             guess: the states around which it is linearised, the present one first, ``(N + 1, size)``.
             offset: states without increments, ``(N + 1, size)``; with them they are ``offset + slope @ increments``.
             slope: ``(N + 1, size, 2 N)``.
-            p: parameters of the steps, ``(N, PARAMETERS)``.
-            margins: by which borders and bounds on the slip are moved inwards.
+            p: see above.
+            margins: see above.
         """
         N, w = self.settings.N, self.settings.weights
         positions, moves = offset[1:, :2], slope[1:, :2]
@@ -145,13 +135,8 @@ class HorizonProgram:
         return QuadraticProgram(H, g, A, low, high, z_low, z_high)
 
     def costs(self, x: Vector, u: Vector, p: Vector, margins: Margins) -> Vector:
-        """What the program minimises, ``(M,)``; infinite where a state is not finite.
-
-        Args:
-            x: states, not linearised, ``(M, N + 1, size)``.
-            u: increments that led there, ``(M, N, 2)``.
-            p: parameters of the steps, ``(N, PARAMETERS)``.
-            margins: by which borders and bounds on the slip are moved inwards.
+        """What the program minimises, ``(M,)``, at states ``x`` ``(M, N + 1, size)``, not linearised, where increments
+        ``u`` ``(M, N, 2)`` led; infinite where a state is not finite.
         """
         finite = np.all(np.isfinite(x), axis=(1, 2))
         x = np.where(finite[:, None, None], x, x[:, :1])
@@ -176,9 +161,8 @@ class HorizonProgram:
         return np.where(finite, costs, np.inf)
 
     def reference_points(self, guess: Vector) -> Vector:
-        """Where on the line the steps of the horizon are compared with it (m).
-
-        They are ``(..., N)`` for guesses ``(..., N + 1, size)``, or ``(N,)`` where all guesses are of the same present.
+        """Where on the line the steps of guesses ``(..., N + 1, size)`` are compared with it (m): ``(..., N)``, or
+        ``(N,)`` where all guesses are of the same present.
         """
         if self.settings.objective == "tracking":
             v = float(guess[..., 0, V_X].flat[0])
@@ -188,9 +172,8 @@ class HorizonProgram:
     def add_borders(
         self, A: Vector, low: Vector, high: Vector, *, guess: Vector, positions: Vector, moves: Vector, margin: Vector
     ) -> None:
-        """Half planes at the feet of the guessed positions on the centre line; both sides share a step's slack.
-
-        They are ``margin`` ``(N,)`` further inwards, where the road is wide enough.
+        """Half planes at the feet of the guessed positions on the centre line, see :meth:`_room`; both sides share a
+        step's slack.
         """
         N = self.settings.N
         s = self.track.project(guess[1:, :2], _along(guess[:, :2], self.at.on_track))[0]
@@ -204,9 +187,8 @@ class HorizonProgram:
         high[:N], low[N:] = left - lateral, -right - lateral
 
     def _room(self, s: Vector, margin: Vector) -> tuple[Vector, Vector]:
-        """From the centre line at ``s`` (m) to where the car's centre may be, to the right and to the left (m).
-
-        Both are ``margin`` ``(N,)`` less, where the road is wide enough.
+        """From the centre line at ``s`` (m) to where the car's centre may be, to the right and to the left (m):
+        ``margin`` ``(N,)`` further inwards, where the road is wide enough.
         """
         right, left = (width - self.settings.margin for width in self.track.widths(s))
         margin = np.minimum(margin, (1.0 - _ROAD_LEFT) * np.maximum(right + left, 0.0) / 2)
@@ -215,9 +197,8 @@ class HorizonProgram:
     def add_slip(
         self, A: Vector, high: Vector, *, guess: Vector, offset: Vector, slope: Vector, p: Vector, margin: Vector
     ) -> None:
-        """The slip angles (rad) of both axles after each step, within their bounds on both sides less ``margin`` ``(N, 2)``.
-
-        They are the model's own, linearised at the guessed states ``(N, size)``.
+        """The model's slip angles (rad) of both axles after each step, linearised at ``guess`` ``(N, size)``, within
+        their bounds on both sides less ``margin`` ``(N, 2)``.
         """
         N = self.settings.N
         slips, by_x = self.model.slip_angles(guess, p)

@@ -1,10 +1,7 @@
 """Laps in closed loop: a plant, a model in the controller, and what is measured of them.
 
-The car starts on the line at the line's own speed unless said otherwise, with its actuators at zero. A model
-that reads a history drives with its nominal coefficients until its window is full. Time runs from the start; a lap is
-done when the car is once around on the centre line.
-
-A violation is the car's centre of gravity outside the borders at any sample.
+The car starts on the line at the line's own speed unless said otherwise, its actuators at zero. A lap is done when the
+car is once around on the centre line. A violation is its centre of gravity outside the borders at any sample.
 """
 
 from __future__ import annotations
@@ -40,45 +37,26 @@ PATIENCE = 3.0  # laps at the line's own speed that a lap may take
 
 @dataclass(frozen=True)
 class Start:
-    """Where a race begins.
+    """Where a race begins."""
 
-    Attributes:
-        s: on the centre line (m).
-        lateral: beside the line that is followed (m, positive left).
-        speed: along the line (m/s), 0: standing; ``None``: the line's own there.
-    """
-
-    s: float = 0.0
-    lateral: float = 0.0
-    speed: float | None = None
+    s: float = 0.0  # on the centre line (m)
+    lateral: float = 0.0  # beside the line that is followed (m, positive left)
+    speed: float | None = None  # along the line (m/s), 0: standing; None: the line's own there
 
 
 @dataclass(frozen=True)
 class Course:
-    """What all models drive alike.
+    """What all models drive alike."""
 
-    Attributes:
-        vehicle: the car that is driven, with all its effects.
-        track: where.
-        plant: how the car is simulated.
-        reference: the line that the controller follows.
-        settings: of the controller.
-        laps: to drive.
-        start: where it begins.
-        sensing: what comes between the car and its controller.
-        learning: the car as its file describes it, if it is to be driven faster every lap
-            (:mod:`dynssm_ros.control.lap_learning`); ``None``: at the reference's speed.
-    """
-
-    vehicle: Vehicle
+    vehicle: Vehicle  # that is driven, with all its effects
     track: Track
-    plant: PlantKind
-    reference: Reference
-    settings: Settings
+    plant: PlantKind  # how it is simulated
+    reference: Reference  # the line that the controller follows
+    settings: Settings  # of the controller
     laps: int = 1
     start: Start = Start()
-    sensing: Sensing = field(default_factory=Sensing)
-    learning: Vehicle | None = None
+    sensing: Sensing = field(default_factory=Sensing)  # what comes between the car and its controller
+    learning: Vehicle | None = None  # the file's car, to be driven faster every lap: lap_learning; None: it is not
 
     @property
     def delay(self) -> float:
@@ -89,8 +67,8 @@ class Course:
         """Pose and motion at the start.
 
         Raises:
-            SimulationError: the road is too narrow for the car; the start is not on it, or backwards; more than a lap of
-                a line for one.
+            SimulationError: the road is too narrow for the car; the start is not on it, or backwards; more than a lap
+                of a line for one.
         """
         if self.laps > 1 and self.reference.standing:
             raise SimulationError(
@@ -121,45 +99,27 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class Race:
-    """A drive of ``n`` control steps with one model. Row ``k`` holds what was at ``time[k]`` and the command from then on.
-
-    Attributes:
-        name: of the model.
-        course: what was driven.
-        time: since the start (s), shape ``(n,)``.
-        pose: ``x, y, theta`` (m, m, rad), shape ``(n, 3)``.
-        state: true ``v_x, v_y, omega``, shape ``(n, 3)``.
-        command: throttle (fraction) and steering (rad), shape ``(n, 2)``.
-        s: along the centre line since its first point, counted on over the laps (m), shape ``(n,)``.
-        lateral: beside it (m, positive left), shape ``(n,)``.
-        theta: coefficients of the first step of each horizon, shape ``(n, 17)``.
-        correction: likewise the correction, shape ``(n, 3)``.
-        weights: shares of :data:`~dynssm_ros.control.evidence.SOURCES` in both, shape ``(n, 3)``.
-        solve: time of each control step, model and plan together (s of one core), shape ``(n,)``.
-        learn: what is learned from it took after its command was out (likewise), shape ``(n,)``.
-        infeasible: steps at which there was no plan.
-        late: steps at which it came too late.
-        failure: why the laps were not completed; empty if they were.
-        learned: lap by lap, what a car that learns was driven with.
+    """A drive of ``n`` control steps with one model. Row ``k`` holds what was at ``time[k]`` and the command from then
+    on.
     """
 
-    name: str
+    name: str  # of the model
     course: Course
-    time: Vector
-    pose: Vector
-    state: Vector
-    command: Vector
-    s: Vector
-    lateral: Vector
-    theta: Vector
-    correction: Vector
-    weights: Vector
-    solve: Vector
-    learn: Vector
-    infeasible: int
-    late: int
-    failure: str
-    learned: tuple[LearnedLap, ...] = ()
+    time: Vector  # since the start (s), (n,)
+    pose: Vector  # x, y, theta (m, m, rad), (n, 3)
+    state: Vector  # true v_x, v_y, omega, (n, 3)
+    command: Vector  # throttle (fraction) and steering (rad), (n, 2)
+    s: Vector  # along the centre line since its first point, counted on over the laps (m), (n,)
+    lateral: Vector  # beside it (m, positive left), (n,)
+    theta: Vector  # coefficients of the first step of each horizon, (n, 17)
+    correction: Vector  # likewise the correction, (n, 3)
+    weights: Vector  # shares of evidence.SOURCES in both, (n, 3)
+    solve: Vector  # time of each control step, model and plan together (s of one core), (n,)
+    learn: Vector  # what is learned from it took after its command was out (likewise), (n,)
+    infeasible: int  # steps at which there was no plan
+    late: int  # steps at which it came too late
+    failure: str  # why the laps were not completed; empty if they were
+    learned: tuple[LearnedLap, ...] = ()  # lap by lap, what a car that learns was driven with
 
     @property
     def completed(self) -> bool:
@@ -263,15 +223,10 @@ class _Drive:
 
     def result(self, name: str, failure: str) -> Race:
         """What was driven."""
-        time, pose, state, command, s, lateral, theta, correction, weights, solve, learn = (
-            np.array(column) for column in zip(*self._rows, strict=True)
-        )
-        counts = self.pilot.counts
-        return Race(
-            name, self._course, time, pose, state, command, s, lateral, theta, correction, weights, solve, learn,
-            counts["infeasible"], counts["late"], failure,
-            () if self._learner is None else tuple(self._learner.laps),
-        )  # fmt: skip
+        counts, learned = self.pilot.counts, () if self._learner is None else tuple(self._learner.laps)
+        columns = [np.array(column) for column in zip(*self._rows, strict=True)]
+        found: list[Any] = [*columns, counts["infeasible"], counts["late"], failure, learned]
+        return Race(name, self._course, *found)
 
     def _log(self, t: float, decision: Decision) -> None:
         """Keeps what was measured at ``t`` (s), and learns from the lap once it is complete."""
@@ -299,12 +254,8 @@ class _Drive:
 
 
 def race(course: Course, model: PredictionModel, progress: NamedProgress | None = None) -> Race:
-    """Drives the laps of ``course`` with ``model`` in the controller.
-
-    Args:
-        course: what to drive.
-        model: what the controller knows of the car.
-        progress: told of the millimetres driven, of how many, and of a few words.
+    """Drives the laps of ``course`` with ``model`` in the controller; ``progress`` is told of millimetres, of how many,
+    and the model.
 
     Raises:
         SimulationError: the road is too narrow for the car, or the start is not on it.

@@ -28,32 +28,19 @@ class Reference:
 
     A line whose first speed is 0 is that of one lap from a standing start: it ends at the speed of its last point, and
     what follows is driven at that. Places on the line (m) count on over the laps.
-
-    Attributes:
-        name: ``centre``, ``racing`` or the file that it came from.
-        line: where to drive.
-        speed: at the points of the line (m/s), shape ``(N,)``.
-        limits: of the car that follows it; ``None``: it can do anything.
-        share: of the limits' accelerations that the speed asks for, everywhere; ``None``: there is no such share.
-        terminal_speed: at the points (m/s), the greatest from which the car can go on, shape ``(N,)``; ``None``: ``speed``.
     """
 
-    name: str
+    name: str  # centre, racing or the file that it came from
     line: ClosedLine
-    speed: Vector
-    limits: Limits | None = None
-    share: float | None = None
-    terminal_speed: Vector | None = None
+    speed: Vector  # at the points of the line (m/s), (N,)
+    limits: Limits | None = None  # of the car that follows it; None: it can do anything
+    share: float | None = None  # of the limits' accelerations that the speed asks for, if it is the same everywhere
+    terminal_speed: Vector | None = None  # greatest at the points from which the car can go on (m/s), (N,); None: speed
 
     @classmethod
     def within(cls, name: str, line: ClosedLine, limits: Limits, share: float | Vector) -> Reference:
-        """A line as fast as a car can drive it.
-
-        Args:
-            name: of the reference.
-            line: where to drive.
-            limits: of the car.
-            share: of its accelerations that are used, for all points or ``(N,)``.
+        """A line as fast as a car within ``limits`` drives it with a ``share`` of its accelerations, of all points or
+        ``(N,)``.
         """
         speed, terminal_speed = (each(line, limits, share) for each in (speed_profile, terminal_speed_profile))
         return cls(name, line, speed, limits, None if isinstance(share, np.ndarray) else share, terminal_speed)
@@ -86,12 +73,10 @@ class Reference:
         return float(np.sum(2 * steps / (speed[1:] + speed[:-1])))
 
     def project(self, points: npt.ArrayLike, near: Floats | None = None) -> Vector:
-        """Places of ``points`` (m, shape ``(..., 2)``) on the line, shape ``(...)``.
+        """Places of ``points`` (m, shape ``(..., 2)``) on the line, ``(...)``, searched around and counted on from
+        ``near`` (m).
 
-        Args:
-            points: positions.
-            near: places (m) to search around and to count on from; ``None``: on the first lap, just before its start
-                rather than at its end.
+        Without ``near`` they are on the first lap, just before its start rather than at its end.
         """
         s, length = self.line.project(points, near)[0], self.line.length
         around = length * (0.5 - _RUN_UP) if near is None else near
@@ -112,14 +97,8 @@ class Reference:
     def within_reach(self, s: float, times: Vector, v: float, scheduled: float | None = None) -> Vector:
         """Places (m) that a car with speed ``v`` (m/s) at ``s`` (m) is to reach after ``times`` (s).
 
-        They are those of :meth:`ahead`, but none beyond what full throttle reaches. A car that is asked for what is far
-        out of its reach, as at a standing start, would take every short cut to get closer.
-
-        Args:
-            s: where the car is.
-            times: from now on.
-            v: its speed.
-            scheduled: where it should be now (m); ``None``: where it is.
+        They are those of :meth:`ahead` from where it is or is ``scheduled`` to be now (m), but none beyond what full
+        throttle reaches: a car that is asked for more, as at a standing start, would take every short cut.
         """
         places = self.ahead(s if scheduled is None else scheduled, times)
         if self.limits is None:

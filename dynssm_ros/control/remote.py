@@ -10,6 +10,7 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, VELOCITIES, HorizonModel
 from dynssm_ros.control.nmpc import Adapted, Plan
+from dynssm_ros.control.prediction_model import Fixed
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose
 
@@ -21,44 +22,31 @@ _ROUNDING = 1e-5  # of a coefficient's range: predictors compute in single preci
 
 
 class ModelOutput(NamedTuple):
-    """What holds now.
+    """What holds now."""
 
-    Attributes:
-        adapted: for the horizon.
-        source: in words.
-        age: of the odometry that it rests on (s); infinite for the nominal car.
-    """
-
-    adapted: Adapted
-    source: str
-    age: float
+    adapted: Adapted  # for the horizon
+    source: str  # in words
+    age: float  # of the odometry that it rests on (s); infinite for the nominal car
 
 
-class RemoteModel:
+class RemoteModel(Fixed):
     """The nominal car with the last coefficients of a predictor, and what the predictor adds to a step with them.
 
-    A prediction carries the stamp of the instant that it is for, one T_s after the odometry that it rests on, and the
-    adapted coefficients carry the same. The correction is the predicted state less the car's own step from the same
-    odometry with these coefficients. Both are held until they are older than ``max_age``; then the nominal car is driven.
-
-    Args:
-        vehicle: the car.
-        max_age: how old the odometry behind the coefficients may be (s).
+    Prediction and coefficients carry the stamp of the instant that they are for, one T_s after the odometry that they
+    rest on. The correction is the predicted state less the car's own step from that odometry. Both are held until the
+    odometry is older than ``max_age`` (s); then the nominal car is driven.
     """
 
-    name = "predictor"
-    H = 0
     NOMINAL = "nominal car"
     ADAPTED = "adapted coefficients"
     CORRECTED = "nominal car, corrected"
 
     def __init__(self, vehicle: Vehicle, max_age: float) -> None:
-        self.car = CarModel.at_any_speed(vehicle)
+        super().__init__("predictor", CarModel.at_any_speed(vehicle), vehicle.nominal)
         self._model = HorizonModel(self.car, 1)
         self._period = round(vehicle.sampling_time * 1e9)
         self._max_age = max_age * 1e9
         self._lower, self._upper = vehicle.lower, vehicle.upper
-        self.calibrated = Adapted(vehicle.nominal, np.zeros(3))
         self._nothing = ModelOutput(self.calibrated, self.NOMINAL, np.inf)
         # all by the predicted instant (ns)
         self._theta: dict[int, Vector] = {}
@@ -68,10 +56,8 @@ class RemoteModel:
         """What :meth:`read` hands on."""
 
     def predicted(self, stamp: int, state: Sequence[float]) -> str:
-        """Takes a predicted ``v_x, v_y, omega`` for the instant ``stamp`` (ns).
-
-        Returns:
-            Nothing if it is usable, else what is wrong with it.
+        """Takes a predicted ``v_x, v_y, omega`` for the instant ``stamp`` (ns). Returns what is wrong with it, else
+        nothing.
         """
         values = np.array(state, dtype=np.float64)
         if not np.all(np.isfinite(values)):
@@ -80,10 +66,8 @@ class RemoteModel:
         return ""
 
     def adapted(self, stamp: int, theta: Mapping[str, float]) -> str:
-        """Takes the coefficients, by name, behind the prediction for the instant ``stamp`` (ns).
-
-        Returns:
-            Nothing if they are usable, else what is wrong with them.
+        """Takes the coefficients behind the prediction for the instant ``stamp`` (ns). Returns what is wrong with them,
+        else nothing.
         """
         missing = [name for name in COEFFICIENTS if name not in theta]
         if missing:
@@ -99,14 +83,8 @@ class RemoteModel:
     def start(
         self, pose: Pose, seen: State, applied: Applied, context: Context, effect_states: Vector | None
     ) -> Vector:
-        """The controller's state, shape ``(size,)``.
-
-        Args:
-            pose: where the car is.
-            seen: its measured velocities.
-            applied: what its actuators do from now on.
-            context: now.
-            effect_states: states of the car's effects; settled if not given.
+        """The controller's state, ``(size,)``. Without ``effect_states`` these are settled in the ``context`` of
+        now.
         """
         if effect_states is None:
             car, theta = self.car, Coefficients(*self.output.adapted.theta.tolist())
@@ -116,12 +94,10 @@ class RemoteModel:
         return np.array([*pose, *seen, *applied, *effect_states])
 
     def measured(self, stamp: int, x: Vector, context: Context) -> None:
-        """Notes where the prediction from the odometry at ``stamp`` (ns) starts.
+        """Notes the controller's state ``x`` ``(size,)`` and the context at the odometry of ``stamp`` (ns), where its
+        prediction starts.
 
-        Args:
-            stamp: of the odometry.
-            x: the controller's state then, its actuators being those that act from then on, shape ``(size,)``.
-            context: then.
+        The actuators in it are those that act from then on.
         """
         self._start[stamp + self._period] = x, context
 
@@ -136,8 +112,7 @@ class RemoteModel:
             for k in [k for k in each if abs(following - k) > self._max_age]:
                 del each[k]
         correctable = self._state.keys() & self._start.keys()
-        candidates = self._theta.keys() | correctable
-        if not candidates:
+        if not (candidates := self._theta.keys() | correctable):
             self.output = self._nothing
             return
         best = max(candidates, key=lambda k: (k in self._theta, k in correctable, k))
@@ -150,20 +125,9 @@ class RemoteModel:
         """What was chosen last; see :class:`~dynssm_ros.control.prediction_model.PredictionModel`."""
         return self.output.adapted
 
-    def learn(self, rows: Vector) -> None:
-        """Nothing: the predictor learns."""
-
-    def interrupt(self) -> None:
-        """Nothing: what was heard holds until it is too old."""
-
     def ahead(self, x: Vector, context: Context, adapted: Adapted, increments: Vector = _HELD) -> Vector:
-        """The state one T_s after ``x``; see :meth:`measured`.
-
-        Args:
-            x: the controller's state, shape ``(size,)``.
-            context: then.
-            adapted: what holds.
-            increments: of its actuators, which are held if not given, shape ``(2,)``.
+        """The state one T_s after ``x`` ``(size,)`` with ``increments`` ``(2,)`` of the actuators, which else are
+        held.
         """
         return self._model.step(x, increments, np.concatenate([*adapted, context]))
 

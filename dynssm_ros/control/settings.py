@@ -1,7 +1,6 @@
-"""How the controller works, the same for cars of any size: its weights and its horizon are in units of the car.
+"""How the controller works, the same for cars of any size: weights and horizon are in units of the car.
 
-A car that is 48 times as long drives the same lap in its own lengths and times, if it grips as well. So lengths are
-measured in wheelbases, and times in that in which the car's grip moves it sideways by half of one.
+Lengths are measured in wheelbases, and times in that in which the car's grip moves it sideways by half of one.
 """
 
 from __future__ import annotations
@@ -27,22 +26,15 @@ HORIZON = 3.5  # in units of the car's time: 15 steps of 20 ms for the 1:43 car,
 # shares of what the tyres can give up to which an axle is used: at its peak the front gives the same for more and for less
 # steering, so that a program that is linearised there knows no way back; from a slide of the rear there is none
 _FRONT_USED, _REAR_USED = 0.98, 0.95
-_LAG_BOUND_WHEELBASES = (
-    0.3  # wheelbases that a car may be behind the line's own time and still be asked to make up for it
-)
+_LAG_BOUND_WHEELBASES = 0.3  # that a car may be off the line's own time and still be asked to make up for it
 
 
 @dataclass(frozen=True)
 class Scale:
-    """What a car's motion is measured in.
+    """What a car's motion is measured in."""
 
-    Attributes:
-        length: wheelbase (m).
-        time: square root of wheelbase over lateral grip (s).
-    """
-
-    length: float
-    time: float
+    length: float  # wheelbase (m)
+    time: float  # square root of wheelbase over lateral grip (s)
 
     @classmethod
     def of(cls, vehicle: Vehicle) -> Scale:
@@ -57,30 +49,18 @@ class Scale:
 
 @dataclass(frozen=True)
 class Weights:
-    """What the controller minimises, in units of the car's :class:`Scale`, integrated over the horizon.
-
-    Attributes:
-        along: of the squared distance from the reference point along the line.
-        across: likewise across it.
-        progress: gain per length that the horizon's last point lies further along the line.
-        throttle: of the squared rate of the throttle (fraction per time).
-        steering: of the squared rate of the steering (rad per time).
-        border: price of the distance beyond a border or a slip angle beyond its bound (rad), whichever is larger, and of
-            its square.
-        terminal_speed: price of speed at the end of the horizon above that from which the car can go on along the line, and
-            of its square; 0: it is not bounded.
-        terminal_across: of the squared distance across the line at the end of the horizon, not integrated. The speed that is
-            allowed there is true of the line.
+    """What the controller minimises, in units of the car's :class:`Scale`, integrated over the horizon but at its
+    end.
     """
 
-    along: float
-    across: float
-    progress: float
-    throttle: float = 0.07
-    steering: float = 15.0
-    border: float = 160.0
-    terminal_speed: float = 0.0
-    terminal_across: float = 0.0
+    along: float  # of the squared distance from the reference point along the line
+    across: float  # likewise across it
+    progress: float  # gain per length that the horizon's last point lies further along the line
+    throttle: float = 0.07  # of its squared rate (fraction per time)
+    steering: float = 15.0  # likewise (rad per time)
+    border: float = 160.0  # price of the larger of what is beyond a border and a slip's bound (rad); of its square too
+    terminal_speed: float = 0.0  # likewise of speed at the end above that from which the car can go on; 0: not bounded
+    terminal_across: float = 0.0  # of the squared distance across the line at the end, where that speed is true
 
 
 WEIGHTS: Mapping[Objective, Weights] = {
@@ -97,33 +77,22 @@ WEIGHTS: Mapping[Objective, Weights] = {
 class Settings:
     """How the controller works.
 
-    Attributes:
-        scale: of the car.
-        objective: ``tracking`` follows the reference at its own speed; ``progress`` goes as far as it can between the
-            borders, to where it can go on from: no faster than cornering and brakes allow on the line there.
-        N: steps of the horizon.
-        deadline: time (s) after which a plan comes too late and is not used.
-        margin: distance to keep between the car's centre and the borders (m).
-        slip: slip angles of front and rear axle that no step is to exceed (rad).
-        lag_bound: how far the place where a car that keeps the line's time would be is from this one (m) at most.
-        follows: whether what the model mispredicts is added to it: at a rate that the data choose, at a fixed one, or not at
-            all; see :mod:`dynssm_ros.control.disturbance`.
-        evidence: whether what a model says is planned with only where it has predicted better than the calibrated car
-            (:mod:`dynssm_ros.control.evidence`), and borders and slip are kept the further off the more was mispredicted
-            (:mod:`dynssm_ros.control.caution`).
-        travel: what carries the pose over a step.
+    ``tracking`` follows the reference at its own speed; ``progress`` goes as far as it can between the borders, no
+    faster at the end than cornering and brakes allow on the line there. With ``evidence`` what a model says is planned
+    with only where it has predicted better than the calibrated car (:mod:`dynssm_ros.control.evidence`), and borders
+    and slip are kept the further off the more was mispredicted (:mod:`dynssm_ros.control.caution`).
     """
 
-    scale: Scale
+    scale: Scale  # of the car
     objective: Objective = "tracking"
-    N: int = 15
-    deadline: float = math.inf
-    margin: float = 0.0
-    slip: tuple[float, float] = (math.inf, math.inf)
-    lag_bound: float = 0.0
-    follows: Follows = "chosen"
+    N: int = 15  # steps of the horizon
+    deadline: float = math.inf  # time (s) after which a plan comes too late and is not used
+    margin: float = 0.0  # distance to keep between the car's centre and the borders (m)
+    slip: tuple[float, float] = (math.inf, math.inf)  # angles of front and rear axle that no step is to exceed (rad)
+    lag_bound: float = 0.0  # most that the car may be off the place of one that keeps the line's time (m)
+    follows: Follows = "chosen"  # at a rate that the data choose, at a fixed one, or not at all; see disturbance
     evidence: bool = True
-    travel: Travel = "middle"
+    travel: Travel = "middle"  # what carries the pose over a step
 
     @classmethod
     def of(
@@ -134,10 +103,11 @@ class Settings:
         offset_free: bool = False,
         evidence: bool = True,
     ) -> Settings:
-        """For a car: a plan has a control period of time, half the car stays within the borders.
+        """For a car as its file describes it: a plan has a control period of time, half the car stays within the
+        borders.
 
         Args:
-            vehicle: the car as its file describes it.
+            vehicle: the car.
             objective: see above.
             N: steps of the horizon; ``None``: ``HORIZON``.
             offset_free: what the model mispredicts is followed at a fixed rate.

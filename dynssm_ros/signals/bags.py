@@ -1,8 +1,7 @@
 """rosbag2 folders and single files (MCAP and SQLite3), any message type that the bag describes.
 
-Reading is rosbags' work. What is added here: one clear error per kind of damage, and the way around it where there is
-one - bags that were cut off (:mod:`dynssm_ros.signals.recover`), that lack their metadata or index, or some of whose
-files are lost.
+Reading is rosbags' work. Added here: one clear error per kind of damage, and the way around it where there is one
+(:mod:`dynssm_ros.signals.recover`).
 """
 
 from __future__ import annotations
@@ -58,8 +57,7 @@ class Bag:
 
     path: Path
     reader: AnyReader
-    mend: Callable[[str], AnyReader]
-    """A reader of what can be read of a bag in which that damage was met."""
+    mend: Callable[[str], AnyReader]  # a reader of what can be read of a bag in which that damage was met
     notes: list[str] = field(default_factory=list)
 
     @cached_property
@@ -99,9 +97,8 @@ class Bag:
         return self.reader.typestore if msgtype in self.reader.typestore.types else _TYPESTORE
 
     def messages(self, topics: Sequence[str]) -> Iterator[BagMessage]:
-        """Yields the messages of ``topics`` in the order in which they were recorded.
-
-        Whether all can be read is seen on the way. Behind what cannot it goes on, if a reader can be made that does.
+        """Yields the messages of ``topics`` in the order in which they were recorded, behind damage too if a reader can
+        be made that does.
 
         Raises:
             BagError: the storage is damaged in the middle.

@@ -30,13 +30,7 @@ def _to_si(source: Source) -> Callable[[float], float]:
 
 
 class TopicDecoder:
-    """Reads all mapped signals of one topic out of its messages.
-
-    Args:
-        topic: absolute name.
-        msgtype: of its messages.
-        signal_map: which signals it carries.
-    """
+    """Reads all signals of ``signal_map`` that one topic carries out of its messages."""
 
     def __init__(self, topic: str, msgtype: str, signal_map: SignalMap) -> None:
         self.topic = topic

@@ -1,8 +1,7 @@
 """The live counterpart of resampling: raw samples in ring buffers, a window on the model's grid at any instant.
 
 The window is sampled back from a given stamp at ``T_s``, so odometry of any rate and jitter works. Between samples it
-interpolates or holds as the extractor does. What is newer than a signal's last sample is not known yet, and that last
-sample is held.
+interpolates or holds as the extractor does; beyond the newest it holds.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from math import isfinite
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.signals.inputs import WINDOW_COLUMNS, model_inputs
+from dynssm_ros.signals.inputs import model_inputs
 from dynssm_ros.signals.signal_map import ROUNDING, STATE_SIGNALS, SignalMap
 
 
@@ -36,9 +35,9 @@ class Refusal(Enum):
 class RingBuffer:
     """The newest samples of one signal, in order, without allocation while running.
 
-    Everything is stored twice, one capacity apart, so that the newest ``n`` samples are always one contiguous view.
-    Times are nanoseconds since an epoch as floats: exact for 104 days, and to 0.3 us even since 1970 (an epoch set by a
-    first message without a stamp).
+    Everything is stored twice, one capacity apart, so that the newest samples are one contiguous view. Times are ns
+    since an epoch as floats: exact for 104 days, and to 0.3 us even since 1970 (an epoch set by a first message without
+    a stamp).
     """
 
     def __init__(self, capacity: int = 256) -> None:
@@ -56,32 +55,31 @@ class RingBuffer:
 
     @property
     def times(self) -> Vector:
-        """Times (ns since the epoch) of all stored samples, oldest first; a view."""
-        end = self._next + self._capacity
-        return self._times[end - self._count : end]
+        """Of all stored samples, oldest first; a view."""
+        return self._times[self._stored]
 
     @property
     def values(self) -> Vector:
-        """Values of all stored samples, oldest first; a view."""
+        """Of all stored samples, oldest first; a view."""
+        return self._values[self._stored]
+
+    @property
+    def _stored(self) -> slice:
         end = self._next + self._capacity
-        return self._values[end - self._count : end]
+        return slice(end - self._count, end)
 
     @property
     def oldest(self) -> float:
-        """Time of the oldest sample (ns since the epoch), ``inf`` if empty."""
+        """Time of the oldest sample, ``inf`` if empty."""
         return float(self._times[self._next + self._capacity - self._count]) if self._count else np.inf
 
     def interpolate(self, grid: Vector) -> Vector:
-        """Values at the times ``grid`` (ns since the epoch), linear between samples and held beyond the newest."""
-        end = self._next + self._capacity
-        stored = slice(end - self._count, end)
-        sampled: Vector = np.interp(grid, self._times[stored], self._values[stored])
-        return sampled
+        """Values at the times ``grid``, linear between samples and held beyond the newest."""
+        return np.interp(grid, self.times, self.values)
 
     def held(self, grid: Vector) -> Vector:
-        """The last values at or before the times ``grid`` (ns since the epoch); the oldest one for times before it."""
-        values: Vector = self.values[np.maximum(np.searchsorted(self.times, grid, side="right") - 1, 0)]
-        return values
+        """The last values at or before the times ``grid``; the oldest one for times before it."""
+        return np.asarray(self.values[np.maximum(np.searchsorted(self.times, grid, side="right") - 1, 0)])
 
     def append(self, time: float, value: float, span: float) -> None:
         """Adds a sample newer than all others, growing if the buffer would forget samples younger than ``span`` ns."""
@@ -116,8 +114,8 @@ class History:
         H: number of rows of the window.
         held: signals that keep their last sample until the next; the others are interpolated.
         max_age: how much older than the requested instant the newest sample of a signal may be (s).
-        jump: stamps that step back by more than this mean that time was set back, not disorder (s). They are believed, as
-            those that are further ahead, when a second message confirms them.
+        jump: stamps further back than this (s) mean that time was set back, not disorder. They are believed, as those
+            that are further ahead, when a second message confirms them.
     """
 
     def __init__(
@@ -134,10 +132,8 @@ class History:
         self.names = (*velocities, *signal_map.active_signals())
         self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
         self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
-        self._delays = dict.fromkeys(self._buffers, 0.0)
-        self._delays |= {
-            name: source.delay * 1e9 for name, source in signal_map.signals.items() if name in self._buffers
-        }
+        sources = signal_map.signals
+        self._delays = {name: sources[name].delay * 1e9 if name in sources else 0.0 for name in self._buffers}
         self._max_gap = float(signal_map.max_gap_ns)
         self._max_age = max_age * 1e9
         self._jump = max(jump * 1e9, 2 * self._max_gap)
@@ -153,15 +149,12 @@ class History:
         self._slack = ROUNDING * T_s * 1e9
 
     def add(self, stamp: int, values: dict[str, float]) -> Refusal | None:
-        """Takes the samples of one message.
-
-        Args:
-            stamp: header stamp (ns).
-            values: by signal name, SI units; signals that are not part of the window are ignored.
+        """Takes the samples of one message with header stamp ``stamp`` (ns), SI values by signal name; those not of the
+        window are ignored.
 
         Returns:
-            ``None`` if they were taken, else why not. After ``JUMPED_BACK`` the older samples are forgotten, and the new
-            window begins with these and those of the message that they confirm.
+            ``None`` if they were taken, else why not. After ``JUMPED_BACK`` the older samples are forgotten, and the
+                new window begins with these and those of the message that they confirm.
         """
         known = {name: value for name, value in values.items() if name in self._buffers}
         if self._epoch is None:
@@ -219,10 +212,8 @@ class History:
         self._epoch = None
 
     def window(self, stamp: int) -> Vector | Refusal:
-        """The ``(H, 7)`` window in the order of ``WINDOW_COLUMNS`` whose last row is at ``stamp`` (ns).
-
-        Instead of a window, the reason is returned if a signal is missing, older than ``max_age``, or does not reach
-        back without a gap.
+        """The ``(H, 7)`` window in the order of ``WINDOW_COLUMNS`` whose last row is at ``stamp`` (ns), or why there is
+        none.
         """
         if self._epoch is None:
             return Refusal.MISSING
@@ -242,10 +233,7 @@ class History:
             name: buffer.held(late) if name in self._held else buffer.interpolate(grid)
             for name, buffer in self._buffers.items()
         }
-        window = np.empty((len(grid), len(WINDOW_COLUMNS)))
-        for column, values in enumerate((*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled))):
-            window[:, column] = values
-        return window
+        return np.stack([*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled)], axis=1)
 
     def ages(self, stamp: int) -> dict[str, float]:
         """Age of the newest sample of each signal at ``stamp`` (s); infinite where none was received."""

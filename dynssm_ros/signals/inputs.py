@@ -1,7 +1,6 @@
 """Raw actuator signals to the model's inputs: signed throttle, and commands as increments on top of the feedback.
 
-This is the only place where absolute commands become increments (applied = feedback + command) and where the brake is
-merged; the extractor and the live window both call it.
+Only here do absolute commands become increments and brakes negative throttle, for extractor and live window alike.
 """
 
 from __future__ import annotations
@@ -29,11 +28,7 @@ class ModelInputs(NamedTuple):
 
 
 def model_inputs(signals: Mapping[str, Any]) -> ModelInputs:
-    """Merges brakes and turns absolute commands into increments; without commands the increments are zero.
-
-    Args:
-        signals: sampled signals by name, each of shape ``(N,)``.
-    """
+    """From sampled signals by name, each ``(N,)``; without commands the increments are zero."""
     r_fb = signed_throttle(signals["throttle_feedback"], signals.get("brake_feedback"))
     delta_fb = signals["steering_feedback"]
     if "throttle_command" not in signals:
@@ -50,7 +45,7 @@ def signed_throttle(throttle: Vector, brake: Vector | None) -> Vector:
 def lookahead_commands(feedback: Vector, segment: npt.NDArray[np.int32]) -> Vector:
     """The increment to the next feedback sample, ``u_t = fb_{t+1} - fb_t``; zero in the last row of a segment.
 
-    This looks ahead in time. It repeats the protocol of the published data sets and is never used live.
+    It looks ahead in time: the protocol of the published data sets, never used live.
     """
     command = np.zeros_like(feedback)
     inside = segment[1:] == segment[:-1]
@@ -59,9 +54,7 @@ def lookahead_commands(feedback: Vector, segment: npt.NDArray[np.int32]) -> Vect
 
 
 def applied_inputs(rows: Any) -> Applied:
-    """Applied throttle and steering of window rows, applied = feedback + command, Eq. (15).
-
-    Args:
-        rows: columns ``WINDOW_COLUMNS`` along the first axis, shape ``(7, ...)``.
+    """Throttle and steering, applied = feedback + command, Eq. (15), of rows with the columns ``WINDOW_COLUMNS`` first,
+    ``(7, ...)``.
     """
     return Applied(rows[3] + rows[5], rows[4] + rows[6])

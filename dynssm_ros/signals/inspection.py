@@ -1,7 +1,7 @@
 """What is in a log: topics, rates, gaps, clocks, and which fields the signals of a signal map may be.
 
-Names of topics and fields suggest a signal map; the values correct it. A steering signal is compared with the curvature that
-is driven, so that degrees, steering-wheel angles and swapped signs are seen.
+Names of topics and fields suggest a signal map; the values correct it. A steering signal is compared with the curvature
+that is driven, so that degrees, steering-wheel angles and swapped signs are seen.
 """
 
 from __future__ import annotations
@@ -56,27 +56,16 @@ _DRIVING = 0.3  # of the largest speed, from which on curvature is compared
 
 @dataclass(frozen=True)
 class TopicContent:
-    """One topic of a log.
-
-    Attributes:
-        name: of the topic.
-        msgtype: of its messages.
-        count: number of messages.
-        rate: median rate by log time (Hz); NaN with fewer than two messages.
-        longest_gap: longest time between two messages by log time (s).
-        lateness: median of log time less header stamp (s); NaN without headers.
-        time: log time of the samples (s since the log's first message), shape ``(N,)``.
-        values: numbers of the sampled messages by field, each ``(N,)``; NaN where a message does not have it.
-    """
+    """One topic of a log."""
 
     name: str
     msgtype: str
-    count: int
-    rate: float
-    longest_gap: float
-    lateness: float
-    time: Vector = field(repr=False)
-    values: dict[str, Vector] = field(repr=False)
+    count: int  # number of messages
+    rate: float  # median by log time (Hz); NaN with fewer than two messages
+    longest_gap: float  # longest time between two messages by log time (s)
+    lateness: float  # median of log time less header stamp (s); NaN without headers
+    time: Vector = field(repr=False)  # log time of the samples (s since the log's first message), (N,)
+    values: dict[str, Vector] = field(repr=False)  # numbers of the samples by field, (N,); NaN where a message lacks it
 
 
 @dataclass(frozen=True)
@@ -96,21 +85,13 @@ class Suggestion:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is in a log.
-
-    Attributes:
-        name: of the log.
-        duration: between its first and last message (s).
-        topics: by name.
-        signals: suggested sources, by signal.
-        notes: what to look at, in sentences.
-    """
+    """What is in a log."""
 
     name: str
-    duration: float
-    topics: dict[str, TopicContent]
-    signals: dict[str, Suggestion]
-    notes: tuple[str, ...]
+    duration: float  # between its first and last message (s)
+    topics: dict[str, TopicContent]  # by name
+    signals: dict[str, Suggestion]  # suggested sources, by signal
+    notes: tuple[str, ...]  # what to look at, in sentences
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -145,12 +126,9 @@ class Inspection:
 
 
 def inspect(path: str | Path, wheelbase: float | None = None, progress: Progress | None = None) -> Inspection:
-    """Reads a log and says what is in it.
+    """Reads a log, a rosbag2 folder or storage file, and says what is in it.
 
-    Args:
-        path: rosbag2 folder or storage file.
-        wheelbase: of the car (m), with which the scale of a steering signal follows from the curvature it drives.
-        progress: told of each message.
+    With the ``wheelbase`` of the car (m) the scale of a steering signal follows from the curvature it drives.
 
     Raises:
         BagError: unreadable, or without messages.

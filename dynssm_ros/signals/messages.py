@@ -36,13 +36,13 @@ def odometry(
     frame_id: str = "map",
     child_frame_id: str = "base_link",
 ) -> Any:
-    """An Odometry message.
+    """An Odometry message with header stamp ``stamp`` (ns).
 
     Args:
-        stamp: header stamp (ns).
+        stamp: see above.
         pose: ``x, y`` (m) and heading ``theta`` (rad) in ``frame_id``.
         state: ``v_x, v_y`` (m/s) and ``omega`` (rad/s) in ``child_frame_id``.
-        twist_covariance: row-major 6 x 6, shape ``(36,)``; nothing is known of it if it is not given.
+        twist_covariance: row-major 6 x 6, ``(36,)``; nothing is known of it if it is not given.
         frame_id: frame of the pose.
         child_frame_id: frame of the twist.
     """
@@ -75,10 +75,10 @@ def _header(stamp: int, frame_id: str) -> Any:
 
 
 def planar_covariance(variances: Vector | None) -> Vector:
-    """Row-major 6 x 6 covariance ``(36,)`` of a pose or a twist from the variances of its planar part, shape ``(3,)``.
+    """Row-major 6 x 6 covariance ``(36,)`` from the variances ``(3,)`` of x, y and yaw, or of ``v_x, v_y, omega``; no
+    two are correlated.
 
-    These are of x, y and yaw, or of ``v_x, v_y, omega``; their errors are followed apart, so no two are correlated. What
-    is not stated, as the vertical or all of it without variances, is :data:`UNKNOWN`.
+    What is not stated, as the vertical or all of it without variances, is :data:`UNKNOWN`.
     """
     covariance = np.diag(np.full(6, UNKNOWN)).ravel()
     if variances is not None:

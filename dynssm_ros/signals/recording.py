@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -119,8 +119,7 @@ class Recording:
         slow = np.concatenate([[0], np.cumsum(self.columns["v_x"] < min_speed)])
         first, last = rows - H + 1, rows + horizon
         usable = (self.segment[first] == self.segment[last]) & (slow[last + 1] == slow[first])
-        selected: Indices = rows[usable]
-        return selected
+        return np.asarray(rows[usable])
 
     def windows(self, ends: Indices, H: int, horizon: int = 0) -> Vector:
         """The model's input rows ``t-H+1 .. t+horizon`` around each ``t`` of ``ends``, ``(n, H + horizon, 7)``."""
@@ -164,11 +163,8 @@ class Recording:
             )
         columns = dict(self.columns)
         for feedback, command in (("r_fb", "r_cmd"), ("delta_fb", "delta_cmd")):
-            columns[command] = (
-                lookahead_commands(columns[feedback], self.segment)
-                if commands == "lookahead"
-                else np.zeros_like(columns[feedback])
-            )
+            ahead = lookahead_commands(columns[feedback], self.segment)
+            columns[command] = ahead if commands == "lookahead" else np.zeros_like(ahead)
         return replace(self, info=self.info.model_copy(update={"commands": commands}), columns=columns)
 
     def require_sampling_time(self, T_s: float, of: str) -> None:
@@ -207,11 +203,8 @@ class Recording:
         Raises:
             RecordingError: missing, not Parquet, not a recording, or damaged.
         """
-        path = Path(path)
-        if not os.path.isfile(path):
-            raise RecordingError(f"{path}: no such recording; `dynssm extract` makes one from a bag")
-        with _readable(path), pq.ParquetFile(path) as file:
-            return cls._read(path, file)
+        with _opened(path) as file:
+            return cls._read(Path(path), file)
 
     @classmethod
     def _read(cls, path: Path, file: pq.ParquetFile) -> Recording:
@@ -269,10 +262,13 @@ def _is_recording(path: str | Path) -> bool:
 
 
 @contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Says of which file it is that Parquet cannot be read."""
+def _opened(path: str | Path) -> Iterator[pq.ParquetFile]:
+    """A recording's file; errors, also of reading it, say which file it is."""
+    if not os.path.isfile(path):
+        raise RecordingError(f"{path}: no such recording; `dynssm extract` makes one from a bag")
     try:
-        yield
+        with pq.ParquetFile(path) as file:
+            yield file
     except (pa.ArrowException, OSError) as error:
         raise RecordingError(f"{path}: not a readable Parquet file ({' '.join(str(error).split())})") from error
 
@@ -283,8 +279,7 @@ def _column(file: pq.ParquetFile, name: str, kind: str, path: Path) -> npt.NDArr
     if str(column.type) != kind or column.null_count:
         have = f"{column.null_count} empty rows" if column.null_count else str(column.type)
         raise RecordingError(f"{path}: column {name}: {have}; expected {kind} in every row")
-    values: npt.NDArray[Any] = column.to_numpy()
-    return values
+    return np.asarray(column.to_numpy())
 
 
 def row_count(path: str | Path) -> int:
@@ -293,16 +288,8 @@ def row_count(path: str | Path) -> int:
     Raises:
         RecordingError: missing, not Parquet, or damaged.
     """
-    path = Path(path)
-    if not os.path.isfile(path):
-        raise RecordingError(f"{path}: no such recording; `dynssm extract` makes one from a bag")
-    with _readable(path), pq.ParquetFile(path) as file:
+    with _opened(path) as file:
         return int(file.metadata.num_rows)
-
-
-def _longest(periods: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The longest period of each signal."""
-    return {name: max(each.get(name, 0.0) for each in periods) for name in sorted(set().union(*periods))}
 
 
 def concatenate(recordings: Sequence[Recording]) -> Recording:
@@ -326,12 +313,13 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
                 )
     names = [name for name in first.columns if all(name in other.columns for other in recordings)]
     offsets = np.cumsum([0] + [int(r.segment[-1]) + 1 if len(r) else 0 for r in recordings[:-1]])
+    periods = [r.info.held_periods for r in recordings]
     info = first.info.model_copy(
         update={
             "source": tuple(s for r in recordings for s in r.info.source),
             "notes": tuple(n for r in recordings for n in r.info.notes),
             "held": tuple(dict.fromkeys(name for r in recordings for name in r.info.held)),
-            "held_periods": _longest([r.info.held_periods for r in recordings]),
+            "held_periods": {k: max(each.get(k, 0.0) for each in periods) for k in sorted(set().union(*periods))},
         }
     )
     return Recording(

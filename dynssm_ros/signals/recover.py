@@ -1,8 +1,7 @@
 """What can be read of a storage file that a killed recorder, an interrupted copy or a bad disk left behind.
 
-A file that was cut off has no index, or one that points behind the cut, so its records are found one by one and copied to
-a new file that any reader opens. Of an MCAP file with bad chunks the others are copied. Nothing is guessed: a record that
-the cut goes through is left out, and so is a chunk that is not what its checksum says.
+A file that was cut off has no index, or one that points behind the cut, so its records are found one by one and copied
+to a new file. What the cut goes through is left out, and so is a chunk that is not what its checksum says.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ def sample(
 
     Returns:
         The values, and for each the number of the stretch it lies in; -1, and a value of no meaning, where it lies in
-        none.
+            none.
     """
     t = stream.stamps
     origin = t[0]

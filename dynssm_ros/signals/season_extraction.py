@@ -68,9 +68,8 @@ def logs_of(
 def extract_season(
     logs: Sequence[Log], out: str | Path, workers: Workers = HERE, progress: Progress | None = None
 ) -> tuple[Season, list[Session]]:
-    """Extracts the logs that are new or changed into the season in a folder; others of it stay.
-
-    The manifest is written after each log, so what is done stays done.
+    """Extracts the logs that are new or changed into the season in the folder ``out``; others of it stay, and what is
+    done stays done.
 
     Args:
         logs: of the season.

@@ -197,39 +197,31 @@ def _compile_path(field: str) -> Accessor:
         names = list(run)
         steps += [_element(name) for name in names] if indexed else [attrgetter(".".join(names))]
 
+    number = _yaw if match["yaw"] else float
+
     def value(message: Any) -> float | None:
         for step in steps:
             message = step(message)
             if message is None:
                 return None
-        return float(message)
+        return number(message)
 
-    def yaw(message: Any) -> float | None:
-        for step in steps:
-            message = step(message)
-            if message is None:
-                return None
-        q = message  # of any length: some drivers publish quaternions that are not quite unit
-        return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
+    return value
 
-    return yaw if match["yaw"] else value
+
+def _yaw(q: Any) -> float:
+    """Of a quaternion of any length: some drivers publish some that are not quite unit."""
+    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
 
 
 def _element(part: str) -> Callable[[Any], Any]:
     """The element of an array by its index, or by the name beside it."""
     name, _, key = part.rstrip("]").partition("[")
-    if key.isdecimal():
-        index = int(key)
+    index = int(key) if key.isdecimal() else None
 
-        def by_index(message: Any) -> Any:
-            values = getattr(message, name)
-            return values[index] if index < len(values) else None
+    def element(message: Any) -> Any:
+        values = getattr(message, name)
+        at = index if index is not None else message.name.index(key) if key in message.name else len(values)
+        return values[at] if at < len(values) else None
 
-        return by_index
-
-    def by_name(message: Any) -> Any:
-        values, names = getattr(message, name), message.name
-        position = names.index(key) if key in names else len(values)
-        return values[position] if position < len(values) else None
-
-    return by_name
+    return element

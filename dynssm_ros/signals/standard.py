@@ -37,11 +37,11 @@ def write_standard_bag(
 
     Args:
         path: folder to write.
-        time: stamps (ns), shape ``(N,)``.
-        state: ``v_x, v_y, omega`` (m/s, m/s, rad/s), shape ``(N, 3)``.
-        pose: ``x, y, theta`` (m, m, rad), shape ``(N, 3)``.
-        feedback: throttle (fraction) and steering (rad), shape ``(N, 2)``.
-        command: absolute throttle and steering, shape ``(N, 2)``.
+        time: stamps (ns), ``(N,)``.
+        state: ``v_x, v_y, omega`` (m/s, m/s, rad/s), ``(N, 3)``.
+        pose: ``x, y, theta`` (m, m, rad), ``(N, 3)``.
+        feedback: throttle (fraction) and steering (rad), ``(N, 2)``.
+        command: absolute throttle and steering, ``(N, 2)``.
     """
     with write_bag(path) as bag:
         bag.add_topic(FEEDBACK_TOPIC, JOINT_STATE)

@@ -23,15 +23,13 @@ _CHUNK = 50_000  # rows at once
 
 
 def body_velocities(time: Vector, poses: Vector, at: int) -> Vector:
-    """``v_x, v_y, omega`` (m/s, m/s, rad/s) at one pose of each window, shape ``(N, 3)``.
+    """``v_x, v_y, omega`` (m/s, m/s, rad/s) at the pose numbered ``at`` of each window, ``(N, 3)``.
 
-    With the yaw ``theta(t)``, a quadratic, the position as a complex number is ``p_0`` plus the integral of
-    ``exp(i theta) (v_0 + t dv)``, which is linear in ``p_0``, ``v_0 = v_x + i v_y`` and ``dv``.
+    With the yaw ``theta(t)``, a quadratic, the position as a complex number is ``p_0`` plus the integral of ``exp(i
+    theta) (v_0 + t dv)``, which is linear in ``p_0``, ``v_0 = v_x + i v_y`` and ``dv``.
 
-    Args:
-        time: of the poses of each window (s), shape ``(N, n)``.
-        poses: ``x, y, theta`` with theta unwrapped (m, m, rad), shape ``(N, n, 3)``.
-        at: the pose of the window whose velocities are wanted.
+    ``time`` is that of the poses of each window (s), ``(N, n)``; ``poses`` have theta unwrapped (m, m, rad), ``(N, n,
+    3)``.
     """
     t = time - time[:, [at]]
     span = np.abs(t).max(axis=1, keepdims=True)
@@ -58,15 +56,11 @@ def _integral(values: Any, t: Vector) -> Any:
 
 
 def velocities_along(time: Vector, poses: Vector, window: float) -> tuple[Indices, Vector]:
-    """Velocities at all poses that have a whole window around them.
+    """Numbers of all poses that have a whole window around them, ``(M,)``, and ``v_x, v_y, omega`` there, ``(M,
+    3)``.
 
-    Args:
-        time: strictly increasing (s), shape ``(N,)``.
-        poses: ``x, y, theta`` with theta unwrapped, shape ``(N, 3)``.
-        window: length of the windows (s).
-
-    Returns:
-        Numbers of the poses, shape ``(M,)``, and their ``v_x, v_y, omega``, shape ``(M, 3)``.
+    ``time`` is strictly increasing (s), ``(N,)``; ``poses`` have theta unwrapped, ``(N, 3)``; ``window`` is a length
+    (s).
     """
     period = float(np.median(np.diff(time))) if len(time) > 1 else window
     half = max(_LEAST // 2, round(window / period / 2))
@@ -82,22 +76,17 @@ def velocities_along(time: Vector, poses: Vector, window: float) -> tuple[Indice
 
 
 class LiveVelocities:
-    """Velocities at the newest pose.
-
-    Args:
-        window: length of the window of poses (s).
-    """
+    """Velocities at the newest pose, by a ``window`` of poses (s)."""
 
     def __init__(self, window: float) -> None:
         self._window = window
         self._poses: deque[tuple[int, tuple[float, float, float]]] = deque()
 
     def add(self, stamp: int, values: dict[str, float]) -> dict[str, float]:
-        """``v_x``, ``v_y`` and ``omega`` at a pose that is newer than all others; nothing until there are poses enough.
+        """``v_x``, ``v_y`` and ``omega`` at the pose in ``values``, stamped ``stamp`` (ns); nothing until there are
+        poses enough.
 
-        Args:
-            stamp: of the pose (ns). One that is not newer than the last begins anew.
-            values: ``x``, ``y`` and ``theta`` among others.
+        A stamp that is not newer than the last begins anew.
         """
         pose = tuple(values.get(name, math.nan) for name in POSE_SIGNALS)
         if not all(map(math.isfinite, pose)):

@@ -1,9 +1,8 @@
 """Four wheels on the stages of the single-track equations: what a training model of one track does not know.
 
-:class:`DoubleTrack` acts like an effect. At stage ``tyres`` it puts the sum of left and right wheels in the place of each
-axle's lateral force; at stage ``forces`` it adds the yaw moment of what the steered wheels, unequal left and right, push
-backwards. The rear axle drives through an open differential: both wheels pull alike and turn nothing. Everything else,
-the vehicle's own effects included, is shared with the single-track car.
+:class:`DoubleTrack` acts like an effect. At stage ``tyres`` the sum of left and right wheels takes the place of each
+axle's lateral force; stage ``forces`` adds the yaw moment of unequal steered wheels. The rear axle has an open
+differential, which turns nothing. All else is shared with the single-track car.
 """
 
 from __future__ import annotations
@@ -32,19 +31,14 @@ class Wheels(NamedTuple):
 class DoubleTrack(StageEffect):
     """Left and right wheels with their own slip angle, load and Pacejka force.
 
-    Without load transfer and with both wheels at one slip angle the forces are those of the single-track car. Beyond
-    that, a wheel that carries the share ``1 + x`` of half its axle's load pulls ``(1 + x) (1 - k x)`` of half its axle's
-    force, so that an axle loses ``k x^2``.
-
-    Attributes:
-        width: distance between left and right wheels (m).
-        roll_front: share of the lateral load transfer that the front axle's roll stiffness takes.
-        sensitivity: ``k``, how much grip per load a wheel loses with load; 0: force proportional to load.
+    Without load transfer and with both wheels at one slip angle the forces are those of the single-track car. Else a
+    wheel that carries the share ``1 + x`` of half its axle's load pulls ``(1 + x) (1 - k x)`` of half its axle's force,
+    so that an axle loses ``k x^2``.
     """
 
-    width: float
-    roll_front: float
-    sensitivity: float = LOAD_SENSITIVITY
+    width: float  # distance between left and right wheels (m)
+    roll_front: float  # share of the lateral load transfer that the front axle's roll stiffness takes
+    sensitivity: float = LOAD_SENSITIVITY  # k, grip per load that a wheel loses with load
 
     @classmethod
     def of(cls, car: Constants) -> DoubleTrack:

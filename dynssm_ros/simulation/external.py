@@ -17,12 +17,10 @@ Clock = Callable[[], float]
 
 
 class CommandHolder:
-    """The last command, within what the actuators can do, for as long as it is fresh; after that the brakes.
+    """The last command, within what the actuators of ``vehicle`` can do, while it is at most ``timeout`` old (s, by
+    ``clock``).
 
-    Args:
-        vehicle: whose actuator limits hold.
-        timeout: age (s) of a command from which on the car brakes with its steering held.
-        clock: time now (s), of any origin.
+    After that the car brakes with its steering held.
     """
 
     def __init__(self, vehicle: Vehicle, timeout: float, clock: Clock) -> None:
@@ -54,13 +52,10 @@ class CommandHolder:
 def drive_by_commands(
     vehicle: Vehicle, track: Track, plant: PlantKind, next_command: Callable[[Applied], Applied]
 ) -> Iterator[Sample]:
-    """Goes on without end from standstill at the first point of the centre line, on and off the road.
+    """Goes on without end from standstill at the first point of the centre line of ``track``, on and off the road.
 
-    Args:
-        vehicle: the car; its effects act.
-        track: where it starts.
-        plant: how the car is modelled and its motion integrated; see :class:`LowSpeedRolling` for low speeds.
-        next_command: from what the actuators do now to what they do next; asked once per T_s.
+    ``next_command`` maps what the actuators do now to what they do next, once per T_s. At low speeds see
+    :class:`LowSpeedRolling`.
 
     Raises:
         SimulationError: the motion is not finite.

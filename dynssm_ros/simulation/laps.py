@@ -36,53 +36,36 @@ class SimulationError(UserError):
 
 
 class Sample(NamedTuple):
-    """One instant: state and pose, the feedback of the actuators, the command that acts until the next instant.
+    """One instant: state and pose, the feedback of the actuators, the command that acts until the next instant."""
 
-    ``s`` (m, counted on over the laps) and ``lateral`` (m, positive left) are along the track's centre line. ``measured``
-    is what the car's sensors say of ``state``, without noise.
-    """
-
-    time: float
+    time: float  # since the start (s)
     state: State
     pose: Pose
     feedback: Applied
     command: Applied
-    s: float
-    lateral: float
-    measured: State
+    s: float  # along the track's centre line (m), counted on over the laps
+    lateral: float  # beside it (m, positive left)
+    measured: State  # what the car's sensors say of state, without noise
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A simulated drive of ``N`` samples. Sample ``k`` holds the state at ``time[k]`` and the command that acts on it.
-
-    Attributes:
-        vehicle: the car, with the effects that acted.
-        track: where it drove.
-        plant: how it was integrated.
-        seed: of driver and noise.
-        time: stamps (ns), shape ``(N,)``.
-        state: true ``v_x, v_y, omega`` (m/s, m/s, rad/s), shape ``(N, 3)``.
-        measured: the same as the sensors say it, with the vehicle's effects on the measurement and noise, ``(N, 3)``.
-        pose: ``x, y, theta`` (m, m, rad unwrapped), shape ``(N, 3)``.
-        feedback: throttle (fraction) and steering (rad) of the actuators: the commands of the step before, ``(N, 2)``.
-        command: absolute throttle and steering that act from this step to the next, shape ``(N, 2)``.
-        s: distance along the centre line since its first point (m), counted on over the laps, shape ``(N,)``.
-        lateral: distance from the centre line (m, positive left), shape ``(N,)``.
+    """A simulated drive of ``N`` samples. Sample ``k`` holds the state at ``time[k]`` and the command that acts on
+    it.
     """
 
-    vehicle: Vehicle
+    vehicle: Vehicle  # the car, with the effects that acted
     track: Track
-    plant: PlantKind
-    seed: int
-    time: npt.NDArray[np.int64]
-    state: Vector
-    measured: Vector
-    pose: Vector
-    feedback: Vector
-    command: Vector
-    s: Vector
-    lateral: Vector
+    plant: PlantKind  # how it was integrated
+    seed: int  # of driver and noise
+    time: npt.NDArray[np.int64]  # stamps (ns), (N,)
+    state: Vector  # true v_x, v_y, omega (m/s, m/s, rad/s), (N, 3)
+    measured: Vector  # the same with the vehicle's effects on the measurement and noise, (N, 3)
+    pose: Vector  # x, y, theta (m, m, rad unwrapped), (N, 3)
+    feedback: Vector  # throttle (fraction) and steering (rad): the commands of the step before, (N, 2)
+    command: Vector  # absolute throttle and steering from this step to the next, (N, 2)
+    s: Vector  # along the centre line since its first point (m), counted on over the laps, (N,)
+    lateral: Vector  # beside it (m, positive left), (N,)
 
     @property
     def duration(self) -> float:

@@ -162,48 +162,33 @@ class _Late:
         return State(*(a + share * (b - a) for a, b in zip(old, new, strict=True)))
 
 
-class PlantType(Protocol):
-    """How cars of a kind of plant are made. Register one of your own by :func:`register_plant`."""
+class PlantType:
+    """How cars of a kind of plant are made. Derive your own and register it by :func:`register_plant`.
 
-    integrator: Integrator
+    This one takes one forward Euler step per T_s for state and pose, as in the published data.
+    """
+
+    integrator: Integrator = "euler"
     """Of a model that steps like it: ``euler`` carries the pose by the velocity at the start of a step."""
-    substeps: int
+    substeps = 1
     """Of such a model."""
 
     def step(self, vehicle: Vehicle) -> float:
         """Longest integration step (s)."""
-
-    def first(self, vehicle: Vehicle) -> tuple[StageEffect, ...]:
-        """Physics that it has beyond the single-track equations."""
-
-    def make(
-        self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], line: ClosedLine | None
-    ) -> Plant:
-        """A car of that kind; see :class:`SingleTrackPlant` for the arguments and errors."""
-
-
-class EulerPlant:
-    """One forward Euler step per T_s for state and pose, as in the published data."""
-
-    integrator: Integrator = "euler"
-    substeps = 1
-
-    def step(self, vehicle: Vehicle) -> float:
-        """T_s."""
         return vehicle.sampling_time
 
     def first(self, vehicle: Vehicle) -> tuple[StageEffect, ...]:
-        """Nothing."""
+        """Physics that it has beyond the single-track equations."""
         return ()
 
     def make(
         self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], line: ClosedLine | None
     ) -> Plant:
-        """The single-track car."""
+        """A car of that kind; see :class:`SingleTrackPlant` for the arguments and errors."""
         return SingleTrackPlant(vehicle, self.integrator, pose, state, first=self.first(vehicle), last=last, line=line)
 
 
-class Rk4Plant(EulerPlant):
+class Rk4Plant(PlantType):
     """Runge-Kutta steps of 1 ms at most."""
 
     integrator: Integrator = "rk4"
@@ -222,7 +207,7 @@ class DoubleTrackPlant(Rk4Plant):
         return (DoubleTrack.of(vehicle.constants),)
 
 
-PLANTS: dict[str, PlantType] = {"euler": EulerPlant(), "rk4": Rk4Plant(), "double_track": DoubleTrackPlant()}
+PLANTS: dict[str, PlantType] = {"euler": PlantType(), "rk4": Rk4Plant(), "double_track": DoubleTrackPlant()}
 """Plants by name."""
 
 

@@ -18,20 +18,12 @@ MOST_LATE = 20  # steps
 
 @dataclass(frozen=True)
 class Sensing:
-    """How a car is measured.
+    """How a car is measured. The controller knows the delay."""
 
-    Attributes:
-        noise: standard deviations of white noise on the measured ``v_x, v_y`` (m/s), ``omega`` (rad/s).
-        pose_noise: likewise on ``x, y`` (m), ``theta`` (rad).
-        delay: from an instant until what was measured at it can be answered (s), at most :data:`MOST_LATE` sampling times;
-            rounded up to whole ones. The controller knows it.
-        seed: of the noise.
-    """
-
-    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    pose_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    delay: float = 0.0
-    seed: int = 0
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)  # standard deviations on v_x, v_y (m/s), omega (rad/s)
+    pose_noise: tuple[float, float, float] = (0.0, 0.0, 0.0)  # likewise on x, y (m), theta (rad)
+    delay: float = 0.0  # of what is measured (s), at most MOST_LATE sampling times; rounded up to whole ones
+    seed: int = 0  # of the noise
 
     def steps(self, T_s: float) -> int:
         """The delay in sampling times (s).
@@ -58,11 +50,7 @@ def steps_late(delay: float, T_s: float) -> int:
 
 
 class Sensors:
-    """A car's sensors on its way, asked once per T_s.
-
-    Args:
-        sensing: how it is measured.
-        T_s: sampling time (s).
+    """A car's sensors on its way, asked once per ``T_s`` (s).
 
     Raises:
         ConfigurationError: the noise or the delay cannot be.

@@ -19,13 +19,11 @@ from dynssm_ros.vehicle.single_track import cornering_stiffness
 class Style:
     """How the driver drives.
 
-    Attributes:
-        aggressiveness: share of the car's grip, drive and brakes that the speed profile asks for.
-        variation: how much speed and line vary, slowly. At 1: down to 0.7 of the profile's speed, and up to 0.3 of the
-            way from the line to the nearer border. At 0 all laps are the same.
+    At ``variation`` 1 speed and line vary slowly: down to 0.7 of the profile's speed, and up to 0.3 of the way from the
+    line to the nearer border. At 0 all laps are the same.
     """
 
-    aggressiveness: float = 0.95
+    aggressiveness: float = 0.95  # share of grip, drive and brakes that the speed profile asks for
     variation: float = 0.5
 
 
@@ -68,14 +66,9 @@ class Driver:
         return self._wander * self._place(time)
 
     def command(self, time: float, pose: Pose, state: State, s: float, previous: Applied) -> Applied:
-        """Absolute throttle and steering within the actuators' limits.
+        """Absolute throttle and steering within the actuators' limits, reached from the ``previous`` ones.
 
-        Args:
-            time: since the start (s).
-            pose: of the car.
-            state: of the car.
-            s: its position along the line (m).
-            previous: the command of the step before, from which the steering can move only so far.
+        ``time`` is since the start (s), ``s`` the car's position along the line (m).
         """
         offset = self.offset(time)
         wanted = Applied(self._throttle(time, state, s, offset, previous), self._steering(pose, state, s, offset))

@@ -19,8 +19,7 @@ _ALIGNED = 0.5  # cosine between the directions in which a place is passed
 def first_lap(recording: Recording) -> ClosedLine | None:
     """The path of the first full lap, closed smoothly; ``None`` without positions or if no lap is completed.
 
-    A lap begins anywhere, so that an out-lap from the pits does no harm, and ends where the car passes the same place
-    in the same direction again.
+    A lap begins anywhere, also on an out-lap, and ends where the car passes the same place in the same direction again.
     """
     if not recording.has_pose:
         return None
@@ -57,16 +56,10 @@ def lap_number(recording: Recording, line: ClosedLine | None) -> Vector | None:
 
 
 def rms_along(position: Vector, errors: Vector, length: float, bins: int) -> Vector:
-    """Root mean square error in equal stretches of the lap.
+    """Root mean square of ``errors`` ``(N, C)`` in ``bins`` equal stretches of the lap of ``length`` (m), ``(bins,
+    C)``; NaN where nothing was driven.
 
-    Args:
-        position: track position of each row (m), in ``[0, length)``, shape ``(N,)``.
-        errors: shape ``(N, C)``.
-        length: of the lap (m).
-        bins: number of stretches.
-
-    Returns:
-        Shape ``(bins, C)``; NaN where nothing was driven.
+    ``position`` is that on the track of each row (m), in ``[0, length)``, ``(N,)``.
     """
     index = np.minimum((position / length * bins).astype(np.intp), bins - 1)
     count = np.bincount(index, minlength=bins)[:, None]

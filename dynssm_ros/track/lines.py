@@ -28,8 +28,7 @@ _SHARPEST = 0.95  # quantile of the curvature
 class ClosedLine:
     """A closed smooth line: the periodic cubic spline by arc length through ``points``.
 
-    Attributes:
-        points: positions in driving order (m), shape ``(N, 2)``; the first is not repeated at the end.
+    These are positions in driving order (m), ``(N, 2)``; the first is not repeated at the end.
     """
 
     points: Vector
@@ -70,10 +69,9 @@ class ClosedLine:
         return np.asarray((first.conjugate() * second).imag / np.abs(first) ** 3)
 
     def bend(self, s: Floats) -> Vector:
-        """How sharply the line bends at ``s`` (m, periodic): its curvature over that of its sharpest places.
+        """How sharply the line bends at ``s`` (m, periodic), smoothed over about a fiftieth of the lap.
 
-        Smoothed over about a fiftieth of the lap; from -1 (to the right) to 1 (to the left), which a twentieth of the lap
-        reaches.
+        It is the curvature over that which a twentieth of the lap exceeds; from -1 (to the right) to 1 (to the left).
         """
         return np.interp(np.asarray(s, dtype=np.float64) / self.length % 1.0, *self._bends)
 
@@ -150,10 +148,11 @@ class ClosedLine:
         return self._knots.tolist(), self._pieces.T.tolist()
 
     def _derivatives(self, s: Floats) -> tuple[Any, Any, Any]:
-        """Position and its first two derivatives by arc length at ``s`` (m, periodic), each ``(...)``, complex: ``x + iy``.
+        """Position and its first two derivatives by arc length at ``s`` (m, periodic), each ``(...)``, complex: ``x +
+        iy``.
 
-        They are plain numbers for a plain number. A controller asks for few points, many times a step. There scipy's own
-        evaluation costs several times as much.
+        Plain numbers for a plain number: a controller asks for few points often, where scipy's own evaluation is
+        several times slower.
         """
         at: Any
         if isinstance(s, float):

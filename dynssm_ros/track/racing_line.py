@@ -2,9 +2,8 @@
 
 The integral of the squared curvature and the length are minimised over lateral offsets by Gauss-Newton: on the line of
 each round, offsets ``e`` along its normals make the integrand ``(kappa + e'' + kappa^2 e / 2)^2`` (to first order, with
-the change of length), and the borders bound ``e`` on both sides. That is a quadratic program in a box with a cyclic
-banded matrix. The offsets start from the line of the round before, and not from the centre line, so that corners tighter
-than the road is wide, where the normals of the centre line cross, do no harm.
+the change of length), and the borders bound ``e``: a quadratic program in a box with a cyclic banded matrix. Each round
+starts from the line before, not from the centre line, whose normals cross in corners tighter than the road is wide.
 """
 
 from __future__ import annotations
@@ -123,14 +122,10 @@ def _offsets(line: ClosedLine, track: Track, margin: float, weight: float, reach
 
 
 def box_qp(H: sparse.csc_array, g: Vector, lower: Vector, upper: Vector, rounds: int = 60) -> Vector:
-    """Minimises ``x' H x / 2 + g' x`` for ``lower <= x <= upper`` by a primal-dual interior-point method.
+    """Minimises ``x' H x / 2 + g' x`` for ``lower < upper`` as bounds, all ``(N,)``, by a primal-dual interior-point
+    method.
 
-    Args:
-        H: symmetric, positive semidefinite, sparse, shape ``(N, N)``.
-        g: shape ``(N,)``.
-        lower: less than ``upper`` everywhere; both of shape ``(N,)``.
-        upper: see ``lower``.
-        rounds: of Newton's method at most.
+    ``H`` is symmetric, positive semidefinite and sparse; Newton's method takes ``rounds`` at most.
     """
     x = (lower + upper) / 2
     scale = float(np.max(np.abs(g))) + float(np.max(H.diagonal())) * 1e-6 * float(np.max(upper - lower))

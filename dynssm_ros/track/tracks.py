@@ -31,7 +31,7 @@ class Track:
     Attributes:
         name: for messages and results.
         centre: the centre line in driving order, ``N`` points.
-        width_right: distance from the centre line to the right border at its points (m), shape ``(N,)``.
+        width_right: distance from the centre line to the right border at its points (m), ``(N,)``.
         width_left: likewise to the left border.
 
     Raises:
