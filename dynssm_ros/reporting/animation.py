@@ -58,6 +58,8 @@ def animate(races: Sequence[Race], path: str | Path) -> None:
         ]
         show += [curve.show for curve in _curves(races, strips, name, longest.time, truth)]
         figure.legend(*road.get_legend_handles_labels(), loc="outside upper left", ncols=5)
+        figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # it is laid out once, not for each frame
     writer = PillowWriter(fps=max(2, round(min(RATE, count / duration))))
     with replacing(path) as aside, writer.saving(figure, str(aside), dpi=90):
         for t in np.linspace(0.0, duration, count):

@@ -185,7 +185,7 @@ def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
 
 
 def test_a_case_is_driven_diagnosed_and_read_back(tmp_path: Path) -> None:
-    case = Case({"steering_offset": {"offset": 0.02}}, 3, "euler", 40.0)
+    case = Case({"steering_offset": {"offset": 0.02}}, 3, "euler", 30.0)
     assert read_outcome(case, tmp_path) is None
     run_case(case, tmp_path)
     found = read_outcome(case, tmp_path)

@@ -162,6 +162,7 @@ def test_a_log_that_is_not_there_is_unavailable(plan, tmp_path):
         step.recipe()
 
 
+@pytest.mark.slow
 def test_the_small_run_measures_all_that_it_can(small_run):
     root, _, outcomes, results = small_run
     track, absent, given = results.comparisons

@@ -13,7 +13,7 @@ SHORT = ("--vehicle", "orca", "--track", "club", "--plant", "euler", "--line", "
 def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
     out, result = tmp_path / "race", tmp_path / "race.json"
     models = ("--model", "true", "--model", "persistence")
-    more = ("--animation", "--offset-free", "--noise", "0.01,0.01,0.03", "--delay", "20", "--seed", "3")
+    more = ("--offset-free", "--noise", "0.01,0.01,0.03", "--delay", "20", "--seed", "3")
     status, text, _ = dynssm("race", *SHORT, *models, "--out", out, "--json", result, *more)
     assert status == 0
     assert "true" in text
@@ -26,7 +26,13 @@ def test_race_writes_a_report_a_table_and_json(dynssm, tmp_path):
     assert list(content["models"]) == ["true", "persistence"]
     assert content["models"]["true"]["completed"]
     assert (out / "report.html").stat().st_size > 50_000
-    with Image.open(out / "race.gif") as animation:
+
+
+@pytest.mark.slow
+def test_an_animation_shows_the_lap(dynssm, tmp_path):
+    status, _, _ = dynssm("race", *SHORT, "--model", "true", "--out", tmp_path / "race", "--animation")
+    assert status == 0
+    with Image.open(tmp_path / "race" / "race.gif") as animation:
         assert animation.n_frames == 120
 
 

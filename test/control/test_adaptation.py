@@ -12,7 +12,7 @@ NOISE, POSE_NOISE = (0.01, 0.01, 0.03), (0.002, 0.002, 0.002)
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
     """Trained on noisy laps of another track."""
-    run = dynssm_ros.simulate("orca", "club", duration=90.0, seed=1, plant="double_track", noise=NOISE)
+    run = dynssm_ros.simulate("orca", "club", duration=60.0, seed=1, plant="double_track", noise=NOISE)
     folder = tmp_path_factory.mktemp("rls") / "rls"
     return str(dynssm_ros.train(dynssm_ros.recorded(run), "rls", "orca", folder).artifact.path)
 
@@ -36,6 +36,7 @@ def test_on_a_car_that_has_lost_grip_the_second_lap_is_almost_that_of_the_true_m
     assert weights["calibrated"] < 0.5
 
 
+@pytest.mark.slow
 def test_on_a_car_that_has_not_changed_nothing_is_lost(model):
     _, fixed, learned = raced(model)
     assert learned.outside == 0.0

@@ -161,6 +161,7 @@ def test_a_line_with_a_speed_of_its_own_is_refused(orca, club):
         LapLearner(orca, club, own, Settings.of(orca), car=CarModel.at_any_speed(orca), theta=orca.nominal)
 
 
+@pytest.mark.slow
 def test_grip_is_learned_where_it_is_and_bounds_the_speed_there(orca, club):
     """On two fifths of the lap the car grips a fifth less; nobody tells."""
     driven = orca.with_effect("grip_patch", {"factor": 0.8, "centre": 0.5, "length": 0.4})

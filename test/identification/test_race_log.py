@@ -37,6 +37,7 @@ def test_where_nothing_is_known_yaw_is_found_to_come_late(recording: Recording) 
     assert found.improvement.reduction_from(RECALIBRATED)[found.improvement.horizon, 2] >= 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_from_the_shipped_file_the_extended_car_also_errs_less_sideways(recording: Recording) -> None:
     found = diagnose(recording, load_vehicle("av21"), horizon=0.6, integrator="rk4")

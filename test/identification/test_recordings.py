@@ -178,6 +178,7 @@ def driven() -> Drive:
     return lambda hidden, seed: drive(Case(hidden, seed, "rk4", 60.0))
 
 
+@pytest.mark.slow
 def test_a_place_that_was_passed_once_is_found_where_all_of_it_agrees() -> None:
     """A quarter of the time has all of the patch, so that the fit without it knows nothing of it."""
     patch = {"factor": 0.85, "centre": 0.35, "length": 0.15}
@@ -192,6 +193,7 @@ def test_a_place_that_was_passed_once_is_found_where_all_of_it_agrees() -> None:
     assert any(note.startswith("grip_patch was seen in one pass of most places") for note in found.notes)
 
 
+@pytest.mark.slow
 def test_what_changed_since_the_reference_is_told_from_what_was_there(driven: Drive) -> None:
     lag = {"steering_lag": {"time_constant": 0.1}}
     wet = {"front_grip": {"factor": 0.75}, "rear_grip": {"factor": 0.75}}

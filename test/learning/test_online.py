@@ -49,6 +49,7 @@ def test_on_exact_laps_of_the_known_car_it_is_the_true_model(laps, orca, make_co
     assert score.rollout.ade < 1e-5
 
 
+@pytest.mark.slow
 def test_memory_of_a_training_grows_with_the_rows_of_the_laps_alone(laps, orca, make_config, tmp_path: Path):
     def peak(recording) -> int:
         tracemalloc.start()

@@ -23,6 +23,7 @@ MakeConfig = Callable[..., ModelConfig]
 GP = {"kind": "gp", "history": 0.2, "physics": {"nominal": "vehicle"}}
 
 
+@pytest.mark.slow
 def test_a_changed_car_is_learned_to_a_fraction_of_the_physics_errors(
     make_fitted: MakeConfig, drive: Callable[..., Recording], orca: Vehicle, tmp_path: Path
 ) -> None:
