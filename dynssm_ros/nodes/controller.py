@@ -21,6 +21,7 @@ from dynssm_ros.control.live import LiveController
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.nodes.executor import failures
 from dynssm_ros.nodes.managed import ManagedNode
 from dynssm_ros.nodes.support import (
     NEWEST_QOS,
@@ -40,7 +41,7 @@ from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.messages import COMMAND_TOPIC, ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.track.tracks import load_track
-from dynssm_ros.vehicle import State, load_vehicle
+from dynssm_ros.vehicle import Applied, State, load_vehicle
 from dynssm_ros.vehicle.kinematics import Pose
 
 _STEPS = (2, 100)  # of a horizon
@@ -69,6 +70,7 @@ class ControllerNode(ManagedNode):
         self._health = Health((ODOMETRY_TOPIC, PREDICTION_TOPIC, PARAMETERS_TOPIC), self._watchdog)
         self._decoder = decoders(load_signal_map("default"))[ODOMETRY_TOPIC]
         self._newest: int | None = None  # stamp of the odometry
+        self._stuck = False  # whether the last odometry could not be planned from
 
         self._publish_command = output(self, JointState, COMMAND_TOPIC).publish
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
@@ -157,7 +159,13 @@ class ControllerNode(ManagedNode):
             return
         stamp, values = _stamp(message), self._decoder.decode(message)
         pose, seen = Pose(*map(values.__getitem__, Pose._fields)), State(*map(values.__getitem__, State._fields))
-        outcome = self._driver.step(stamp, pose, seen)
+        outcome: Applied | Refusal | None
+        try:
+            outcome = self._driver.step(stamp, pose, seen)
+            self._stuck = False
+        except Exception as error:  # whatever it is: the car must not go on with the command before
+            failures(self).add(self, error)
+            outcome, self._stuck = self._driver.brake(), True
         if isinstance(outcome, Refusal):
             self._health.refused(outcome)
             return
@@ -165,7 +173,8 @@ class ControllerNode(ManagedNode):
         self._newest = stamp
         if outcome is not None:
             self._publish_command(actuators(stamp + self._driver.answered_after, outcome))
-            self._driver.learn()
+            if not self._stuck:
+                self._driver.learn()
 
     def _watch(self) -> None:
         """Brakes while odometry is silent."""
@@ -184,6 +193,8 @@ class ControllerNode(ManagedNode):
     def _diagnose(self) -> None:
         now, driver, health = self._now(), self._driver, self._health
         level, words = driver.verdict() if self.active else (Level.OK, "inactive, drives nothing")
+        if self.active and self._stuck:
+            level, words = Level.ERROR, "cannot plan: brakes"
         if self._silent():
             age = health.age(ODOMETRY_TOPIC, now)
             silence = "nothing received" if math.isinf(age) else f"silent for {age:.1f} s"

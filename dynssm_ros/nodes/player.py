@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from dynssm_ros.errors import BagError
+from dynssm_ros.nodes.executor import EnduringExecutor
 from dynssm_ros.nodes.support import describe, message_class, output, run
 from dynssm_ros.signals.bags import BagMessage, open_bag
 
@@ -137,7 +138,8 @@ class PlayerNode(Node):
 
     def play(self) -> None:
         """Plays the bag, once or in a loop, when somebody listens."""
-        unheard = self.playback.wait_for_listeners(lambda seconds: rclpy.spin_once(self, timeout_sec=seconds))
+        self._spin_once = EnduringExecutor(self).spin_once
+        unheard = self.playback.wait_for_listeners(self._spin_once)
         if unheard:
             self.get_logger().warning(f"nobody listens to {', '.join(unheard)}")
         while True:
@@ -153,7 +155,7 @@ class PlayerNode(Node):
         while rclpy.ok() and (elapsed := time.monotonic() - begin) < _UNACKNOWLEDGED:
             if elapsed > _LINGER and self.playback.acknowledged:
                 return
-            rclpy.spin_once(self, timeout_sec=0.1)
+            self._spin_once(0.1)
 
 
 def main(args: list[str] | None = None) -> None:

@@ -19,7 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -30,6 +30,7 @@ from sensor_msgs.msg import JointState
 from dynssm_ros.configuration import config_root
 from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.extras import load_plugins
+from dynssm_ros.nodes.executor import EnduringExecutor, failures
 from dynssm_ros.vehicle import Applied
 
 NodeType = TypeVar("NodeType", bound=Node)
@@ -144,7 +145,8 @@ def actuators(stamp: int, applied: Applied) -> JointState:
 def diagnostics(
     node: Node, part: str, hardware: str, *, level: int, words: str, values: Mapping[str, str]
 ) -> DiagnosticArray:
-    """What ``node`` says of its ``part``, stamped now."""
+    """What ``node`` says of its ``part`` and of exceptions in its callbacks, stamped now."""
+    level, words, values = failures(node).told(level, words, values)
     status = DiagnosticStatus(
         level=bytes([level]),
         name=f"{node.get_fully_qualified_name()}: {part}",
@@ -181,9 +183,7 @@ def spin(node: Node) -> None:
     gc.collect()
     gc.freeze()
     node.create_timer(_AWAKE, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    executor.spin()
+    EnduringExecutor(node).spin()
 
 
 def run(

@@ -110,6 +110,10 @@ def test_a_controller_drives_while_it_is_active(parked: tuple[Collector, LiveRun
     assert not commands
     assert change(collector, "controller", ACTIVATE)
     assert collector.wait_for(lambda: len(commands) > 20, 20.0)
+    assert not change(collector, "controller", ACTIVATE), "it is active"
+    assert not change(collector, "controller", CONFIGURE)
+    seen = len(commands)
+    assert collector.wait_for(lambda: len(commands) > seen + 20, 20.0), "and it drives on"
     assert change(collector, "controller", DEACTIVATE)
     assert told("inactive, drives nothing")
     seen = len(commands)

@@ -1,0 +1,169 @@
+"""Nothing that a callback raises ends a node: it is counted, logged once, and told to who asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter as Value
+
+from benchmarks.endurance.live_run import isolated_environment
+from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.nodes.controller import ControllerNode
+from dynssm_ros.nodes.executor import EnduringExecutor, Failures, failures, refused
+from dynssm_ros.nodes.managed import ManagedNode
+from dynssm_ros.runtime.health import Level
+
+
+class Logging:
+    """Stands in for a node."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(error=self.lines.append)
+
+
+def raised(text: str) -> Exception:
+    try:
+        raise RuntimeError(text)
+    except RuntimeError as error:
+        return error
+
+
+def test_exceptions_are_logged_once_for_each_place_and_all_are_counted() -> None:
+    node, counted = Logging(), Failures()
+    for k in range(3):
+        counted.add(node, raised(f"number\n{k}"))
+    assert len(node.lines) == 1
+    assert "Traceback" in node.lines[0]
+    counted.add(node, ConfigurationError("one line"), "/dynssm/set_parameters")
+    assert node.lines[1:] == ["/dynssm/set_parameters: refused: ConfigurationError: one line"]
+    assert counted.count == 4
+
+
+def test_a_verdict_speaks_of_an_exception_for_a_while_and_counts_it_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = Failures()
+    assert counted.told(Level.OK, "drives", {"laps": "3"}) == (
+        Level.OK, "drives", {"laps": "3", "exceptions": "0", "last exception": ""},
+    )  # fmt: skip
+    counted.add(Logging(), raised("of a sort"))
+    level, words, _ = counted.told(Level.OK, "drives", {})
+    assert level == Level.WARN
+    assert words.startswith("drives; goes on after an exception: RuntimeError: of a sort (test_executor.py:")
+    assert counted.told(Level.ERROR, "", {})[0] == Level.ERROR
+    monkeypatch.setattr("dynssm_ros.nodes.executor._RECENT_S", 0.0)
+    level, words, values = counted.told(Level.OK, "drives", {})
+    assert (level, words, values["exceptions"]) == (Level.OK, "drives", "1")
+
+
+def test_who_asks_for_what_fails_is_told_why_as_far_as_there_is_a_place_for_it() -> None:
+    asked = SetParameters.Request(parameters=[Parameter(name="a"), Parameter(name="b")])
+    results = refused(asked, SetParameters.Response(), "why").results
+    assert [(one.successful, one.reason) for one in results] == [(False, "why")] * 2
+    result = refused(SetParametersAtomically.Request(), SetParametersAtomically.Response(), "why").result
+    assert (result.successful, result.reason) == (False, "why")
+    assert refused(ListParameters.Request(), ListParameters.Response(), "why") == ListParameters.Response()
+
+
+class Failing(ManagedNode):
+    """Its timer fails three times."""
+
+    def __init__(self) -> None:
+        super().__init__("failing")
+        self.calls = 0
+        self.create_timer(1e-3, self._on_time)
+        self.start()
+
+    def prepare(self) -> None:
+        """Nothing to prepare."""
+
+    def _on_time(self) -> None:
+        self.calls += 1
+        if self.calls <= 3:
+            raise RuntimeError("of the timer")
+
+
+@pytest.fixture(scope="module")
+def ros() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in isolated_environment().items():
+            patch.setenv(name, value)
+        rclpy.init()
+        yield
+        rclpy.shutdown()
+
+
+@pytest.mark.live
+@pytest.mark.timeout(60)
+def test_a_node_survives_its_timers_forbidden_transitions_and_parameters_of_no_type(ros: None) -> None:
+    node, asking = Failing(), rclpy.create_node("asking")
+    executor, asker = EnduringExecutor(node), SingleThreadedExecutor()
+    asker.add_node(asking)
+    while node.calls < 4:
+        executor.spin_once(1.0)
+    assert failures(node).count == 3
+
+    def answer(service: Any, name: str, **request: Any) -> Any:
+        client = asking.create_client(service, f"/failing/{name}")
+        assert client.wait_for_service(10.0)
+        future = client.call_async(service.Request(**request))
+        for _ in range(1000):
+            executor.spin_once(0.01)
+            asker.spin_once(0.0)
+            if future.done():
+                return future.result()
+        raise AssertionError(f"{name}: no answer")
+
+    for transition in (0, Transition.TRANSITION_CONFIGURE):  # none that exists, and none for an active node
+        assert not answer(ChangeState, "change_state", transition=Transition(id=transition)).success
+    assert node.active
+    nonsense = Parameter(name="autostart", value=ParameterValue(type=99))
+    results = answer(SetParameters, "set_parameters", parameters=[nonsense]).results
+    assert not results[0].successful
+    assert results[0].reason
+    good = Value("use_sim_time", value=False).to_parameter_msg()
+    assert answer(SetParameters, "set_parameters", parameters=[good]).results[0].successful
+    assert failures(node).count == 6
+    node.destroy_node()
+    asking.destroy_node()
+
+
+@pytest.mark.live
+@pytest.mark.timeout(60)
+def test_a_controller_that_cannot_plan_brakes_says_so_and_drives_on_when_it_can(
+    ros: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = ControllerNode()
+    commands, told = [], []
+    node._publish_command = commands.append
+    node._publish_diagnostics = lambda array: told.append(array.status[0])
+    message = Odometry()
+    message.header.stamp.sec = 1
+    message.pose.pose.orientation.w = 1.0
+
+    def refuse(*_: Any) -> None:
+        raise MemoryError("of the solver")
+
+    with monkeypatch.context() as ill:
+        ill.setattr(node._driver, "step", refuse)
+        node._on_odometry(message)
+        node._diagnose()
+    assert commands[-1].position[0] == node._driver.brake().r < 0
+    assert told[-1].level == b"\x02"
+    assert told[-1].message.startswith("cannot plan: brakes; goes on after an exception: MemoryError: of the solver")
+    message.header.stamp.sec = 2
+    node._on_odometry(message)
+    node._diagnose()
+    assert "cannot plan" not in told[-1].message
+    node.destroy_node()
