@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from dynssm_ros.api.inputs import disambiguated
 from dynssm_ros.arrays import Vector
 from dynssm_ros.cli.console import console, progress_bar
 from dynssm_ros.errors import UserError
@@ -24,6 +23,7 @@ from dynssm_ros.reporting.tables import Column, Table
 from dynssm_ros.runtime.artifact import Artifact, open_artifact
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Predictor
+from dynssm_ros.runtime.registry import disambiguated
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, load_signal_map
 from dynssm_ros.signals.standard import recording_to_bag

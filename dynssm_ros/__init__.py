@@ -34,20 +34,13 @@ if TYPE_CHECKING:
     from dynssm_ros.vehicle.effects import register_effect
 
 _HOMES = {
-    **dict.fromkeys(
-        (
-            "calibrate", "diagnose", "evaluate", "extract", "extract_season", "inspect", "load_model", "race", "recorded",
-            "replay", "review_season", "simulate", "sweep", "train",
-        ),
-        "api",
-    ),
     "Recording": "signals.recording",
     "Season": "signals.season",
     **dict.fromkeys(("Vehicle", "load_vehicle", "save_vehicle"), "vehicle"),
     "register_effect": "vehicle.effects",
     "register_model": "learning.models.registry",
     "register_plant": "simulation.plant",
-}  # fmt: skip
+}
 __all__ = [
     "Recording",
     "Season",
@@ -76,8 +69,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """The public names, from where they are defined, when they are first asked for."""
-    if name in _HOMES:
-        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    if name in __all__:
+        return getattr(import_module(f"{__name__}.{_HOMES.get(name, 'api')}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

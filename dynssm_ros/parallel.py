@@ -64,7 +64,7 @@ class Pool:
         self._workers, self._died = workers, died
 
     def each(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
-        """See :func:`each`."""
+        """Places and results of ``function`` on all items, in the order in which they are done; see :func:`each`."""
         if not self._workers.elsewhere or (self._workers.backend == "processes" and len(items) < 2):
             yield from ((k, function(item)) for k, item in enumerate(items))
             return

@@ -11,12 +11,11 @@ import numpy as np
 
 import dynssm_ros
 from benchmarks.matrix.scored_cells import Cell, Training, test_drive, training_drive
-from dynssm_ros.api.inputs import with_offline
 from dynssm_ros.evaluation.open_loop import evaluate
 from dynssm_ros.files import write_json
 from dynssm_ros.runtime.baselines import Persistence, SingleTrack, SingleTrackEwma
 from dynssm_ros.runtime.contract import WindowModel
-from dynssm_ros.runtime.registry import load_model
+from dynssm_ros.runtime.registry import load_model, with_offline
 from dynssm_ros.signals.recording import concatenate
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.vehicle import load_vehicle

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from dynssm_ros.api.inputs import Log, PathLike, opened, track_of, vehicle_of
@@ -16,6 +16,7 @@ from dynssm_ros.api.settings import (
 )
 from dynssm_ros.extras import require
 from dynssm_ros.parallel import connected
+from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.integrators import Integrator
 
@@ -51,7 +52,7 @@ def diagnose(
     *,
     settings: DiagnoseSettings,
     suspect: Log | Sequence[Log] = (),
-    on_progress: Callable[[str], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> Diagnosis:
     """Finds out what the simulation gets wrong about measured laps, and why.
 

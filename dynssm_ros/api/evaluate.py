@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dynssm_ros.api.inputs import Log, PathLike, centre_line, joined, open_models, opened, several, with_offline
+from dynssm_ros.api.inputs import Log, PathLike, centre_line, joined, opened, several, vehicle_in_windows
 from dynssm_ros.api.settings import (
     MIN_SPEED_HELP,
     MIN_SPEED_OTHERWISE,
@@ -73,9 +73,12 @@ def evaluate(
     """
     require("evaluate", "race")
     from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
+    from dynssm_ros.runtime.registry import open_models, with_offline
     from dynssm_ros.track.lap_position import first_lap
 
-    s, known = settings, models if isinstance(models, Mapping) else open_models(models, vehicle)
+    s, known = settings, models
+    if not isinstance(known, Mapping):
+        known = open_models(known, None if vehicle is None else vehicle_in_windows(vehicle))
     car = next((model.vehicle for model in known.values() if model.vehicle is not None), None)
     log = joined(opened(recordings, car))
     line = first_lap(log) if s.track is None else centre_line(s.track, log)

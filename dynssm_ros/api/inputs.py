@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,32 +36,6 @@ def load_model(name_or_dir: PathLike, vehicle: Vehicle | PathLike | None = None)
     from dynssm_ros.runtime.registry import load_model
 
     return load_model(name_or_dir, None if vehicle is None else vehicle_in_windows(vehicle))
-
-
-def open_models(
-    models: Sequence[WindowModel | PathLike], vehicle: Vehicle | PathLike | None = None
-) -> dict[str, WindowModel]:
-    """Models by their names; where two have the same one, what was given disambiguates."""
-    opened = {str(m): load_model(m, vehicle) if isinstance(m, (str, Path)) else m for m in models}
-    return disambiguated(opened, lambda model: model.name)
-
-
-def with_offline(models: Mapping[str, WindowModel]) -> dict[str, WindowModel]:
-    """Models, each that has an online layer followed by itself without it."""
-    from dynssm_ros.runtime.contract import without_online
-
-    both: dict[str, WindowModel] = {}
-    for label, model in models.items():
-        both[label] = model
-        if model.online is not None:
-            both[f"{label} (offline)"] = without_online(model)
-    return both
-
-
-def disambiguated(opened: Mapping[str, Any], name: Callable[[Any], str]) -> dict[str, Any]:
-    """What was opened, by name; where several have the same one, by what was given."""
-    called = [name(each) for each in opened.values()]
-    return {given if called.count(name(each)) > 1 else name(each): each for given, each in opened.items()}
 
 
 def vehicle_of(vehicle: Vehicle | PathLike) -> Vehicle:

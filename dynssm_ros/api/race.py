@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
-from dynssm_ros.api.inputs import PathLike, disambiguated, track_of, vehicle_of
+from dynssm_ros.api.inputs import PathLike, track_of, vehicle_of
 from dynssm_ros.api.settings import (
     EFFECTS_HELP,
     NOISE_HELP,
@@ -18,6 +18,7 @@ from dynssm_ros.api.settings import (
 )
 from dynssm_ros.errors import SettingError
 from dynssm_ros.extras import require
+from dynssm_ros.progress import NamedProgress
 from dynssm_ros.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -57,9 +58,9 @@ class RaceSettings(VerbSettings):
         False, "Plan with what each model says, whether or not it has predicted better than the calibrated car."
     )
     effects: Effects = setting({}, EFFECTS_HELP, option="--effect")
-    scale: float | None = setting(None, "Size of the track (factor), for other cars than it was made for.")
+    scale: float | None = setting(None, "Size of the track (factor), for other cars than it was made for.", gt=0.0)
     lap_length: float | None = setting(
-        None, "Or scale it to this length (m): 401 for Austin, 291 for IMS with the 1:43 car."
+        None, "Or scale it to this length (m): 401 for Austin, 291 for IMS with the 1:43 car.", gt=0.0
     )
     start: float = setting(0.0, "Where the car starts on the centre line (m).")
     start_offset: float = setting(0.0, "How far left of the line it starts (m).")
@@ -84,7 +85,7 @@ def race(
     models: Sequence[str],
     *,
     settings: RaceSettings,
-    on_progress: Callable[[int, int, str], None] | None = None,
+    on_progress: NamedProgress | None = None,
 ) -> list[Race]:
     """Drives laps in closed loop: a predictive controller with each model in turn, on a simulated car.
 
@@ -106,6 +107,7 @@ def race(
     from dynssm_ros.control.race_models import load_prediction_model
     from dynssm_ros.control.reference import load_reference
     from dynssm_ros.control.settings import Settings
+    from dynssm_ros.runtime.registry import disambiguated
     from dynssm_ros.simulation.sensing import Sensing
 
     s, car = settings, vehicle_of(vehicle)

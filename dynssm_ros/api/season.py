@@ -7,16 +7,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dynssm_ros import __version__
 from dynssm_ros.api.extract import ExtractSettings
-from dynssm_ros.api.inputs import PathLike, open_models, signal_map_of, vehicle_of
+from dynssm_ros.api.inputs import PathLike, signal_map_of, vehicle_of
 from dynssm_ros.api.settings import WorkerSettings, keywords, setting
 from dynssm_ros.errors import SettingError
 from dynssm_ros.extras import require
-from dynssm_ros.files import checksum, content_key, digest, write_json
 from dynssm_ros.parallel import each
 from dynssm_ros.progress import Progress
-from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.season import Season, Session, season_part
 from dynssm_ros.signals.signal_map import SignalMap
 from dynssm_ros.vehicle import Vehicle
@@ -105,11 +102,11 @@ def review_season(
         ...     print(alarm.review.session, alarm.words)
     """
     require("season", "train", "race")
-    from dynssm_ros.evaluation.season_review import SIMPLE
+    from dynssm_ros.evaluation.season_review import SIMPLE, review_again
 
     whole, chosen = (season, season.chosen()) if isinstance(season, Season) else season_part(season)
     names = [*dict.fromkeys([*map(str, models), *SIMPLE])]
-    task = partial(_reviewed, names, vehicle_of(vehicle), Path(out), settings.stretch)
+    task = partial(review_again, names, vehicle_of(vehicle), Path(out), settings.stretch)
     sessions = [(session, whole.file(session.place)) for session in chosen]
     found: dict[int, Review] = {}
     for k, review in each(task, sessions, settings.workers):
@@ -117,19 +114,3 @@ def review_season(
         if on_progress is not None:
             on_progress(len(found), len(sessions))
     return [found[k] for k in sorted(found)]
-
-
-def _reviewed(models: list[str], car: Vehicle, out: Path, stretch: float | None, task: tuple[Session, Path]) -> Review:
-    """What is found in a session, or was found in it before."""
-    from dynssm_ros.evaluation.season_review import read_review, review
-
-    session, file = task
-    trained = [digest(Path(name)) for name in models if Path(name).exists()]
-    key = content_key([__version__, car.model_dump(mode="json"), models, trained, stretch, checksum(file)])
-    kept = out / "sessions" / f"{'-'.join(session.place)}.json"
-    known = read_review(kept)
-    if known is not None and known.key == key:
-        return known
-    found = review(Recording.load(file), session, key, open_models(models, car), car, stretch=stretch)
-    write_json(kept, found.model_dump(mode="json"))
-    return found

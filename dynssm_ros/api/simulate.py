@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 class SimulateSettings(VerbSettings):
     """Settings of :func:`simulate`."""
 
-    duration: float | None = setting(None, "Time to drive (s).", otherwise="60, if there are no laps either")
-    laps: float | None = setting(None, "Laps to drive (number), instead of a duration.")
+    duration: float | None = setting(None, "Time to drive (s).", otherwise="60, if there are no laps either", gt=0.0)
+    laps: float | None = setting(None, "Laps to drive (number), instead of a duration.", gt=0.0)
     plant: str = setting("euler", PLANT_HELP)
     line: Literal["centre", "racing"] = setting(
         "centre", "What the driver follows: the centre line or the racing line."
@@ -39,7 +39,7 @@ class SimulateSettings(VerbSettings):
     variation: float = setting(0.5, "How much speed and line vary.", ge=0.0, le=1.0)
     noise: StandardDeviations = setting((0.0, 0.0, 0.0), NOISE_HELP)
     effects: Effects = setting({}, EFFECTS_HELP, option="--effect")
-    scale: float = setting(1.0, "Size of the track (factor), for other cars than it was made for.")
+    scale: float = setting(1.0, "Size of the track (factor), for other cars than it was made for.", gt=0.0)
 
 
 @keywords(SimulateSettings)

@@ -18,7 +18,8 @@ from dynssm_ros.signals.recording import concatenate
 from dynssm_ros.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from dynssm_ros.evaluation.sweep import Errors, Sweep
+    from dynssm_ros.evaluation.open_loop import Accuracy
+    from dynssm_ros.evaluation.sweep import Sweep
 
 
 class SweepSettings(CommandsSettings, WorkerSettings):
@@ -85,10 +86,9 @@ def sweep(
 def _scored(
     recordings: list[Log], validation: list[Log], model: PathLike, car: Vehicle, out: Path, settings: SweepSettings,
     number: int, chosen: Mapping[str, Any],
-) -> Errors:  # fmt: skip
+) -> Accuracy:  # fmt: skip
     """Trains with chosen values of the model file, and scores on laps that were left out."""
-    from dynssm_ros.evaluation.open_loop import evaluate
-    from dynssm_ros.evaluation.sweep import STRIDE, Errors
+    from dynssm_ros.evaluation.open_loop import accuracies
     from dynssm_ros.learning.models.registry import load_model_config, overrides
 
     folder, holdout = out / "trials" / f"{number:03d}", settings.holdout
@@ -99,6 +99,4 @@ def _scored(
         trained = load_model(folder)
         logs = [log.with_commands(trained.commands) for log in opened(validation or recordings, car)]
     log = concatenate(logs if validation else [log.split_last(holdout)[1] for log in logs])
-    score = evaluate(log, {trained.name: trained}, stride=STRIDE, calls=1).scores[trained.name]
-    v_x, v_y, omega = map(float, score.rmse)
-    return Errors(float(score.rollout.ade), (v_x, v_y, omega))
+    return accuracies(log, {trained.name: trained})[trained.name]

@@ -10,6 +10,7 @@ from dynssm_ros.api.inputs import Log, PathLike, files, joined, opened, vehicle_
 from dynssm_ros.api.settings import CommandsSettings, keywords, setting
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
+from dynssm_ros.progress import NamedProgress
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 
@@ -52,7 +53,7 @@ def train(
     out: PathLike,
     *,
     settings: TrainSettings,
-    on_progress: Callable[[int, int, str], None] | None = None,
+    on_progress: NamedProgress | None = None,
     picture: Callable[[Trained, Path], None] | None = None,
 ) -> TrainingResult:
     """Trains a model and writes its folder: card, weights, ONNX graph, metrics. Continues after a kill.

@@ -7,16 +7,25 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from dynssm_ros.files import write_json
 
+if TYPE_CHECKING:
+    from dynssm_ros.reporting.page import Report
+    from dynssm_ros.reporting.tables import Table
+
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
 _LINE_EVERY_S, _SHOWN_EVERY_S = 10.0, 0.1
+
+
+def say(words: str) -> None:
+    """Prints words as they are; the terminal breaks the line."""
+    console.print(words, markup=False, soft_wrap=True)
 
 
 def write_results(content: dict[str, Any], out: Path, also: Path | None) -> None:
@@ -24,6 +33,15 @@ def write_results(content: dict[str, Any], out: Path, also: Path | None) -> None
     for path in (out / "results.json", also):
         if path is not None:
             write_json(path, content)
+
+
+def publish(report: Report, content: dict[str, Any], out: Path, also: Path | None, *shown: Table | str) -> None:
+    """Writes the page and the result for programs to the folder ``out``; prints tables in brief, words, and where it is."""
+    report.save(out / "report.html")
+    write_results(content, out, also)
+    for each in shown:
+        say(each) if isinstance(each, str) else console.print(each.brief.rich())
+    say(f"{out / 'report.html'}: figures and how to read them")
 
 
 class Update(Protocol):
@@ -42,9 +60,8 @@ def _progress_lines(description: str) -> Update:
         now = time.monotonic()
         if now - last >= _LINE_EVERY_S:
             last = now
-            errors.print(
-                f"{description}: {100 * done / max(total, 1):.0f} % {words}".rstrip(), markup=False, soft_wrap=True
-            )
+            share = 100 * done / max(total, 1)
+            errors.print(f"{description}: {share:.0f} % {words}".rstrip(), markup=False, soft_wrap=True)
 
     return update
 

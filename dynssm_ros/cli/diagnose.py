@@ -10,7 +10,7 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.api.diagnose import DiagnoseSettings
-from dynssm_ros.cli.console import console, progress_bar, write_results
+from dynssm_ros.cli.console import progress_bar, say, write_results
 from dynssm_ros.cli.options import JsonOption, VehicleOption, with_settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
@@ -56,5 +56,5 @@ def diagnose(
     save_vehicle(result.vehicle, path, about)
     diagnosis_report(result).save(out / "report.html")
     write_results(result.to_json(str(path)), out, json)
-    console.print(as_text(result), markup=False, soft_wrap=True)
-    console.print(f"{path} written; {out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)
+    say(as_text(result))
+    say(f"{path} written; {out / 'report.html'}: figures and how to read them")

@@ -9,8 +9,8 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.api.evaluate import EvaluateSettings
-from dynssm_ros.api.inputs import open_models
-from dynssm_ros.cli.console import console, progress_bar, write_results
+from dynssm_ros.api.inputs import vehicle_in_windows
+from dynssm_ros.cli.console import progress_bar, publish, say
 from dynssm_ros.cli.options import JsonOption, RecordingsArgument, with_settings
 from dynssm_ros.extras import require
 from dynssm_ros.files import replacing
@@ -44,20 +44,19 @@ def evaluate(
     require("evaluate", "report")
     from dynssm_ros.evaluation.open_loop import shared_commands
     from dynssm_ros.reporting.evaluation_report import markdown, open_loop_report, summary_table, verdict
+    from dynssm_ros.runtime.registry import open_models
 
-    models = open_models(model, vehicle)
+    models = open_models(model, None if vehicle is None else vehicle_in_windows(vehicle))
     logs = [Recording.load(recording) for recording in recording_files(recordings)]
     wanted, recorded = shared_commands(models), {log.info.commands for log in logs}
     if settings.commands is None and wanted is not None and recorded != {wanted}:
         others = "', '".join(sorted(recorded - {wanted}))
-        console.print(f"note: commands '{wanted}' as the models were trained, not the recording's '{others}'")
+        say(f"note: commands '{wanted}' as the models were trained, not the recording's '{others}'")
     name = ", ".join(recording.name for recording in recordings)
     with progress_bar("evaluating") as progress:
         evaluation = api.evaluate(logs, models, vehicle, settings=settings, name=name, on_progress=progress)
-    open_loop_report(evaluation).save(out / "report.html")
     with replacing(out / "results.md") as aside:
         aside.write_text(markdown(evaluation), encoding="utf-8")
-    write_results(evaluation.to_json(), out, json)
-    console.print(summary_table(evaluation).brief.rich())
-    console.print(verdict(evaluation), markup=False, soft_wrap=True)
-    console.print(f"{out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)
+    publish(
+        open_loop_report(evaluation), evaluation.to_json(), out, json, summary_table(evaluation), verdict(evaluation)
+    )

@@ -10,7 +10,7 @@ import typer
 from dynssm_ros import api
 from dynssm_ros.api.extract import ExtractSettings
 from dynssm_ros.api.season import ExtractSeasonSettings
-from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.cli.console import progress_bar, say
 from dynssm_ros.cli.options import SignalsOption, with_settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.signals.season import Season, Session
@@ -56,26 +56,22 @@ def extract(
         recording_to_bag(recording, bag)
     recording.save(out)
     for note in recording.info.notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
+        say(f"note: {note}")
     segments = int(recording.segment[-1]) + 1
-    console.print(
+    say(
         f"{out}: {len(recording)} rows at {one.rate:g} Hz, {recording.duration:.1f} s in {segments} "
-        f"segment{'s' if segments > 1 else ''}, commands: {recording.info.commands}",
-        markup=False,
-        soft_wrap=True,
+        f"segment{'s' if segments > 1 else ''}, commands: {recording.info.commands}"
     )
 
 
 def _say_season(season: Season, new: list[Session], bags: list[Path]) -> None:
     failed = [session for session in season.of_bags(bags) if session.failure]
     for session in failed:
-        console.print(f"{session.bag}: not extracted: {session.failure}", markup=False, soft_wrap=True)
+        say(f"{session.bag}: not extracted: {session.failure}")
     read = [session for session in new if not session.failure]
-    console.print(
+    say(
         f"{season.path}: {len(season.sessions)} sessions; of {len(bags)} bags {len(read)} extracted, "
-        f"{len(bags) - len(new)} as they were, {len(failed)} not readable",
-        markup=False,
-        soft_wrap=True,
+        f"{len(bags) - len(new)} as they were, {len(failed)} not readable"
     )
     if len(failed) == len(bags):
         raise typer.Exit(1)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.cli.console import console, progress_bar, say
 from dynssm_ros.cli.options import JsonOption
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
 from dynssm_ros.files import replacing, write_json
-from dynssm_ros.reporting.inspection_tables import season_table, topic_table
-from dynssm_ros.signals.inspection import Inspection
 from dynssm_ros.signals.season import Season, is_season
 
 
@@ -36,6 +33,8 @@ def inspect(
     json: JsonOption = None,
 ) -> None:
     """Show what is in a log: topics, rates, gaps, clocks; suggest a signal map."""
+    from dynssm_ros.reporting.inspection_tables import inspection_json, season_table, topic_table
+
     if is_season(bag):
         if vehicle is not None or out is not None:
             raise ConfigurationError(f"{bag}: a season is listed alone; expected neither --vehicle nor --out")
@@ -48,10 +47,10 @@ def inspect(
         found = api.inspect(bag, vehicle, on_progress=progress)
     console.print(topic_table(found).brief.rich())
     for note in found.notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
+        say(f"note: {note}")
     console.print(found.signal_map(), markup=False, soft_wrap=True, end="")
     if json is not None:
-        write_json(json, as_json(found))
+        write_json(json, inspection_json(found))
     if out is not None:
         require("inspect --out", "report")
         from dynssm_ros.reporting.inspection_report import inspection_report
@@ -59,32 +58,4 @@ def inspect(
         with replacing(out / "signals.yaml") as aside:
             aside.write_text(found.signal_map(), encoding="utf-8")
         inspection_report(found).save(out / "report.html")
-        console.print(f"{out / 'signals.yaml'} written; {out / 'report.html'}: the signals over time", soft_wrap=True)
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def as_json(found: Inspection) -> dict[str, Any]:
-    """The inspection for programs."""
-    return {
-        "name": found.name,
-        "duration_s": found.duration,
-        "topics": {
-            topic.name: {
-                "type": topic.msgtype,
-                "count": topic.count,
-                "rate_hz": _known(topic.rate),
-                "longest_gap_s": topic.longest_gap,
-                "lateness_s": _known(topic.lateness),
-            }
-            for topic in found.topics.values()
-        },
-        "signals": {
-            name: {"topic": one.topic.name, "field": one.field, "scale": one.scale, "note": one.note}
-            for name, one in found.signals.items()
-        },
-        "missing": list(found.missing),
-        "notes": list(found.notes),
-    }
+        say(f"{out / 'signals.yaml'} written; {out / 'report.html'}: the signals over time")

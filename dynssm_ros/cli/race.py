@@ -9,7 +9,7 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.api.race import RaceSettings
-from dynssm_ros.cli.console import console, progress_bar, write_results
+from dynssm_ros.cli.console import progress_bar, publish
 from dynssm_ros.cli.options import CourseOption, JsonOption, VehicleOption, with_settings
 from dynssm_ros.extras import require
 
@@ -41,10 +41,6 @@ def race(
 
     with progress_bar("racing") as progress:
         races = api.race(vehicle, track, model, settings=settings, on_progress=progress)
-    race_report(races).save(out / "report.html")
     if animation:
         animate(races, out / "race.gif")
-    write_results(race_json(races), out, json)
-    console.print(race_table(races).brief.rich())
-    console.print(summary(races), markup=False, soft_wrap=True)
-    console.print(f"{out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)
+    publish(race_report(races), race_json(races), out, json, race_table(races), summary(races))

@@ -9,7 +9,7 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.api.replay import ReplaySettings
-from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.cli.console import progress_bar, say
 from dynssm_ros.cli.options import SignalsOption, with_settings
 
 
@@ -25,6 +25,6 @@ def replay(
     with progress_bar("replaying") as progress:
         count, refusals, notes = api.replay(bag, model, out, signals, settings=settings, on_progress=progress)
     for note in notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
+        say(f"note: {note}")
     reasons = ", ".join(f"{number} x {refusal.value}" for refusal, number in refusals.items())
-    console.print(f"{out}: {count} predictions" + (f"; none for: {reasons}" if reasons else ""), soft_wrap=True)
+    say(f"{out}: {count} predictions" + (f"; none for: {reasons}" if reasons else ""))

@@ -9,7 +9,7 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.api.season import SeasonSettings
-from dynssm_ros.cli.console import console, progress_bar, write_results
+from dynssm_ros.cli.console import progress_bar, publish
 from dynssm_ros.cli.options import JsonOption, VehicleOption, with_settings
 from dynssm_ros.extras import require
 
@@ -32,7 +32,7 @@ def season(
     """Review a season: each model in each session, coefficients over time, causes that come and go, alarms."""
     require("season", "train", "race", "report")
     from dynssm_ros.evaluation.season_review import alarms
-    from dynssm_ros.reporting.season_report import alarm_table, season_report, session_table
+    from dynssm_ros.reporting.season_report import alarm_table, season_json, season_report, session_table
 
     with progress_bar("reviewing") as progress:
         reviews = api.review_season(folder, model or [], vehicle, out, settings=settings, on_progress=progress)
@@ -44,14 +44,5 @@ def season(
         "Coefficients": "of whole sessions" if stretch is None else f"of stretches of {stretch:g} s",
         "Each session": "alone; online layers start from their prior",
     }
-    season_report(reviews, raised, protocol).save(out / "report.html")
-    found = {
-        "sessions": [review.model_dump(mode="json", exclude={"key"}) for review in reviews],
-        "alarms": [
-            {"session": alarm.review.session, "subject": alarm.subject, "words": alarm.words} for alarm in raised
-        ],
-    }
-    write_results(found, out, json)
-    console.print(session_table(reviews, raised).brief.rich())
-    console.print(alarm_table(raised).brief.rich())
-    console.print(f"{out / 'report.html'}: figures and how to read them", markup=False, soft_wrap=True)
+    report, tables = season_report(reviews, raised, protocol), (session_table(reviews, raised), alarm_table(raised))
+    publish(report, season_json(reviews, raised), out, json, *tables)

@@ -9,7 +9,7 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.api.simulate import SimulateSettings
-from dynssm_ros.cli.console import console, progress_bar
+from dynssm_ros.cli.console import progress_bar, say
 from dynssm_ros.cli.options import CourseOption, JsonOption, VehicleOption, with_settings
 from dynssm_ros.extras import require
 from dynssm_ros.files import write_json
@@ -36,10 +36,9 @@ def simulate(
     result = summary(run) | {"line": settings.line}
     if json is not None:
         write_json(json, result)
-    console.print(
+    say(
         f"{out}: {run.vehicle.name} on {run.track.name}, {result['laps']:.2f} laps in {result['duration_s']:.1f} s, "
-        f"speed mean {result['mean_speed']:.2f} top {result['top_speed']:.2f} m/s, seed {settings.seed}",
-        soft_wrap=True,
+        f"speed mean {result['mean_speed']:.2f} top {result['top_speed']:.2f} m/s, seed {settings.seed}"
     )
 
 

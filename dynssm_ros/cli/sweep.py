@@ -10,7 +10,7 @@ import yaml
 
 from dynssm_ros import api
 from dynssm_ros.api.sweep import SweepSettings
-from dynssm_ros.cli.console import console, progress_bar, write_results
+from dynssm_ros.cli.console import console, progress_bar, say, write_results
 from dynssm_ros.cli.options import JsonOption, ModelFileOption, RecordingsArgument, VehicleOption, with_settings
 from dynssm_ros.extras import require
 from dynssm_ros.files import replacing
@@ -45,5 +45,5 @@ def sweep(
         aside.write_text(yaml.safe_dump(best.model_dump(mode="json"), sort_keys=False), encoding="utf-8")
     write_results(found.to_json(), out, json)
     console.print(trial_table(found).brief.rich())
-    console.print(f"{verdict(found)} {CAUTION}", markup=False, soft_wrap=True)
-    console.print(f"{out / 'best.yaml'}: its model file", markup=False, soft_wrap=True)
+    say(f"{verdict(found)} {CAUTION}")
+    say(f"{out / 'best.yaml'}: its model file")

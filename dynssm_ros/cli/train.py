@@ -9,7 +9,7 @@ import typer
 
 from dynssm_ros import api
 from dynssm_ros.api.train import TrainSettings
-from dynssm_ros.cli.console import console, errors, progress_bar
+from dynssm_ros.cli.console import errors, progress_bar, say
 from dynssm_ros.cli.options import ModelFileOption, RecordingsArgument, VehicleOption, with_settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import missing_libraries
@@ -41,24 +41,22 @@ def train(
             errors.print(f"interrupted; the same command continues from {name}")
             raise typer.Exit(130) from None
     if trained.restarts:
-        console.print(f"began anew {trained.restarts} times: it was no better than predicting the mean change")
+        say(f"began anew {trained.restarts} times: it was no better than predicting the mean change")
     if trained.resumed_from:
-        console.print(f"continued from epoch {trained.resumed_from}")
+        say(f"continued from epoch {trained.resumed_from}")
     v_x, v_y, omega = trained.validation_rmse
-    console.print(
+    say(
         f"{artifact.path}: {artifact.card.parameters} parameters, best epoch {trained.best_epoch}, "
         f"seed {trained.config.training.seed}; one-step RMSE on {trained.windows[1]} validation windows: v_x {v_x:.4g} m/s, "
-        f"v_y {v_y:.4g} m/s, omega {omega:.3g} rad/s (commands: {artifact.card.commands})",
-        soft_wrap=True,
+        f"v_y {v_y:.4g} m/s, omega {omega:.3g} rad/s (commands: {artifact.card.commands})"
     )
     if trained.failure:
         raise ConfigurationError(trained.failure)
     if trained.network_gain is not None:
         used = "network" in (trained.features.names if trained.features else ())
-        console.print(
+        say(
             f"beside physics and online layer the network takes {100 * trained.network_gain:.1f} % off the error on "
-            f"left-out parts of the laps, so it is {'used' if used else 'left out of the online layer'}",
-            soft_wrap=True,
+            f"left-out parts of the laps, so it is {'used' if used else 'left out of the online layer'}"
         )
 
 

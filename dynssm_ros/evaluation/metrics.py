@@ -38,15 +38,9 @@ def predict_rows(
     tick: Tick = silent,
     drive: DriveThrough | None = None,
 ) -> Iterator[WindowPrediction]:
-    """The model's predictions of the rows that follow ``rows``, batch by batch; windows exist for one batch at a time.
+    """The model's predictions of the rows that follow ``rows`` ``(M,)``, ``batch`` windows at a time.
 
-    Args:
-        model: reads windows of ``model.H`` rows.
-        recording: measured rows.
-        rows: last row of each window, shape ``(M,)``.
-        batch: windows per call.
-        tick: told of progress.
-        drive: what the model's online layer knew along these rows; ``None``: it stays out.
+    The model's online layer corrects them by what it knew along a ``drive``; without one it stays out.
     """
     for start in range(0, len(rows), batch):
         chunk = rows[start : start + batch]
@@ -75,17 +69,12 @@ def drive_through(
 ) -> Iterator[tuple[DriveThrough | None, list[Indices]]]:
     """Lets the model's online layer learn wherever its window is whole and the car not slower than its minimum speed.
 
-    It knows a kilobyte of numbers at each row, so it is asked block by block, and what it knew is given up after each.
-
-    Args:
-        model: with or without an online layer.
-        recording: that it is driven through, in order.
-        asked: rows that something is asked at, each ascending.
-        batch: rows of a block.
+    It knows a kilobyte of numbers at each row, so it is asked in blocks of ``batch`` rows, and what it knew is given up
+    after each.
 
     Yields:
-        What it knew, with those of each ``asked`` that the block answers for. ``None``, once and with all of them, if
-        nothing learns.
+        What it knew, with those rows of each ``asked`` (ascending) that the block answers for. ``None``, once and with all
+        of them, if nothing learns.
     """
     layer, H = model.online, model.H
     if layer is None or len(ends := recording.window_ends(H, 0, layer.minimum_speed)) == 0:
@@ -110,12 +99,6 @@ def rmse(errors: Vector) -> Vector:
     return root
 
 
-def max_error(errors: Vector) -> Vector:
-    """Largest absolute error of each channel, shape ``(3,)``."""
-    largest: Vector = np.abs(errors).max(axis=0)
-    return largest
-
-
 def explained(increments: Vector, predicted: Vector) -> Vector:
     """Share of the measured increments that is predicted, ``1 - sum(e^2) / sum(ds^2)``, shape ``(3,)``.
 
@@ -128,12 +111,9 @@ def explained(increments: Vector, predicted: Vector) -> Vector:
 
 
 def coverage(errors: Vector, variance: Vector, level: float = 0.9) -> Vector:
-    """Share of the errors inside the central Gaussian interval of ``level``; equals ``level`` for honest variances.
+    """Share of the errors ``(N, 3)`` inside the central Gaussian interval of probability ``level``.
 
-    Args:
-        errors: one-step errors, shape ``(N, 3)``.
-        variance: stated variances of these errors, shape ``(N, 3)`` or, if the same for all, ``(3,)``.
-        level: probability of the interval.
+    Equals ``level`` for honest variances, which are of shape ``(N, 3)`` or, if the same for all, ``(3,)``.
     """
     z = NormalDist().inv_cdf(0.5 + level / 2)
     share: Vector = np.mean(np.abs(errors) <= z * np.sqrt(variance), axis=0)
@@ -143,11 +123,7 @@ def coverage(errors: Vector, variance: Vector, level: float = 0.9) -> Vector:
 def latency_us(model: WindowModel, windows: Vector, calls: int = 200, warm_up: int = 20) -> Vector:
     """Wall-clock time of single predictions (us), shape ``(calls,)``, after ``warm_up`` unmeasured ones.
 
-    Args:
-        model: the model to time.
-        windows: real windows to cycle through, shape ``(M, H, 7)``.
-        calls: measured predictions.
-        warm_up: predictions before the first measured one.
+    They cycle through real ``windows`` ``(M, H, 7)``.
     """
     single = [np.ascontiguousarray(window[None]) for window in windows]
     samples = np.empty(warm_up + calls)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError, RecordingError
 from dynssm_ros.evaluation.coefficients import CoefficientTally
 from dynssm_ros.evaluation.metrics import (
@@ -22,7 +24,6 @@ from dynssm_ros.evaluation.metrics import (
     explained,
     finite,
     latency_us,
-    max_error,
     predict_rows,
     rmse,
 )
@@ -82,7 +83,7 @@ class Evaluation:
     @property
     def every(self) -> int:
         """Coefficients are kept of every so-many-th of :attr:`rows`."""
-        return _coefficients_every(self.rows)
+        return max(1, len(self.rows) // _COEFFICIENT_ROWS)
 
     @property
     def current(self) -> Vector:
@@ -125,8 +126,17 @@ class Evaluation:
         }
 
 
-def _minimum_speed(models: Iterable[WindowModel]) -> float:
-    return max((model.vehicle.minimum_speed for model in models if model.vehicle is not None), default=0.0)
+class Accuracy(StrictModel, allow_inf_nan=True):
+    """Of a model on a recording, in short."""
+
+    ade: float = Field(description="mean distance of rollouts from the measured path (m)")
+    rmse: tuple[float, float, float] = Field(description="of one step: v_x, v_y (m/s), omega (rad/s)")
+
+
+def accuracies(recording: Recording, models: Mapping[str, WindowModel]) -> dict[str, Accuracy]:
+    """Displacement and one-step errors alone, with a rollout from every fifth row."""
+    scores = evaluate(recording, models, stride=5, calls=1).scores
+    return {name: Accuracy(ade=score.rollout.ade, rmse=tuple(score.rmse)) for name, score in scores.items()}
 
 
 def evaluate(
@@ -168,7 +178,8 @@ def evaluate(
         check_fit(model, recording)
     steps = horizon_steps(horizon_s, recording.T_s)
     H = max(model.H for model in models.values())
-    speed = _minimum_speed(models.values()) if min_speed is None else min_speed
+    speeds = [model.vehicle.minimum_speed for model in models.values() if model.vehicle is not None]
+    speed = max(speeds, default=0.0) if min_speed is None else min_speed
     rows = recording.window_ends(H, 1, speed)
     starts = recording.window_ends(H, steps, speed)[::stride]
     if len(starts) == 0:
@@ -179,7 +190,9 @@ def evaluate(
     each_model = len(rows) + len(starts) * steps
     tick = _counting(len(models) * each_model, progress)
     regimes = driving_regimes(recording.rows(rows))
-    drawn = _liveliest_starts(recording, rows, steps)
+    time = (recording.time[rows + 1] - recording.time[0]) / 1e9
+    lively = rows[liveliest(time, recording.states(rows + 1), max(_DRAWN_S, steps * recording.T_s))]
+    drawn = lively[: len(lively) - steps + 1 : steps]  # rollouts one after the other
     on = _On(recording, rows, regimes, starts, drawn, steps, batch)
     labels = list(models)
     found: dict[str, Score] = {}
@@ -204,19 +217,6 @@ def evaluate(
         scores=scores,
         line=first_lap(recording) if line is None else line,
     )
-
-
-def _coefficients_every(rows: Indices) -> int:
-    return max(1, len(rows) // _COEFFICIENT_ROWS)
-
-
-def _liveliest_starts(recording: Recording, rows: Indices, steps: int) -> Indices:
-    """Starts of rollouts of so many steps, one after the other, where the driving is liveliest."""
-    seconds = max(_DRAWN_S, steps * recording.T_s)
-    time = (recording.time[rows + 1] - recording.time[0]) / 1e9
-    stretch = rows[liveliest(time, recording.states(rows + 1), seconds)]
-    starts: Indices = stretch[: len(stretch) - steps + 1 : steps]
-    return starts
 
 
 def _counting(total: int, progress: Callable[[int, int], None] | None) -> Tick:
@@ -249,7 +249,7 @@ class _On:
         recording, rows, batch = self.recording, self.rows, self.batch
         measured = recording.states(rows + 1)
         with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
-            predicted, rollouts, knowledge = _OneStep(model.vehicle, measured, _coefficients_every(rows)), [], []
+            predicted, rollouts, knowledge = _OneStep(model.vehicle, measured), [], []
             for drive, (ends, starts, drawn) in drive_through(model, recording, (rows, self.starts, self.drawn), batch):
                 for prediction in predict_rows(model, recording, ends, batch=batch, tick=tick, drive=drive):
                     predicted.add(prediction)
@@ -267,7 +267,7 @@ class _On:
                 state=predicted.state,
                 theta=predicted.theta,
                 rmse=rmse(errors),
-                max_error=max_error(errors),
+                max_error=np.abs(errors).max(axis=0),
                 explained=explained(increments, increments + errors),
                 coverage_90=predicted.coverage,
                 regime_rmse=regime_rmse(self.regimes, errors),
@@ -283,11 +283,10 @@ class _OneStep:
     Args:
         vehicle: of the model, if it has one.
         measured: states of the predicted rows, shape ``(N, 3)``.
-        every: coefficients are kept of every so-many-th row.
     """
 
-    def __init__(self, vehicle: Vehicle | None, measured: Vector, every: int):
-        self._measured, self._every = measured, every
+    def __init__(self, vehicle: Vehicle | None, measured: Vector):
+        self._measured, self._every = measured, max(1, len(measured) // _COEFFICIENT_ROWS)
         self._rows = 0
         self._thetas: list[Vector] = []
         self._inside: list[Vector] = []  # errors of each batch that are inside the stated interval, ``(3,)``
@@ -323,11 +322,7 @@ def horizon_steps(horizon_s: float, T_s: float) -> int:
 
 
 def shared_commands(models: Mapping[str, WindowModel]) -> Commands | None:
-    """The command protocol that the models were trained with; ``None`` if any of them will do.
-
-    Raises:
-        ArtifactError: they were trained with different ones, so no recording serves all.
-    """
+    """The command protocol that the models were trained with; ``None`` if any will do, an error if it is not the same."""
     trained = {label: model.commands for label, model in models.items() if model.commands is not None}
     if len(set(trained.values())) > 1:
         listed = ", ".join(f"{label}: {commands}" for label, commands in trained.items())
@@ -336,11 +331,7 @@ def shared_commands(models: Mapping[str, WindowModel]) -> Commands | None:
 
 
 def check_fit(model: WindowModel, recording: Recording) -> None:
-    """Checks that a model is for recordings like this one.
-
-    Raises:
-        ArtifactError: the sampling time or the command protocol differs.
-    """
+    """Checks that a model is for the sampling time and the command protocol of a recording."""
     where = f"model {model.name} on recording {', '.join(recording.info.source)}"
     if model.T_s > 0 and not math.isclose(model.T_s, recording.T_s, rel_tol=1e-3):
         raise ArtifactError(

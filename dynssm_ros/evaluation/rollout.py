@@ -67,17 +67,14 @@ class Rollout:
 def predicted_states(
     model: WindowModel, recording: Recording, starts: Indices, steps: int, learned: Learned | None = None
 ) -> tuple[Vector, Vector]:
-    """States of rollouts, and those that were measured.
+    """Predicted and measured states after ``starts``, each of shape ``(M, steps, 3)``.
 
     Args:
-        model: reads windows of ``model.H`` rows.
+        model: to roll out.
         recording: measured rows.
         starts: last measured row of each rollout, shape ``(M,)``.
         steps: length of the horizon.
         learned: what the model's online layer had learned at the starts, and keeps over the horizon.
-
-    Returns:
-        Predicted and measured states after the starts, each of shape ``(M, steps, 3)``.
     """
     stretches, layer = recording.windows(starts, model.H, steps), model.online
     correction = None if layer is None or learned is None else RolloutCorrection(layer, learned)
@@ -87,14 +84,9 @@ def predicted_states(
 def branches(
     model: WindowModel, recording: Recording, starts: Indices, steps: int, learned: Learned | None = None
 ) -> Vector:
-    """Predicted paths that leave the measured one, each at its start.
+    """Predicted paths that leave the measured one, each at its start; arguments as of :func:`predicted_states`.
 
-    Args:
-        model: reads windows of ``model.H`` rows.
-        recording: measured rows, without a gap between the first start and the last end.
-        starts: last measured row of each branch, ascending, shape ``(M,)``.
-        steps: length of a branch.
-        learned: what the model's online layer had learned at ``starts``.
+    There is no gap in the recording between the first start and the last end.
 
     Returns:
         Positions ``x, y`` (m) from the start of each branch to its end, shape ``(M, steps + 1, 2)``, in the frame of
@@ -118,16 +110,9 @@ def score_rollouts(
     tick: Tick = silent,
     drive: DriveThrough | None = None,
 ) -> Rollout:
-    """Rolls the model out from all ``starts`` and compares with what was measured.
+    """Rolls the model out from all ``starts`` (at least one), ``batch`` side by side, and compares with what was measured.
 
-    Args:
-        model: the model to score.
-        recording: measured rows.
-        starts: last measured row of each rollout, shape ``(M,)``, ``M > 0``.
-        steps: length of the horizon.
-        batch: rollouts that run side by side.
-        tick: told of progress.
-        drive: what the model's online layer knew along these rows.
+    ``drive`` is what the model's online layer knew along these rows.
     """
     squares, distances, T_s = np.zeros((steps, 3)), np.zeros(steps), recording.T_s
     for begin in range(0, len(starts), batch):

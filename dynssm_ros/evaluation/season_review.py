@@ -16,14 +16,17 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from pydantic import Field, ValidationError
 
+from dynssm_ros import __version__
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import UserError
-from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
+from dynssm_ros.evaluation.open_loop import Accuracy, accuracies, shared_commands
+from dynssm_ros.files import checksum, content_key, digest, write_json
 from dynssm_ros.identification.result.calibration import calibrate
 from dynssm_ros.identification.result.diagnose import diagnose
 from dynssm_ros.identification.result.diagnosis import Cause
 from dynssm_ros.runtime.coefficients import SHIFTS, daily_change
 from dynssm_ros.runtime.contract import WindowModel
+from dynssm_ros.runtime.registry import open_models
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.season import Session
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
@@ -34,14 +37,6 @@ SIMPLE = ("single_track", "single_track_ewma")
 """What a model has to beat: the vehicle file, and the same with an average of its errors."""
 DEVIATIONS, BEFORE = 4.0, 3  # of a coefficient that has moved; points before it that are needed to say so
 LOSS, WORSE = 1.05, 1.5  # ADE over that of the best simple model; over the median of the sessions before
-_STRIDE = 5  # a rollout starts at every fifth row
-
-
-class Accuracy(StrictModel):
-    """Of a model in a session."""
-
-    ade: float = Field(description="mean distance of rollouts from the measured path (m)")
-    rmse: tuple[float, float, float] = Field(description="of one step: v_x, v_y (m/s), omega (rad/s)")
 
 
 class Estimate(StrictModel):
@@ -112,7 +107,9 @@ def review(
         stretch: length of the stretches that coefficients are of (s); if not given, all of the session.
     """
     failures: list[str] = []
-    accuracy = _attempt("models", lambda: _accuracy(recording, models), failures)
+    accuracy = _attempt(
+        "models", lambda: accuracies(recording.with_commands(shared_commands(models)), models), failures
+    )
     stretches = _attempt("coefficients", lambda: _stretches(recording, session, vehicle, stretch), failures)
     diagnosis = _attempt("diagnosis", lambda: diagnose(recording, vehicle), failures)
     return Review(
@@ -136,15 +133,6 @@ def _attempt(what: str, work: Callable[[], Result], failures: list[str]) -> Resu
     except UserError as error:
         failures.append(f"{what}: {error}")
         return None
-
-
-def _accuracy(recording: Recording, models: Mapping[str, WindowModel]) -> dict[str, Accuracy]:
-    found = {}
-    log = recording.with_commands(shared_commands(models))
-    for name, score in evaluate(log, models, stride=_STRIDE, calls=1).scores.items():
-        v_x, v_y, omega = map(float, score.rmse)
-        found[name] = Accuracy(ade=float(score.rollout.ade), rmse=(v_x, v_y, omega))
-    return found
 
 
 def _stretches(recording: Recording, session: Session, vehicle: Vehicle, stretch: float | None) -> tuple[Stretch, ...]:
@@ -183,12 +171,23 @@ def _parts(recording: Recording, stretch: float | None) -> Iterator[tuple[float,
         yield (recording.time[first] - recording.time[0]) / 1e9, recording.select(slice(first, last))
 
 
-def read_review(file: Path) -> Review | None:
-    """As it was written; ``None`` if there is none, or it is of another version."""
+def review_again(
+    models: list[str], car: Vehicle, out: Path, stretch: float | None, task: tuple[Session, Path]
+) -> Review:
+    """What is found in a session, or was found in it before and written to ``out``; see :func:`review`."""
+    session, file = task
+    trained = [digest(Path(name)) for name in models if Path(name).exists()]
+    key = content_key([__version__, car.model_dump(mode="json"), models, trained, stretch, checksum(file)])
+    kept = out / "sessions" / f"{'-'.join(session.place)}.json"
     try:
-        return Review.model_validate_json(file.read_bytes())
-    except (OSError, ValidationError):
-        return None
+        known = Review.model_validate_json(kept.read_bytes())
+    except (OSError, ValidationError):  # there is none, or it is of another version
+        known = None
+    if known is not None and known.key == key:
+        return known
+    found = review(Recording.load(file), session, key, open_models(models, car.in_windows), car, stretch=stretch)
+    write_json(kept, found.model_dump(mode="json"))
+    return found
 
 
 def alarms(reviews: Sequence[Review]) -> list[Alarm]:

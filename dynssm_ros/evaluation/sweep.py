@@ -23,11 +23,11 @@ from typing_extensions import Self
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ConfigurationError, UserError
+from dynssm_ros.evaluation.open_loop import Accuracy
 from dynssm_ros.parallel import HERE, Workers, each
 from dynssm_ros.progress import Progress
 
 WAVE = 4
-STRIDE = 5  # a rollout starts at every fifth row of the laps that were left out
 _STATE = "sweep.journal"
 _RMSE, _FAILURE = "one_step_rmse", "failure"
 
@@ -87,25 +87,16 @@ class Space(StrictModel):
         return configuration.validate(cls, {"choices": configuration.read_yaml(path)}, path)
 
 
-class Errors(NamedTuple):
-    """Of a trained model on the laps that were left out."""
-
-    ade: float
-    """Mean distance of rollouts from the measured path (m); what is minimised."""
-    rmse: tuple[float, float, float]
-    """Of one step: v_x, v_y (m/s), omega (rad/s)."""
-
-
 class Trial(NamedTuple):
-    """Settings, and what became of them."""
+    """Settings, and what became of them: the displacement is minimised."""
 
     number: int
     settings: dict[str, Any]
-    errors: Errors | None
+    errors: Accuracy | None
     failure: str
 
 
-Objective = Callable[[int, Mapping[str, Any]], Errors]
+Objective = Callable[[int, Mapping[str, Any]], Accuracy]
 
 
 class Sweep:
@@ -208,7 +199,7 @@ class Sweep:
             )
             self.study.ask(self.distributions)
 
-    def _tell(self, trial: FrozenTrial, outcome: Errors | str) -> None:
+    def _tell(self, trial: FrozenTrial, outcome: Accuracy | str) -> None:
         live = optuna.Trial(self.study, trial._trial_id)
         if isinstance(outcome, str):
             live.set_user_attr(_FAILURE, outcome)
@@ -221,7 +212,7 @@ class Sweep:
 _CHOSEN = (TrialState.RUNNING, TrialState.COMPLETE, TrialState.FAIL)
 
 
-def _outcome(task: tuple[Objective, int, dict[str, Any]]) -> Errors | str:
+def _outcome(task: tuple[Objective, int, dict[str, Any]]) -> Accuracy | str:
     objective, number, settings = task
     try:
         return objective(number, settings)
@@ -233,6 +224,5 @@ def _trial(found: FrozenTrial) -> Trial:
     errors = None
     if found.state == TrialState.COMPLETE:
         assert found.value is not None
-        v_x, v_y, omega = found.user_attrs[_RMSE]
-        errors = Errors(found.value, (v_x, v_y, omega))
+        errors = Accuracy(ade=found.value, rmse=tuple(found.user_attrs[_RMSE]))
     return Trial(found.number, dict(found.params), errors, found.user_attrs.get(_FAILURE, ""))

@@ -1,11 +1,13 @@
-"""The tables of an inspection, for terminal and page."""
+"""An inspection as tables, for terminal and page, and for programs."""
 
 from __future__ import annotations
 
 from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
+from dynssm_ros.evaluation.metrics import finite
 from dynssm_ros.reporting.tables import Column, Table
 from dynssm_ros.signals.inspection import Inspection
 from dynssm_ros.signals.season import Season
@@ -49,3 +51,27 @@ def season_table(season: Season) -> Table:
         (Column("notes"), lambda each: f"not read: {each.failure}" if each.failure else "; ".join(each.notes)),
         caption=f"{len(sessions)} sessions, {sum(each.seconds for each in sessions) / 3600:.3g} h.",
     )
+
+
+def inspection_json(found: Inspection) -> dict[str, Any]:
+    """The inspection for programs."""
+    return {
+        "name": found.name,
+        "duration_s": found.duration,
+        "topics": {
+            topic.name: {
+                "type": topic.msgtype,
+                "count": topic.count,
+                "rate_hz": finite(topic.rate),
+                "longest_gap_s": topic.longest_gap,
+                "lateness_s": finite(topic.lateness),
+            }
+            for topic in found.topics.values()
+        },
+        "signals": {
+            name: {"topic": one.topic.name, "field": one.field, "scale": one.scale, "note": one.note}
+            for name, one in found.signals.items()
+        },
+        "missing": list(found.missing),
+        "notes": list(found.notes),
+    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -41,6 +42,12 @@ def season_report(reviews: Sequence[Review], alarms: Sequence[Alarm], protocol: 
         f"Alarms: {len(alarms)}, in {len({id(alarm.review) for alarm in alarms})} of them."
     )
     return Report("Season", summary, sections, protocol, session_table(reviews, alarms))
+
+
+def season_json(reviews: Sequence[Review], alarms: Sequence[Alarm]) -> dict[str, Any]:
+    """The result for programs."""
+    said = [{"session": each.review.session, "subject": each.subject, "words": each.words} for each in alarms]
+    return {"sessions": [each.model_dump(mode="json", exclude={"key"}) for each in reviews], "alarms": said}
 
 
 def alarm_table(alarms: Sequence[Alarm]) -> Table:

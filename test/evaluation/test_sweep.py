@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from dynssm_ros.errors import ConfigurationError, UserError
-from dynssm_ros.evaluation.sweep import WAVE, Errors, Space, Sweep, Trial
+from dynssm_ros.evaluation.open_loop import Accuracy
+from dynssm_ros.evaluation.sweep import WAVE, Space, Sweep, Trial
 from dynssm_ros.parallel import Workers
 
 SPACE = Space.model_validate(
@@ -25,12 +26,12 @@ SPACE = Space.model_validate(
 OWN = {"rate": 0.5, "width": 60, "kind": "b"}
 
 
-def bowl(number: int, settings: Mapping[str, Any]) -> Errors:
+def bowl(number: int, settings: Mapping[str, Any]) -> Accuracy:
     """Least at a rate of 0.01, a width of 20 and kind a; widths above 62 fail."""
     if settings["width"] > 62:
         raise UserError("too wide")
     off = abs(settings["rate"] - 0.01) / 0.01 + abs(settings["width"] - 20) / 20 + (settings["kind"] != "a")
-    return Errors(0.1 + off, (off, off, off))
+    return Accuracy(ade=0.1 + off, rmse=(off, off, off))
 
 
 def test_the_best_is_found_beginning_with_the_file_as_it_is(tmp_path: Path) -> None:
@@ -49,7 +50,7 @@ def test_what_was_interrupted_finds_the_same_and_done_trials_are_not_done_again(
     whole.run(bowl, 3 * WAVE)
     done: list[int] = []
 
-    def stopping(number: int, settings: Mapping[str, Any]) -> Errors:
+    def stopping(number: int, settings: Mapping[str, Any]) -> Accuracy:
         if len(done) == WAVE + 2:
             raise KeyboardInterrupt
         done.append(number)
@@ -61,7 +62,7 @@ def test_what_was_interrupted_finds_the_same_and_done_trials_are_not_done_again(
     assert [trial.number for trial in cut.trials] == done
     later: list[int] = []
 
-    def counting(number: int, settings: Mapping[str, Any]) -> Errors:
+    def counting(number: int, settings: Mapping[str, Any]) -> Accuracy:
         later.append(number)
         return bowl(number, settings)
 
@@ -84,8 +85,8 @@ def test_several_processes_find_what_one_finds(tmp_path: Path) -> None:
     for name, workers in (("one", Workers()), ("two", Workers(2))):
         sweep = Sweep(tmp_path / name, SPACE, OWN)
 
-        def objective(number: int, settings: Mapping[str, Any]) -> Errors:  # the module's own has no name elsewhere
-            return Errors(settings["rate"], (0.0, 0.0, 0.0))
+        def objective(number: int, settings: Mapping[str, Any]) -> Accuracy:  # the module's own has no name elsewhere
+            return Accuracy(ade=settings["rate"], rmse=(0.0, 0.0, 0.0))
 
         sweep.run(objective, 2 * WAVE, workers)
         found.append(sweep.trials)
@@ -96,7 +97,7 @@ def test_a_trial_that_fails_is_listed_with_its_reason(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path, SPACE, OWN)
     counted = itertools.count()
 
-    def failing(number: int, settings: Mapping[str, Any]) -> Errors:
+    def failing(number: int, settings: Mapping[str, Any]) -> Accuracy:
         if next(counted) == 1:
             raise UserError("no better than the mean")
         return bowl(number, settings | {"width": 20})

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from dynssm_ros.cli.main import main
-from dynssm_ros.evaluation.season_review import Accuracy, Estimate, Found, Review, Stretch, alarms
+from dynssm_ros.evaluation.open_loop import Accuracy
+from dynssm_ros.evaluation.season_review import Estimate, Found, Review, Stretch, alarms
 from dynssm_ros.reporting.season_report import season_report, session_table
 from dynssm_ros.signals.season import Season, Session
 from dynssm_ros.simulation.laps import as_recording, simulate
