@@ -16,15 +16,9 @@ AT_BOUND = 0.01  # of the admissible range: nearer to a bound than this counts a
 
 @dataclass(frozen=True)
 class CoefficientStatistics:
-    """Statistics of the adapted coefficients over the scored rows, each of shape ``(17,)``.
+    """Statistics of the adapted coefficients over the scored rows, each of shape ``(17,)`` in the coefficient's unit.
 
-    Attributes:
-        mean: in the coefficient's unit; so are the next three.
-        std: standard deviation.
-        low: smallest value.
-        high: largest value.
-        at_bound: share of the rows in which the coefficient rests on a bound, in [0, 1].
-        vehicle: whose bounds these are.
+    ``at_bound`` is the share of the rows in which the coefficient rests on a bound of the vehicle's, in [0, 1].
     """
 
     mean: Vector
@@ -36,16 +30,11 @@ class CoefficientStatistics:
 
     def to_json(self) -> dict[str, Any]:
         """By coefficient; what is not finite becomes ``None``."""
+        values = {"mean": self.mean, "std": self.std, "min": self.low, "max": self.high, "at_bound": self.at_bound}
+        bounds = np.stack([self.vehicle.lower, self.vehicle.upper], axis=1).tolist()
         return {
-            name: {
-                "mean": finite(self.mean[k]),
-                "std": finite(self.std[k]),
-                "min": finite(self.low[k]),
-                "max": finite(self.high[k]),
-                "bounds": [float(self.vehicle.lower[k]), float(self.vehicle.upper[k])],
-                "at_bound": finite(self.at_bound[k]),
-                "unit": COEFFICIENT_UNITS[name],
-            }
+            name: {key: finite(value[k]) for key, value in values.items()}
+            | {"bounds": bounds[k], "unit": COEFFICIENT_UNITS[name]}
             for k, name in enumerate(COEFFICIENTS)
         }
 
@@ -63,11 +52,7 @@ def coefficient_label(name: str, symbol: str = "") -> str:
 
 
 class CoefficientTally:
-    """Statistics of coefficients that come block by block, so that nobody has to hold them all.
-
-    Args:
-        vehicle: whose bounds these are; without it there are no statistics.
-    """
+    """Statistics of a vehicle's coefficients that come block by block, so that nobody has to hold them all."""
 
     def __init__(self, vehicle: Vehicle | None):
         self._vehicle = vehicle
@@ -108,8 +93,7 @@ class CoefficientTally:
 
 def range_used(theta: Vector, vehicle: Vehicle) -> Vector:
     """Coefficients ``(N, 17)`` as their place in the admissible range: 0 is the lower bound, 1 the upper."""
-    place: Vector = (theta - vehicle.lower) / (vehicle.upper - vehicle.lower)
-    return place
+    return np.asarray((theta - vehicle.lower) / (vehicle.upper - vehicle.lower))
 
 
 def resting(theta: Vector, vehicle: Vehicle) -> Vector:

@@ -95,8 +95,7 @@ def drive_through(
 
 def rmse(errors: Vector) -> Vector:
     """Root mean square over the rows of ``errors`` ``(N, 3)``, one value per channel and in its unit."""
-    root: Vector = np.sqrt(np.mean(errors**2, axis=0))
-    return root
+    return np.asarray(np.sqrt(np.mean(errors**2, axis=0)))
 
 
 def explained(increments: Vector, predicted: Vector) -> Vector:
@@ -106,8 +105,7 @@ def explained(increments: Vector, predicted: Vector) -> Vector:
     """
     total = np.sum(increments**2, axis=0)
     left = np.sum((increments - predicted) ** 2, axis=0)
-    share: Vector = 1.0 - np.divide(left, total, out=np.full(len(total), np.nan), where=total > 0)
-    return share
+    return np.asarray(1.0 - np.divide(left, total, out=np.full(len(total), np.nan), where=total > 0))
 
 
 def coverage(errors: Vector, variance: Vector, level: float = 0.9) -> Vector:
@@ -116,8 +114,7 @@ def coverage(errors: Vector, variance: Vector, level: float = 0.9) -> Vector:
     Equals ``level`` for honest variances, which are of shape ``(N, 3)`` or, if the same for all, ``(3,)``.
     """
     z = NormalDist().inv_cdf(0.5 + level / 2)
-    share: Vector = np.mean(np.abs(errors) <= z * np.sqrt(variance), axis=0)
-    return share
+    return np.asarray(np.mean(np.abs(errors) <= z * np.sqrt(variance), axis=0))
 
 
 def latency_us(model: WindowModel, windows: Vector, calls: int = 200, warm_up: int = 20) -> Vector:

@@ -50,14 +50,13 @@ class Evaluation:
 
     Attributes:
         recording: what was scored on, after selection and with the commands in use.
-        name: of the recording, for people.
-        split: which part of it was scored, for people.
+        name: of the recording, for people; so is ``split``, the part of it that was scored.
         min_speed: slower stretches were left out (m/s).
         rows: last row of each window; the predicted rows are ``rows + 1``.
         drawn: rows where rollouts start that are drawn: one after the other, in the liveliest seconds.
         regimes: how these rows were driven.
         scores: by label, in the order in which the models were given.
-        line: closed line that the position on the lap is counted along; ``None`` if there is none.
+        line: closed line that the position on the lap is counted along, if there is one.
     """
 
     recording: Recording
@@ -78,7 +77,7 @@ class Evaluation:
     @property
     def steps(self) -> int:
         """Length of the rollouts in steps."""
-        return len(next(iter(self.scores.values())).rollout.time)
+        return len(self._rollout.time)
 
     @property
     def every(self) -> int:
@@ -103,12 +102,16 @@ class Evaluation:
     @property
     def horizon_s(self) -> float:
         """Length of the rollouts (s)."""
-        return float(next(iter(self.scores.values())).rollout.time[-1])
+        return float(self._rollout.time[-1])
 
     @property
     def starts(self) -> int:
         """Number of rollouts."""
-        return next(iter(self.scores.values())).rollout.starts
+        return self._rollout.starts
+
+    @property
+    def _rollout(self) -> Rollout:
+        return next(iter(self.scores.values())).rollout
 
     def to_json(self) -> dict[str, Any]:
         """``results.json``: the contract's fields, and more."""

@@ -23,14 +23,7 @@ QUANTITIES = {"speed": "speed", "lateral_acceleration": "lateral acceleration", 
 
 @dataclass(frozen=True)
 class Regime:
-    """Rows that were driven alike.
-
-    Attributes:
-        quantity: what tells this regime from its neighbours, one of :data:`QUANTITIES`.
-        label: its range, or a word for it.
-        unit: of the range; empty with a word.
-        member: which of the scored rows belong to it, shape ``(N,)``; at least one does.
-    """
+    """Rows that were driven alike: the range, or a word, of one of :data:`QUANTITIES`, and which of the scored rows."""
 
     quantity: str
     label: str
@@ -57,13 +50,8 @@ def driving_regimes(rows: Vector) -> tuple[Regime, ...]:
     """The regimes that occur in ``rows``.
 
     Speed ``v_x`` and lateral acceleration ``|v_x omega|`` are divided at round numbers over their range; the applied
-    throttle tells braking, coasting (within 2 % of zero) and accelerating.
-
-    Args:
-        rows: the model's input rows from which the steps start, shape ``(N, 7)``, ``N > 0``.
-
-    Returns:
-        Regimes by quantity, ascending; each row belongs to one regime of every quantity.
+    throttle tells braking, coasting (within 2 % of zero) and accelerating. Each of the model's input rows ``(N, 7)`` belongs
+    to one regime of every quantity; those of a quantity ascend.
     """
     v_x, omega = rows[:, 0], rows[:, 2]
     throttle = np.asarray(applied_inputs(rows.T).r)
@@ -76,15 +64,7 @@ def driving_regimes(rows: Vector) -> tuple[Regime, ...]:
 
 
 def regime_rmse(regimes: tuple[Regime, ...], errors: Vector) -> Vector:
-    """One-step RMSE in each regime.
-
-    Args:
-        regimes: ``R`` of them.
-        errors: of all scored rows, shape ``(N, 3)``.
-
-    Returns:
-        Shape ``(R, 3)`` (m/s, m/s, rad/s).
-    """
+    """One-step RMSE in each of ``R`` regimes, shape ``(R, 3)`` (m/s, m/s, rad/s), by errors ``(N, 3)``."""
     return np.stack([rmse(errors[regime.member]) for regime in regimes])
 
 
@@ -100,12 +80,10 @@ def round_edges(low: float, high: float, most: int) -> Vector:
     The outer edges are multiples of the width too, so that there may be one bin more.
     """
     span = max(high - low, 1e-12 * max(abs(low), abs(high), 1e-300))
-    power = 10.0 ** np.floor(np.log10(span / most))
-    for width in (factor * power for factor in (1.0, 2.0, 2.5, 5.0, 10.0, 20.0)):
-        if width * most >= span * (1 - 1e-9):
-            first, last = np.floor(low / width + 1e-9), np.ceil(high / width - 1e-9)
-            return np.asarray(width * np.arange(first, max(last, first + 1) + 1))
-    raise AssertionError("one of the widths is wide enough")
+    widths = 10.0 ** np.floor(np.log10(span / most)) * np.array([1.0, 2.0, 2.5, 5.0, 10.0, 20.0])
+    width = widths[np.argmax(widths * most >= span * (1 - 1e-9))]
+    first, last = np.floor(low / width + 1e-9), np.ceil(high / width - 1e-9)
+    return np.asarray(width * np.arange(first, max(last, first + 1) + 1))
 
 
 def _members(quantity: str, labels: tuple[str, ...], unit: str, index: npt.NDArray[np.intp]) -> Iterator[Regime]:
@@ -115,12 +93,9 @@ def _members(quantity: str, labels: tuple[str, ...], unit: str, index: npt.NDArr
 
 
 def liveliest(time: Vector, states: Vector, seconds: float) -> Indices:
-    """Rows of the stretch of ``seconds`` without a gap in which the states change most.
+    """Rows of the stretch of ``seconds`` without a gap in which the states ``(N, 3)`` change most.
 
-    Args:
-        time: of each row (s), increasing, shape ``(N,)``.
-        states: shape ``(N, 3)``.
-        seconds: length of the stretch; all of the longest gap-free run if no run is that long.
+    All of the longest gap-free run if no run is that long. ``time`` is of each row (s), increasing.
     """
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     length = max(2, round(seconds / step))

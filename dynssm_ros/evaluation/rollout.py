@@ -26,13 +26,10 @@ from dynssm_ros.vehicle.kinematics import path
 
 @dataclass(frozen=True)
 class Rollout:
-    """Errors of recursive predictions over a horizon of ``n`` steps.
+    """Errors of recursive predictions, after each step of a horizon of ``n``, over a number of ``starts``.
 
-    Attributes:
-        T_s: sampling time (s).
-        starts: number of rollouts.
-        rmse: of the state ``k + 1`` steps ahead, shape ``(n, 3)`` (m/s, m/s, rad/s).
-        displacement: mean distance between predicted and measured path after ``k + 1`` steps, shape ``(n,)`` (m).
+    RMSE of the state, shape ``(n, 3)`` (m/s, m/s, rad/s), and mean distance between predicted and measured path, shape
+    ``(n,)`` (m).
     """
 
     T_s: float

@@ -70,11 +70,7 @@ class Score:
         return float(np.percentile(self.latency_us, 99))
 
     def to_json(self, regimes: Sequence[Regime]) -> dict[str, Any]:
-        """The entry of one model in ``results.json``; what is not finite becomes ``None``.
-
-        Args:
-            regimes: those of :attr:`regime_rmse`, ``R`` of them.
-        """
+        """The entry of one model in ``results.json``, by the regimes of :attr:`regime_rmse`; not finite is ``None``."""
         by_quantity: dict[str, dict[str, Any]] = {}
         for regime, values in zip(regimes, self.regime_rmse, strict=True):
             entry = {"rows": regime.rows, "rmse": by_channel(values)}
@@ -101,12 +97,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Group:
-    """The scores of one model, trained with one seed or with several; a row of the tables.
-
-    Attributes:
-        name: of the model, or its label.
-        scores: one for each training; not empty.
-    """
+    """The scores of one model, one for each seed that it was trained with; a row of the tables."""
 
     name: str
     scores: tuple[Score, ...]
@@ -142,16 +133,10 @@ class Group:
 
 
 def grouped(scores: Mapping[str, Score]) -> dict[str, Group]:
-    """Joins scores of the same model that was trained with several seeds; all others stay alone.
+    """Joins scores of the same model that was trained with several seeds, by its name; all others stay alone, by label.
 
     Models are the same if their cards have the same name and architecture. Where two of them share a seed too, nothing
     tells which is meant, so all of that name keep their own labels.
-
-    Args:
-        scores: by label.
-
-    Returns:
-        Groups by model name where scores were joined, else by label, in the given order.
     """
     groups = {}
     for label, score in scores.items():
@@ -163,9 +148,8 @@ def grouped(scores: Mapping[str, Score]) -> dict[str, Group]:
 
 
 def _differ_by_seed_only(scores: Sequence[Score]) -> bool:
-    cards = [score.model.card for score in scores if score.model.card is not None]
-    recipes = [_without_seeds(card.architecture) for card in cards]
-    same = len(recipes) == len(scores) and all(recipe == recipes[0] for recipe in recipes)
+    recipes = [None if score.model.card is None else _without_seeds(score.model.card.architecture) for score in scores]
+    same = recipes[0] is not None and all(recipe == recipes[0] for recipe in recipes)
     return same and len({score.seed for score in scores}) == len(scores)
 
 

@@ -96,15 +96,9 @@ def review(
     *,
     stretch: float | None = None,
 ) -> Review:
-    """Looks at a session.
+    """Looks at a session: scores models, the simple ones among them, calibrates the vehicle, and diagnoses it.
 
-    Args:
-        recording: of it.
-        session: its entry in the season.
-        key: see :class:`Review`.
-        models: to score, by name; the simple ones among them.
-        vehicle: where calibration and diagnosis start from.
-        stretch: length of the stretches that coefficients are of (s); if not given, all of the session.
+    ``stretch`` is the length of the stretches that coefficients are of (s), all of the session if not given.
     """
     failures: list[str] = []
     accuracy = _attempt(

@@ -12,13 +12,7 @@ from dynssm_ros.arrays import Vector
 
 @dataclass(frozen=True)
 class SeedSpread:
-    """Mean and spread of a number that was measured with several seeds.
-
-    Attributes:
-        mean: over the seeds.
-        std: sample standard deviation over the seeds; 0 for a single one.
-        n: number of seeds.
-    """
+    """Mean and sample standard deviation of a number that was measured with ``n`` seeds; 0 for a single one."""
 
     mean: float
     std: float

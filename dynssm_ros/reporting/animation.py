@@ -39,10 +39,6 @@ def animate(races: Sequence[Race], path: str | Path) -> None:
     Beside the map, over the time: the coefficient that hidden physics moves most, as planned with (dashed: the driven
     car's); the speed; and the room between the car's centre and the nearer border. A stretch of the road on which the car
     is another is marked.
-
-    Args:
-        races: on one course.
-        path: of the file.
     """
     longest = max(races, key=lambda race: float(race.time[-1]))
     name, truth = _most_changed(longest)

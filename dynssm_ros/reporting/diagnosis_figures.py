@@ -74,11 +74,7 @@ def simulated_and_measured(improvement: Improvement) -> Figure:
 def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector, effect: Effect) -> Figure:
     """How much a cause takes away, where and when; and along the lap, if it is a matter of the place.
 
-    Args:
-        windows: the held-out simulations.
-        without: errors of the car with all other causes, shape ``(W, 3)``.
-        with_it: errors of the extended car, likewise.
-        effect: the cause.
+    Errors ``(W, 3)`` of held-out simulations are those of the car ``without`` it, but all other causes, and ``with_it``.
     """
     lap = np.linspace(0.0, 1.0, _PLACES)
     known = windows.data.context
@@ -183,13 +179,7 @@ def errors_over_time(improvement: Improvement) -> Figure:
 
 @styled
 def errors_over(abscissa: str, x: Vector, improvement: Improvement) -> Figure:
-    """Mean and spread of the errors against something, one step and the horizon ahead, a column per channel.
-
-    Args:
-        abscissa: what ``x`` is, with its unit.
-        x: abscissa of each simulation, shape ``(W,)``.
-        improvement: whose errors are shown.
-    """
+    """Mean and spread of the errors over what ``x`` ``(W,)`` is, one step and the horizon ahead, a column per channel."""
     figure, axes = sheet(4.6, 2, 3, sharex=True)
     bins = _binned(x)
     centre = [x[b].mean() for b in bins]

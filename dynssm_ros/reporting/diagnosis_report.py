@@ -21,12 +21,6 @@ from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS
 from dynssm_ros.vehicle.effects import EFFECTS
 
-_COEFFICIENTS_IN_WORDS = {
-    "D_f": "the front tyres' peak force", "D_r": "the rear tyres' peak force", "C_m1": "the drive force",
-    "C_m2": "what the drive loses with speed", "C_r0": "the rolling resistance", "C_r2": "the drag", "I_z": "the yaw inertia",
-    "S_hf": "the front slip angle's zero", "S_hr": "the rear slip angle's zero", "m": "the mass",
-    "B_f": "the front tyres' stiffness", "B_r": "the rear tyres' stiffness",
-}  # fmt: skip
 _LITTLE = 0.02  # of the squared error; less is not worth a word
 _WIDTH = 110
 _MANY_TIMES = 2.0  # farther off, a percentage says nothing
@@ -117,11 +111,11 @@ def formula_in_words(formula: Formula) -> str:
 
 def moved_in_words(diagnosis: Diagnosis) -> list[str]:
     """What recalibration moved farther than the vehicle file allows for."""
-    sentences = []
+    sentences, words = [], Prose("diagnosis").words["coefficients"]
     for name, (was, now) in diagnosis.recalibrated.items():
         unit = "kg" if name == "m" else COEFFICIENT_UNITS[name]
         value = text(now) if unit == "1" else f"{text(now)} {unit}"
-        what = f"{_COEFFICIENTS_IN_WORDS[name]} ({name})" if name in _COEFFICIENTS_IN_WORDS else name
+        what = f"{words[name]} ({name})" if name in words else name
         if was * now > 0 and abs(now / was - 1) < _MANY_TIMES:
             more = f"{abs(now / was - 1):.0%} {'more' if abs(now) > abs(was) else 'less'}"
             change = f"{more} than the vehicle file's {text(was)}"

@@ -1,8 +1,9 @@
-"""Figures, each a function of plain arrays that returns a :class:`~matplotlib.figure.Figure`.
+"""Figures, each a function of plain arrays that returns a :class:`~matplotlib.figure.Figure`, and their style.
 
-Colours are Okabe and Ito's, continued by Paul Tol's, which stay apart for colour-blind readers; measured values are
-black, persistence is grey.
-Nothing here touches pyplot's global state, so figures can be drawn in any thread and without a display.
+States are of shape ``(N, 3)``, errors of models by model name; ``std`` is their standard deviation over the seeds, 0 for a
+single one. Colours are Okabe and Ito's, continued by Paul Tol's, which stay apart for colour-blind readers; measured values
+are black, persistence is grey. Nothing here touches pyplot's global state, so figures can be drawn in any thread and without
+a display.
 """
 
 from __future__ import annotations
@@ -100,14 +101,7 @@ def model_lines(models: Mapping[str, Drawn]) -> Iterator[tuple[str, Drawn, dict[
 def predicted_and_measured(
     time: Vector, measured: Vector, predicted: Mapping[str, Vector], seconds: float = 12.0
 ) -> Figure:
-    """One-step predictions over the liveliest stretch: values at the left, errors at the right.
-
-    Args:
-        time: of the predicted rows (s), shape ``(N,)``.
-        measured: states, shape ``(N, 3)``.
-        predicted: predicted states by model name, each ``(N, 3)``.
-        seconds: length of the stretch.
-    """
+    """One-step predictions over the liveliest ``seconds``: values at the left, errors at the right; ``time`` in s."""
     shown = liveliest(time, measured, seconds)
     figure, axes = sheet(6.2, 3, 2, sharex=True)
     t = time[shown]
@@ -130,13 +124,7 @@ def predicted_and_measured(
 
 @styled
 def increments(current: Vector, measured: Vector, predicted: Mapping[str, Vector]) -> Figure:
-    """Predicted against measured change of the state, a row of panels per model.
-
-    Args:
-        current: states the predictions start from, shape ``(N, 3)``.
-        measured: states one step later, shape ``(N, 3)``.
-        predicted: predicted states by model name, each ``(N, 3)``.
-    """
+    """Predicted against measured change of the state from ``current`` on, a row of panels per model."""
     shown = {name: states for name, states in predicted.items() if name != "persistence"} or dict(predicted)
     colours = model_colours(list(predicted))
     figure, axes = sheet(0.5 + 2.6 * len(shown), len(shown), 3, squeeze=False)
@@ -163,13 +151,7 @@ def increments(current: Vector, measured: Vector, predicted: Mapping[str, Vector
 
 @styled
 def relative_errors(rmse: Mapping[str, Vector], std: Mapping[str, Vector], persistence: Vector) -> Figure:
-    """One-step RMSE as a share of persistence's; shorter is better, beyond 100 % is worse than no model.
-
-    Args:
-        rmse: by model name, mean over the seeds, each ``(3,)``.
-        std: its standard deviation over the seeds, 0 for a single one, each ``(3,)``; drawn as whiskers.
-        persistence: RMSE of the prediction that nothing changes, shape ``(3,)``.
-    """
+    """One-step RMSE ``(3,)`` as a share of persistence's; shorter is better, beyond 100 % is worse than no model."""
     names = [name for name in rmse if name != "persistence"] or list(rmse)
     colours = model_colours(names)
     figure, panel = sheet(1.3 + 0.26 * len(names) * 3)
@@ -205,13 +187,7 @@ def relative_errors(rmse: Mapping[str, Vector], std: Mapping[str, Vector], persi
 
 @styled
 def rollout_growth(time: Vector, errors: Mapping[str, Vector], std: Mapping[str, Vector]) -> Figure:
-    """How the error grows with the time ahead: the three states, and the displacement.
-
-    Args:
-        time: ahead (s), shape ``(n,)``.
-        errors: by model name, mean over the seeds of the RMSE of the states and of the displacement, each ``(n, 4)``.
-        std: their standard deviation over the seeds, 0 for a single one; drawn as a band.
-    """
+    """How the error grows with the ``time`` ahead (s): RMSE of the states, and mean displacement, each ``(n, 4)``."""
     figure, axes = sheet(5.4, 2, 2, sharex=True)
     titles = [*(label(channel, ": RMSE") for channel in STATE_SIGNALS), "Displacement: mean distance (m)"]
     for k, (panel, title) in enumerate(zip(axes.flat, titles, strict=True)):
@@ -230,13 +206,7 @@ def rollout_growth(time: Vector, errors: Mapping[str, Vector], std: Mapping[str,
 
 @styled
 def adapted_parameters(time: Vector, theta: Vector, vehicle: Vehicle) -> Figure:
-    """Adapted coefficients along the run; what lies outside the admissible range is shaded.
-
-    Args:
-        time: of each row (s), shape ``(N,)``; steps back or holes cut the line.
-        theta: coefficients, shape ``(N, 17)``.
-        vehicle: gives range and nominal value.
-    """
+    """Adapted coefficients ``(N, 17)`` over ``time`` (s), cut where that has holes; what is outside the bounds is shaded."""
     figure, axes = sheet(9.6, 6, 3, sharex=True)
     axes = axes.ravel()
     every = slice(None, None, max(1, len(time) // MAX_POINTS))
@@ -262,12 +232,7 @@ def adapted_parameters(time: Vector, theta: Vector, vehicle: Vehicle) -> Figure:
 
 @styled
 def parameter_usage(theta: Vector, vehicle: Vehicle) -> Figure:
-    """How much of its admissible range each coefficient uses, and whether it rests on a bound.
-
-    Args:
-        theta: adapted coefficients, shape ``(N, 17)``.
-        vehicle: gives range and nominal value.
-    """
+    """How much of its range each of adapted coefficients ``(N, 17)`` uses, and whether it rests on a bound."""
     low, q1, median, q3, high = np.percentile(range_used(theta, vehicle), [1, 25, 50, 75, 99], axis=0)
     at_bound = resting(theta, vehicle).mean(axis=0)
     places = np.arange(len(COEFFICIENTS))
@@ -294,10 +259,7 @@ def parameter_usage(theta: Vector, vehicle: Vehicle) -> Figure:
 def latency_histogram(samples: Mapping[str, Vector], unit: str = "µs", what: str = "time per prediction") -> Figure:
     """Distribution of latencies on a logarithmic axis, with median and 99th percentile in the legend.
 
-    Args:
-        samples: by model (or stage) name, each of any length, positive.
-        unit: of the samples.
-        what: was measured.
+    ``samples`` are by model (or stage) name, each of any length, positive, of a ``unit``; ``what`` was measured.
     """
     colours = model_colours(list(samples))
     everything = np.concatenate(list(samples.values()))
@@ -317,14 +279,7 @@ def latency_histogram(samples: Mapping[str, Vector], unit: str = "µs", what: st
 
 @styled
 def regime_errors(labels: Sequence[str], what: str, rmse: Mapping[str, Vector], std: Mapping[str, Vector]) -> Figure:
-    """One-step RMSE in each driving regime, a panel per channel.
-
-    Args:
-        labels: of the ``R`` regimes.
-        what: tells the regimes apart, with its unit.
-        rmse: by model name, mean over the seeds, each ``(R, 3)``.
-        std: its standard deviation over the seeds, 0 for a single one; drawn as whiskers.
-    """
+    """One-step RMSE ``(R, 3)`` in each of ``R`` driving regimes, a panel per channel; ``what`` tells the regimes apart."""
     figure, axes = sheet(2.9, 1, 3)
     places = np.arange(len(labels))
     bars: dict[str, Any] = {"marker": "o", "ms": 3.5, "lw": 0.8, "elinewidth": 1.2, "capsize": 2.5}
@@ -351,11 +306,7 @@ def _cut_at_holes(x: Vector, values: Vector) -> tuple[Vector, Vector]:
 
 
 def room(models: Mapping[str, Vector]) -> float:
-    """Upper end of an axis on which persistence is seen, and all models but those far worse than most.
-
-    Args:
-        models: magnitudes drawn, by model name, of any shape.
-    """
+    """Upper end of an axis for magnitudes of models: persistence is seen, and all models but those far worse than most."""
     finite = {name: values[np.isfinite(values)] for name, values in models.items()}
     largest = {name: float(values.max()) for name, values in finite.items() if len(values)}
     usual = OUTLYING * np.median(list(largest.values())) if largest else 0.0
@@ -372,9 +323,7 @@ def _symbol(name: str) -> str:
 def loss_components(history: Mapping[str, Sequence[float]], best_epoch: int) -> Figure:
     """The terms of the training objective over the epochs, the paper's loss figure.
 
-    Args:
-        history: mean loss per epoch by ``train/TERM`` and ``validation/TERM``; terms that are never used are left out.
-        best_epoch: the epoch whose weights were kept.
+    ``history`` is the mean loss per epoch by ``train/TERM`` and ``validation/TERM``; terms never used are left out.
     """
     terms = [key.removeprefix("train/") for key, values in history.items() if key.startswith("train/") and any(values)]
     figure, axes = sheet(2.0 * len(terms) + 0.6, len(terms), sharex=True, squeeze=False)

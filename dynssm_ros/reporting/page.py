@@ -29,14 +29,7 @@ RASTER_DPI = 160  # of the rasterised parts of a figure
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report.
-
-    Attributes:
-        title: short, names the subject.
-        text: one or two sentences on how to read the figure or table.
-        figure: shown below the text, if any.
-        table: shown below the figure, if any.
-    """
+    """A part of a report: one or two sentences on how to read the figure below them, or the table below that."""
 
     title: str
     text: str
@@ -46,14 +39,9 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """A report as data; :meth:`save` writes it.
+    """A report as data: the result in a sentence or two, the main figures below, and the sections in order of reading.
 
-    Attributes:
-        title: what it is about.
-        summary: the result in a sentence or two.
-        sections: in order of reading.
-        protocol: how it was obtained (recording, commands, split, integrator, seeds ...), by name.
-        table: the main figures, below the summary.
+    The ``protocol`` says by name how it was obtained (recording, commands, split, integrator, seeds ...).
     """
 
     title: str
@@ -80,25 +68,20 @@ class Report:
 
 
 class Prose:
-    """Titles and texts of a page's sections and protocol, from ``templates/PAGE.yaml``.
-
-    Args:
-        page: name of that file.
-        values: fill the ``{names}`` in its texts.
-    """
+    """Titles and texts of a page's sections and protocol, from ``templates/PAGE.yaml``; values fill the ``{names}``."""
 
     def __init__(self, page: str, **values: object) -> None:
-        self._texts = yaml.safe_load(_template(f"{page}.yaml"))
+        self.words = yaml.safe_load(_template(f"{page}.yaml"))
         self._values = values
 
     def section(self, name: str, figure: Figure | None = None, table: Table | None = None, **more: object) -> Section:
         """The section of a name, its texts filled with ``more`` values too."""
-        title, text = (words.format(**self._values, **more) for words in self._texts[name])
+        title, text = (words.format(**self._values, **more) for words in self.words[name])
         return Section(title, text, figure, table)
 
     def protocol(self, **more: object) -> dict[str, str]:
         """How what is reported was obtained, by name."""
-        return {name: words.format(**self._values, **more) for name, words in self._texts["protocol"].items()}
+        return {name: words.format(**self._values, **more) for name, words in self.words["protocol"].items()}
 
 
 def _template(name: str) -> str:

@@ -38,11 +38,7 @@ _ANSWERS = 6  # coefficients at most in a figure of hidden effects
 
 @styled
 def trajectories(races: Sequence[Race]) -> Figure:
-    """Paths on the track with marks at equal times; on a large track also, enlarged, where they part most.
-
-    Args:
-        races: on one course.
-    """
+    """Paths on the track with marks at equal times; on a large track also, enlarged, where they part most."""
     place, side = _parting(races)
     across, up = np.ptp(races[0].course.track.centre.points, axis=0)
     enlarged = side * _ENLARGED < np.hypot(across, up)
@@ -139,12 +135,9 @@ def compared_forces(races: Sequence[Race]) -> Race:
 
 
 def _motion(race: Race, with_effects: bool = True, theta: Vector | None = None) -> Motion:
-    """The equations of motion at what was driven; states of effects are settled.
+    """The equations of motion at what was driven, with coefficients ``(n, 17)``, the driven car's if not given.
 
-    Args:
-        race: whose states and commands.
-        with_effects: whether the driven car's effects act.
-        theta: coefficients ``(n, 17)``; ``None``: the driven car's.
+    The driven car's effects act, their states settled, or do not.
     """
     course = race.course
     x, y, heading = race.pose.T

@@ -51,13 +51,7 @@ ColumnOf = tuple[Column | Sequence[Column], Callable[[Any], Any]]
 
 @dataclass(frozen=True)
 class Cell:
-    """A value as shown.
-
-    Attributes:
-        value: the value itself.
-        spread: how far it varies, stacked below the value where there is little room; empty if it does not.
-        best: whether it is marked.
-    """
+    """A value as shown, its spread (stacked below it where there is little room), and whether it is marked."""
 
     value: str
     spread: str

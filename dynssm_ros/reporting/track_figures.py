@@ -30,13 +30,9 @@ _ENLARGED = 1000.0  # at most; what is smaller then is no difference
 
 @styled
 def error_map(x: Vector, y: Vector, errors: Vector, smooth: int = 1) -> Figure:
-    """Error along the driven track, one map per channel; the largest errors are drawn last.
+    """Errors ``(N, 3)`` at positions (m), one map per channel; the largest are drawn last.
 
-    Args:
-        x: position of each row (m), shape ``(N,)``.
-        y: likewise.
-        errors: shape ``(N, 3)``.
-        smooth: rows over which the root mean square is taken; 1 shows each row's absolute error.
+    Shown is the root mean square over ``smooth`` rows; 1 shows each row's absolute error.
     """
     width, height = float(np.ptp(x)), float(np.ptp(y))
     shape = np.clip(height / max(width, 1e-9), 0.25, 2.0)
@@ -68,8 +64,7 @@ def trajectories(time: Vector, measured: Vector, predicted: Mapping[str, Vector]
     Args:
         time: of the measured positions (s), shape ``(P * n + 1,)``.
         measured: positions (m), shape ``(P * n + 1, 2)``.
-        predicted: ``P`` paths of ``n`` steps by model name, each ``(P, n + 1, 2)``; path ``k`` leaves from position
-            ``k * n``.
+        predicted: by model name ``(P, n + 1, 2)``; path ``k`` of ``n`` steps leaves from position ``k * n``.
     """
     pieces, points, _ = next(iter(predicted.values())).shape
     rows = np.arange(pieces)[:, None] * (points - 1) + np.arange(points)
@@ -113,14 +108,9 @@ def trajectories(time: Vector, measured: Vector, predicted: Mapping[str, Vector]
 def errors_along_lap(
     position: Vector, speed: Vector, errors: Mapping[str, Vector], length: float, bins: int = 80
 ) -> Figure:
-    """One-step error over the position on the lap, below the speed driven there.
+    """One-step errors ``(N, 3)`` over the position on a lap of ``length`` (m), below the speed driven there (m/s).
 
-    Args:
-        position: of each row on the lap (m), in ``[0, length)``, shape ``(N,)``.
-        speed: of each row (m/s), shape ``(N,)``.
-        errors: one-step errors by model name, each ``(N, 3)``.
-        length: of the lap (m).
-        bins: stretches of equal length; a point is the root mean square over one.
+    A point is the root mean square over one of ``bins`` stretches of equal length.
     """
     centres = (np.arange(bins) + 0.5) * length / bins
     figure, (top, *panels) = sheet(6.6, 4, sharex=True, height_ratios=[0.7, 1, 1, 1])

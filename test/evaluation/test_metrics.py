@@ -51,10 +51,9 @@ def test_windows_exist_for_one_batch_only(rng, recorded):
     assert done == [40, 40, 17]
 
 
-def test_rmse_and_largest_error_of_planted_errors():
+def test_rmse_of_planted_errors():
     errors = np.array([[3.0, 0.0, -1.0], [-4.0, 0.0, 1.0]])
     np.testing.assert_allclose(metrics.rmse(errors), [np.sqrt(12.5), 0.0, 1.0])
-    np.testing.assert_array_equal(metrics.max_error(errors), [4.0, 0.0, 1.0])
 
 
 def test_rmse_of_persistence_is_the_rms_of_the_increments(rng, recorded):
