@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -184,16 +184,20 @@ def call_service() -> Callable[..., Any]:
 RefusedStart = Callable[..., str]
 
 
-@pytest.fixture(scope="session")
-def refused_start() -> RefusedStart:
-    """Starts a node with parameters that it refuses; returns the one line that it ends with."""
+@pytest.fixture
+def refused_start(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> RefusedStart:
+    """Starts a node in this process with parameters that it refuses; returns the one line that it ends with."""
+    for name, value in isolated_environment().items():
+        monkeypatch.setenv(name, value)
 
-    def start(node: str, *parameters: str, timeout: float = 60) -> str:
-        given = ["--ros-args", *(part for text in parameters for part in ("-p", text))] if parameters else []
-        command = [sys.executable, "-m", f"dynssm_ros.nodes.{node}", *given]
-        result = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
-        assert result.returncode == 1
-        lines = result.stderr.strip().splitlines()
+    def start(node: str, *parameters: str) -> str:
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as stopped:
+            importlib.import_module(f"dynssm_ros.nodes.{node}").main(
+                ["--ros-args", *(part for text in parameters for part in ("-p", text))] if parameters else []
+            )
+        assert stopped.value.code == 1
+        lines = capfd.readouterr().err.strip().splitlines()
         assert len(lines) == 1
         assert lines[0].startswith("error: ")
         return lines[0]

@@ -109,14 +109,15 @@ def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(model, stints
     assert np.abs(fresh[first] - goes_on[first]).max() > 0.0
 
 
-def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(model, stints, tmp_path: Path):
+@pytest.mark.parametrize("rounds", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(model, stints, rounds, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
     recording_to_bag(stints[0], bag)
     os.environ.update(isolated_environment())
     here = os.environ.copy()
     with ExitStack() as stack:
         stack.enter_context(node_process("player", {"bag": bag, "rate": 3.0, "loop": True}, here))
-        for stop in (*(signal.SIGINT,) * 4, signal.SIGTERM) * 3:
+        for stop in (*(signal.SIGINT,) * 4, signal.SIGTERM) * rounds:
             run = LiveRun(20_000_000)
             state.unlink(missing_ok=True)
             with predictor_process(model, {"online_state": state}, here) as process, collecting(run) as collector:
