@@ -32,7 +32,6 @@ from pathlib import Path
 from typing import Any
 
 from doit import get_var
-from doit.tools import config_changed
 
 from benchmarks.hidden_causes.cases import TRUTHS, cases
 from benchmarks.hidden_causes.outcomes import matrix, rates
@@ -44,10 +43,9 @@ from benchmarks.page import save_figure, save_page
 from benchmarks.paper.document import write
 from benchmarks.paper.plan import Plan, load_plan
 from benchmarks.paper.race_document import write_races
-from benchmarks.paper.reference import load_reference
-from benchmarks.paper.results import Made, read_results
+from benchmarks.paper.results import read_results
 from benchmarks.paper.schedule import steps_of
-from benchmarks.tasks import doit_config, split_available, tasks
+from benchmarks.tasks import doit_config, split_available, task, tasks
 from dynssm_ros import __version__
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
@@ -57,6 +55,7 @@ GROUP = get_var("group", "")
 OUT = Path(get_var("out", f"out/{GROUP}"))
 PAGES = Path(get_var("page", str(OUT)))
 DATA = get_var("data", os.environ.get("DYNSSM_DATA", ""))
+LOGS = Path(DATA or "../shared/data")
 
 
 class Variables:
@@ -116,8 +115,7 @@ class Paper:
     def write(self) -> None:
         """The tables of the models, and those of the races."""
         path = Path(get_var("results", str(PAGES / "results.md")))
-        made = Made({"Page written": origin()}, self.quick)
-        results = read_results(self.plan, load_reference(), OUT, self.steps, made)
+        results = read_results(self.plan, OUT, self.steps, f"Page written: {origin()}", self.quick)
         write(results, path)
         if self.plan.races:
             write_races(results, OUT, path.with_name(f"{path.stem}_race.md"))
@@ -177,12 +175,7 @@ class HiddenCauses:
     def task_case(self) -> Iterator[dict[str, Any]]:
         """Drives and diagnoses each case."""
         for case in self.cases:
-            yield {
-                "name": case.name,
-                "actions": [(run_case, [case, OUT])],
-                "targets": [str(outcome_file(case, OUT))],
-                "uptodate": [config_changed(repr(case))],
-            }
+            yield task(case.name, (run_case, [case, OUT]), outcome_file(case, OUT), repr(case))
 
     def task_page(self) -> dict[str, Any]:
         """Writes rates, confusion matrix and page of what is there."""
@@ -222,29 +215,22 @@ class Matrix:
     def task_drive(self) -> Iterator[dict[str, Any]]:
         """Makes the laps of each training."""
         for training in self.trainings.values():
-            yield {
-                "name": training.name,
-                "actions": [(scores.drive, [training, self.trained, Path(DATA or "../shared/data")])],
-                "targets": [str(scores.drive_file(training, self.trained))],
-                "uptodate": [config_changed(repr(training))],
-            }
+            action = (scores.drive, [training, self.trained, LOGS])
+            yield task(training.name, action, scores.drive_file(training, self.trained), repr(training))
 
     def task_train(self) -> Iterator[dict[str, Any]]:
         """Trains each model on each training."""
         contents = scores.models_of(scores.SETS)
         for training in self.trainings.values():
+            drive = scores.drive_file(training, self.trained)
             for name in self.models:
-                yield {
-                    "name": f"{training.name}:{name}",
-                    "actions": [(scores.train_model, [training, name, self.trained])],
-                    "file_dep": [str(scores.drive_file(training, self.trained))],
-                    "targets": [self.card(training, name)],
-                    "uptodate": [config_changed(repr((training, contents[name])))],
-                }
+                action = (scores.train_model, [training, name, self.trained])
+                recipe = repr((training, contents[name]))
+                yield task(f"{training.name}:{name}", action, self.card(training, name), recipe, [drive])
 
-    def card(self, training: scored_cells.Training, model: str) -> str:
+    def card(self, training: scored_cells.Training, model: str) -> Path:
         """The file that a trained model has when it is done."""
-        return str(scores.model_folder(training, model, self.trained) / CARD)
+        return scores.model_folder(training, model, self.trained) / CARD
 
     def known(self, outcomes: Mapping[Any, dict[str, Any] | None]) -> dict[Any, dict[str, Any]]:
         """Those of the cells that were done.
@@ -263,21 +249,16 @@ class Generalisation(Matrix):
 
     def __init__(self) -> None:
         super().__init__(Variables(part="development", sets="shipped", only=""), OUT)
-        self.data, self.sets = Path(DATA or "../shared/data"), self.variables.several("sets")
-        every = scored_cells.cells(self.data)
-        self.cells = [cell for cell in every if self.wanted(cell.training.name, cell.is_test)]
+        self.sets = self.variables.several("sets")
+        self.cells = [cell for cell in scored_cells.cells(LOGS) if self.wanted(cell.training.name, cell.is_test)]
         self.trainings = {cell.training.name: cell.training for cell in self.cells}
 
     def task_score(self) -> Iterator[dict[str, Any]]:
         """Scores the models on each cell."""
         for cell in self.cells:
-            yield {
-                "name": cell.name,
-                "actions": [(scores.score_cell, [cell, OUT, self.data, self.sets])],
-                "file_dep": [self.card(cell.training, name) for name in self.models],
-                "targets": [str(scores.cell_file(cell, OUT))],
-                "uptodate": [config_changed(repr((cell, self.sets)))],
-            }
+            action = (scores.score_cell, [cell, OUT, LOGS, self.sets])
+            needs = [self.card(cell.training, name) for name in self.models]
+            yield task(cell.name, action, scores.cell_file(cell, OUT), repr((cell, self.sets)), needs)
 
     def task_page(self) -> dict[str, Any]:
         """Writes the page and the heat map of what is there."""
@@ -315,13 +296,12 @@ class ClosedLoop(Matrix):
         """Drives each cell with each model."""
         for cell in self.cells:
             for name in (*races.BASELINES, *self.driven):
-                yield {
-                    "name": f"{cell.name}:{name}",
-                    "actions": [(races.race_model, [cell, name, OUT, self.trained])],
-                    "file_dep": [self.card(cell.training, name if name in self.driven else races.CALIBRATES)],
-                    "targets": [str(races.outcome_file(cell, name, OUT))],
-                    "uptodate": [config_changed(repr(cell))],
-                }
+                action, target = (
+                    (races.race_model, [cell, name, OUT, self.trained]),
+                    races.outcome_file(cell, name, OUT),
+                )
+                needs = [self.card(cell.training, name if name in self.driven else races.CALIBRATES)]
+                yield task(f"{cell.name}:{name}", action, target, repr(cell), needs)
 
     def task_page(self) -> dict[str, Any]:
         """Writes the page and the figure of what is there."""
@@ -330,13 +310,9 @@ class ClosedLoop(Matrix):
     def task_learn(self) -> Iterator[dict[str, Any]]:
         """Drives each cell faster every lap."""
         for cell in self.cells:
-            yield {
-                "name": cell.name,
-                "actions": [(races.learn_cell, [cell, OUT, self.trained, races.LEARNS])],
-                "file_dep": [self.card(cell.training, races.LEARNS)],
-                "targets": [str(races.learning_file(cell, OUT))],
-                "uptodate": [config_changed(repr(cell))],
-            }
+            action = (races.learn_cell, [cell, OUT, self.trained, races.LEARNS])
+            needs = [self.card(cell.training, races.LEARNS)]
+            yield task(cell.name, action, races.learning_file(cell, OUT), repr(cell), needs)
 
     def task_learning_page(self) -> dict[str, Any]:
         """Writes the page of what learned."""

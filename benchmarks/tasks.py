@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from doit import get_initial_workdir
 from doit.dependency import JsonDB
@@ -19,6 +19,9 @@ from doit.tools import config_changed
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import replacing
+
+if TYPE_CHECKING:
+    from benchmarks.paper.steps import Step
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # several processes share the cores
 
@@ -35,36 +38,6 @@ class NotingDB(JsonDB):  # type: ignore[misc]
         """Writes the file aside and renames it."""
         with replacing(self.name) as aside:
             aside.write_text(self.codec.encode(self._db), encoding="utf-8")
-
-
-class Step(Protocol):
-    """A piece of work with one output; see :class:`benchmarks.paper.steps.Step`."""
-
-    @property
-    def key(self) -> str:
-        """Path of the output below the run's folder; its name."""
-
-    @property
-    def title(self) -> str:
-        """What is done, for people."""
-
-    @property
-    def marker(self) -> str:
-        """File of the output that is written last, relative to :attr:`key`; empty: the output itself."""
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """Keys of steps whose outputs must be there."""
-
-    @property
-    def uses(self) -> tuple[str, ...]:
-        """Keys of steps whose outputs are taken as far as they are there."""
-
-    def recipe(self) -> dict[str, Any]:
-        """All that decides the outcome beside the steps that this one builds on, as JSON has it."""
-
-    def make(self, root: Path, there: frozenset[str]) -> None:
-        """Makes the output below ``root``; ``there``: which of the other steps' outputs are."""
 
 
 def output(step: Step, root: Path) -> Path:
@@ -97,14 +70,21 @@ def tasks(steps: Sequence[Step], root: Path) -> Iterator[dict[str, Any]]:
     by_key = {step.key: step for step in steps}
     for step in steps:
         before = [by_key[key] for key in (*step.needs, *step.uses) if key in by_key]
-        yield {
-            "name": step.key,
-            "doc": step.title,
-            "actions": [(perform, [step, root, [other.key for other in before]])],
-            "targets": [str(output(step, root))],
-            "file_dep": [str(output(other, root)) for other in before],
-            "uptodate": [config_changed(json.dumps(step.recipe(), sort_keys=True))],
-        }
+        action = (perform, [step, root, [other.key for other in before]])
+        needs = [output(other, root) for other in before]
+        recipe = json.dumps(step.recipe(), sort_keys=True)
+        yield task(step.key, action, output(step, root), recipe, needs) | {"doc": step.title}
+
+
+def task(name: str, action: tuple[Any, ...], target: Path, recipe: str, needs: Iterable[Path] = ()) -> dict[str, Any]:
+    """A task of doit that makes the file ``target``, anew when ``recipe`` or the files that it ``needs`` have changed."""
+    return {
+        "name": name,
+        "actions": [action],
+        "targets": [str(target)],
+        "file_dep": [str(each) for each in needs],
+        "uptodate": [config_changed(recipe)],
+    }
 
 
 def perform(step: Step, root: Path, before: Iterable[str]) -> TaskFailed | None:

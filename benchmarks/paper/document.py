@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.page import render, save_figure
 from benchmarks.paper import figures, tables
+from benchmarks.paper.plan import Plan
 from benchmarks.paper.results import Comparison, Results
 from benchmarks.paper.stale import signed
 from benchmarks.paper.summary import EXACT, summary
@@ -18,7 +19,6 @@ from dynssm_ros.files import replacing
 from dynssm_ros.reporting.evaluation_figures import loss_components
 from dynssm_ros.reporting.evaluation_report import COMMANDS_IN_WORDS
 
-MADE_BY = "Made by `make paper`; no number here is typed by hand. The paper's own numbers are those of its tables."
 _CARS = {"real": "Full-size car", "sim": "Small car", "other": "1:10 car"}
 
 
@@ -28,8 +28,13 @@ def write(results: Results, path: Path) -> None:
         name: save_figure(figure, path.with_name(f"{path.stem}_{name}.png"), tight=True)
         for name, figure in draw(results)
     }
+    write_signed(markdown(results, pictures), results.plan, path)
+
+
+def write_signed(text: str, plan: Plan, path: Path) -> None:
+    """Writes a page with the fingerprint of its plan."""
     with replacing(path) as aside:
-        aside.write_text(signed(markdown(results, pictures), results.plan), encoding="utf-8")
+        aside.write_text(signed(text, plan), encoding="utf-8")
 
 
 def draw(results: Results) -> Iterator[tuple[str, Figure]]:
@@ -49,24 +54,12 @@ def draw(results: Results) -> Iterator[tuple[str, Figure]]:
             yield f"ablations_{c.name}_{base}", figures.against_the_full_model(c.rmse(base), ablations)
     for model, training in results.losses.items():
         yield f"losses_{model}", loss_components(training["history"], training["best_epoch"])
-    tried = {
-        results.plan.sweeps[name].model: {
-            rate: [tables.validation_loss(each) for each in trainings] for rate, trainings in rates.items()
-        }
-        for name, rates in results.rates.items()
-        if rates
-    }
-    if tried:
+    if tried := {results.plan.sweeps[name].model: rates for name, rates in results.rates.items() if rates}:
         yield "rates", figures.learning_rates(tried)
 
 
 def markdown(results: Results, pictures: Mapping[str, str]) -> str:
-    """The document.
-
-    Args:
-        results: of a run.
-        pictures: addresses of the figures by their names.
-    """
+    """The document; ``pictures``: addresses of the figures by their names."""
     models = results.plan.models
     planned = {comparison.car.reference for comparison in results.comparisons}
     coverage = tables.coverage_table([comparison for comparison in results.comparisons if comparison.tests])
@@ -78,13 +71,10 @@ def markdown(results: Results, pictures: Mapping[str, str]) -> str:
         costs=tables.cost_table(results).markdown() if results.costs else "",
         coverage=coverage.markdown() if coverage.rows else "",
         exact=EXACT,
-        made_by=MADE_BY,
-        missing=results.missing,
         pictures={"rates": ""} | dict(pictures),
         plan=results.plan,
-        protocol=results.made.protocol,
-        quick=results.made.quick,
         rates=tables.rate_table(results).markdown() if any(results.rates.values()) else "",
+        results=results,
         shipped={name: model.base for name, model in models.items() if model.base and model.base not in models},
         short=summary(results),
     )
@@ -97,7 +87,7 @@ def _car(results: Results, data: str, title: str, pictures: Mapping[str, str]) -
     cars = [car for car in results.plan.cars.values() if car.reference == data]
     wanted = dict.fromkeys(car.coefficients for car in cars)
     coefficients = (tables.coefficient_table(by_name[name], results) for name in wanted if name in by_name)
-    reference = results.reference.open_loop.get(data)
+    reference = results.reference["open_loop"].get(data)
     losses = dict.fromkeys(f"losses_{car.paper}" for car in cars)
     return {
         "title": title,
@@ -115,13 +105,12 @@ def _car(results: Results, data: str, title: str, pictures: Mapping[str, str]) -
 
 def _lacking(results: Results, data: str) -> Iterator[dict[str, str]]:
     """Each study that lacks something, and what."""
-    for comparison in results.comparisons:
-        if comparison.car.reference == data and not comparison.planned:
-            words = "not measured, no recording was given with `test=NAME=R.parquet`"
-            yield {"label": comparison.label, "words": words}
-        elif comparison.car.reference == data and comparison.reasons:
-            what = "not measured" if not comparison.tests else "measured in part"
-            yield {"label": comparison.label, "words": f"{what}; {'; '.join(dict.fromkeys(comparison.reasons))}"}
+    for comparison in (each for each in results.comparisons if each.car.reference == data):
+        words = "measured in part" if comparison.tests else "not measured"
+        if not comparison.planned:
+            yield {"label": comparison.label, "words": f"{words}, no recording was given with `test=NAME=R.parquet`"}
+        elif comparison.reasons:
+            yield {"label": comparison.label, "words": f"{words}; {'; '.join(dict.fromkeys(comparison.reasons))}"}
 
 
 def _study(comparison: Comparison, results: Results, pictures: Mapping[str, str]) -> dict[str, Any]:
@@ -134,8 +123,7 @@ def _study(comparison: Comparison, results: Results, pictures: Mapping[str, str]
         }
         for base in comparison.bases
     ]
-    about = {name: getattr(study, name) for name in ("commands", "text", "data", "remark")}
-    return about | {
+    return study.model_dump() | {
         "title": f"{study.title[0].upper()}{study.title[1:]}",
         "errors": tables.error_table(comparison).markdown(),
         "relative": tables.relative_table(comparison).markdown(),

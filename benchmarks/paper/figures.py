@@ -9,6 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
+from benchmarks.paper.results import Entry
+from benchmarks.paper.tables import validation_loss
 from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.spread import SeedSpread
 from dynssm_ros.reporting.evaluation_figures import NO_MODEL, PALETTE, STYLE, SYMBOLS, WIDTH
@@ -70,18 +72,18 @@ def against_the_full_model(full: Sequence[SeedSpread], ablations: Mapping[str, S
     return figure
 
 
-def learning_rates(tried: Mapping[str, Mapping[float, Sequence[Sequence[float]]]]) -> Figure:
+def learning_rates(tried: Mapping[str, Mapping[float, Sequence[Entry]]]) -> Figure:
     """The lowest validation loss so far over the epochs, a panel for each model, a line for each training.
 
     Args:
-        tried: by model, then by learning rate, for each training: the loss of each epoch.
+        tried: by model, then by learning rate, for each training: what it says of itself.
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 0.28 * WIDTH), layout="constrained")
         for axis, (model, rates) in zip(figure.subplots(1, len(tried), squeeze=False)[0], tried.items(), strict=True):
             for k, (rate, trainings) in enumerate(rates.items()):
-                for n, losses in enumerate(trainings):
-                    best = np.minimum.accumulate(np.array(losses, dtype=float)) if len(losses) else np.array([])
+                for n, training in enumerate(trainings):
+                    best = np.minimum.accumulate(np.array(validation_loss(training), dtype=float))
                     label = f"{rate:g}" if n == 0 else None
                     axis.plot(np.arange(1, len(best) + 1), best, color=PALETTE[k % len(PALETTE)], label=label)
             axis.set(title=model, xlabel="epoch", yscale="log")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.paper.plan import Car, Plan, Study, Sweep
 from benchmarks.paper.racing import NUMBERS
-from benchmarks.paper.reference import Reference
+from benchmarks.paper.reference import load_reference
 from benchmarks.paper.schedule import COSTS, model_key, race_key, rate_key, score_key
 from benchmarks.paper.steps import Step
 from benchmarks.tasks import output, split_available
@@ -25,19 +25,6 @@ _NOT_MADE = "not made; `make paper` says why"
 
 Entry = Mapping[str, Any]
 """Scores of one training of a model on one test, as :meth:`~dynssm_ros.evaluation.score.Score.to_json` writes them."""
-
-
-@dataclass(frozen=True)
-class Made:
-    """How the results came about.
-
-    Attributes:
-        protocol: by name: machine, versions, date ...
-        quick: whether the plan was shortened to try things out.
-    """
-
-    protocol: Mapping[str, str] = field(default_factory=dict)
-    quick: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,11 +43,12 @@ class Results:
         costs: of the models, by name: parameters, flops, latency_us, integrator.
         missing: why steps are not done, by their titles; steps that only lack others are left out.
         reasons: why scores are not there, by their keys.
-        made: how it came about.
+        made: machine, versions, date.
+        quick: whether the plan was shortened to try things out.
     """
 
     plan: Plan
-    reference: Reference
+    reference: Entry
     scores: Mapping[str, Entry]
     races: Mapping[str, Entry]
     rates: Mapping[str, Mapping[float, Sequence[Entry]]]
@@ -69,7 +57,8 @@ class Results:
     costs: Mapping[str, Entry]
     missing: Mapping[str, str]
     reasons: Mapping[str, str]
-    made: Made
+    made: str
+    quick: bool = False
 
     @property
     def comparisons(self) -> list[Comparison]:
@@ -113,11 +102,14 @@ class Comparison:
         """Models with results, in the plan's order."""
         return tuple(model for model, runs in self._runs.items() if runs)
 
+    def those(self, *models: str | None) -> list[str]:
+        """Those of some models that have results."""
+        return [model for model in models if model in self.models]
+
     @property
     def bases(self) -> tuple[str, ...]:
         """The models with results that have ablations: the paper's, the one that ships."""
-        named = [each for each in (self.car.paper, self.car.full) if each in self.models]
-        return tuple(base for base in named if self.ablations(base))
+        return tuple(base for base in self.those(self.car.paper, self.car.full) if self.ablations(base))
 
     def ablations(self, base: str) -> dict[str, str]:
         """Models that are ``base`` less something, by what they lack."""
@@ -132,9 +124,8 @@ class Comparison:
     @property
     def compared(self) -> tuple[str, ...]:
         """The models that are no ablations."""
-        left_out = [
-            model for base in (self.car.paper, self.car.full) if base for model in self.ablations(base).values()
-        ]
+        bases = [base for base in (self.car.paper, self.car.full) if base]
+        left_out = [model for base in bases for model in self.ablations(base).values()]
         return tuple(model for model in self.models if model not in left_out)
 
     def seeds(self, model: str) -> int:
@@ -159,13 +150,13 @@ class Comparison:
 
     def displacement(self, model: str) -> list[SeedSpread]:
         """ADE and FDE (m)."""
-        return self._pooled(model, lambda entry: _numbers([entry["ade"], entry["fde"]]), _mean)
+        return self._pooled(model, lambda entry: _numbers([entry["ade"], entry["fde"]]), lambda each: each.mean(axis=0))
 
     def coverage(self, model: str) -> list[SeedSpread] | None:
         """Share of errors inside the 90 % interval, for each state; ``None`` for a model that states none."""
         if any(entry["coverage_90"] is None for entry in self.entries(model)):
             return None
-        return self._pooled(model, lambda entry: by_name(entry["coverage_90"]), _mean)
+        return self._pooled(model, lambda entry: by_name(entry["coverage_90"]), lambda each: each.mean(axis=0))
 
     def relative(self, model: str, test: str) -> Vector:
         """One-step RMSE of each state as a multiple of persistence's, mean over the seeds, shape ``(3,)``."""
@@ -179,12 +170,8 @@ class Comparison:
         """Trainings, each with its entries of all tests; those that lack one are left out."""
         runs = []
         for seed in seeds:
-            found = [
-                entry
-                for test in self.tests
-                for entry in self._tests[test]["models"].get(model, [])
-                if entry["seed"] == seed
-            ]
+            scored = [entry for test in self.tests for entry in self._tests[test]["models"].get(model, [])]
+            found = [entry for entry in scored if entry["seed"] == seed]
             if found and len(found) == len(self.tests):
                 runs.append(found)
         return runs
@@ -195,7 +182,7 @@ class Comparison:
         return spreads([pool(np.stack([measure(entry) for entry in run])) for run in self._runs[model]])
 
 
-def read_results(plan: Plan, reference: Reference, root: Path, steps: Sequence[Step], made: Made) -> Results:
+def read_results(plan: Plan, root: Path, steps: Sequence[Step], made: str = "", quick: bool = False) -> Results:
     """Reads what the steps of ``plan`` left in ``root``."""
     done = {step.key for step in steps if output(step, root).exists()}
     _, reasons, causes = split_available(steps)
@@ -204,7 +191,7 @@ def read_results(plan: Plan, reference: Reference, root: Path, steps: Sequence[S
     scores = {key: _read(root / key) for key in done if key.startswith("scores/")}
     return Results(
         plan=plan,
-        reference=reference,
+        reference=load_reference(),
         scores=scores,
         races={name: _read(root / race_key(name) / NUMBERS) for name in plan.races if race_key(name) in done},
         rates={name: _rates(sweep, root, done) for name, sweep in plan.sweeps.items()},
@@ -215,6 +202,7 @@ def read_results(plan: Plan, reference: Reference, root: Path, steps: Sequence[S
         | {titles[key]: reason for key, reason in failed.items()},
         reasons={key: f"{titles[causes[key]]}: {reason}" for key, reason in reasons.items()} | failed,
         made=made,
+        quick=quick,
     )
 
 
@@ -242,14 +230,9 @@ def _networks(plan: Plan, root: Path, done: Container[str]) -> dict[str, tuple[i
     kept: dict[str, dict[str, bool]] = {}
     for study in plan.studies.values():
         model = plan.car(study).full
-        if model not in study.models:
-            continue
-        keys = [
-            model_key(split, study.commands, model, seed) for split in study.splits for seed in plan.seeds(study, model)
-        ]
-        for key in keys:
-            layer = read_card(root / key).online if key in done else None
-            if layer is not None:
+        seeds = plan.seeds(study, model) if model in study.models else ()
+        for key in (model_key(split, study.commands, model, seed) for split in study.splits for seed in seeds):
+            if key in done and (layer := read_card(root / key).online):
                 kept.setdefault(model, {})[key] = "network" in layer.features
     return {model: (sum(each.values()), len(each)) for model, each in kept.items()}
 
@@ -260,12 +243,7 @@ def by_name(values: Entry) -> Vector:
 
 
 def _numbers(values: Sequence[float | None]) -> Vector:
-    return np.array([np.nan if value is None else value for value in values])
-
-
-def _mean(each: Vector) -> Vector:
-    mean: Vector = each.mean(axis=0)
-    return mean
+    return np.array(values, dtype=float)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.paper.reference import Ablation, OpenLoop, Reference
-from benchmarks.paper.results import Comparison, Entry, Results
+from benchmarks.paper.results import Comparison, Entry, Results, by_name
 from dynssm_ros.evaluation.coefficients import coefficient_unit
 from dynssm_ros.evaluation.spread import SeedSpread, spreads
 from dynssm_ros.reporting.evaluation_figures import UNITS
@@ -21,7 +20,7 @@ _PHYSICS_ONLY = "single_track"
 _ERRORS = ("ADE", "FDE")
 
 
-def published_table(comparisons: Sequence[Comparison], reference: Mapping[str, OpenLoop]) -> Table:
+def published_table(comparisons: Sequence[Comparison], reference: Mapping[str, Entry]) -> Table:
     """The paper's open-loop table, and the same models measured on each study that has them."""
     columns = (
         Column("model"),
@@ -31,23 +30,18 @@ def published_table(comparisons: Sequence[Comparison], reference: Mapping[str, O
     )
     rows: list[list[Value]] = []
     for name, row in reference.items():
-        pairs = [v for pair in zip(row.rmse.values, row.max_error.values, strict=True) for v in pair]
-        rows.append([f"{name}, the paper's", "the paper's", *pairs, row.ade, row.fde])
+        pairs = [row[what][channel] for channel in STATE_SIGNALS for what in ("rmse", "max_error")]
+        rows.append([f"{name}, the paper's", "the paper's", *pairs, row["ade"], row["fde"]])
     for comparison in (each for each in comparisons if each.car.ddm in each.models):
-        for model in published_models(comparison):
+        car = comparison.car
+        for model in comparison.those(car.ddm, car.fthd, car.paper, car.full):
             errors = zip(comparison.rmse(model), comparison.max_error(model), strict=True)
             spreads = [*(each for pair in errors for each in pair), *comparison.displacement(model)]
             rows.append([f"`{model}`", comparison.label, *(each.mean for each in spreads)])
     return Table(columns, rows)
 
 
-def published_models(comparison: Comparison) -> list[str]:
-    """DDM, FTHD, the paper's configuration of DynSSM, and the full one, as far as they have results."""
-    car = comparison.car
-    return [model for model in (car.ddm, car.fthd, car.paper, car.full) if model in comparison.models]
-
-
-def reduction_table(comparisons: Sequence[Comparison], reference: Reference, data: str) -> Table:
+def reduction_table(comparisons: Sequence[Comparison], reference: Entry, data: str) -> Table:
     """How much lower the errors are than DDM's, in percent; above 0 is better."""
     columns = (
         Column("model"),
@@ -55,24 +49,31 @@ def reduction_table(comparisons: Sequence[Comparison], reference: Reference, dat
         *(Column(TITLES[channel], "%") for channel in STATE_SIGNALS),
         *(Column(name, "%") for name in _ERRORS),
     )
-    paper = reference.open_loop[data]
-    rows: list[list[Value]] = [
-        ["DynSSM, the paper's table", "the paper's", *_reductions(paper["DynSSM"], paper["DDM"])]
-    ]
+    own, base = (
+        [*by_name(row["rmse"]), row["ade"], row["fde"]]
+        for row in map(reference["open_loop"][data].get, ("DynSSM", "DDM"))
+    )
+    rows: list[list[Value]] = [["DynSSM, the paper's table", "the paper's", *_reductions(own, base)]]
     if data == "real":
-        claims = [_percentage(value) for value in reference.claims.rmse.values]
+        claims = 100 * by_name(reference["claims"]["rmse"])
         rows.append(["DynSSM, the paper's abstract: up to, over DDM or FTHD", "the paper's", *claims, None, None])
-    for comparison in comparisons:
-        car = comparison.car
-        if car.ddm not in comparison.models:
-            continue
-        base = [*comparison.rmse(car.ddm), *comparison.displacement(car.ddm)]
-        for model in (car.paper, car.full):
-            if model in comparison.models:
-                own = [*comparison.rmse(model), *comparison.displacement(model)]
-                shares = [1 - _ratio(a.mean, b.mean) for a, b in zip(own, base, strict=True)]
-                rows.append([f"`{model}`", comparison.label, *(_percentage(share) for share in shares)])
+    for comparison in (each for each in comparisons if each.car.ddm in each.models):
+        base = _errors(comparison, comparison.car.ddm)
+        rows += [
+            [f"`{model}`", comparison.label, *_reductions(_errors(comparison, model), base)]
+            for model in comparison.those(comparison.car.paper, comparison.car.full)
+        ]
     return Table(columns, rows)
+
+
+def _errors(comparison: Comparison, model: str) -> list[float]:
+    return [each.mean for each in (*comparison.rmse(model), *comparison.displacement(model))]
+
+
+def _reductions(own: Sequence[float], base: Sequence[float]) -> Iterator[float]:
+    """By how much errors are lower than others, in percent."""
+    for ours, theirs in zip(own, base, strict=True):
+        yield 100 * (1 - (ours / theirs if theirs else math.inf))
 
 
 def error_table(comparison: Comparison) -> Table:
@@ -107,7 +108,7 @@ def relative_table(comparison: Comparison) -> Table:
 
 def ablation_table(comparison: Comparison, results: Results, base: str) -> Table:
     """A model and its ablations: errors and what they cost; the paper's numbers beside those of its own model."""
-    paper = results.reference.ablation.get(comparison.car.reference, {}) if base == comparison.car.paper else {}
+    paper = results.reference["ablation"].get(comparison.car.reference, {}) if base == comparison.car.paper else {}
     shown = [Column(TITLES[channel], UNITS[channel], "", "min") for channel in STATE_SIGNALS]
     shown += [Column("parameters"), Column("FLOPs"), Column("latency p50", "µs")]
     columns = [Column("variant")]
@@ -122,16 +123,15 @@ def ablation_table(comparison: Comparison, results: Results, base: str) -> Table
         cost = results.costs.get(model)
         own: list[Value] = list(comparison.rmse(model))
         own += [cost["parameters"], cost["flops"], cost["latency_us"]["p50"]] if cost else [None] * 3
-        published = _published_row(theirs)
+        published = [*by_name(theirs["rmse"]), *_cost(theirs)] if theirs else [None] * 6
         pairs = [[mine, other] if paper else [mine] for mine, other in zip(own, published, strict=True)]
         rows.append([names[lacking], *(value for pair in pairs for value in pair)])
     return Table(tuple(columns), rows, f"{better_ablations(comparison, base)} {_seeds(comparison)}")
 
 
-def _published_row(row: Ablation | None) -> list[Value]:
-    if row is None:
-        return [None] * 6
-    return [*row.rmse.values, row.parameters, row.flops, 1e6 * row.latency]
+def _cost(row: Entry) -> list[Value]:
+    """What the paper says of a model's cost: parameters, FLOPs, latency in microseconds."""
+    return [row["parameters"], row["flops"], 1e6 * row["latency"]]
 
 
 def better_ablations(comparison: Comparison, base: str) -> str:
@@ -147,8 +147,8 @@ def better_ablations(comparison: Comparison, base: str) -> str:
         once = comparison.seeds(model) < 2
         for channel, own, whole in zip(STATE_SIGNALS, comparison.rmse(model), full, strict=True):
             if whole.mean - own.mean > math.hypot(whole.std if once else own.std, whole.std):
-                percent = _percentage(1 - own.mean / whole.mean)
-                found.append(f"{comparison.variants(base)[lacking]} in {TITLES[channel]} by {text(percent)} %")
+                percent = text(100 * (1 - own.mean / whole.mean))
+                found.append(f"{comparison.variants(base)[lacking]} in {TITLES[channel]} by {percent} %")
     if not found:
         return "No ablation is better than the full model beyond the spread over seeds."
     return f"Better than the full model beyond the spread over seeds: {', '.join(found)}."
@@ -184,8 +184,8 @@ def validation_loss(metrics: Entry) -> list[float]:
 
 def coefficient_table(comparison: Comparison, results: Results) -> Table | None:
     """The adapted coefficients against their bounds; ``None`` if no model adapts any."""
-    paper = results.reference.coefficients.get(comparison.car.reference, {})
-    models = [model for model in (comparison.car.paper, comparison.car.full) if model in comparison.models]
+    paper = results.reference["coefficients"].get(comparison.car.reference, {})
+    models = comparison.those(comparison.car.paper, comparison.car.full)
     statistics = {model: found for model in models if (found := _coefficients(comparison.entries(model)))}
     if not statistics:
         return None
@@ -198,10 +198,10 @@ def coefficient_table(comparison: Comparison, results: Results) -> Table | None:
         theirs = paper.get(name)
         row: list[Value] = [f"{name} ({unit})" if unit else name]
         if paper:
-            row += [_range(theirs.bounds), _plus_minus(theirs.mean, theirs.std)] if theirs else ["–", "–"]
+            row += [_range(*theirs["bounds"]), _plus_minus(theirs["mean"], theirs["std"])] if theirs else ["–", "–"]
         for found in statistics.values():
             bounds, mean, std, at_bound = found[name]
-            row += [_range(bounds), _plus_minus(mean, std), _percentage(at_bound)]
+            row += [_range(*bounds), _plus_minus(mean, std), 100 * at_bound]
         rows.append(row)
     kept = "".join(f" `{model}` keeps its own constant." for model in models if model not in statistics)
     return Table(tuple(columns), rows, f"Mean ± standard deviation over the predictions; {comparison.label}.{kept}")
@@ -212,12 +212,10 @@ def coverage_table(comparisons: Sequence[Comparison]) -> Table:
     columns = (Column("test"), Column("model"), *(Column(TITLES[channel], "%") for channel in STATE_SIGNALS))
     rows: list[list[Value]] = []
     for comparison in comparisons:
-        for model in (comparison.car.paper, comparison.car.full):
-            covered = comparison.coverage(model) if model in comparison.models else None
-            if covered is not None:
-                rows.append(
-                    [comparison.label, f"`{model}`", *(SeedSpread(100 * s.mean, 100 * s.std, s.n) for s in covered)]
-                )
+        for model in comparison.those(comparison.car.paper, comparison.car.full):
+            if (covered := comparison.coverage(model)) is not None:
+                shares = [SeedSpread(100 * s.mean, 100 * s.std, s.n) for s in covered]
+                rows.append([comparison.label, f"`{model}`", *shares])
     return Table(columns, rows)
 
 
@@ -227,26 +225,23 @@ def cost_table(results: Results) -> Table:
         Column("model"), Column("parameters"), Column("FLOPs"), Column("latency p50", "µs"), Column("p99", "µs"),
         Column("physics step"),
     )  # fmt: skip
-    ablations = {
-        model
-        for comparison in results.comparisons
-        for base in comparison.bases
-        for model in comparison.ablations(base).values()
-    }
-    rows: list[list[Value]] = []
-    for data, models in results.reference.open_loop.items():
-        for name, row in models.items():
-            car = "AV-21" if data == "real" else "ORCA"
-            rows.append([f"{name}, {car}, the paper's", row.parameters, row.flops, 1e6 * row.latency, None, "–"])
+    ablations = {each for c in results.comparisons for base in c.bases for each in c.ablations(base).values()}
+    rows: list[list[Value]] = [
+        [f"{name}, {'AV-21' if data == 'real' else 'ORCA'}, the paper's", *_cost(row), None, "–"]
+        for data, models in results.reference["open_loop"].items()
+        for name, row in models.items()
+    ]
     for name, cost in results.costs.items():
         if name not in ablations:
             latency = cost["latency_us"]
-            times = (latency["p50"], latency["p99"])
-            rows.append([f"`{name}`", cost["parameters"], cost["flops"], *times, _step(cost)])
+            # how the physics of a trained model is integrated
+            times = f", {cost['substeps']} times" if cost["integrator"] and cost["substeps"] > 1 else ""
+            step = f"{cost['integrator'] or '–'}{times}"
+            rows.append([f"`{name}`", cost["parameters"], cost["flops"], latency["p50"], latency["p99"], step])
     return Table(columns, rows)
 
 
-def _coefficients(entries: Sequence[Entry]) -> dict[str, tuple[tuple[float, float], float, float, float]]:
+def _coefficients(entries: Sequence[Entry]) -> dict[str, tuple[Sequence[float], float, float, float]]:
     """Bounds, mean, standard deviation and share at a bound over all entries; empty if they have none."""
     each = [entry["coefficients"] for entry in entries]
     if any(found is None for found in each):
@@ -255,40 +250,19 @@ def _coefficients(entries: Sequence[Entry]) -> dict[str, tuple[tuple[float, floa
     for name in COEFFICIENTS:
         mean, std, at_bound = (np.array([found[name][key] for found in each]) for key in ("mean", "std", "at_bound"))
         spread = math.sqrt(float((std**2).mean() + mean.var()))  # within the entries and between them
-        lower, upper = each[0][name]["bounds"]
-        statistics[name] = ((lower, upper), float(mean.mean()), spread, float(at_bound.mean()))
+        statistics[name] = (each[0][name]["bounds"], float(mean.mean()), spread, float(at_bound.mean()))
     return statistics
 
 
-def _reductions(row: OpenLoop, base: OpenLoop) -> list[Value]:
-    pairs = zip([*row.rmse.values, row.ade, row.fde], [*base.rmse.values, base.ade, base.fde], strict=True)
-    return [_percentage(1 - own / other) for own, other in pairs]
-
-
 def _seeds(comparison: Comparison) -> str:
-    numbers = {model: comparison.seeds(model) for model in comparison.models}
-    several = {model: n for model, n in numbers.items() if n > 1}
-    if not several:
+    most = max(map(comparison.seeds, comparison.models), default=1)
+    if most < 2:
         return "One seed each."
-    return f"± is the standard deviation over {max(several.values())} seeds; models without it were trained once."
+    return f"± is the standard deviation over {most} seeds; models without it were trained once."
 
 
-def _step(cost: Entry) -> str:
-    """How the physics of a trained model is integrated."""
-    times = f", {cost['substeps']} times" if cost["integrator"] and cost["substeps"] > 1 else ""
-    return f"{cost['integrator'] or '–'}{times}"
-
-
-def _percentage(share: float) -> float:
-    return 100 * share
-
-
-def _ratio(a: float, b: float) -> float:
-    return a / b if b else math.inf
-
-
-def _range(bounds: tuple[float, float]) -> str:
-    return f"{bounds[0]:g} … {bounds[1]:g}"
+def _range(lower: float, upper: float) -> str:
+    return f"{lower:g} … {upper:g}"
 
 
 def _plus_minus(mean: float, std: float) -> str:

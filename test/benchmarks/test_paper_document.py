@@ -10,7 +10,7 @@ import pytest
 from benchmarks.paper import document, tables
 from benchmarks.paper.plan import load_plan
 from benchmarks.paper.reference import load_reference
-from benchmarks.paper.results import Made, Results
+from benchmarks.paper.results import Results
 from benchmarks.paper.stale import NOTE, marked
 from benchmarks.paper.summary import summary
 from dynssm_ros.learning.losses import COMPONENTS
@@ -107,7 +107,7 @@ def make(scores):
         parts = {
             "plan": plan, "reference": load_reference(), "scores": scores, "races": {}, "rates": {}, "losses": {},
             "networks": {}, "costs": dict.fromkeys(MODELS, cost),
-            "missing": {}, "reasons": {}, "made": Made({"Made": "today"}),
+            "missing": {}, "reasons": {}, "made": "Made: today",
         }  # fmt: skip
         return Results(**parts | changes)
 
@@ -192,7 +192,7 @@ def test_the_paper_s_numbers_stand_beside_and_are_never_the_best(make):
     assert best == {("full model", 1), ("full model", 2), ("full model", 3)}
     theirs = tables.ablation_table(results.comparisons[0], results, "dynssm_av21_paper")
     assert cells(theirs, "physics only, calibrated")[:2] == ["0.800", "0.0350"]
-    published = tables.published_table(results.comparisons, results.reference.open_loop["real"])
+    published = tables.published_table(results.comparisons, results.reference["open_loop"]["real"])
     assert cells(published, "FTHD, the paper's")[1:4] == ["0.0270", "0.938", "0.0338"]
     assert not any(cell.best for row in published.cells for cell in row)
 
@@ -310,7 +310,7 @@ def test_a_study_of_given_recordings_asks_for_them(make):
 
 def test_quick_runs_say_so(make):
     assert "Not results" not in document.markdown(make(), {})
-    assert "**Not results:** a quick run" in document.markdown(make(made=Made(quick=True)), {})
+    assert "**Not results:** a quick run" in document.markdown(make(quick=True), {})
 
 
 def short(results):

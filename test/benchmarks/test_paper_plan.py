@@ -13,6 +13,7 @@ import benchmarks.rivals
 from benchmarks.paper.parts import cut, quantity
 from benchmarks.paper.plan import Part, Range, Study, load_plan
 from benchmarks.paper.reference import load_reference
+from benchmarks.paper.results import by_name
 from dynssm_ros.configuration import config_root
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
@@ -180,18 +181,18 @@ def test_a_mistake_in_the_plan_is_one_line(content, tmp_path, change, expected):
 def test_the_reference_has_every_table_for_both_cars():
     reference = load_reference()
     for data in ("real", "sim"):
-        assert list(reference.open_loop[data]) == ["DDM", "FTHD", "DynSSM"]
-        assert set(reference.coefficients[data]) == {
+        assert list(reference["open_loop"][data]) == ["DDM", "FTHD", "DynSSM"]
+        assert set(reference["coefficients"][data]) == {
             c for c in COEFFICIENTS if not c.startswith("C_m") and c[:3] != "C_r"
         } | {"C_r"}
     # the paper's own sums: the abstract's shares follow from its table, the last one against FTHD
-    real = reference.open_loop["real"]
-    shares = 1 - np.array(real["DynSSM"].rmse.values) / np.array(real["DDM"].rmse.values)
-    np.testing.assert_allclose(shares[:2], reference.claims.rmse.values[:2], atol=1e-3)
-    assert 1 - real["DynSSM"].rmse.omega / real["FTHD"].rmse.omega == pytest.approx(
-        reference.claims.rmse.omega, abs=1e-3
+    real = reference["open_loop"]["real"]
+    shares = 1 - by_name(real["DynSSM"]["rmse"]) / by_name(real["DDM"]["rmse"])
+    np.testing.assert_allclose(shares[:2], by_name(reference["claims"]["rmse"])[:2], atol=1e-3)
+    assert 1 - real["DynSSM"]["rmse"]["omega"] / real["FTHD"]["rmse"]["omega"] == pytest.approx(
+        reference["claims"]["rmse"]["omega"], abs=1e-3
     )
-    assert reference.ablation["real"]["full"].rmse == real["DynSSM"].rmse
+    assert reference["ablation"]["real"]["full"]["rmse"] == real["DynSSM"]["rmse"]
 
 
 def test_the_bounds_in_the_reference_are_those_of_the_shipped_vehicles():
@@ -199,8 +200,8 @@ def test_the_bounds_in_the_reference_are_those_of_the_shipped_vehicles():
 
     for data, name in (("real", "av21_paper"), ("sim", "orca")):
         vehicle = load_vehicle(name)
-        for coefficient, row in load_reference().coefficients[data].items():
-            assert row.bounds == vehicle.coefficients[coefficient].bounds, coefficient
+        for coefficient, row in load_reference()["coefficients"][data].items():
+            assert tuple(row["bounds"]) == vehicle.coefficients[coefficient].bounds, coefficient
 
 
 @pytest.mark.parametrize(
@@ -217,9 +218,9 @@ def test_the_papers_model_has_the_papers_size(name, vehicle, data):
     config, car = load_model_config(name), load_vehicle(vehicle)
     model, H = build_model(config, car, none), config.rows(car.sampling_time)
     of_gru = 2 * H * sum(weight.numel() for key, weight in model.named_parameters() if "gru.weight" in key)
-    paper = load_reference().open_loop[data]["DynSSM"]
-    assert sum(weight.numel() for weight in model.parameters()) == pytest.approx(paper.parameters, rel=0.05)
-    assert count_flops(model, H) - of_gru == pytest.approx(paper.flops, rel=0.05)
+    paper = load_reference()["open_loop"][data]["DynSSM"]
+    assert sum(weight.numel() for weight in model.parameters()) == pytest.approx(paper["parameters"], rel=0.05)
+    assert count_flops(model, H) - of_gru == pytest.approx(paper["flops"], rel=0.05)
 
 
 def test_an_unreadable_plan_is_named():

@@ -13,8 +13,7 @@ from benchmarks.paper.plan import load_plan
 from benchmarks.paper.race_document import claimed, write_races
 from benchmarks.paper.race_figures import lap_over_speed_scale
 from benchmarks.paper.racing import NUMBERS
-from benchmarks.paper.reference import load_reference
-from benchmarks.paper.results import Made, read_results
+from benchmarks.paper.results import read_results
 from benchmarks.paper.schedule import race_key, steps_of
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle import load_vehicle, save_vehicle
@@ -51,7 +50,7 @@ def race_step(plan):
 
 
 def document(plan, root, path):
-    results = read_results(plan, load_reference(), root, steps_of(plan, None, {}), Made({"Made": "now"}))
+    results = read_results(plan, root, steps_of(plan, None, {}))
     write_races(results, root, path)
     return path.read_text()
 
@@ -117,7 +116,7 @@ def test_lap_times_over_the_pace(tmp_path):
 def test_the_papers_claim_stands_beside_what_its_model_does(plan, root, tmp_path):
     """Laps of 5 s by the paper's model and of 5.05 s by DDM: 0.99 %."""
     whole = load_plan()
-    results = read_results(whole, load_reference(), root, [], Made({}, False))
+    results = read_results(whole, root, [])
     race = whole.races["ethz_mobil"]
     laps = {
         "dynssm_orca_paper": {"lap_time_s": 5.0},

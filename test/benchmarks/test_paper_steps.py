@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from benchmarks.paper.plan import Plan, load_plan
-from benchmarks.paper.reference import load_reference
-from benchmarks.paper.results import Made, read_results
+from benchmarks.paper.results import read_results
 from benchmarks.paper.schedule import steps_of
 from benchmarks.paper.steps import Evaluate, Take, Train, UnavailableError
 from benchmarks.tasks import output, perform, split_available
@@ -76,7 +75,7 @@ def small_run(plan, tmp_path_factory):
     available = split_available(steps)[0]
     for step in sorted(available, key=lambda step: len(step.uses)):
         assert perform(step, root, [other.key for other in available if output(other, root).exists()]) is None
-    return root, steps, available, read_results(plan, load_reference(), root, steps, Made())
+    return root, steps, available, read_results(plan, root, steps)
 
 
 def by_key(steps):
