@@ -15,6 +15,14 @@ Mask = npt.NDArray[np.bool_]
 """Which of them."""
 
 
+def sums_by(number: Indices, values: Vector) -> Vector:
+    """Sums of the rows of ``values`` with the same number, in the order of the numbers that there are."""
+    kinds, row = np.unique(number, return_inverse=True)
+    out = np.zeros((len(kinds), *values.shape[1:]))
+    np.add.at(out, row, values)
+    return out
+
+
 def normal_equations(J: Any, r: Any, precision: Any) -> tuple[Any, Any]:
     """``J^T J + precision`` and ``J^T r``: the equations of a maximum a posteriori estimate, after Gauss and Newton.
 

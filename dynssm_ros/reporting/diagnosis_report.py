@@ -12,7 +12,7 @@ from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBR
 from dynssm_ros.identification.result.formula import Formula
 from dynssm_ros.identification.result.improvement import Improvement
 from dynssm_ros.identification.result.residuals import ExplainedVariance
-from dynssm_ros.identification.search.selection import DECISIVE_DELTA_BIC
+from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC
 from dynssm_ros.reporting import diagnosis_figures
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.page import Prose, Report, Section

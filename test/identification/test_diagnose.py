@@ -12,6 +12,7 @@ import pytest
 from benchmarks.hidden_causes.cases import Case, record, size
 from benchmarks.hidden_causes.outcomes import judge
 from dynssm_ros.errors import ConfigurationError, RecordingError
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem import windows
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.fit import IdentificationProblem
@@ -19,7 +20,7 @@ from dynssm_ros.identification.problem.recordings import RecordingSet
 from dynssm_ros.identification.result.diagnose import _moved_together, diagnose
 from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis
 from dynssm_ros.identification.search.candidates import Responses, ScoreTest, candidates
-from dynssm_ros.identification.search.selection import DECISIVE_DELTA_BIC
+from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC
 from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report, headline
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.tracks import load_track
@@ -54,7 +55,7 @@ def test_a_hidden_cause_is_named(name: str, laps: Laps) -> None:
 @pytest.mark.parametrize("name", sorted(set(EFFECTS) - set(AT_ONCE)))
 def test_of_all_effects_the_hidden_one_explains_most(name: str, laps: Laps, monkeypatch: pytest.MonkeyPatch) -> None:
     """The score test, which a search begins with, on few windows."""
-    monkeypatch.setattr(windows, "_MAX_WINDOWS", 100)
+    monkeypatch.setattr(tuning, "MAX_WINDOWS", 100)
     recording, vehicle = hidden_drive(name, laps)
     together = RecordingSet.of([recording], 0.25, LINE)
     fitted = windows.fit_windows(recording, together.rows(), 0.52, vehicle.minimum_speed, together.held_out)

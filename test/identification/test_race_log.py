@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dynssm_ros.identification.problem import windows
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.result.calibration import calibrate
 from dynssm_ros.identification.result.diagnose import diagnose
 from dynssm_ros.identification.result.diagnosis import RECALIBRATED
@@ -21,7 +21,7 @@ LATE_OR_ELSEWHERE = {"odometry_lever_arm", "odometry_delay", "yaw_rate_lag", "st
 @pytest.fixture
 def recording(putnam: Path, monkeypatch: pytest.MonkeyPatch) -> Recording:
     # fewer simulations than those of a diagnosis proper tell the same, in less time
-    monkeypatch.setattr(windows, "_MAX_WINDOWS", 200)
+    monkeypatch.setattr(tuning, "MAX_WINDOWS", 200)
     return extract([putnam], load_signal_map("av21"), 25.0)
 
 

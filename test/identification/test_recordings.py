@@ -11,10 +11,10 @@ import pytest
 from benchmarks.hidden_causes.cases import Case, drive, vehicle_file
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.identification.problem.car import CarEstimate
-from dynssm_ros.identification.problem.fit import BLOCK
 from dynssm_ros.identification.problem.recordings import RecordingSet, driven_alike
 from dynssm_ros.identification.problem.windows import SimulationWindows, fit_windows
 from dynssm_ros.identification.result.diagnose import diagnose
+from dynssm_ros.identification.tuning import BLOCK_S
 from dynssm_ros.reporting.diagnosis_report import as_text
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
@@ -43,7 +43,7 @@ def test_each_recording_has_its_own_clock_and_they_follow_each_other(days: list[
     firsts = np.flatnonzero(np.diff(together.number, prepend=-1))
     np.testing.assert_array_equal(together.clock[firsts], 0.0)
     assert (np.diff(together.time) > 0).all()
-    np.testing.assert_allclose(together.time[firsts] % BLOCK, 0.0)
+    np.testing.assert_allclose(together.time[firsts] % BLOCK_S, 0.0)
     name, clock = together.place(float(together.time[firsts[1]]) + 12.0)
     assert name == "day 2"
     assert clock == pytest.approx(12.0, abs=ORCA.sampling_time)
@@ -128,7 +128,7 @@ def test_places_that_one_part_alone_has_are_left_out_by_stretches(duration: floa
     _, parts, places = together.left_out(starts)
     assert (places is parts) == again
     if not again:
-        block = together.time[starts] // BLOCK
+        block = together.time[starts] // BLOCK_S
         assert all(len(set(places.fold[block == k])) == 1 for k in set(block))
         assert len(set(places.fold)) == 3
 

@@ -15,8 +15,9 @@ from dynssm_ros.identification.result.diagnose import _not_confirmed
 from dynssm_ros.identification.search.candidates import Candidate, Responses, ScoredCandidate, ScoreTest
 from dynssm_ros.identification.search.confirmation import Confirmation, LeaveOneOut
 from dynssm_ros.identification.search.integrator import _with_what_hides, search_causes
-from dynssm_ros.identification.search.selection import DECISIVE_DELTA_BIC, Refined, Search, _pays
+from dynssm_ros.identification.search.selection import Refined, Search
 from dynssm_ros.identification.search.size_search import SizeSearch
+from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC
 from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
@@ -114,13 +115,13 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     fit = searching.base
     everywhere = Confirmation(np.array([3.0, 4.0, 5.0, -1.0]), 4.0, 0.0, np.zeros(3))
     strong = Refined(FEW[0], fit, 100.0, 90.0, everywhere, 5.0)
-    assert _pays(strong)
+    assert strong.pays
     once = replace(everywhere, improvement=np.array([20.0, -1.0, -2.0, -0.5]))
-    assert not _pays(replace(strong, confirmation=once))
-    assert not _pays(replace(strong, confirmation=replace(everywhere, std=12.0)))
-    assert not _pays(replace(strong, delta_bic=DECISIVE_DELTA_BIC))
-    assert not _pays(replace(strong, sure=2.9))
-    assert not _pays(replace(strong, confirmation=None))
+    assert not replace(strong, confirmation=once).pays
+    assert not replace(strong, confirmation=replace(everywhere, std=12.0)).pays
+    assert not replace(strong, delta_bic=DECISIVE_DELTA_BIC).pays
+    assert not replace(strong, sure=2.9).pays
+    assert not replace(strong, confirmation=None).pays
     centre_known = 0.02 * (ORCA.constants.l_f + ORCA.constants.l_r)
     for effect, values, pays in (
         ("grip", {"factor": 0.85}, True),
@@ -132,16 +133,16 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
         ("odometry_lever_arm", {"x": 0.9 * centre_known, "y": 0.9 * centre_known}, True),
     ):
         sized = replace(strong, candidate=Candidate(effect, tuple(values)))
-        assert _pays(replace(sized, fit=replace(fit, car=fit.car.with_effect(effect, values)))) == pays
+        assert replace(sized, fit=replace(fit, car=fit.car.with_effect(effect, values))).pays == pays
     for length, pays in ((0.5, True), (0.8, False)):
         values = {"factor": 0.8, "centre": 0.3, "length": length}
         sized = replace(strong, candidate=Candidate("grip_patch", tuple(values)))
         sized = replace(sized, fit=replace(fit, car=fit.car.with_effect("grip_patch", values)))
-        assert _pays(sized) == pays, "a patch as long as can be is everywhere"
+        assert sized.pays == pays, "a patch as long as can be is everywhere"
         assert sized.strangeness == (False, False, True, False)
     once_alone = replace(everywhere, least=2.0)
-    assert _pays(replace(strong, confirmation=once_alone))
-    assert not _pays(replace(strong, confirmation=replace(once_alone, std=6.0)))
+    assert replace(strong, confirmation=once_alone).pays
+    assert not replace(strong, confirmation=replace(once_alone, std=6.0)).pays
 
 
 def test_what_is_not_confirmed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,7 +57,7 @@ def test_simulations_in_blocks_are_those_at_once(monkeypatch: pytest.MonkeyPatch
     some, car = windows(AV21), CarEstimate.of(AV21)
     cars = [car.with_effect("steering_lag", {"time_constant": value}) for value in (0.05, 0.1)]
     at_once = some.errors_of(cars)
-    monkeypatch.setattr("dynssm_ros.identification.problem.windows._AT_ONCE", 7)
+    monkeypatch.setattr("dynssm_ros.identification.tuning.AT_ONCE", 7)
     np.testing.assert_array_equal(some.errors_of(cars), at_once)
     assert len(some) % 7
 

@@ -12,15 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.identification import tuning
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, Effect
 from dynssm_ros.vehicle.parameters import VehicleConstants
 
 Values = dict[str, float]
-
-MASS_STD = 0.01  # of the mass, where the vehicle file does not say how well it was weighed
-_LIGHTEST = 0.1  # of the nominal mass
-_ON_BOUND = 1e-3  # of the range, that a nominal value keeps from its bounds
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class CarEstimate:
     vehicle: Vehicle
     moved: Vector
     effects: Mapping[str, Values]
-    mass_std: float = MASS_STD
+    mass_std: float = tuning.MASS_STD
     only_in: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     @classmethod
@@ -47,26 +44,17 @@ class CarEstimate:
         """The car as the vehicle file has it, with the standard deviation of the mass that it states if not given."""
         if mass_std is None:
             weighed = vehicle.constants.m_std
-            mass_std = MASS_STD if weighed is None else weighed / vehicle.constants.m
+            mass_std = tuning.MASS_STD if weighed is None else weighed / vehicle.constants.m
         return cls(vehicle, np.zeros(len(COEFFICIENTS) + 1), {}, mass_std)
 
     def at(self, theta: Vector) -> CarEstimate:
         """The same car with coefficients ``theta`` ``(17,)``."""
-        known, scales, nominal = prior_std(self.vehicle), _scaling(self.vehicle), self.vehicle.nominal
-        base = np.where(scales, nominal, 1.0)
-        grown = base * np.log(np.where(scales, theta, 1.0) / base)
-        return replace(self, moved=np.append(np.where(scales, grown, theta - nominal) / known, self.moved[-1]))
+        return replace(self, moved=np.append(_moved(self.vehicle, theta), self.moved[-1]))
 
     @property
     def as_known(self) -> CarEstimate:
         """The same car with its nominal values where they were known to be."""
         return replace(self, moved=np.zeros_like(self.moved))
-
-    def in_units(self, relative: Vector) -> Vector:
-        """Standard deviations of the coefficients from those of :attr:`moved`, ``(17,)``."""
-        nominal, scales = self.vehicle.nominal, _scaling(self.vehicle)
-        grown = np.where(scales, np.array(self.theta) / np.where(scales, nominal, 1.0), 1.0)
-        return np.asarray(relative * prior_std(self.vehicle) * grown)
 
     @property
     def prior_precision(self) -> Vector:
@@ -78,15 +66,11 @@ class CarEstimate:
     @cached_property
     def limits(self) -> tuple[Vector, Vector]:
         """The least and the largest of :attr:`moved`."""
-        vehicle, known, scales = self.vehicle, prior_std(self.vehicle), _scaling(self.vehicle)
-        margin = _ON_BOUND * (vehicle.upper - vehicle.lower)
-        nominal = np.where(scales, vehicle.nominal, 1.0)
-        bounds = [
-            np.where(scales, nominal * np.log(np.where(scales, b, 1.0) / nominal), b - vehicle.nominal) / known
-            for b in (vehicle.lower + margin, vehicle.upper - margin)
-        ]
-        mass = np.log([_LIGHTEST, 1.0 / _LIGHTEST]) / self.mass_std if self.mass_std else np.array([-1.0, 1.0])
-        return np.append(bounds[0], mass[0]), np.append(bounds[1], mass[1])
+        vehicle = self.vehicle
+        margin = tuning.INSIDE_BOUNDS * (vehicle.upper - vehicle.lower)
+        lower, upper = (_moved(vehicle, bound) for bound in (vehicle.lower + margin, vehicle.upper - margin))
+        mass = np.log([1 / tuning.MASS_RANGE, tuning.MASS_RANGE]) / self.mass_std if self.mass_std else (-1.0, 1.0)
+        return np.append(lower, mass[0]), np.append(upper, mass[1])
 
     @cached_property
     def theta(self) -> Coefficients:
@@ -116,13 +100,13 @@ class CarEstimate:
             values: of its parameters.
             only_in: recordings in which it acts; empty: in all; ``None``: as before.
         """
-        changed = replace(self, effects={**self.effects, name: dict(values)})
-        return changed if only_in is None else replace(changed, only_in=_changed(self.only_in, name, only_in))
+        where = self.only_in if only_in is None else {k: v for k, v in {**self.only_in, name: only_in}.items() if v}
+        return replace(self, effects={**self.effects, name: dict(values)}, only_in=where)
 
     def without(self, name: str) -> CarEstimate:
         """The same car without an effect."""
-        others = {key: values for key, values in self.effects.items() if key != name}
-        return replace(self, effects=others, only_in=_changed(self.only_in, name, ()))
+        effects = {key: values for key, values in self.effects.items() if key != name}
+        return replace(self, effects=effects, only_in={k: v for k, v in self.only_in.items() if k != name})
 
     def known(self, covariance: Vector) -> Vehicle:
         """The vehicle with refitted nominal values and what is now known of them, never less than before.
@@ -130,10 +114,12 @@ class CarEstimate:
         Args:
             covariance: of :attr:`moved`, at least its first 17 rows and columns.
         """
-        n = len(COEFFICIENTS)
+        n, nominal, scales = len(COEFFICIENTS), self.vehicle.nominal, _scaling(self.vehicle)
         relative = np.sqrt(np.diag(covariance)[:n])
         correlation = covariance[:n, :n] / np.outer(relative, relative)
-        return self.vehicle.with_nominal(np.array(self.theta), self.in_units(np.minimum(relative, 1.0)), correlation)
+        grown = np.where(scales, np.array(self.theta) / np.where(scales, nominal, 1.0), 1.0)
+        std = np.minimum(relative, 1.0) * prior_std(self.vehicle) * grown
+        return self.vehicle.with_nominal(np.array(self.theta), std, correlation)
 
     def extended(self, covariance: Vector, recording: int | None = None) -> Vehicle:
         """The vehicle to write: as :meth:`known`, with mass and effects.
@@ -152,10 +138,7 @@ class CarEstimate:
 
 
 class CarBatch(NamedTuple):
-    """``P`` cars as one, whose values are arrays of shape ``(P, 1)`` that broadcast against ``W`` simulations.
-
-    What is the same in all of them stays a number.
-    """
+    """``P`` cars as one: values are shape ``(P, 1)``, which broadcasts against ``W`` simulations, or equal numbers."""
 
     theta: Coefficients
     constants: Any
@@ -184,14 +167,6 @@ class CarBatch(NamedTuple):
         return cls(theta, constants, (*first.vehicle.active_effects, *own))
 
 
-def _changed(
-    only_in: Mapping[str, tuple[int, ...]], name: str, recordings: tuple[int, ...]
-) -> dict[str, tuple[int, ...]]:
-    """Where effects act, with one of them in other recordings; none: in all."""
-    others = {key: where for key, where in only_in.items() if key != name}
-    return others | {name: recordings} if recordings else others
-
-
 def _together(values: Sequence[float]) -> Any:
     """The number that all are, or a column of them."""
     column = np.array(values)
@@ -201,6 +176,14 @@ def _together(values: Sequence[float]) -> Any:
 def _scaling(vehicle: Vehicle) -> npt.NDArray[np.bool_]:
     """The coefficients that move as logarithms, so that an effect that multiplies can make up for them exactly."""
     return np.asarray((vehicle.lower >= 0) & (vehicle.nominal > 0))
+
+
+def _moved(vehicle: Vehicle, values: Vector) -> Vector:
+    """How far coefficients ``(17,)`` are off nominal, in standard deviations of what is known before."""
+    scales, nominal = _scaling(vehicle), vehicle.nominal
+    base = np.where(scales, nominal, 1.0)
+    grown = base * np.log(np.where(scales, values, 1.0) / base)
+    return np.asarray(np.where(scales, grown, values - nominal) / prior_std(vehicle))
 
 
 def prior_std(vehicle: Vehicle) -> Vector:

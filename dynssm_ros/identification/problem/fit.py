@@ -10,7 +10,8 @@ from typing import TypeVar
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from dynssm_ros.arrays import Indices, Mask, Vector, normal_equations
+from dynssm_ros.arrays import Indices, Mask, Vector, normal_equations, sums_by
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.noise import Noise, NoiseResponse, fit_noise, weights
 from dynssm_ros.identification.problem.windows import SimulationWindows
@@ -19,25 +20,13 @@ from dynssm_ros.vehicle.effects import EFFECTS
 Free = tuple[tuple[str, str], ...]
 """Effect and parameter of each value that is fitted beside the nominal ones."""
 
-BLOCK = 3.0  # s; errors farther apart count as independent
-_SPEEDS, _STEERINGS = 3, 4  # bins
-_UNIT = 0.1  # of the way from neutral to the upper bound: in this unit effects are fitted
-_FREE = 10.0  # of these units an effect's parameter may be, as one standard deviation
-_ROUNDS = 30
-_NOMINAL_STEP, _EFFECT_STEP = 1e-3, 0.02  # of the derivatives: standard deviations known before, units of an effect
-_KEPT_PROMISE = 0.5  # of what a quadratic promises: derivatives that keep less are too old
-_LARGEST_NOISE_SHARE, _LEAST = 1e-2, 1e-12  # of the variance of a channel: more than any noise, and less
-_DAMPING = (0.0, 0.03, 0.3, 3.0, 30.0)
 _ROUNDING = 1e-12  # of second derivatives, that keeps them positive where nothing was excited
-_CONVERGED = 0.3  # of the squared error
-_CLEARLY = 20.0  # difference of twice the log-likelihood for which another option is taken than the first
-
 Option = TypeVar("Option")
 
 
 def unit(effect: str, parameter: str) -> float:
     """The unit in which a parameter is fitted."""
-    return _UNIT * EFFECTS[effect].PARAMETERS[parameter].span
+    return tuning.EFFECT_UNIT * EFFECTS[effect].PARAMETERS[parameter].span
 
 
 def _in_units(effect: str, parameter: str, value: float) -> float:
@@ -90,7 +79,7 @@ def closest(fits: Mapping[Option, Fit]) -> Option:
     """What is closest to the data; not the first option only if that is clear."""
     first = next(iter(fits))
     best = min(fits, key=lambda one: fits[one].objective)
-    return best if fits[best].objective < fits[first].objective - _CLEARLY else first
+    return best if fits[best].objective < fits[first].objective - tuning.CLEARLY_CLOSER else first
 
 
 def position(car: CarEstimate, free: Free) -> Vector:
@@ -117,7 +106,7 @@ def with_values(car: CarEstimate, free: Free, p: Vector) -> CarEstimate:
 
 
 class IdentificationProblem:
-    """SimulationWindows with their noise, and fits to them.
+    """Simulations with their noise, and fits to them.
 
     Args:
         windows: the simulations that are compared with the measurement.
@@ -130,8 +119,6 @@ class IdentificationProblem:
         self.windows = windows
         speed = windows.target[:, :, 0].mean(axis=1)
         self.spread = NoiseResponse.of(windows.transitions(car), speed)
-        block = (windows.time // BLOCK).astype(np.intp)
-        self.block: Indices = np.unique(block, return_inverse=True)[1]
         self._regime = _regimes(windows)
         self._channels = np.tile(windows.spread**2, 3)
         self._known = car.prior_precision
@@ -147,8 +134,11 @@ class IdentificationProblem:
 
         Where the data counted for more, nominal values may lie in a valley that is no longer the deepest.
         """
-        anew = self.fit(fit.car.as_known, fit.free)
-        return min(self.fit(fit.car, fit.free, fit), anew, key=lambda each: each.objective)
+        return min(self.again(fit), self.fit(fit.car.as_known, fit.free), key=lambda each: each.objective)
+
+    def again(self, fit: Fit) -> Fit:
+        """The same values, fitted to the end from where they are."""
+        return self.fit(fit.car, fit.free, fit)
 
     def errors(self, car: CarEstimate, context: dict[str, float] | None = None) -> Vector:
         """Errors of a car, shape ``(W, 3 K)``."""
@@ -160,7 +150,8 @@ class IdentificationProblem:
 
     def noise(self, errors: Vector) -> Noise:
         """The noise under which ``errors`` are most likely, whatever it was taken for before."""
-        return fit_noise(self.spread, errors, _LARGEST_NOISE_SHARE * self._channels, _LEAST * self._channels)
+        least, largest = tuning.NOISE_SHARES
+        return fit_noise(self.spread, errors, largest * self._channels, least * self._channels)
 
     def columns(self, car: CarEstimate, errors: Vector, free: Free, first: int = 0) -> Vector:
         """Derivatives of ``errors`` by the 18 nominal values and by ``free``, from the ``first`` on.
@@ -171,7 +162,7 @@ class IdentificationProblem:
         upper = limits(car, free)[1]
         cars, done = [], np.empty(len(at) - first)
         for k in range(first, len(at)):
-            step = _NOMINAL_STEP if k < n else _EFFECT_STEP
+            step = tuning.NOMINAL_STEP if k < n else tuning.EFFECT_STEP
             moved = at.copy()
             moved[k] += step if at[k] + step <= upper[k] else -step
             done[k - first] = moved[k] - at[k]
@@ -188,13 +179,13 @@ class IdentificationProblem:
     def log_likelihood(errors: Vector, noise: Noise) -> Vector:
         """Of each window, ``(W,)``, but for a constant; windows that are far out count less and less."""
         white = noise.whiten(errors)
-        size, limit = (white**2).sum(axis=1), 4.0 * white.shape[1]
+        size, limit = (white**2).sum(axis=1), tuning.OUTLIER_FACTOR * white.shape[1]
         far = np.maximum(size / limit, 1.0)
         return np.asarray(-0.5 * (np.minimum(size, limit) + limit * np.log(far) + noise.log_dets))
 
     def prior_precision(self, p: Vector) -> Vector:
         """Inverse covariance of what is known of the values ``(P,)`` beforehand, ``(P, P)``."""
-        known = np.diag(np.full(len(p), _FREE**-2))
+        known = np.diag(np.full(len(p), tuning.EFFECT_STD**-2))
         known[: len(self._known), : len(self._known)] = self._known
         return known
 
@@ -208,7 +199,7 @@ class IdentificationProblem:
         free: Free,
         near: Fit | None = None,
         *,
-        rounds: int = _ROUNDS,
+        rounds: int = tuning.MAX_ROUNDS,
         rough: bool = False,
         noise: Noise | None = None,
     ) -> Fit:
@@ -241,7 +232,7 @@ class IdentificationProblem:
                 jacobian, stale = self.columns(car, errors, free), False
             H, g = self._normal(errors, jacobian, p, noise)
             before, promised, gained = best, 0.0, 0.0
-            for damping in _DAMPING:
+            for damping in tuning.DAMPING:
                 step = _step(H + damping * np.diag(np.diag(H)), g, lower - p, upper - p)
                 other = with_values(car, free, p + step)
                 there = self.errors(other)
@@ -250,14 +241,14 @@ class IdentificationProblem:
                     promised = -float(2 * g @ step + step @ H @ step)
                     gained = best - value
                     car, errors, p = other, there, position(other, free)
-                    if gained > _CONVERGED and not given:
+                    if gained > tuning.CONVERGED and not given:
                         noise = self.noise(errors)
                     best = self.objective(errors, p, noise)
                     break
-            settled = before - best < _CONVERGED
+            settled = before - best < tuning.CONVERGED
             if settled and (rough or not stale):
                 break
-            if stale and (settled or gained < _KEPT_PROMISE * promised):
+            if stale and (settled or gained < tuning.KEPT_PROMISE * promised):
                 nominal = None
             elif not stale:
                 nominal = jacobian[..., :n]
@@ -268,10 +259,9 @@ class IdentificationProblem:
 
         So what is found does not hang on a calibration that was made on the same laps before.
         """
-        starts = {"known": car.as_known, "given": car}
-        if not car.moved.any():
-            del starts["given"]
-        fits = {name: self.fit(start, ()) for name, start in starts.items()}
+        fits = {"known": self.fit(car.as_known, ())}
+        if car.moved.any():
+            fits["given"] = self.fit(car, ())
         return fits[closest(fits)]
 
     def select(self, chosen: Indices | Mask) -> IdentificationProblem:
@@ -279,7 +269,6 @@ class IdentificationProblem:
         other = copy(self)
         other.windows = self.windows.select(chosen)
         other.spread = NoiseResponse(self.spread.group[chosen], self.spread.G)
-        other.block = np.unique(self.block[chosen], return_inverse=True)[1]
         other._regime = self._regime[chosen]
         return other
 
@@ -335,7 +324,7 @@ class IdentificationProblem:
 
     def information(self, fit: Fit) -> Vector:
         """What the data alone say of the fitted values, ``(P, P)``: the inverse of their covariance."""
-        return self._scores(fit, self.block)[0]
+        return self._scores(fit, self.windows.block)[0]
 
     def inflation(self, fit: Fit, last: int = 0) -> float:
         """How many times larger the variance of the scores is than independent errors would make it, at least 1.
@@ -343,7 +332,7 @@ class IdentificationProblem:
         The larger one of the mean over all that the data tell of and, with ``last``, what is sure of that of the last
         values, with what the others can take up projected out.
         """
-        information, meat = self._scores(fit, self.block)
+        information, meat = self._scores(fit, self.windows.block)
         values, vectors = np.linalg.eigh(information)
         told = values > 1.0
         ratio = np.einsum("pi,pq,qi->i", vectors[:, told], meat, vectors[:, told]) / values[told]
@@ -354,7 +343,7 @@ class IdentificationProblem:
             taken = np.linalg.solve((information + known)[:n, :n], information[:n, n:])
             left = np.concatenate([-taken, np.eye(last)])
             own = np.linalg.solve(left.T @ information @ left + 1e-9 * np.eye(last), left.T @ meat @ left)
-            chance = 1.0 + 2.0 * np.sqrt(2.0 / (self.block.max() + 1))
+            chance = 1.0 + 2.0 * np.sqrt(2.0 / (self.windows.block.max() + 1))
             inflation = max(inflation, float(np.trace(own)) / last / chance)
         return max(1.0, inflation)
 
@@ -366,20 +355,19 @@ class IdentificationProblem:
         scores = np.einsum("wnp,wn->wp", J, white * root[:, None])
         flat = J.reshape(-1, J.shape[2])
         information = flat.T @ flat
-        sums = np.zeros((cluster.max() + 1, len(information)))
-        np.add.at(sums, cluster, scores)
+        sums = sums_by(cluster, scores)
         sums -= sums.mean(axis=0)
         return information, sums.T @ sums * len(sums) / max(1, len(sums) - 1)
 
 
 def _regimes(windows: SimulationWindows) -> Indices:
     """Number of the speed and steering with which each window is driven, ``(W,)``: bins with as many windows each."""
-    rows = windows.data.rows[:, windows.starts[:, None] + np.arange(windows.steps)].mean(axis=2)
+    rows, (speeds, steerings) = windows.driven, tuning.REGIME_BINS
     speed, steering = (
         np.searchsorted(np.quantile(value, np.linspace(0.0, 1.0, bins + 1)[1:-1]), value)
-        for value, bins in ((rows[0], _SPEEDS), (rows[4] + rows[6], _STEERINGS))
+        for value, bins in ((rows[0], speeds), (rows[4] + rows[6], steerings))
     )
-    return np.unique(speed * _STEERINGS + steering, return_inverse=True)[1]
+    return np.unique(speed * steerings + steering, return_inverse=True)[1]
 
 
 def _step(H: Vector, g: Vector, lower: Vector, upper: Vector) -> Vector:

@@ -16,17 +16,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.identification import tuning
 from dynssm_ros.signals.recording import Recording
 
 Group = tuple[int, ...]
 """Numbers of recordings; none: all."""
 Level = Literal["car", "road", "session", "recording", "suspects"]
-
-_PAUSE_H = 8.0  # between recordings of one session, at most
-_BESIDE = 0.05  # of the extent of a path, within which another one is beside it
-_ALIGNED = 0.8  # cosine between directions of travel there
-_COVERED = 0.9  # of the points of both paths
-_POINTS = 2000  # of a path that are looked at
 
 
 @dataclass(frozen=True)
@@ -86,9 +81,8 @@ def _clusters(recordings: Sequence[Recording], together: Callable[[Recording, Re
 
 
 def _of_one_session(one: Recording, other: Recording) -> bool:
-    """Whether hardly any time lies between two recordings."""
     apart = max(int(one.time[0]) - int(other.time[-1]), int(other.time[0]) - int(one.time[-1]))
-    return bool(apart < _PAUSE_H * 3600e9)
+    return bool(apart < tuning.SESSION_PAUSE_H * 3600e9)
 
 
 def _of_one_road(one: Recording, other: Recording) -> bool:
@@ -96,23 +90,20 @@ def _of_one_road(one: Recording, other: Recording) -> bool:
     if not (one.has_pose and other.has_pose):
         return True
     path, another = _path(one), _path(other)
-    return min(_covered(path, another), _covered(another, path)) >= _COVERED
+    return min(_covered(path, another), _covered(another, path)) >= tuning.NEARLY_ALL
 
 
 def _path(recording: Recording) -> tuple[Vector, Vector]:
     """Some positions (m) and headings as unit vectors, each ``(n, 2)``."""
-    some = slice(None, None, max(1, len(recording) // _POINTS))
-    theta = recording["theta"][some]
-    return np.stack([recording["x"][some], recording["y"][some]], axis=1), np.stack(
-        [np.cos(theta), np.sin(theta)], axis=1
-    )
+    x, y, theta = (recording[name][:: max(1, len(recording) // tuning.PATH_POINTS)] for name in ("x", "y", "theta"))
+    return np.stack([x, y], axis=1), np.stack([np.cos(theta), np.sin(theta)], axis=1)
 
 
 def _covered(path: tuple[Vector, Vector], by: tuple[Vector, Vector]) -> float:
     """Share of the points of a path that another one passes, in the same direction."""
     (positions, along), (others, along_others) = path, by
-    reach = _BESIDE * float(np.hypot(*np.ptp(positions, axis=0)))
+    reach = tuning.BESIDE * float(np.hypot(*np.ptp(positions, axis=0)))
     near = cKDTree(others).query_ball_point(positions, reach)
     beside = (along_others[np.asarray(k, dtype=np.intp)] for k in near)
-    passed = [np.max(each @ own, initial=-1.0) > _ALIGNED for each, own in zip(beside, along, strict=True)]
+    passed = [np.max(each @ own, initial=-1.0) > tuning.ALIGNED for each, own in zip(beside, along, strict=True)]
     return float(np.mean(passed))

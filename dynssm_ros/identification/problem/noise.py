@@ -4,7 +4,7 @@ An error after ``k`` steps is what the error of the start has become by then, mi
 the disturbances in between. With variances ``P`` of the start, ``R`` of the measurement and ``Q`` of a disturbance per
 step, the ``3 K`` errors of a window have the covariance ``G diag(P, Q, ..., Q) G' + I R``, where ``G`` follows from the
 derivatives of the steps. Errors that are divided by its root are independent of unit variance, so that sums of squares
-are likelihoods. SimulationWindows of like speed share their ``G``.
+are likelihoods. Windows of like speed share their ``G``.
 """
 
 from __future__ import annotations
@@ -15,20 +15,9 @@ from functools import cached_property
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.identification import tuning
 
-_VARIANCES = 9
-_GROUPS = 10
-_RANGE = 30.0  # of the logarithm of a variance above its floor
 _ROUNDING = 1e-10  # of each variance, that keeps covariances positive
-_ROUNDS = 40
-_HALVINGS = 8
-_STRIDE = 3.0  # of the logarithm of a variance in one round, at most
-_FLAT = 1e-3  # curvature added where a variance that vanishes has none
-_SETTLED = 1e-2  # of twice the logarithm of the likelihood, that another round promises
-_REWEIGHTED = 8  # times at most, that far errors are weighed anew
-_OUTLIER_FACTOR = (
-    4.0  # a window whose squared error exceeds the expected one by this factor counts only as much as that
-)
 
 
 @dataclass(frozen=True)
@@ -46,7 +35,7 @@ class NoiseResponse:
     @classmethod
     def of(cls, transitions: Vector, speed: Vector) -> NoiseResponse:
         """Groups windows by speed (m/s), shape ``(W,)``, and follows noise along ``transitions`` ``(W, K, 3, 3)``."""
-        count = int(np.clip(len(speed) // 6, 1, _GROUPS))
+        count = int(np.clip(len(speed) // tuning.GROUP_WINDOWS, 1, tuning.SPEED_GROUPS))
         edges = np.quantile(speed, np.linspace(0, 1, count + 1)[1:-1])
         group = np.searchsorted(edges, speed)
         steps = transitions.shape[1]
@@ -98,7 +87,7 @@ class Noise:
 def weights(white: Vector) -> Vector:
     """Weight of each window, 1 unless its whitened errors ``(W, 3 K)`` are far out."""
     size = (white**2).sum(axis=1)
-    return np.asarray(np.minimum(1.0, _OUTLIER_FACTOR * white.shape[1] / np.maximum(size, 1e-300)))
+    return np.asarray(np.minimum(1.0, tuning.OUTLIER_FACTOR * white.shape[1] / np.maximum(size, 1e-300)))
 
 
 def fit_noise(spread: NoiseResponse, errors: Vector, start: Vector, floor: Vector) -> Noise:
@@ -112,10 +101,10 @@ def fit_noise(spread: NoiseResponse, errors: Vector, start: Vector, floor: Vecto
         floor: the least that they may be, shape ``(9,)``.
     """
     noise = Noise(spread, np.maximum(start, floor))
-    for _ in range(_REWEIGHTED):
+    for _ in range(tuning.MAX_TRIES):
         weight = weights(noise.whiten(errors))
         before, noise = noise, Noise(spread, _most_likely(spread, errors * np.sqrt(weight)[:, None], noise.v, floor))
-        if abs(noise.log_dets.sum() - before.log_dets.sum()) < _SETTLED:
+        if abs(noise.log_dets.sum() - before.log_dets.sum()) < tuning.NOISE_CONVERGED:
             break
     return noise
 
@@ -131,12 +120,12 @@ def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Ve
     moment = np.stack([errors[spread.group == m].T @ errors[spread.group == m] for m in groups])
     # which variance each column of W has, as an indicator (columns, 9)
     rows, channel = G.shape[1], np.eye(3)
-    of_column = np.zeros((rows + G.shape[2], _VARIANCES))
+    of_column = np.zeros((rows + G.shape[2], 9))
     of_column[:rows, 0:3] = np.tile(channel, (rows // 3, 1))
     of_column[rows : rows + 3, 6:9] = channel
     of_column[rows + 3 :, 3:6] = np.tile(channel, (rows // 3, 1))
     low = np.log(floor)
-    high = low + _RANGE
+    high = low + tuning.NOISE_RANGE
 
     def likelihood(log_v: Vector) -> tuple[float, Vector]:
         """Twice the negative logarithm of the likelihood, and the covariances' inverses."""
@@ -148,8 +137,8 @@ def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Ve
 
     log_v = np.clip(np.log(start), low, high)
     value, inverse = likelihood(log_v)
-    for _ in range(_ROUNDS):
-        slope, curvature = np.zeros(_VARIANCES), np.zeros((_VARIANCES, _VARIANCES))
+    for _ in range(tuning.MAX_ROUNDS):
+        slope, curvature = np.zeros(9), np.zeros((9, 9))
         for m in groups:
             across = inverse[m] @ G[m]
             weighed = np.concatenate([inverse[m], across], axis=1)  # C^-1 W
@@ -160,12 +149,13 @@ def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Ve
         v = np.exp(log_v)
         slope, curvature = v * slope, np.outer(v, v) * curvature
         free = ~((log_v <= low) & (slope > 0) | (log_v >= high) & (slope < 0))
-        step = np.zeros(_VARIANCES)
-        step[free] = -np.linalg.solve(curvature[np.ix_(free, free)] + _FLAT * np.eye(free.sum()), slope[free])
-        step = np.clip(step, -_STRIDE, _STRIDE)
-        if -slope @ step < _SETTLED:
+        step = np.zeros(9)
+        flat = 1e-3 * np.eye(free.sum())  # where a variance that vanishes has no curvature
+        step[free] = -np.linalg.solve(curvature[np.ix_(free, free)] + flat, slope[free])
+        step = np.clip(step, -tuning.NOISE_STRIDE, tuning.NOISE_STRIDE)
+        if -slope @ step < tuning.NOISE_CONVERGED:
             break
-        for _ in range(_HALVINGS):
+        for _ in range(tuning.MAX_TRIES):
             there = np.clip(log_v + step, low, high)
             new, inverse_there = likelihood(there)
             if new < value:

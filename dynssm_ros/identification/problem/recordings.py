@@ -11,20 +11,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dynssm_ros.arrays import Indices, Mask, Vector
-from dynssm_ros.identification.problem.fit import BLOCK
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.levels import Group, Levels
 from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows, rows_per_sample
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number, track_position
 from dynssm_ros.track.lines import ClosedLine
-
-LEAST_LAPS = 3  # with which whole laps are held out, and left out in turn
-_LEAST_RECORDINGS = 3  # with which whole recordings are left out in turn
-_QUARTERS = 4  # parts of a recording that are left out in turn where there are no laps
-_PLACES = 32  # of a lap, of which is told in which parts of the drive they are
-_NEARLY_ALL = 0.9  # of the simulations, whose place another part has as well
-_LIKE = 0.5  # spreads of speed, steering and throttle within which two simulations are driven alike
-_MOST_PARTS = 8  # of a single recording, so that many short laps do not take long
 
 
 class Folds(NamedTuple):
@@ -46,7 +38,7 @@ class CrossValidation(NamedTuple):
         recordings: whole recordings; with fewer than three of them their parts.
         parts: laps, or quarters of the time where there are fewer than three.
         places: the same; where the laps are so few that one part alone has most places, every fourth stretch of
-            :data:`BLOCK`, so that what acts at a place is predicted by what was driven there before and after.
+            3 s, so that what acts at a place is predicted by what was driven there before and after.
     """
 
     recordings: Folds
@@ -115,9 +107,9 @@ class RecordingSet:
 
     @cached_property
     def time(self) -> Vector:
-        """Time of each row (s), ``(N,)``: each recording follows the one before, at a multiple of :data:`BLOCK`."""
+        """Time of each row (s), ``(N,)``: each recording follows the one before, at a multiple of 3 s."""
         longest = [self.clock[self.number == k].max() for k in range(len(self.names))]
-        begins = np.cumsum([0.0, *(BLOCK * (np.floor(t / BLOCK) + 1.0) for t in longest[:-1])])
+        begins = np.cumsum([0.0, *(tuning.BLOCK_S * (np.floor(t / tuning.BLOCK_S) + 1.0) for t in longest[:-1])])
         return np.asarray(begins[self.number] + self.clock)
 
     @property
@@ -145,21 +137,24 @@ class RecordingSet:
 
     def left_out(self, starts: Indices) -> CrossValidation:
         """How simulations from the rows ``starts`` are left out: recordings in turn, and parts of each of them in turn."""
-        whose, several = self.number[starts], len(self.names) > 1
+        whose, most = self.number[starts], tuning.QUARTERS if len(self.names) > 1 else tuning.MAX_PARTS
         part = np.empty(len(starts), dtype=np.intp)
         for k in np.unique(whose):
             own = starts[whose == k]
             lap = lap_number(self._part(k), self.lines[k])
             passed = None if lap is None else lap[own - int(np.argmax(self.number == k))]
-            if passed is not None and np.ptp(passed) + 1 >= LEAST_LAPS:
-                part[whose == k] = _grouped(passed, _QUARTERS if several else _MOST_PARTS)
+            if passed is not None and np.ptp(passed) + 1 >= tuning.LEAST_PARTS:
+                laps, order = np.unique(passed, return_inverse=True)
+                part[whose == k] = order * min(most, len(laps)) // len(laps)
             else:
                 t = self.clock[own] - self.clock[own[0]]
-                part[whose == k] = np.floor(_QUARTERS * t / (np.ptp(t) + 1e-9))
+                part[whose == k] = np.floor(tuning.QUARTERS * t / (np.ptp(t) + 1e-9))
         parts = Folds(*(np.unique(n, return_inverse=True)[1] for n in (part, whose * (part.max() + 1) + part)))
-        again = not self.has_places or self._passed_again(starts, parts)
-        places = parts if again else self._stretches(starts)
-        if len(np.unique(whose)) < _LEAST_RECORDINGS:
+        places = parts
+        if self.has_places and not self._passed_again(starts, parts):
+            stretch = (self.time[starts] // tuning.BLOCK_S).astype(np.intp) % tuning.QUARTERS
+            places = Folds(*2 * (np.unique(stretch, return_inverse=True)[1],))
+        if len(np.unique(whose)) < tuning.LEAST_PARTS:
             return CrossValidation(parts, parts, places)
         number = np.unique(whose, return_inverse=True)[1]
         return CrossValidation(Folds(number, number), parts, places)
@@ -170,16 +165,10 @@ class RecordingSet:
         for k, line in enumerate(self.lines):
             if line is not None:
                 s = track_position(line, self._part(k, starts))
-                on_lap = np.floor(_PLACES * s / line.length).astype(np.intp) % _PLACES
-                place[whose == k] = _PLACES * self.levels.road[k] + on_lap
-        there = np.zeros((_PLACES * (1 + max(self.levels.road)), int(parts.fold.max()) + 1), dtype=bool)
-        there[place, parts.fold] = True
-        return bool(np.mean(there.sum(axis=1)[place] > 1) >= _NEARLY_ALL)
-
-    def _stretches(self, starts: Indices) -> Folds:
-        """Stretches of :data:`BLOCK` one after the other, of which every fourth is left out together."""
-        fold = np.unique((self.time[starts] // BLOCK).astype(np.intp) % _QUARTERS, return_inverse=True)[1]
-        return Folds(fold, fold)
+                on_lap = np.floor(tuning.LAP_BINS * s / line.length).astype(np.intp) % tuning.LAP_BINS
+                place[whose == k] = tuning.LAP_BINS * self.levels.road[k] + on_lap
+        there = np.unique(np.stack([place, parts.fold]), axis=1)[0]  # each place once for each part that has it
+        return bool(np.mean(np.bincount(there)[place] > 1) >= tuning.NEARLY_ALL)
 
 
 def driven_alike(windows: SimulationWindows, recordings: Collection[int]) -> float:
@@ -187,11 +176,11 @@ def driven_alike(windows: SimulationWindows, recordings: Collection[int]) -> flo
 
     What only one recording has can be told from what its driving shows only where others were driven alike.
     """
-    rows = windows.data.rows[:, windows.starts[:, None] + np.arange(windows.steps)].mean(axis=2)
+    rows = windows.driven
     driven = np.stack([rows[0], rows[3] + rows[5], rows[4] + rows[6]], axis=1)
     driven /= np.maximum(driven.std(axis=0), 1e-9)
     own = np.isin(windows.number, list(recordings))
-    return float(np.mean(cKDTree(driven[~own]).query(driven[own])[0] < _LIKE))
+    return float(np.mean(cKDTree(driven[~own]).query(driven[own])[0] < tuning.LIKE_SPREADS))
 
 
 def _first_laps(
@@ -203,13 +192,6 @@ def _first_laps(
         if laps.get(number) is None:
             laps[number] = first_lap(one.select(np.arange(len(one)) < cut))
     return tuple(laps[number] for number in road)
-
-
-def _grouped(lap: Vector, most: int) -> Indices:
-    """Numbers of at most ``most`` groups of laps that follow each other."""
-    order = np.unique(lap, return_inverse=True)[1]
-    count = int(order.max()) + 1
-    return np.asarray(order * min(most, count) // count)
 
 
 def _names(recordings: Sequence[Recording]) -> tuple[str, ...]:
@@ -227,16 +209,13 @@ def _in_words(splits: Sequence[str]) -> str:
 
 def _cut(recording: Recording, holdout: float) -> tuple[int, str]:
     """First held-out row, and in words."""
-    N = len(recording)
-    line = first_lap(recording)
-    lap = lap_number(recording, line)
+    N, lap = len(recording), lap_number(recording, first_lap(recording))
     if lap is not None:
         # laps are counted from the first row's place, so that the last full ones are held out
         total = int(lap[-1] - lap[0])
         held = max(1, round(holdout * total))
-        if total >= LEAST_LAPS:
-            cut = int(np.argmax(lap >= lap[-1] - held))
-            if 0 < cut < N:
-                return cut, f"the last {held} of {total} laps and what follows"
+        cut = int(np.argmax(lap >= lap[-1] - held))
+        if total >= tuning.LEAST_PARTS and 0 < cut < N:
+            return cut, f"the last {held} of {total} laps and what follows"
     cut = N - max(1, round(holdout * N))
-    return cut, f"the last {100 * holdout:.0f} % as one block (fewer than {LEAST_LAPS} laps)"
+    return cut, f"the last {100 * holdout:.0f} % as one block (fewer than {tuning.LEAST_PARTS} laps)"

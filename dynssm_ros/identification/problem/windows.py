@@ -13,6 +13,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.errors import RecordingError
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarBatch, CarEstimate
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
@@ -20,17 +21,6 @@ from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.integrators import Integrator
 from dynssm_ros.vehicle.single_track import settling_rate
-
-_LONGEST = 1.5  # integration step, times the rate at which the linear car settles
-_FINEST = 16  # integration steps per sampling time, at most
-WARM_UP = 0.64  # s of measured rows along which a simulation is led before it runs free
-_FOLLOWING = 0.16  # s, time constant with which a simulation that is led follows the measured rows
-_COMPARED = 13  # rows of each simulation, at most: more hang together
-_MAX_WINDOWS = 300  # windows in a fit, evenly spread: more would cost time and tell little
-_MEASURED = 3000  # windows in held-out rows
-_LEAST = 24  # windows with which a fit can begin
-_AT_ONCE = 16384  # simulations that are stepped together
-_WILD = 1e3  # a prediction farther off than this many spreads of its channel counts as that far
 
 
 @dataclass(frozen=True)
@@ -113,18 +103,15 @@ class SimulationWindows:
 
     def blocks(self) -> list[slice]:
         """All of them, so many at a time as are stepped together."""
-        return [slice(first, first + _AT_ONCE) for first in range(0, len(self), _AT_ONCE)]
+        return [slice(first, first + tuning.AT_ONCE) for first in range(0, len(self), tuning.AT_ONCE)]
 
     def with_integrator(self, integrator: Integrator, vehicle: Vehicle) -> SimulationWindows:
-        """The same simulations in Euler steps of the sampling time, or in Runge-Kutta steps that are short enough.
-
-        A step is at most 1.5 times the inverse of the rate at which the linear car settles; see :func:`settling_rate`.
-        """
+        """The same in Euler steps of the sampling time, or in Runge-Kutta steps that are short for :func:`settling_rate`."""
         if integrator == "euler":
             return replace(self, integrator=integrator, substeps=1)
         slow = max(float(np.quantile(self.data.rows[0, self.starts], 0.05)), 0.1)
         rate = settling_rate(Coefficients(*vehicle.nominal), vehicle.constants) / slow
-        count = int(np.clip(np.ceil(self.data.T_s * rate / _LONGEST), 1, _FINEST))
+        count = int(np.clip(np.ceil(self.data.T_s * rate / tuning.STEP_LIMIT), 1, tuning.MAX_SUBSTEPS))
         return replace(self, integrator=integrator, substeps=count)
 
     def stepped_as(self, other: SimulationWindows) -> SimulationWindows:
@@ -137,10 +124,20 @@ class SimulationWindows:
         at = self.starts[:, None] + np.arange(self.every, self.steps + 1, self.every)
         return np.moveaxis(self.data.rows[:3, at], 0, -1)
 
+    @property
+    def driven(self) -> Vector:
+        """Mean of each model input along each simulation, shape ``(7, W)``."""
+        return np.asarray(self.data.rows[:, self.starts[:, None] + np.arange(self.steps)].mean(axis=2))
+
     @cached_property
     def time(self) -> Vector:
         """Time of each start (s), shape ``(W,)``."""
         return self.data.time[self.starts]
+
+    @cached_property
+    def block(self) -> Indices:
+        """Number of the stretch of 3 s in which each starts, ``(W,)``: errors of different ones count as independent."""
+        return np.unique((self.time // tuning.BLOCK_S).astype(np.intp), return_inverse=True)[1]
 
     @property
     def number(self) -> Indices:
@@ -165,26 +162,25 @@ class SimulationWindows:
         out = np.empty((len(cars), len(self), self.steps // self.every, 3))
         for block in self.blocks():
             self.select(block)._simulate(cars, context, out[:, block])
-        limit = _WILD * self.spread
+        limit = tuning.WILD * self.spread
         out -= self.target
         return np.asarray(np.clip(np.nan_to_num(out, copy=False, nan=1e9, posinf=1e9, neginf=-1e9), -limit, limit))
 
     def _simulate(self, cars: Sequence[CarEstimate], context: dict[str, float] | None, out: Vector) -> None:
-        """Writes the predicted states of ``P`` cars to ``out``, shape ``(P, W, K, 3)``."""
         fleet = CarBatch.of(cars, self.number)
         car = self._bound(fleet)
         shift = -self.warm if car.effect_states or self.filtered else 0
-        taken = 1.0 - np.exp(-self.data.T_s / _FOLLOWING) if self.filtered else 1.0
+        taken = 1.0 - np.exp(-self.data.T_s / tuning.OBSERVER_S) if self.filtered else 1.0
         first = self.data.rows[:, self.starts + shift]
         here = self.context(shift) | (context or {})
         state = State(*first[:3])
         effect_states = car.settled(state, Applied(*first[3:5]), fleet.theta, context=here)
         with np.errstate(all="ignore"):
             for k in range(shift, self.steps):
-                rows = self.data.rows[:, self.starts + k]
                 if k <= 0:
-                    state = State(*(led + taken * (row - led) for led, row in zip(state, rows[:3], strict=True)))
-                state, effect_states = self._step(car, fleet.theta, state, effect_states, rows, k, context)
+                    measured = self.data.rows[:3, self.starts + k]
+                    state = State(*(led + taken * (row - led) for led, row in zip(state, measured, strict=True)))
+                state, effect_states = self._step(car, fleet.theta, state, effect_states, k, context)
                 if k >= 0 and (k + 1) % self.every == 0:
                     for channel, value in enumerate(state):
                         out[:, :, k // self.every, channel] = value
@@ -196,13 +192,12 @@ class SimulationWindows:
         bound, theta = self._bound(fleet), fleet.theta
         out = np.empty((len(self), self.steps, 3, 3))
         for k in range(self.steps):
-            rows = self.data.rows[:, self.starts + k]
-            state = State(*rows[:3])
-            base, _ = self._step(bound, theta, state, {}, rows, k, None)
+            state = State(*self.data.rows[:3, self.starts + k])
+            base, _ = self._step(bound, theta, state, {}, k)
             for j in range(3):
                 h = 1e-4 * self.spread[j]
                 there = State(*(v + h * (i == j) for i, v in enumerate(state)))
-                moved, _ = self._step(bound, theta, there, {}, rows, k, None)
+                moved, _ = self._step(bound, theta, there, {}, k)
                 out[:, k, :, j] = np.stack([(a - b) / h for a, b in zip(moved, base, strict=True)], axis=-1)
         steps = np.clip(np.nan_to_num(out), -10.0, 10.0).reshape(len(self), -1, self.every, 3, 3)
         through = steps[:, :, 0]
@@ -221,20 +216,17 @@ class SimulationWindows:
         theta: Coefficients,
         state: State,
         effect_states: Mapping[str, Vector],
-        rows: Vector,
         k: int,
-        context: Mapping[str, float] | None,
+        context: Mapping[str, float] | None = None,
     ) -> tuple[State, dict[str, Vector]]:
         """One step from the rows ``k`` after the starts."""
-        applied = applied_inputs(rows)
+        now = self.starts + k
+        applied = applied_inputs(self.data.rows[:, now])
         if self.hold == "first":
-            lines, now = self.data.lines, self.starts + k
-            applied = Applied(*(lines[:, now] + lines[:, now + 1]) / 2)
-        around = self.context(k) | dict(context or {})
-        return car.step(state, applied, theta, effect_states, context=around)
+            applied = Applied(*(self.data.lines[:, now] + self.data.lines[:, now + 1]) / 2)
+        return car.step(state, applied, theta, effect_states, context=self.context(k) | dict(context or {}))
 
     def _bound(self, fleet: CarBatch) -> CarModel:
-        """``fleet`` with the steps of these simulations."""
         return CarModel(fleet.constants, self.data.T_s, fleet.effects, self.integrator, self.substeps)
 
 
@@ -254,9 +246,16 @@ def rows_per_sample(recording: Recording) -> tuple[int, int]:
     return throttle, steering
 
 
-def compared_every(steps: int) -> int:
-    """Of how many rows one is compared in a simulation of ``steps``."""
-    return -(-steps // _COMPARED)
+def steps_of(horizon: float, T_s: float) -> int:
+    """Sampling times that cover ``horizon`` (s)."""
+    return int(np.ceil(horizon / T_s - 1e-9))
+
+
+def rounded_steps(horizon: float, T_s: float) -> tuple[int, int]:
+    """Sampling times that cover ``horizon`` (s) in a fit, and of how many one is compared, of which they are a multiple."""
+    steps = max(1, steps_of(horizon, T_s))
+    every = -(-steps // tuning.COMPARED_ROWS)
+    return every * -(-steps // every), every
 
 
 def fit_windows(
@@ -274,24 +273,21 @@ def fit_windows(
     Raises:
         RecordingError: too few stretches.
     """
-    steps = max(1, int(np.ceil(horizon / recording.T_s - 1e-9)))
-    every = compared_every(steps)
-    steps = every * -(-steps // every)
-    warm = round(WARM_UP / recording.T_s)
+    steps, every = rounded_steps(horizon, recording.T_s)
+    warm = round(tuning.WARM_UP_S / recording.T_s)
     ends = recording.window_ends(warm + 1, horizon=steps, min_speed=min_speed)
     starts: list[int] = []
     for row in ends if held_out is None else ends[~held_out[ends + steps]]:
         if not starts or row >= starts[-1] + steps:
             starts.append(int(row))
-    if len(starts) < _LEAST:
+    if len(starts) < tuning.MIN_WINDOWS:
         beside = " beside the held-out part" if held_out is not None else ""
         raise RecordingError(
             f"recording {', '.join(recording.info.source)}: {len(starts)} stretches of {steps * recording.T_s:g} s at "
-            f"{min_speed:g} m/s or more{beside}; expected at least {_LEAST}"
+            f"{min_speed:g} m/s or more{beside}; expected at least {tuning.MIN_WINDOWS}"
         )
-    return SimulationWindows(
-        data, _spread_evenly(np.array(starts), data.number), steps, warm, every=every, filtered=True
-    )
+    spread = _spread_evenly(np.array(starts), data.number)
+    return SimulationWindows(data, spread, steps, warm, every=every, filtered=True)
 
 
 def _spread_evenly(starts: Indices, number: Indices) -> Indices:
@@ -299,7 +295,7 @@ def _spread_evenly(starts: Indices, number: Indices) -> Indices:
     parts = sorted((starts[number[starts] == k] for k in np.unique(number[starts])), key=len)
     chosen: list[Indices] = []
     for k, part in enumerate(parts):
-        share = (_MAX_WINDOWS - sum(map(len, chosen))) // (len(parts) - k)
+        share = (tuning.MAX_WINDOWS - sum(map(len, chosen))) // (len(parts) - k)
         chosen.append(part[np.linspace(0, len(part) - 1, min(len(part), share)).round().astype(int)])
     return np.sort(np.concatenate(chosen))
 
@@ -312,13 +308,14 @@ def held_out_windows(
     Raises:
         RecordingError: too few rows.
     """
-    warm = round(WARM_UP / recording.T_s)
+    warm = round(tuning.WARM_UP_S / recording.T_s)
     ends = recording.window_ends(warm + 1, horizon=long, min_speed=min_speed)
     later = ends[held_out[ends - warm]]
-    if len(later) < _LEAST:
+    if len(later) < tuning.MIN_WINDOWS:
         raise RecordingError(
             f"recording {', '.join(recording.info.source)}: {len(later)} rows in the held-out part from which "
-            f"{long * recording.T_s:g} s can be simulated; expected at least {_LEAST}: record longer or hold out more"
+            f"{long * recording.T_s:g} s can be simulated; expected at least {tuning.MIN_WINDOWS}: record longer or hold "
+            "out more"
         )
-    every = max(1, steps // 4, len(later) // _MEASURED)
+    every = max(1, steps // 4, len(later) // tuning.MEASURED_WINDOWS)
     return SimulationWindows(data, later[::every], long, warm)

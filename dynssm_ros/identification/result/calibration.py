@@ -22,6 +22,7 @@ from scipy import optimize
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import RecordingError
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, closest
 from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows, fit_windows, recorded_rows
@@ -34,16 +35,7 @@ from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.effects.base import LAP
 from dynssm_ros.vehicle.integrators import Integrator
 
-HORIZONS_S = (0.5, 0.25, 0.1)
-"""Lengths of the simulations: the first for which a recording has stretches enough."""
 _INTEGRATORS: tuple[Integrator, ...] = ("rk4", "euler")  # the first, unless another is clearly closer to the data
-_EXPLAINED = 2.0  # how many times less errors count that hang together, up to which a model explains the data
-_SEARCHED, _POLISHED_ON = 1000, 4000  # rows with which starting points are judged, and the best is made better
-_SEARCH_PRIOR, _POLISHED = 0.1, 3  # weight of what is known before, at first; rounds that find it
-_INSIDE = 1e-6  # of the range, that a starting point keeps from its bounds
-_DIFFERENCE = 2.0**-26  # of the range, with which derivatives are taken
-_WEIGHT_SHOWN = 0.25  # least weight of a coefficient in a direction that the data do not determine
-_ON_BOUND = 1e-6  # of the range in units of a fit
 
 
 @dataclass(frozen=True)
@@ -108,42 +100,43 @@ def calibrate(
     require_context(vehicle.active_effects, context, f"recording {', '.join(recording.info.source)}")
     speed = vehicle.minimum_speed if min_speed is None else min_speed
     data = recorded_rows(recording, context)
-    windows = _windows(recording, data, HORIZONS_S if horizon is None else (horizon,), speed)
-    laps = recording.fingerprints
-    known = vehicle.known_before(laps)
-    given = CarEstimate.of(known, mass_std=0.0).at(vehicle.nominal)
-    single = recording.window_ends(1, horizon=1, min_speed=speed)
-    one_step = SimulationWindows(data, single, 1, 0)
+    windows = _windows(recording, data, tuning.HORIZONS_S if horizon is None else (horizon,), speed)
+    given = CarEstimate.of(vehicle.known_before(recording.fingerprints), mass_std=0.0).at(vehicle.nominal)
+    one_step = SimulationWindows(data, recording.window_ends(1, horizon=1, min_speed=speed), 1, 0)
     points = _starting_points(vehicle, starts, seed)
     tried = _INTEGRATORS if integrator is None else (integrator,)
     tick = _counter(on_progress, len(tried) * len(points) + 1)
-    problems, fits = {}, {}
-    for one in tried:
-        problems[one], fits[one] = _fitted(windows, one_step.with_integrator(one, vehicle), given, points, tick)
-    chosen = closest(fits)
-    if problems[chosen].inflation(fits[chosen]) > _EXPLAINED:
-        chosen = tried[0]
-    problem = problems[chosen]
-    fit = problem.temper(fits[chosen])
+    fits = {one: _fitted(windows, one_step.with_integrator(one, vehicle), given, points, tick) for one in tried}
+    problem, fit = fits[closest({one: found for one, (_, found) in fits.items()})]
+    if problem.inflation(fit) > tuning.EXPLAINED_INFLATION:
+        problem, fit = fits[tried[0]]
+    fit = problem.temper(fit)
     tick()
-    theta = np.array(fit.car.theta)
-    calibrated = fit.car.known(problem.covariance(fit)).model_copy(update={"integrator": chosen})
-    calibrated = calibrated.calibrated_on(laps, vehicle)
-    std = np.array([calibrated.coefficients[name].std for name in COEFFICIENTS])
-    lower, upper = (limit[: len(COEFFICIENTS)] for limit in given.limits)
-    held = (fit.position[: len(COEFFICIENTS)] <= lower + _ON_BOUND) | (
-        fit.position[: len(COEFFICIENTS)] >= upper - _ON_BOUND
-    )
-    one_step = one_step.stepped_as(problem.windows)
-    before, after = (_rmse(one_step, car) for car in (given, fit.car))
+    return _calibration(recording, vehicle, problem, fit, given, one_step.stepped_as(problem.windows))
+
+
+def _calibration(
+    recording: Recording,
+    vehicle: Vehicle,
+    problem: IdentificationProblem,
+    fit: Fit,
+    given: CarEstimate,
+    one_step: SimulationWindows,
+) -> Calibration:
+    """What the ``fit`` of ``problem`` says beside the car as ``given``."""
+    windows, n = problem.windows, len(COEFFICIENTS)
+    calibrated = fit.car.known(problem.covariance(fit)).model_copy(update={"integrator": windows.integrator})
+    calibrated = calibrated.calibrated_on(recording.fingerprints, vehicle)
+    lower, upper = given.limits
+    held = (fit.position <= lower + tuning.AT_BOUND) | (fit.position >= upper - tuning.AT_BOUND)
     return Calibration(
         calibrated,
-        theta,
-        std,
-        tuple(name for name, on in zip(COEFFICIENTS, held, strict=True) if on),
+        np.array(fit.car.theta),
+        np.array([calibrated.coefficients[name].std for name in COEFFICIENTS]),
+        tuple(name for name, on in zip(COEFFICIENTS, held[:n], strict=True) if on),
         _unidentified(problem, fit),
-        before,
-        after,
+        _rmse(one_step, given),
+        _rmse(one_step, fit.car),
         windows.target.shape[0] * windows.target.shape[1],
         windows.steps * recording.T_s,
     )
@@ -208,7 +201,8 @@ def _nearest_start(
     increments. What is known before is weighed with the errors that are left, found by a few rounds.
     """
     few, many = (
-        one_step.select(np.arange(0, len(one_step), max(1, len(one_step) // n))) for n in (_SEARCHED, _POLISHED_ON)
+        one_step.select(np.arange(0, len(one_step), max(1, len(one_step) // n)))
+        for n in (tuning.SEARCH_ROWS, tuning.POLISH_ROWS)
     )
     rows = many.data.rows
     scale = np.maximum((rows[:3, many.starts + 1] - rows[:3, many.starts]).std(axis=1), 1e-12)
@@ -217,7 +211,7 @@ def _nearest_start(
     def fitted(
         some: SimulationWindows, start: Vector, prior: float, tolerance: float, evaluations: int
     ) -> optimize.OptimizeResult:
-        inside = np.clip(start, _INSIDE, 1.0 - _INSIDE)
+        inside = np.clip(start, tuning.AT_BOUND, 1.0 - tuning.AT_BOUND)
 
         def residuals_of(points: Vector) -> Vector:
             cars = [given.at(lower + p * width) for p in points]
@@ -227,7 +221,7 @@ def _nearest_start(
             )
 
         def derivatives(p: Vector) -> Vector:
-            moved = p + np.diag(np.where(p + _DIFFERENCE > 1.0, -_DIFFERENCE, _DIFFERENCE))
+            moved = p + np.diag(np.where(p + tuning.DIFFERENCE > 1.0, -tuning.DIFFERENCE, tuning.DIFFERENCE))
             at = residuals_of(np.vstack([p, moved]))
             return np.asarray((at[1:] - at[0]).T / (np.diag(moved) - p))
 
@@ -241,11 +235,11 @@ def _nearest_start(
 
     found = []
     for theta in points:
-        found.append(fitted(few, (theta - lower) / width, _SEARCH_PRIOR, 1e-5, 60))
+        found.append(fitted(few, (theta - lower) / width, tuning.SEARCH_PRIOR, 1e-5, 60))
         tick()
     best = min(found, key=lambda fit: float(fit.cost))
     left = float(np.median(np.abs(best.fun[: 3 * len(few)])))
-    for _ in range(_POLISHED):
+    for _ in range(tuning.POLISH_ROUNDS):
         best = fitted(many, best.x, left, 1e-8, 60)
         left = float(np.median(np.abs(best.fun[: 3 * len(many)])))
     return given.at(lower + best.x * width)
@@ -263,6 +257,6 @@ def _unidentified(problem: IdentificationProblem, fit: Fit) -> tuple[dict[str, f
     information = problem.information(fit)[: len(COEFFICIENTS), : len(COEFFICIENTS)]
     values, vectors = np.linalg.eigh(information)
     return tuple(
-        {COEFFICIENTS[k]: round(float(v), 2) for k, v in enumerate(vectors[:, d]) if abs(v) > _WEIGHT_SHOWN}
+        {COEFFICIENTS[k]: round(float(v), 2) for k, v in enumerate(vectors[:, d]) if abs(v) > tuning.WEIGHT_SHOWN}
         for d in np.flatnonzero(values < 1.0)
     )

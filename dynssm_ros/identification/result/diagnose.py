@@ -7,22 +7,28 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.extras import missing_libraries
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate, Values
-from dynssm_ros.identification.problem.fit import BLOCK, Fit, IdentificationProblem, per_unit
-from dynssm_ros.identification.problem.levels import Group, Levels
+from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, per_unit
+from dynssm_ros.identification.problem.levels import Levels
 from dynssm_ros.identification.problem.recordings import CrossValidation, RecordingSet, driven_alike
-from dynssm_ros.identification.problem.windows import SimulationWindows, compared_every, fit_windows, held_out_windows
+from dynssm_ros.identification.problem.windows import (
+    SimulationWindows,
+    fit_windows,
+    held_out_windows,
+    rounded_steps,
+    steps_of,
+)
 from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis
 from dynssm_ros.identification.result.formula import Formula, formulas
-from dynssm_ros.identification.result.gate import HeldOut, Without, gated
+from dynssm_ros.identification.result.gate import Gated, Without, gated
 from dynssm_ros.identification.result.minimum_effect import minimum_detectable
 from dynssm_ros.identification.search.candidates import Candidate
-from dynssm_ros.identification.search.integrator import search_causes
+from dynssm_ros.identification.search.integrator import SearchResult, search_causes
 from dynssm_ros.identification.search.selection import Refined, Selection
 from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.progress import OnProgress
@@ -33,15 +39,7 @@ from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, require_context
 from dynssm_ros.vehicle.integrators import Integrator
 
-_HORIZON = 0.5  # s
-_HOLDOUT = 0.25
 _NAMES = (*COEFFICIENTS, "m")  # of what is recalibrated
-_MOVED = 3.0  # standard deviations beyond which recalibration is a finding
-# the same of all of them together: as rare, squared
-_TOGETHER = float(stats.chi2.isf(2.0 * stats.norm.sf(_MOVED), len(_NAMES)))
-_NAMED = 4  # of them, in a note
-_NOTED = 0.1  # relative difference of what the vehicle file has
-_DRIVEN_ALIKE = 0.5  # of a recording, that others must have for causes of it alone
 _HELD = {"zero": "held", "first": "a line from sample to sample"}
 
 
@@ -49,8 +47,8 @@ def diagnose(
     recordings: Recording | Sequence[Recording],
     vehicle: Vehicle,
     *,
-    horizon: float = _HORIZON,
-    holdout: float = _HOLDOUT,
+    horizon: float = tuning.HORIZONS_S[0],
+    holdout: float = tuning.HOLDOUT,
     min_speed: float | None = None,
     integrator: Integrator | None = None,
     line: ClosedLine | None = None,
@@ -60,10 +58,6 @@ def diagnose(
     pool: Pool = IN_TURN,
 ) -> Diagnosis:
     """Finds out what a vehicle file gets wrong about recordings.
-
-    An effect acts in all recordings, or in some and not in the others: in one alone, in those of one session, or in those of
-    one road (:mod:`~dynssm_ros.identification.problem.levels`). With ``suspect`` it acts in all or in those: what has changed
-    since.
 
     Args:
         recordings: measured laps of one car.
@@ -83,11 +77,10 @@ def diagnose(
         ConfigurationError: an effect of the vehicle needs a signal that the recording has not; options out of range.
     """
     first = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    suspects = tuple(range(len(first), len(first) + len(suspect)))
-    at = _prepare([*first, *suspect], suspects, vehicle, horizon, holdout, min_speed, line)
     if unknown := sorted(set(exclude) - set(EFFECTS)):
         raise ConfigurationError(f"exclude {', '.join(unknown)}: no such effect; expected some of {', '.join(EFFECTS)}")
-    levels = _driven_alike(at)
+    at = _prepare(first, list(suspect), vehicle, horizon=horizon, holdout=holdout, min_speed=min_speed, line=line)
+
     found = search_causes(
         at.fitted,
         at.car,
@@ -95,48 +88,53 @@ def diagnose(
         integrator=integrator,
         on_progress=on_progress,
         exclude=exclude,
-        levels=levels,
+        levels=_driven_alike(at),
         pool=pool,
     )
-    problem, windows = found.problem, found.problem.windows
     on_progress("measuring the improvement on held-out laps")
-    selection, without, left, improvement = gated(
-        found, at.car, HeldOut(at.unseen.stepped_as(windows), at.steps), at.notes
-    )
-    fit = selection.fit
-    terms = _formulas(windows, fit.car, at.left_out, at.notes, on_progress) if left.is_there else ()
+    gate = gated(found, at.car, at.unseen.stepped_as(found.problem.windows), at.steps, at.notes)
+    return _diagnosis(at, found, gate, vehicle, on_progress)
+
+
+def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle, on_progress: OnProgress) -> Diagnosis:
+    """What passed the gate, with the car to write and what limits the diagnosis."""
+    problem, windows, selection, fit = found.problem, found.problem.windows, gate.selection, gate.selection.fit
+    terms = _formulas(windows, fit.car, at.left_out, at.notes, on_progress) if gate.left.is_there else ()
     sizes = minimum_detectable(problem, fit, found.search.found)
     covariance = problem.covariance(fit)
     live, known = _as_held(problem, fit, covariance, at.car)
+    suspects = at.recordings.levels.suspects
     extended = live.extended(known, suspects[-1] if suspects else None)
     extended = extended.model_copy(update={"integrator": windows.integrator})
     extended = extended.calibrated_on(at.recordings.recording.select(~at.recordings.held_out).fingerprints, vehicle)
     std = np.sqrt(np.diag(covariance))
-    causes = tuple(
-        _cause(one, rest, selection, at.recordings, std) for one, rest in zip(selection.chosen, without, strict=True)
+    causes = [
+        _cause(one, rest, selection, at.recordings, std)
+        for one, rest in zip(selection.chosen, gate.without, strict=True)
+    ]
+    notes = (
+        *at.notes,
+        *(f"{name} cannot be judged: {why}" for name, why in found.impossible.items()),
+        *_steps_otherwise(vehicle, windows, fit.car, live),
+        *_hidden(sizes),
+        *_passed_once(at.left_out, selection.candidates),
+        *_not_confirmed(selection.unconfirmed),
+        *_moved_together(fit.car),
+        *_not_live(extended),
+        *_not_written(fit.car, extended),
     )
     return Diagnosis(
         tuple(sorted(causes, key=lambda cause: cause.small)),
         _moved(fit.car),
         extended,
-        improvement,
-        left.systematic,
-        left.clustered,
+        gate.improvement,
+        gate.left.systematic,
+        gate.left.clustered,
         sizes,
         selection,
         fit.car,
         std[:18],
-        (
-            *at.notes,
-            *(f"{name} cannot be judged: {why}" for name, why in found.impossible.items()),
-            *_steps_otherwise(vehicle, windows, fit.car, live),
-            *_hidden(sizes),
-            *_passed_once(at.left_out, selection.candidates),
-            *_not_confirmed(selection.unconfirmed),
-            *_moved_together(fit.car),
-            *_not_live(extended),
-            *_not_written(fit.car, extended),
-        ),
+        notes,
         at.protocol | {"Integrator": windows.integrator, "Inputs between samples": _HELD[windows.hold]},
         windows,
         at.recordings,
@@ -159,28 +157,25 @@ def _formulas(
 
 def _driven_alike(at: _Prepared) -> Levels:
     """The levels with those groups that were driven like the other recordings: others show another side of the car."""
-    levels, fitted = at.recordings.levels, set(np.unique(at.fitted.number).tolist())
+    levels, names, fitted = at.recordings.levels, at.recordings.names, set(np.unique(at.fitted.number).tolist())
     alike = {group: driven_alike(at.fitted, group) for group in levels.groups if fitted & set(group) < fitted}
-    tried = tuple(group for group, share in alike.items() if levels.suspects or share >= _DRIVEN_ALIKE)
-
-    def named(group: Iterable[int]) -> str:
-        return " and ".join(at.recordings.names[k] for k in group)
-
+    tried = tuple(group for group, share in alike.items() if levels.suspects or share >= tuning.ALIKE_SHARE)
     for group, share in alike.items():
-        if share < _DRIVEN_ALIKE:
-            others = tuple(k for k in range(len(at.recordings.names)) if k not in group)
+        if share < tuning.ALIKE_SHARE:
+            others = tuple(k for k in range(len(names)) if k not in group)
+            these, those = (" and ".join(names[k] for k in each) for each in (group, others))
             at.notes.append(
-                f"{named(group)}: {100 * share:.0f} % driven like the others (speed, steering, throttle), so that what "
+                f"{these}: {100 * share:.0f} % driven like the others (speed, steering, throttle), so that what "
                 "differs there can hardly be told from what its driving shows"
                 + ("" if levels.suspects else "; causes of it alone are not tried")
-                + (f", and what is named of {named(others)} alone may be the opposite there" if others in tried else "")
+                + (f", and what is named of {those} alone may be the opposite there" if others in tried else "")
             )
     return replace(levels, groups=tried)
 
 
 def _moved(car: CarEstimate) -> dict[str, float]:
     """See :attr:`Diagnosis.moved`."""
-    return {name: float(by) for name, by in zip(_NAMES, car.moved, strict=True) if abs(by) > _MOVED}
+    return {name: float(by) for name, by in zip(_NAMES, car.moved, strict=True) if abs(by) > tuning.SURE_STD}
 
 
 def _passed_once(left_out: CrossValidation, chosen: Iterable[Candidate]) -> Iterator[str]:
@@ -189,8 +184,9 @@ def _passed_once(left_out: CrossValidation, chosen: Iterable[Candidate]) -> Iter
         for candidate in chosen:
             if candidate.by_place:
                 yield (
-                    f"{candidate.effect} was seen in one pass of most places and is confirmed by stretches of {BLOCK:g} s "
-                    f"that were left out in turn; it may be of the moment and not of the place, which another lap tells"
+                    f"{candidate.effect} was seen in one pass of most places and is confirmed by stretches of "
+                    f"{tuning.BLOCK_S:g} s that were left out in turn; it may be of the moment and not of the place, which "
+                    "another lap tells"
                 )
 
 
@@ -198,7 +194,7 @@ def _not_confirmed(doubtful: Refined | None) -> Iterator[str]:
     """What would explain most of what is left, if left-out parts of the drive agreed."""
     if doubtful is not None and doubtful.confirmation is not None:
         effect, units = doubtful.candidate.effect, doubtful.confirmation.improvement
-        values = ", ".join(f"{name} {value:.3g}" for name, value in doubtful.fit.car.effects[effect].items())
+        values = ", ".join(f"{name} {value:.3g}" for name, value in doubtful.values.items())
         yield (
             f"{effect} ({values}) would explain most of what is left (information criterion {doubtful.delta_bic:.0f}), but "
             f"not where parts of the drive are left out: there the logarithm of the likelihood changes by "
@@ -211,11 +207,11 @@ def _moved_together(car: CarEstimate) -> Iterator[str]:
     """How far coefficients went as a whole, where none did alone: of correlated ones some combinations are known better."""
     shares = car.moved * (car.prior_precision @ car.moved)
     squared = float(shares.sum())
-    if not _moved(car) and squared > _TOGETHER:
-        most = [_NAMES[k] for k in np.argsort(-shares)[:_NAMED] if shares[k] > 0.0]
+    if not _moved(car) and squared > tuning.MOVED_TOGETHER:
+        most = [_NAMES[k] for k in np.argsort(-shares)[:4] if shares[k] > 0.0]
         yield (
             f"together the coefficients moved by {np.sqrt(squared):.0f} standard deviations, though none by more than "
-            f"{_MOVED:g} alone: "
+            f"{tuning.SURE_STD:g} alone: "
             f"{', '.join(most)} most, in a combination that the vehicle file knows better than each of them"
         )
 
@@ -234,49 +230,46 @@ class _Prepared(NamedTuple):
 
 
 def _prepare(
-    recordings: Sequence[Recording],
-    suspects: Group,
+    recordings: list[Recording],
+    suspect: list[Recording],
     vehicle: Vehicle,
+    *,
     horizon: float,
     holdout: float,
     min_speed: float | None,
     line: ClosedLine | None,
 ) -> _Prepared:
     """Checks what was given, holds laps out and lays the simulations along the rest; see :func:`diagnose`."""
-    if not 0.05 <= holdout <= 0.8:
-        raise ConfigurationError(f"holdout {holdout:g}: expected a share between 0.05 and 0.8")
-    together = RecordingSet.of(recordings, holdout, line, suspects)
+    least, most = tuning.HOLDOUT_RANGE
+    if not least <= holdout <= most:
+        raise ConfigurationError(f"holdout {holdout:g}: expected a share between {least:g} and {most:g}")
+    suspects = tuple(range(len(recordings), len(recordings) + len(suspect)))
+    together = RecordingSet.of([*recordings, *suspect], holdout, line, suspects)
     recording = together.recording
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
-    steps = int(np.ceil(horizon / recording.T_s - 1e-9))
-    if steps < 2:
-        raise ConfigurationError(
-            f"horizon {horizon:g} s: expected at least two sampling times ({2 * recording.T_s:g} s)"
-        )
-    asked = steps
-    every = compared_every(steps)
-    steps = every * -(-steps // every)
+    asked, T_s = steps_of(horizon, recording.T_s), recording.T_s
+    if asked < 2:
+        raise ConfigurationError(f"horizon {horizon:g} s: expected at least two sampling times ({2 * T_s:g} s)")
     notes = _check_signals(recording)
-    speed = vehicle.minimum_speed if min_speed is None else min_speed
     if not together.has_places:
         notes.append(
             "no full lap with positions among the fitted rows: effects that live at a place of the track cannot be judged "
             "unless the track is given"
         )
-    data = together.rows()
-    source = ", ".join(recording.info.source)
+    speed = vehicle.minimum_speed if min_speed is None else min_speed
+    data, source = together.rows(), ", ".join(recording.info.source)
     require_context(vehicle.active_effects, data.context, f"recording {source}")
-    fitted = fit_windows(recording, data, steps * recording.T_s, speed, together.held_out)
+    steps, _ = rounded_steps(horizon, T_s)
+    fitted = fit_windows(recording, data, steps * T_s, speed, together.held_out)
     unseen = held_out_windows(recording, data, steps=steps, long=2 * asked, min_speed=speed, held_out=together.held_out)
     protocol = {
         "Recording": source,
         "Commands": recording.info.commands,
         "Vehicle": vehicle.name,
         "Held out": together.split,
-        "Fit": f"{len(fitted)} simulations of {steps * recording.T_s:g} s, from {speed:g} m/s",
-        "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * recording.T_s:g} s",
+        "Fit": f"{len(fitted)} simulations of {steps * T_s:g} s, from {speed:g} m/s",
+        "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * T_s:g} s",
     }
-    left_out = together.left_out(fitted.starts)
     known = vehicle.known_before(recording.fingerprints)
     if known is not vehicle:
         notes.append(
@@ -284,7 +277,7 @@ def _prepare(
             "they were known before"
         )
     car = CarEstimate.of(known).at(vehicle.nominal)
-    return _Prepared(together, fitted, left_out, asked, unseen, car, notes, protocol)
+    return _Prepared(together, fitted, together.left_out(fitted.starts), asked, unseen, car, notes, protocol)
 
 
 def _cause(one: Refined, without: Without, selection: Selection, recordings: RecordingSet, std: Vector) -> Cause:
@@ -345,7 +338,7 @@ def _differently(effects: Mapping[str, Values], live: Mapping[str, Values]) -> I
     """Effects whose sizes are others with inputs that are held."""
     for effect, values in effects.items():
         for name, value in values.items():
-            if abs(live[effect][name] - value) > _NOTED * abs(value):
+            if abs(live[effect][name] - value) > tuning.NOTED_CHANGE * abs(value):
                 yield f"; {effect}: {name} {live[effect][name]:.3g} there, {value:.3g} in a simulation"
 
 

@@ -1,4 +1,4 @@
-"""What a diagnosis says: causes, what recalibration moved, what is gained, what is left; for people and programs."""
+"""What a diagnosis says: causes, what recalibration moved, what is better, what is left; for people and programs."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.levels import Level
 from dynssm_ros.identification.problem.recordings import RecordingSet
@@ -24,8 +25,6 @@ from dynssm_ros.vehicle.effects import EFFECTS
 
 Verdict = Literal["effects", "none", "unexplained"]
 
-SMALL_SHARE = 0.06  # of the squared error of each channel, on left-out parts
-_SMALL_GAIN = 0.01  # of the error on held-out rows: what takes less of both off is within the structure of the model
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
 
@@ -40,7 +39,7 @@ class Cause:
         improvement: decrease of twice the negative log-likelihood by it.
         delta_bic: what is left when its parameters are paid for.
         heldout_improvement: share of the error on the held-out rows that is gone by it.
-        confirmation: what it gains on parts of the fitted rows that were left out.
+        confirmation: what it improves on parts of the fitted rows that were left out.
         on_bound: its parameters that the data push against a bound: they are at least that far off.
         alternatives: effects that explain the data as well.
         only_in: names of the recordings in which it acts; empty: in all.
@@ -68,7 +67,8 @@ class Cause:
         It takes little off the error of each channel, on parts that were left out and on held-out rows. What a recalibration
         would make up for is told by what was known, and by how far the coefficients would have to be off, not by the error.
         """
-        little = float(self.confirmation.share.max()) < SMALL_SHARE and self.heldout_improvement < _SMALL_GAIN
+        little = float(self.confirmation.share.max()) < tuning.SMALL_SHARE
+        little = little and self.heldout_improvement < tuning.NEGLIGIBLE_SHARE
         return little and not self.confirmation.rests_on_known
 
 
@@ -142,29 +142,23 @@ class Diagnosis:
 
     def to_json(self, vehicle_path: str) -> dict[str, Any]:
         """For programs; ``vehicle_path`` is where the extended vehicle was written."""
-        improvement = self.improvement
-        at = improvement.horizon
-        rmse = {name: by_channel(values[at]) for name, values in improvement.rmse.items()}
+        improvement, at = self.improvement, self.improvement.horizon
+        names = {"before": GIVEN, "recalibrated": RECALIBRATED, "after": EXTENDED}
+        systematic = {key: improvement.explained_variance[name][at].share for key, name in names.items()}
         return {
             "verdict": self.verdict,
             "causes": [_cause_to_json(cause) for cause in self.causes],
             "small_effects": [_cause_to_json(cause) for cause in self.small_effects],
             "improvement": {
                 "horizon_s": float(improvement.horizons[at]),
-                "before": rmse[GIVEN],
-                "recalibrated": rmse[RECALIBRATED],
-                "after": rmse[EXTENDED],
+                **{key: by_channel(improvement.rmse[name][at]) for key, name in names.items()},
                 "reduction": by_channel(improvement.reduction[at]),
                 "interval_95": _intervals(improvement.interval[:, at]),
                 "reduction_from_recalibrated": by_channel(improvement.reduction_from(RECALIBRATED)[at]),
                 "interval_95_from_recalibrated": _intervals(improvement.interval_from(RECALIBRATED)[:, at]),
             },
-            "systematic": {
-                "before": by_channel(improvement.explained_variance[GIVEN][at].share),
-                "recalibrated": by_channel(improvement.explained_variance[RECALIBRATED][at].share),
-                "after": by_channel(improvement.explained_variance[EXTENDED][at].share),
-                "gone": by_channel(improvement.systematic_gone(GIVEN)[at]),
-            },
+            "systematic": {key: by_channel(share) for key, share in systematic.items()}
+            | {"gone": by_channel(improvement.systematic_gone(GIVEN)[at])},
             "minimum_detectable": {
                 effect: size if np.isfinite(size) else None for effect, size in self.minimum_detectable.items()
             },

@@ -13,20 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Indices, Vector, sums_by
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.recordings import CrossValidation
 from dynssm_ros.identification.problem.windows import SimulationWindows
-from dynssm_ros.identification.search.confirmation import standard_error, sums_of
+from dynssm_ros.identification.search.confirmation import standard_error
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
-_SPAN = 0.12  # s; over which the missing acceleration is taken: shorter is noise, longer the car answers to it
-_BESIDE = 0.1  # s before and after, whose mean are the signals
-_DEGREE = 3
-_TERMS = 3  # in a formula, at most
-_SURE = 3.0  # standard errors by which it must predict what was left out
-_LEAST = 0.01  # of the squared error there that it must take
-_FAR = 4.0  # spreads; what is farther off counts as that far
 _SIGNALS = ("v_x", "v_y", "omega", "throttle", "steering", "t")
 
 
@@ -52,7 +46,10 @@ class Formula:
     def holds(self) -> bool:
         """Whether it carries over to what it was not fitted to: surely, and more than by the parts' standard error."""
         total = float(self.improvement.sum())
-        return total > max(_SURE * self.std, standard_error(self.improvement)) and self.share > _LEAST
+        return (
+            total > max(tuning.SURE_STD * self.std, standard_error(self.improvement))
+            and self.share > tuning.NEGLIGIBLE_SHARE
+        )
 
 
 class _Missing(NamedTuple):
@@ -87,21 +84,20 @@ def _missing(windows: SimulationWindows, car: CarEstimate, left_out: CrossValida
     The signals are of rows before the start and after the end, whose noise is not that of the two.
     """
     T_s = windows.data.T_s
-    steps = max(1, min(round(_SPAN / T_s), windows.steps))
+    steps = max(1, min(round(tuning.FORMULA_SPAN_S / T_s), windows.steps))
     shifts = np.arange(0, windows.steps - steps + 1, steps)
     starts = (windows.starts[:, None] + shifts).ravel()
     short = replace(windows, starts=starts, steps=steps, warm=windows.warm, every=steps, filtered=False)
     acceleration = -short.errors(car)[:, 0] / (steps * T_s)
-    width = max(1, round(_BESIDE / T_s))
+    width = max(1, round(tuning.FORMULA_BESIDE_S / T_s))
     rows, last = windows.data.rows, windows.data.rows.shape[1] - 1
     beside = np.concatenate([np.arange(-width, 0), np.arange(steps + 1, steps + width + 1)])
     states = rows[:3, np.clip(starts[:, None] + beside, 0, last)].mean(axis=2)
     inputs = (rows[3:5] + rows[5:7])[:, starts[:, None] + np.arange(steps)].mean(axis=2)
     signals = np.stack([*states, *inputs, windows.data.context["t"][starts]], axis=1)
-    unit = np.repeat(left_out.recordings.unit, len(shifts))
-    return _Missing(
-        signals, acceleration, np.unique(unit, return_inverse=True)[1], np.repeat(np.arange(len(windows)), len(shifts))
-    )
+    unit = np.unique(left_out.recordings.unit, return_inverse=True)[1]
+    fold, block = (np.repeat(number, len(shifts)) for number in (unit, np.arange(len(windows))))
+    return _Missing(signals, acceleration, fold, block)
 
 
 def _formula(missing: _Missing, channel: int) -> Formula | None:
@@ -110,56 +106,52 @@ def _formula(missing: _Missing, channel: int) -> Formula | None:
     spread = float(np.sqrt(np.mean(np.clip(y, *np.quantile(y, [0.01, 0.99])) ** 2)))
     if spread == 0.0:
         return None
-    y = np.clip(y / spread, -_FAR, _FAR)
+    y = np.clip(y / spread, -tuning.FAR_SPREADS, tuning.FAR_SPREADS)
     names, X = _library(missing.signals)
     scale = np.sqrt((X**2).mean(axis=0))
-    kept = scale > 0
-    names, X, scale = (
-        [name for name, keep in zip(names, kept, strict=True) if keep],
-        X[:, kept] / scale[kept],
-        scale[kept],
-    )
+    kept = np.flatnonzero(scale > 0)
+    names, X, scale = [names[k] for k in kept], X[:, kept] / scale[kept], scale[kept]
 
     def better(path: Callable[[Vector, Vector], Vector]) -> Vector:
         """By how much each squared error is less with a path of coefficients that its part did not see, ``(n, M)``."""
-        predicted = np.empty((_TERMS, len(y)))
+        predicted = np.empty((tuning.FORMULA_TERMS, len(y)))
         for part in np.unique(missing.fold):
             rest = missing.fold != part
-            predicted[:, ~rest] = np.clip(X[~rest] @ path(X[rest], y[rest]), -_FAR, _FAR).T
+            predicted[:, ~rest] = np.clip(X[~rest] @ path(X[rest], y[rest]), -tuning.FAR_SPREADS, tuning.FAR_SPREADS).T
         return np.asarray(y**2 - (y - predicted) ** 2)
 
-    gained = better(_pursued)
-    best = int(np.argmax(gained.sum(axis=1)))
+    better_by = better(_pursued)
+    best = int(np.argmax(better_by.sum(axis=1)))
     found = _pursued(X, y)
     order = sorted(np.flatnonzero(found[:, best]).tolist(), key=lambda k: int(np.argmax(found[k] != 0.0)))
     same = better(lambda X, y: _fitted(X, y, order))
     more = same[len(order) - 1] - same[: len(order)]
-    few = next(n for n, each in enumerate(more) if each.sum() <= standard_error(sums_of(each, missing.block)))
+    few = next(n for n, each in enumerate(more) if each.sum() <= standard_error(sums_by(missing.block, each)))
     coefficients = spread * _fitted(X, y, order)[:, few] / scale
-    improvement = sums_of(gained[best], missing.fold)
+    improvement = sums_by(missing.fold, better_by[best])
     return Formula(
         STATE_SIGNALS[channel],
         {names[k]: float(coefficients[k]) for k in order[: few + 1]},
         float(improvement.sum() / (y**2).sum()),
         improvement,
-        standard_error(sums_of(gained[best], missing.block)),
+        standard_error(sums_by(missing.block, better_by[best])),
     )
 
 
 def _fitted(X: Vector, y: Vector, order: Sequence[int]) -> Vector:
     """Coefficients ``(P, n)`` by least squares of the first of some terms, of the first two, and so on."""
-    path = np.zeros((X.shape[1], _TERMS))
-    for n in range(_TERMS):
+    path = np.zeros((X.shape[1], tuning.FORMULA_TERMS))
+    for n in range(tuning.FORMULA_TERMS):
         some = order[: n + 1]
         path[some, n] = np.linalg.lstsq(X[:, some], y, rcond=None)[0]
     return path
 
 
 def _library(signals: Vector) -> tuple[list[str], Vector]:
-    """Products of up to :data:`_DEGREE` signals, time once at most: names, and values ``(M, P)``."""
+    """Products of up to three signals, time once at most: names, and values ``(M, P)``."""
     from sklearn.preprocessing import PolynomialFeatures
 
-    products = PolynomialFeatures(_DEGREE).fit(signals)
+    products = PolynomialFeatures(tuning.FORMULA_DEGREE).fit(signals)
     # of what changes over the drive a trend is all that carries over
     kept = products.powers_[:, _SIGNALS.index("t")] <= 1
     return list(products.get_feature_names_out(_SIGNALS)[kept]), np.asarray(products.transform(signals))[:, kept]
@@ -169,4 +161,6 @@ def _pursued(X: Vector, y: Vector) -> Vector:
     """Coefficients ``(P, n)`` with one term, with two, and so on."""
     from sklearn.linear_model import orthogonal_mp
 
-    return np.asarray(orthogonal_mp(X, y, n_nonzero_coefs=_TERMS, return_path=True)).reshape(X.shape[1], -1)
+    return np.asarray(orthogonal_mp(X, y, n_nonzero_coefs=tuning.FORMULA_TERMS, return_path=True)).reshape(
+        X.shape[1], -1
+    )

@@ -7,62 +7,25 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.fit import IdentificationProblem
 from dynssm_ros.identification.problem.noise import weights
 from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED
 from dynssm_ros.identification.result.improvement import Improvement, measure_improvement
-from dynssm_ros.identification.result.residuals import (
-    ClusteredResiduals,
-    ExplainedVariance,
-    clustered,
-    explained_variance,
-)
+from dynssm_ros.identification.result.residuals import Left, clustered, explained_variance
 from dynssm_ros.identification.search.integrator import SearchResult
 from dynssm_ros.identification.search.selection import Search, Selection
 
-_NO_WORSE = 0.01  # of the error on held-out laps, that the car may be worse with a cause than without
-
-
-class HeldOut(NamedTuple):
-    """The simulations that only measure.
-
-    Attributes:
-        windows: on held-out rows.
-        steps: of the horizon that the diagnosis is about.
-    """
-
-    windows: SimulationWindows
-    steps: int
-
-    def errors(self, car: CarEstimate) -> Vector:
-        """What a car errs at the horizon, ``(W, 3)`` (m/s, m/s, rad/s)."""
-        return self.windows.errors(car)[:, self.steps - 1]
-
 
 class Without(NamedTuple):
-    """The car with all causes but one.
-
-    Attributes:
-        errors: on the held-out rows at the horizon, ``(W, 3)`` (m/s, m/s, rad/s).
-        improvement: share of them that the cause takes away, as a mean of the channels.
-    """
+    """The car with all causes but one."""
 
     errors: Vector
+    """On the held-out rows at the horizon, ``(W, 3)`` (m/s, m/s, rad/s)."""
     improvement: float
-
-
-class Left(NamedTuple):
-    """What the selected car leaves on the rows of the fit: what is systematic, and what comes together in time."""
-
-    systematic: ExplainedVariance
-    clustered: ClusteredResiduals
-
-    @property
-    def is_there(self) -> bool:
-        """Whether it is more than noise."""
-        return self.systematic.is_there or self.clustered.is_there
+    """Share of them that the cause takes away, as a mean of the channels."""
 
 
 class Gated(NamedTuple):
@@ -71,7 +34,7 @@ class Gated(NamedTuple):
     Attributes:
         selection: the causes.
         without: the car without each of them, in the same order.
-        left: what the car with all of them leaves.
+        left: what the car with all of them leaves on the rows of the fit.
         improvement: on the held-out rows.
     """
 
@@ -81,57 +44,60 @@ class Gated(NamedTuple):
     improvement: Improvement
 
 
-def gated(found: SearchResult, given: CarEstimate, at: HeldOut, notes: list[str]) -> Gated:
+def gated(found: SearchResult, given: CarEstimate, windows: SimulationWindows, steps: int, notes: list[str]) -> Gated:
     """A selection of which no cause is worse on held-out rows beside the others, nor all together.
 
     Args:
         found: what a search has selected; it goes on without what is not kept.
         given: the car as the vehicle file has it.
-        at: the held-out simulations.
+        windows: simulations on held-out rows.
+        steps: of the horizon that the diagnosis is about.
         notes: told what is not kept.
     """
     selection = found.selection
     while True:
-        without, left = _without_each(selection, found.search, at), _left_behind(found.problem, selection)
+        without, left = _without_each(selection, found.search, windows, steps), _left(found.problem, selection)
         strange = [one.candidate.effect for one in selection.chosen if not one.is_met]
         worst = min(zip(without, selection.candidates, strict=True), key=lambda pair: pair[0].improvement, default=None)
-        if worst is not None and worst[0].improvement <= -_NO_WORSE:
-            notes.append(_not_kept(worst[1].effect))
-            selection = found.search.reject(worst[1].effect)
+        if worst is not None and worst[0].improvement <= -tuning.NEGLIGIBLE_SHARE:
+            rejected = worst[1].effect
+            notes.append(_not_kept(rejected))
         elif strange and left.is_there:
+            rejected = strange[0]
             notes.append(
-                f"{strange[0]} would be on the side of neutral on which no car has it, and leaves errors that come together: "
+                f"{rejected} would be on the side of neutral on which no car has it, and leaves errors that come together: "
                 "it stands for something else, so that nothing of it is kept"
             )
-            selection = found.search.reject(strange[0])
         else:
             break
+        selection = found.search.reject(rejected)
     cars = {GIVEN: given, RECALIBRATED: selection.base.car, EXTENDED: selection.fit.car}
-    improvement = measure_improvement(at.windows, cars, at.steps)
+    improvement = measure_improvement(windows, cars, steps)
     if selection.chosen and _worse(improvement):
         notes.append(_not_kept(", ".join(one.effect for one in selection.candidates)))
         none = found.search.eliminated(())
-        return Gated(none, (), _left_behind(found.problem, none), improvement.ending_with(RECALIBRATED))
+        return Gated(none, (), _left(found.problem, none), improvement.ending_with(RECALIBRATED))
     return Gated(selection, without, left, improvement)
 
 
-def _without_each(selection: Selection, search: Search, at: HeldOut) -> tuple[Without, ...]:
-    with_all = (at.errors(selection.fit.car) ** 2).mean(axis=0)
-    without = [at.errors(search.leave_out(selection, one).car) for one in selection.chosen]
+def _without_each(selection: Selection, search: Search, windows: SimulationWindows, steps: int) -> tuple[Without, ...]:
+    fits = [selection.fit, *(search.leave_out(selection, one) for one in selection.chosen)]
+    with_all, *without = (windows.errors(fit.car)[:, steps - 1] for fit in fits)
+    squared = (with_all**2).mean(axis=0)
     return tuple(
-        Without(errors, float(1.0 - np.sqrt((with_all / np.maximum((errors**2).mean(axis=0), 1e-300)).mean())))
+        Without(errors, float(1.0 - np.sqrt((squared / np.maximum((errors**2).mean(axis=0), 1e-300)).mean())))
         for errors in without
     )
 
 
-def _left_behind(problem: IdentificationProblem, selection: Selection) -> Left:
+def _left(problem: IdentificationProblem, selection: Selection) -> Left:
     windows, fit = problem.windows, selection.fit
     white = fit.noise.whiten(fit.errors)
     size = weights(white) * (white**2).mean(axis=1)
     size = size / (np.bincount(windows.number, size) / np.bincount(windows.number))[windows.number]
     ends = fit.errors.reshape(len(windows), -1, 3)[:, -1]
-    together = clustered(size, windows.time, problem.block, selection.inflation)
-    return Left(explained_variance(windows, ends, problem.block), together)
+    together = clustered(size, windows.time, windows.block, selection.inflation)
+    return Left(explained_variance(windows, ends, windows.block), together)
 
 
 def _not_kept(effects: str) -> str:
@@ -144,4 +110,4 @@ def _worse(improvement: Improvement) -> bool:
     Causes that a recalibration would make up for, such as more mass for less drive, change nothing but noise.
     """
     ratio = 1.0 - improvement.reduction_from(RECALIBRATED)[improvement.horizon]
-    return bool(np.log(np.maximum(ratio, 1e-300)).mean() > _NO_WORSE)
+    return bool(np.log(np.maximum(ratio, 1e-300)).mean() > tuning.NEGLIGIBLE_SHARE)

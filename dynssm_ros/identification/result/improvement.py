@@ -1,4 +1,4 @@
-"""What an extended car gains on laps that neither the fit nor the selection saw."""
+"""What an extended car improves on laps that neither the fit nor the selection saw."""
 
 from __future__ import annotations
 
@@ -8,14 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Vector, sums_by
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate
-from dynssm_ros.identification.problem.fit import BLOCK
 from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.identification.result.residuals import ExplainedVariance, explained_variance
-
-_DRAWS = 400
-_NEXT_TO_NONE = 0.01  # of the squared error
 
 
 @dataclass(frozen=True)
@@ -29,7 +26,6 @@ class Improvement:
         errors: predicted minus measured at these times by car, each ``(W, n, 3)`` (m/s, m/s, rad/s).
         explained_variance: what of them is no noise, by car, one for each horizon.
         windows: the simulations.
-        seed: of the bootstrap over blocks in time.
     """
 
     cars: Mapping[str, CarEstimate]
@@ -38,7 +34,6 @@ class Improvement:
     errors: Mapping[str, Vector]
     explained_variance: Mapping[str, tuple[ExplainedVariance, ...]]
     windows: SimulationWindows
-    seed: int = 0
 
     @cached_property
     def rmse(self) -> dict[str, Vector]:
@@ -71,53 +66,33 @@ class Improvement:
 
     def interval_from(self, name: str) -> Vector:
         """95 % interval of :meth:`reduction_from` by a bootstrap over blocks in time, shape ``(2, n, 3)``."""
-        block = blocks(self.windows)
-        sums = [_sums(self.errors[car] ** 2, block) for car in (name, list(self.errors)[-1])]
-        rng = np.random.default_rng(self.seed)
-        drawn = rng.integers(0, len(sums[0]), (_DRAWS, len(sums[0])))
-        ratios = np.sqrt(sums[1][drawn].sum(axis=1) / np.maximum(sums[0][drawn].sum(axis=1), 1e-300))
+        before, after = (sums_by(self.windows.block, self.errors[car] ** 2) for car in (name, list(self.errors)[-1]))
+        drawn = np.random.default_rng(0).integers(0, len(before), (tuning.DRAWS, len(before)))
+        ratios = np.sqrt(after[drawn].sum(axis=1) / np.maximum(before[drawn].sum(axis=1), 1e-300))
         return np.asarray(1.0 - np.quantile(ratios, [0.975, 0.025], axis=0))
 
     def systematic_gone(self, name: str) -> Vector:
-        """Share of the systematic squared error of a car that is gone with the last, shape ``(n, 3)``.
+        """Share of the systematic squared error of a car that is gone with the last; NaN where there was next to none.
 
-        NaN where there was next to none.
+        Shape ``(n, 3)``.
         """
-        before, after = (
-            np.stack([s.share for s in self.explained_variance[car]]) * self.rmse[car] ** 2
-            for car in (name, list(self.errors)[-1])
-        )
-        there = np.stack([s.share for s in self.explained_variance[name]]) > _NEXT_TO_NONE
-        return np.where(there, 1.0 - after / np.maximum(before, 1e-300), np.nan)
+        shares = [np.stack([s.share for s in self.explained_variance[car]]) for car in (name, list(self.errors)[-1])]
+        before, after = shares[0] * self.rmse[name] ** 2, shares[1] * self.rmse[list(self.errors)[-1]] ** 2
+        return np.where(shares[0] > tuning.NEGLIGIBLE_SHARE, 1.0 - after / np.maximum(before, 1e-300), np.nan)
 
 
-def measure_improvement(
-    windows: SimulationWindows, cars: Mapping[str, CarEstimate], steps: int, seed: int = 0
-) -> Improvement:
+def measure_improvement(windows: SimulationWindows, cars: Mapping[str, CarEstimate], steps: int) -> Improvement:
     """Simulates ``cars`` from every start.
 
     Args:
         windows: on held-out rows.
         cars: by name, what was first and what is last.
         steps: of the horizon that the diagnosis is about.
-        seed: of the bootstrap over blocks in time.
     """
     ahead = sorted({1, steps, windows.steps})
     errors = {name: windows.errors(car)[:, np.array(ahead) - 1] for name, car in cars.items()}
-    block = blocks(windows)
     found = {
-        name: tuple(explained_variance(replace(windows, steps=k), e[:, i], block) for i, k in enumerate(ahead))
+        name: tuple(explained_variance(replace(windows, steps=k), e[:, i], windows.block) for i, k in enumerate(ahead))
         for name, e in errors.items()
     }
-    return Improvement(cars, np.array(ahead) * windows.data.T_s, ahead.index(steps), errors, found, windows, seed)
-
-
-def blocks(windows: SimulationWindows) -> Indices:
-    """Number of the block in time of each window, shape ``(W,)``."""
-    return np.unique((windows.time // BLOCK).astype(np.intp), return_inverse=True)[1]
-
-
-def _sums(values: Vector, block: Indices) -> Vector:
-    out = np.zeros((block.max() + 1, *values.shape[1:]))
-    np.add.at(out, block, values)
-    return out
+    return Improvement(cars, np.array(ahead) * windows.data.T_s, ahead.index(steps), errors, found, windows)

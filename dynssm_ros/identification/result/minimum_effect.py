@@ -12,24 +12,12 @@ from itertools import groupby
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import Values
 from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, limits, unit, with_values
 from dynssm_ros.identification.problem.noise import weights
-from dynssm_ros.identification.result.diagnosis import SMALL_SHARE
 from dynssm_ros.identification.search.candidates import Candidate
-from dynssm_ros.identification.search.selection import DECISIVE_DELTA_BIC
-from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
-
-_PLACES = np.linspace(0.0, 1.0, 4, endpoint=False)  # of the lap
-_TRIED = 100  # windows, which count for all
-_FIRST = 0.01  # of the unit of a parameter: so little that fitted values follow in proportion
-_ROUNDS = 12  # in which sizes are looked for
-_AT_ONCE = 10.0  # times, by which one changes in a round
-_SETTLED = 1.1  # times
-_FOLLOWED = 2  # rounds in which fitted values follow an effect
-_SHARES = (1.0, 0.3)  # of the way there that a round tries
-_NOTHING = 1e-9  # of what is needed
-_MATTERS = SMALL_SHARE / (1 - SMALL_SHARE)  # of the squared error of what is left
+from dynssm_ros.vehicle.effects import LOCATION
 
 
 def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable[Candidate]) -> dict[str, float]:
@@ -49,9 +37,10 @@ def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable
     sizes: dict[str, list[_Size]] = {}
     for candidate in found:
         if candidate.effect not in taken and candidate.effect not in sizes:
-            sizes[candidate.effect] = [_Size(candidate, at, len(fit.position)) for at in _where(candidate)]
+            places = [{LOCATION[0]: at} for at in tuning.DETECTION_PLACES] if candidate.local else [{}]
+            sizes[candidate.effect] = [_Size(candidate, at, len(fit.position)) for at in places]
     nearby = _Nearby(problem, fit)
-    for _ in range(_ROUNDS):
+    for _ in range(tuning.DETECTION_ROUNDS):
         left = [one for each in sizes.values() for one in each if not one.settled]
         for one, worth in zip(left, nearby.worth(left), strict=True):
             one.change(float(worth))
@@ -59,11 +48,6 @@ def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable
         effect: max(float(np.median([one.size for one in each])), fit.car.least(effect))
         for effect, each in sizes.items()
     }
-
-
-def _where(candidate: Candidate) -> list[Values]:
-    """Where on the lap it is tried."""
-    return [{LOCATION[0]: float(place)} for place in _PLACES] if candidate.local else [{}]
 
 
 class _Size:
@@ -76,14 +60,12 @@ class _Size:
     """
 
     def __init__(self, candidate: Candidate, at: Values, fitted: int) -> None:
-        self.effect = candidate.effect
-        self._parameter = candidate.amplitudes[0]
-        about = EFFECTS[self.effect].PARAMETERS
+        self.effect, self._parameter, about = candidate.effect, candidate.amplitudes[0], candidate.about
         self._about = about[self._parameter]
-        self._form = {name: about[name].neutral for name in candidate.shapes} | dict(at)
+        self._form = {name: about[name].neutral for name in candidate.shapes} | at
         bound = self._about.upper if self._about.direction > 0 else self._about.lower
         self._most = abs(bound - self._about.neutral)
-        self.size = min(_FIRST * unit(self.effect, self._parameter), self._most)
+        self.size = min(tuning.FIRST_SIZE * unit(self.effect, self._parameter), self._most)
         self.follows: Vector = np.zeros(fitted)
         """What the fitted values do for each unit of it."""
         self.settled = False
@@ -101,27 +83,23 @@ class _Size:
             self._less = self.size
         else:
             self._enough = self.size
-        change = worth**-0.5 if worth > _NOTHING else np.inf
-        close, beyond = 1 / _SETTLED < change < _SETTLED, worth < 1.0 and self.size >= self._most
-        self.settled = bool(close or beyond or self._enough < _SETTLED * self._less)
+        change, tolerance = worth**-0.5 if worth > 1e-9 else np.inf, tuning.DETECTION_TOLERANCE
+        close, beyond = 1 / tolerance < change < tolerance, worth < 1.0 and self.size >= self._most
+        self.settled = bool(close or beyond or self._enough < tolerance * self._less)
         if close or beyond:
             self.size *= change
         elif self._less > 0.0 and np.isfinite(self._enough):
             self.size = float(np.sqrt(self._less * self._enough))
         else:
-            self.size = min(self.size * float(np.clip(change, 1 / _AT_ONCE, _AT_ONCE)), self._most)
+            limited = float(np.clip(change, 1 / tuning.SIZE_CHANGE, tuning.SIZE_CHANGE))
+            self.size = min(self.size * limited, self._most)
 
 
 class _Nearby:
-    """Cars that are like that of a fit but for an effect, as the data see them.
-
-    Args:
-        problem: the windows.
-        fit: the fit.
-    """
+    """Cars that are like that of a fit but for an effect, as the data see them."""
 
     def __init__(self, problem: IdentificationProblem, fit: Fit) -> None:
-        some, near = problem.part(fit, -(-len(problem.windows) // _TRIED))
+        some, near = problem.part(fit, -(-len(problem.windows) // tuning.DETECTION_WINDOWS))
         self._problem, self._fit = some, near
         counts = len(problem.windows) / (len(some.windows) * problem.counted_once(fit))
         self._root = np.sqrt(weights(near.noise.whiten(near.errors)) * counts)[:, None]
@@ -130,7 +108,7 @@ class _Nearby:
         self._H = self._J.T @ self._J + self._prior
         self._error = np.maximum((near.errors[:, -3:] ** 2).sum(axis=0), 1e-300)
         self._limits = limits(near.car, near.free)
-        self._needed = np.log(problem.windows.target.size) + DECISIVE_DELTA_BIC
+        self._needed = np.log(problem.windows.target.size) + tuning.DECISIVE_DELTA_BIC
 
     def worth(self, sizes: Sequence[_Size]) -> Vector:
         """How far each exceeds what makes it a cause, once all fitted values have followed it as far as they can, ``(n,)``.
@@ -141,14 +119,23 @@ class _Nearby:
         """
         if not sizes:
             return np.empty(0)
-        present = np.concatenate([self._with_effect(name, list(one)) for name, one in groupby(sizes, _name)])
+        car = self._fit.car
+        present = np.concatenate(
+            [
+                self._problem.errors_of([car.with_effect(name, {**car.effects.get(name, {}), **each.values}) for each in own])
+                for name, own in groupby(sizes, lambda size: size.effect)
+            ]
+        )  # fmt: skip
         followed = np.zeros((len(sizes), len(self._H)))
         rest = present - self._fit.errors
         told = self._told(rest, followed)
-        for k in range(1 + _FOLLOWED):
-            # at first as for the size before
-            move = self._move(rest, followed) if k else np.stack([one.size * one.follows for one in sizes])
-            for share in _SHARES if k else (1.0,):
+        for k in range(1 + tuning.FOLLOW_ROUNDS):
+            if k:  # as if errors were linear in the fitted values
+                pull = self._seen(rest).reshape(len(rest), -1) @ self._J - followed @ self._prior
+                move = np.asarray(np.linalg.solve(self._H, pull.T).T)
+            else:  # as for the size before
+                move = np.stack([one.size * one.follows for one in sizes])
+            for share in tuning.FOLLOW_SHARES if k else (1.0,):
                 tried = np.clip(self._fit.position + followed + share * move, *self._limits) - self._fit.position
                 other = present - self._errors(tried)
                 less = self._told(other, tried)
@@ -157,18 +144,15 @@ class _Nearby:
         for one, each in zip(sizes, followed, strict=True):
             one.follows = each / one.size
         seen = told - self._surprise(followed)
-        matters = np.max((rest[..., -3:] ** 2).sum(axis=1) / self._error, axis=1) / _MATTERS
+        # of the squared error of what is left
+        share = np.max((rest[..., -3:] ** 2).sum(axis=1) / self._error, axis=1)
+        matters = share / (tuning.SMALL_SHARE / (1 - tuning.SMALL_SHARE))
         return np.asarray(np.minimum(told / self._needed, np.where(2 * seen < told, np.inf, matters)))
 
     def _errors(self, followed: Vector) -> Vector:
         """Errors of the car of the fit with its values moved by ``(n, P)``: ``(n, W, 3 K)``."""
         fit = self._fit
         return self._problem.errors_of([with_values(fit.car, fit.free, fit.position + each) for each in followed])
-
-    def _move(self, rest: Vector, followed: Vector) -> Vector:
-        """How the fitted values would take up what is left, if errors were linear in them, ``(n, P)``."""
-        pull = self._seen(rest).reshape(len(rest), -1) @ self._J - followed @ self._prior
-        return np.asarray(np.linalg.solve(self._H, pull.T).T)
 
     def _told(self, rest: Vector, followed: Vector) -> Vector:
         """Twice the logarithm of the likelihood of what is left and of how far the fitted values moved, ``(n,)``."""
@@ -178,16 +162,7 @@ class _Nearby:
         """How far the fitted values moved: squared, in standard deviations of what was known, ``(n,)``."""
         return np.asarray(np.einsum("np,pq,nq->n", followed, self._prior, followed))
 
-    def _with_effect(self, name: str, sizes: Sequence[_Size]) -> Vector:
-        """Errors of the car with an effect of several sizes, ``(n, W, 3 K)``."""
-        own = dict(self._fit.car.effects.get(name, {}))
-        return self._problem.errors_of([self._fit.car.with_effect(name, own | dict(one.values)) for one in sizes])
-
     def _seen(self, change: Vector) -> Vector:
         """Changes ``(n, W, 3 K)`` of the errors in units of the noise, as far as they count; outliers count less."""
         white = [self._fit.noise.whiten(one) for one in change]
         return np.stack([self._root * np.sqrt(weights(one))[:, None] * one for one in white])
-
-
-def _name(size: _Size) -> str:
-    return size.effect

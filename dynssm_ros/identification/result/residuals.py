@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Indices, Vector, sums_by
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
-
-_FOLDS = 10
-_PLACES = 20
-_RIDGE = 3.0
-_ORDERS = 500
-_BEYOND_CHANCE = 5.0  # standard deviations; noise alone reached 2.2 in 15 drives
-_INFLATED = 4.5  # noise alone reached 1.1 in 15 drives, and 3.9 in 4 where it hung together over a fifth of a second
-_SURE = 3.0  # standard errors by which the explanation must be better than none
 
 
 @dataclass(frozen=True)
@@ -41,7 +35,7 @@ class ExplainedVariance:
     @property
     def is_there(self) -> bool:
         """Whether there is any beyond chance."""
-        return self.sure > _SURE
+        return self.sure > tuning.SURE_STD
 
 
 @dataclass(frozen=True)
@@ -62,10 +56,22 @@ class ClusteredResiduals:
     @property
     def is_there(self) -> bool:
         """Whether it is beyond chance."""
-        return self.sure > _BEYOND_CHANCE or self.inflation > _INFLATED
+        return self.sure > tuning.CLUSTERED_STD or self.inflation > tuning.CLUSTERED_INFLATION
 
 
-def clustered(sizes: Vector, time: Vector, block: Indices, inflation: float, seed: int = 0) -> ClusteredResiduals:
+class Left(NamedTuple):
+    """What a car leaves: what is systematic, and what comes together in time."""
+
+    systematic: ExplainedVariance
+    clustered: ClusteredResiduals
+
+    @property
+    def is_there(self) -> bool:
+        """Whether it is more than noise."""
+        return self.systematic.is_there or self.clustered.is_there
+
+
+def clustered(sizes: Vector, time: Vector, block: Indices, inflation: float) -> ClusteredResiduals:
     """Looks for errors that come together.
 
     Args:
@@ -74,15 +80,14 @@ def clustered(sizes: Vector, time: Vector, block: Indices, inflation: float, see
         time: of each window (s), shape ``(W,)``.
         block: number of the block in time of each window, shape ``(W,)``.
         inflation: of the variance of what was fitted, by errors that hang together.
-        seed: of the orders that are drawn.
     """
     count = np.bincount(block)
 
     def uneven(x: Vector) -> float:
         return float((count * (np.bincount(block, x) / count - x.mean()) ** 2).sum())
 
-    rng = np.random.default_rng(seed)
-    by_chance = np.array([uneven(rng.permutation(sizes)) for _ in range(_ORDERS)])
+    rng = np.random.default_rng(0)
+    by_chance = np.array([uneven(rng.permutation(sizes)) for _ in range(tuning.SHUFFLES)])
     worst = time[block == int(np.argmax(np.bincount(block, sizes) / count))]
     sure = (uneven(sizes) - by_chance.mean()) / max(by_chance.std(), 1e-12)
     return ClusteredResiduals(float(sure), inflation, (float(worst.min()), float(worst.max())))
@@ -97,41 +102,33 @@ def explained_variance(windows: SimulationWindows, errors: Vector, block: Indice
         block: number of the block in time of each window, shape ``(W,)``; blocks are left out as a whole.
     """
     y = errors / np.maximum(np.sqrt((errors**2).mean(axis=0)), 1e-12)
-    y = np.clip(y, -4.0, 4.0)
-    signals = _signals(windows)
+    y = np.clip(y, -tuning.FAR_SPREADS, tuning.FAR_SPREADS)
+    signals, places = _signals(windows), _places(windows)
     X = _features(np.stack(list(signals.values()), axis=1))
-    places = _places(windows)
-    fold = block * _FOLDS // (block.max() + 1)
-    alone = None if places is None else _cross_validated(places, y, fold)
+    fold = block * tuning.FOLDS // (block.max() + 1)
     both = _cross_validated(X if places is None else np.concatenate([X, places], axis=1), y, fold)
-    better = ((y**2) - (y - both) ** 2).sum(axis=1)
-    sums = np.bincount(block, better)
-    sure = float(sums.sum() / max(np.sqrt((sums**2).sum()), 1e-12))
+    sums = sums_by(block, ((y**2) - (y - both) ** 2).sum(axis=1))
     return ExplainedVariance(
         _share(y, both),
-        np.full(3, np.nan) if alone is None else _share(y, alone),
-        sure,
-        {
-            channel: {name: round(value, 2) for name, value in _strongest(signals, y[:, c]).items()}
-            for c, channel in enumerate(STATE_SIGNALS)
-        },
+        np.full(3, np.nan) if places is None else _share(y, _cross_validated(places, y, fold)),
+        float(sums.sum() / max(np.sqrt((sums**2).sum()), 1e-12)),
+        {channel: _strongest(signals, y[:, c]) for c, channel in enumerate(STATE_SIGNALS)},
         {} if places is None else _stretches(windows, places, y),
     )
 
 
 def _signals(windows: SimulationWindows) -> dict[str, Vector]:
     """What was going on in each window, on average."""
-    at = windows.starts[:, None] + np.arange(windows.steps)
-    v_x, v_y, omega, r, delta, r_cmd, delta_cmd = windows.data.rows[:, at].mean(axis=2)
-    change = windows.data.rows[:, windows.starts + windows.steps] - windows.data.rows[:, windows.starts]
-    span = windows.steps * windows.data.T_s
+    v_x, v_y, omega, r, delta, r_cmd, delta_cmd = windows.driven
+    rows, span = windows.data.rows, windows.steps * windows.data.T_s
+    change = (rows[:, windows.starts + windows.steps] - rows[:, windows.starts]) / span
     return {
         "speed": v_x,
         "lateral acceleration": v_x * omega,
-        "longitudinal acceleration": change[0] / span,
-        "yaw acceleration": change[2] / span,
+        "longitudinal acceleration": change[0],
+        "yaw acceleration": change[2],
         "steering": delta + delta_cmd,
-        "steering speed": change[4] / span,
+        "steering speed": change[4],
         "throttle": r + r_cmd,
         "sideslip": v_y / np.maximum(v_x, 0.1),
         "time": windows.time,
@@ -146,11 +143,11 @@ def _features(signals: Vector) -> Vector:
 
 
 def _places(windows: SimulationWindows) -> Vector | None:
+    """In which stretch of the lap each window is, as an indicator; ``None``: not known."""
     if not windows.data.on_one_lap:
         return None
-    here = windows.context(windows.steps // 2)
-    bin_ = np.minimum((here["s"] / here["lap_length"] * _PLACES).astype(int), _PLACES - 1)
-    return np.asarray(np.eye(_PLACES)[bin_])
+    here, count = windows.context(windows.steps // 2), tuning.LAP_STRETCHES
+    return np.asarray(np.eye(count)[np.minimum((here["s"] / here["lap_length"] * count).astype(int), count - 1)])
 
 
 def _stretches(windows: SimulationWindows, places: Vector, y: Vector) -> dict[str, tuple[float, float]]:
@@ -158,7 +155,7 @@ def _stretches(windows: SimulationWindows, places: Vector, y: Vector) -> dict[st
     count = np.maximum(places.sum(axis=0), 1.0)[:, None]
     mean = places.T @ y / count
     spread = np.sqrt(np.maximum(places.T @ y**2 / count - mean**2, 1e-12) / count)
-    length = float(windows.context(0)["lap_length"][0]) / _PLACES
+    length = float(windows.context(0)["lap_length"][0]) / tuning.LAP_STRETCHES
     worst = np.abs(mean / (spread + 1.0 / np.sqrt(len(y)))).argmax(axis=0)
     return {c: (float(k * length), float((k + 1) * length)) for c, k in zip(STATE_SIGNALS, worst, strict=True)}
 
@@ -168,9 +165,9 @@ def _cross_validated(X: Vector, y: Vector, fold: Indices) -> Vector:
     out = np.zeros_like(y)
     for part in np.unique(fold):
         rest = fold != part
-        H = X[rest].T @ X[rest] + _RIDGE * np.eye(X.shape[1])
+        H = X[rest].T @ X[rest] + tuning.RIDGE * np.eye(X.shape[1])
         out[~rest] = X[~rest] @ np.linalg.solve(H, X[rest].T @ y[rest])
-    return np.asarray(np.clip(out, -4.0, 4.0))
+    return np.asarray(np.clip(out, -tuning.FAR_SPREADS, tuning.FAR_SPREADS))
 
 
 def _share(y: Vector, predicted: Vector) -> Vector:
@@ -179,5 +176,6 @@ def _share(y: Vector, predicted: Vector) -> Vector:
 
 
 def _strongest(signals: dict[str, Vector], y: Vector) -> dict[str, float]:
+    """The three signals with which an error goes most, with their correlation."""
     known = {name: float(np.corrcoef(x, y)[0, 1]) for name, x in signals.items() if x.std() > 0 and y.std() > 0}
-    return dict(sorted(known.items(), key=lambda item: -abs(item[1]))[:3])
+    return {name: round(known[name], 2) for name in sorted(known, key=lambda name: -abs(known[name]))[:3]}

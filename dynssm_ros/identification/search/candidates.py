@@ -6,29 +6,23 @@ A local effect's response is the global response times a window over the lap, so
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate, Values
 from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, unit
 from dynssm_ros.identification.problem.levels import ONE_RECORDING, Levels
 from dynssm_ros.identification.problem.noise import weights
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
-from dynssm_ros.vehicle.effects.base import LAP, section
+from dynssm_ros.vehicle.effects.base import LAP, Parameter, section
 
-_SIZE_GRID_UNITS = (6.0, 1.5, 0.375, 0.094, 0.023)  # units: sizes at which effects are tried, a factor of 4 apart
-BOTH_SIDES_UNITS = (*_SIZE_GRID_UNITS, *(-size for size in _SIZE_GRID_UNITS))
-_LOCAL_SIZE_UNITS = 1.5  # unit at which effects are tried that act somewhere on the lap
-_SIZE_REACH = (0.5, 3.0)  # times a size, for which its response serves
-_NONLINEARITY = (
-    0.1  # relative difference of responses to a small and a large size, beyond which an effect is not linear
-)
-_VISIBLE_NOISE_SHARE = 0.3  # of the noise, that a unit of an effect has to change
-_LEAST = 1e-5  # share of a column that the nominal values must leave for the effect to be seen
+_MIDDLE, _SMALL = tuning.SIZE_GRID[1], tuning.SIZE_GRID[3]
 
 
 @dataclass(frozen=True)
@@ -46,19 +40,24 @@ class Candidate:
     only_in: tuple[int, ...] = ()
 
     @property
+    def about(self) -> Mapping[str, Parameter]:
+        """All parameters of the effect."""
+        return EFFECTS[self.effect].PARAMETERS
+
+    @property
     def amplitudes(self) -> tuple[str, ...]:
         """The parameters that say how much."""
-        return tuple(p for p in self.parameters if not EFFECTS[self.effect].PARAMETERS[p].shape)
+        return tuple(p for p in self.parameters if not self.about[p].shape)
 
     @property
     def shapes(self) -> tuple[str, ...]:
         """The parameters that say where or how."""
-        return tuple(p for p in self.parameters if EFFECTS[self.effect].PARAMETERS[p].shape)
+        return tuple(p for p in self.parameters if self.about[p].shape)
 
     @property
     def local(self) -> bool:
         """Whether it acts on a section of the lap only."""
-        return any(EFFECTS[self.effect].PARAMETERS[p].local for p in self.parameters)
+        return any(self.about[p].local for p in self.parameters)
 
     @property
     def by_place(self) -> bool:
@@ -73,13 +72,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class ScoredCandidate:
-    """How much a candidate would improve the fit, by linearised errors.
-
-    Attributes:
-        candidate: what was tried.
-        values: with which parameters.
-        improvement: decrease of the squared error in units of the noise.
-    """
+    """How much a candidate with some values would improve the fit: decrease of the squared error in units of the noise."""
 
     candidate: Candidate
     values: Values
@@ -122,8 +115,7 @@ def candidates(
     return found, left
 
 
-@dataclass(frozen=True)
-class Response:
+class Response(NamedTuple):
     """What a parameter does to the errors, per unit, when it is as large as ``size`` (units, signed)."""
 
     size: float
@@ -138,7 +130,7 @@ class Responses:
     """
 
     def __init__(self, problem: IdentificationProblem, car: CarEstimate, errors: Vector) -> None:
-        self._study, self._car, self._errors = problem, car, errors
+        self._problem, self._car, self._errors = problem, car, errors
         self._known: dict[tuple[str, str, bool, tuple[tuple[str, float], ...]], list[Response]] = {}
         windows = problem.windows
         if "s" in windows.data.context:
@@ -150,38 +142,37 @@ class Responses:
 
         A response to one size alone serves for all.
         """
-        effect = candidate.effect
         place = {k: v for k, v in shape.items() if k in LOCATION}
         form = {k: v for k, v in shape.items() if k not in place}
-        about = EFFECTS[effect].PARAMETERS[parameter]
-        local = bool(place) and about.local
-        key = (effect, parameter, local, tuple(sorted(form.items())))
+        local = bool(place) and candidate.about[parameter].local
+        key = (candidate.effect, parameter, local, tuple(sorted(form.items())))
         if key not in self._known:
-            everywhere = {"s": 0.5, "lap_length": 1.0} if local else None
-            if candidate.local:
-                found = self._simulated(effect, parameter, form, (_LOCAL_SIZE_UNITS, -_LOCAL_SIZE_UNITS), everywhere)
-            else:
-                found = self._simulated(effect, parameter, form, (_SIZE_GRID_UNITS[1], _SIZE_GRID_UNITS[3]), everywhere)
-                if _differ(found):
-                    found = self._simulated(effect, parameter, form, BOTH_SIDES_UNITS, everywhere)
-                else:
-                    found = found[:1]
-            self._known[key] = found
+            self._known[key] = self._simulated(candidate, parameter, form, local)
         share = np.asarray(section(np, self._lap, **place)).mean(axis=0) if local else None
         if candidate.only_in:
-            acts = np.isin(self._study.windows.number, candidate.only_in)
+            acts = np.isin(self._problem.windows.number, candidate.only_in)
             share = acts if share is None else acts * share
         return self._known[key], share
 
-    def _simulated(
-        self, effect: str, parameter: str, form: Values, sizes: Sequence[float], everywhere: dict[str, float] | None
-    ) -> list[Response]:
-        """Responses to those sizes that the parameter can have; at least one."""
+    def _simulated(self, candidate: Candidate, parameter: str, form: Values, local: bool) -> list[Response]:
+        """To a size on either side where it acts at a place; else to one size, or to all if it is not linear."""
+        if candidate.local:
+            return self._at(candidate.effect, parameter, form, (_MIDDLE, -_MIDDLE), local)
+        found = self._at(candidate.effect, parameter, form, (_MIDDLE, _SMALL), local)
+        largest = max(np.linalg.norm(response.errors) for response in found)
+        apart = max(np.linalg.norm(response.errors - found[0].errors) for response in found)
+        if apart > tuning.NONLINEARITY * largest:
+            return self._at(candidate.effect, parameter, form, tuning.BOTH_SIDES, local)
+        return found[:1]
+
+    def _at(self, effect: str, parameter: str, form: Values, sizes: Sequence[float], local: bool) -> list[Response]:
+        """To those sizes that the parameter can have; at least one."""
         about, one = EFFECTS[effect].PARAMETERS[parameter], unit(effect, parameter)
         start = dict(self._car.effects.get(effect, {})) | form
         steps = steps_off(effect, parameter, sizes) or [-sizes[0] * one]
         cars = [self._car.with_effect(effect, start | {parameter: about.neutral + step}) for step in steps]
-        changes = self._study.errors_of(cars, everywhere) - self._errors
+        everywhere = {"s": 0.5, "lap_length": 1.0} if local else None
+        changes = self._problem.errors_of(cars, everywhere) - self._errors
         return [Response(step / one, change * one / step) for step, change in zip(steps, changes, strict=True)]
 
 
@@ -192,26 +183,15 @@ def steps_off(effect: str, parameter: str, sizes: Sequence[float]) -> list[float
     return sorted({step for step in wanted if step != 0.0})
 
 
-def _differ(found: list[Response]) -> bool:
-    """Whether the responses to several sizes are not the same per unit."""
-    sizes = [np.linalg.norm(response.errors) for response in found]
-    apart = max(np.linalg.norm(response.errors - found[0].errors) for response in found)
-    return bool(apart > _NONLINEARITY * max(sizes))
-
-
-@dataclass(frozen=True)
-class _WhitenedResponse:
-    """A response as the errors see it, window by window.
-
-    Attributes:
-        white: whitened, shape ``(W, 3 K)``.
-        taken: its products with the basis of what the fitted values can take up, shape ``(W, P)``.
-        along: its products with the errors, shape ``(W,)``.
-    """
+class _Whitened(NamedTuple):
+    """A response as the errors see it, window by window."""
 
     white: Vector
+    """Whitened, ``(W, 3 K)``."""
     taken: Vector
+    """Products with the basis of what the fitted values can take up, ``(W, P)``."""
     along: Vector
+    """Products with the errors, ``(W,)``."""
 
 
 class ScoreTest:
@@ -225,7 +205,7 @@ class ScoreTest:
 
     def __init__(self, problem: IdentificationProblem, fit: Fit, responses: Responses) -> None:
         self._fit, self._responses = fit, responses
-        self._columns: dict[int, _WhitenedResponse] = {}
+        self._columns: dict[int, _Whitened] = {}
         self._products: dict[tuple[int, int], Vector] = {}
         white = fit.noise.whiten(fit.errors)
         self._root = np.sqrt(weights(white))[:, None]
@@ -243,21 +223,21 @@ class ScoreTest:
     def try_all(self, found: list[Candidate]) -> Iterator[ScoredCandidate]:
         """The best place, form and size of each candidate that shows at all."""
         for candidate in found:
-            best = None
-            about = EFFECTS[candidate.effect].PARAMETERS
-            for combination in product(*(about[p].tried for p in candidate.shapes)):
-                scored = self._try(candidate, dict(zip(candidate.shapes, combination, strict=True)))
-                if scored is not None and (best is None or scored.improvement > best.improvement):
-                    best = scored
+            tried = [candidate.about[p].tried for p in candidate.shapes]
+            scored = (
+                self._try(candidate, dict(zip(candidate.shapes, shape, strict=True))) for shape in product(*tried)
+            )
+            best = max(filter(None, scored), key=lambda one: one.improvement, default=None)
             if best is not None:
                 yield best
 
     def _try(self, candidate: Candidate, shape: Values) -> ScoredCandidate | None:
+        """The best size of a candidate whose shape is given; ``None`` where nothing of it shows."""
         responses = [self._responses.of(candidate, p, shape) for p in candidate.amplitudes]
         nonlinear = np.array([len(known) > 1 for known, _ in responses]) & (not candidate.local)
         sizes = sorted({abs(r.size) for (known, _), b in zip(responses, nonlinear, strict=True) if b for r in known})
         best: tuple[float, Vector] | None = None
-        for size in sizes or [_LOCAL_SIZE_UNITS]:
+        for size in sizes or [_MIDDLE]:
             signs = np.ones(len(responses))
             for _ in range(2):
                 gram, along, seen = self._normal(
@@ -274,7 +254,8 @@ class ScoreTest:
                 continue
             # the slope serves for all: with nominal values that make up for it, it goes on
             if sizes and size > sizes[0]:
-                limited = np.sign(amounts) * np.clip(np.abs(amounts), size * _SIZE_REACH[0], size * _SIZE_REACH[1])
+                lower, upper = tuning.SIZE_REACH
+                limited = np.sign(amounts) * np.clip(np.abs(amounts), size * lower, size * upper)
                 amounts = np.where(nonlinear, limited, amounts)
             improvement = float(2 * along @ amounts - amounts @ gram @ amounts)
             if best is None or improvement > best[0]:
@@ -283,12 +264,11 @@ class ScoreTest:
             return None
         values = dict(shape)
         for parameter, amount in zip(candidate.amplitudes, best[1], strict=True):
-            about = EFFECTS[candidate.effect].PARAMETERS[parameter]
+            about = candidate.about[parameter]
             wanted = about.neutral + float(amount) * unit(candidate.effect, parameter)
-            margin = 0.02 * (about.upper - about.lower)
-            values[parameter] = float(
-                np.clip(wanted, about.lower + margin * (about.lower < about.neutral), about.upper - margin)
-            )
+            margin = tuning.BOUND_MARGIN * (about.upper - about.lower)
+            lowest = about.lower + margin * (about.lower < about.neutral)
+            values[parameter] = float(np.clip(wanted, lowest, about.upper - margin))
         return ScoredCandidate(candidate, values, best[0])
 
     def _normal(self, raw: list[Vector], shares: list[Vector | None]) -> tuple[Vector, Vector, bool]:
@@ -299,23 +279,20 @@ class ScoreTest:
         """
         columns = [self._column(r) for r in raw]
         weight = [np.ones(len(self._left)) if s is None else s for s in shares]
+        pairs = list(zip(raw, weight, strict=True))
         taken = np.stack([w @ c.taken for c, w in zip(columns, weight, strict=True)])
-        whole = np.array(
-            [
-                [(w * v) @ self._product(a, b) for b, v in zip(raw, weight, strict=True)]
-                for a, w in zip(raw, weight, strict=True)
-            ]
-        )
+        whole = np.array([[(w * v) @ self._product(a, b) for b, v in pairs] for a, w in pairs])
         gram = whole - taken @ taken.T
         along = -np.array([w @ c.along for c, w in zip(columns, weight, strict=True)])
         size, left = np.diag(whole), np.diag(gram)
-        return gram, along, bool((size > _VISIBLE_NOISE_SHARE**2).all() and (left > _LEAST**2 * size).any())
+        visible = (size > tuning.VISIBLE_NOISE_SHARE**2).all() and (left > tuning.COLUMN_LEFT**2 * size).any()
+        return gram, along, bool(visible)
 
-    def _column(self, raw: Vector) -> _WhitenedResponse:
+    def _column(self, raw: Vector) -> _Whitened:
         if id(raw) not in self._columns:
             white = self._fit.noise.whiten(raw) * self._root
             taken = np.einsum("wn,wnp->wp", white, self._basis)
-            self._columns[id(raw)] = _WhitenedResponse(white, taken, np.einsum("wn,wn->w", white, self._left))
+            self._columns[id(raw)] = _Whitened(white, taken, np.einsum("wn,wn->w", white, self._left))
         return self._columns[id(raw)]
 
     def _product(self, a: Vector, b: Vector) -> Vector:

@@ -28,17 +28,7 @@ from dynssm_ros.vehicle.effects.actuators import SteeringLag
 from dynssm_ros.vehicle.effects.inertia import YawInertia
 from dynssm_ros.vehicle.integrators import Integrator
 
-_TRIED = 300  # windows with which the integrator is chosen at first
-
-
-class Stepping(NamedTuple):
-    """How a simulation steps from row to row."""
-
-    integrator: Integrator
-    hold: Hold
-
-
-_OPTIONS = (Stepping("rk4", "zero"), Stepping("rk4", "first"), Stepping("euler", "zero"))
+_OPTIONS: tuple[tuple[Integrator, Hold], ...] = (("rk4", "zero"), ("rk4", "first"), ("euler", "zero"))
 
 
 class SearchResult(NamedTuple):
@@ -90,42 +80,39 @@ def search_causes(
         return SearchResult(problem, searching, searching.run(start), impossible)
 
     on_progress("choosing how the model steps")
-    options = [one for one in _OPTIONS if integrator in (None, one.integrator)]
-    options.sort(key=lambda one: car.vehicle.integrator not in (None, one.integrator))  # those of the file first
-    stepped = {one: _stepped(windows, car, one) for one in options}
-    first = _closest({one: (problem, fit) for one, (_, problem, fit) in stepped.items()})
-    found = search(stepped[first][0])
+    options = [one for one in _OPTIONS if integrator in (None, one[0])]
+    options.sort(key=lambda one: car.vehicle.integrator not in (None, one[0]))  # those of the file first
+    stepped = {one: _stepped(replace(windows, hold=one[1]), car, one[0]) for one in options}
+    first = _closest(stepped)
+    found = search(stepped[first][0].windows)
     fit = found.selection.fit
-    fits = {first: (found.problem, fit)}
-    for one in options:
-        if one != first:
-            problem = IdentificationProblem(stepped[one][0], known, found.problem.tempering)
-            fits[one] = problem, problem.fit(fit.car, fit.free)
-    last = _closest({one: fits[one] for one in options})
-    return found if last == first else search(stepped[last][0], fit)
+
+    def refitted(one: tuple[Integrator, Hold]) -> tuple[IdentificationProblem, Fit]:
+        if one == first:
+            return found.problem, fit
+        problem = IdentificationProblem(stepped[one][0].windows, known, found.problem.tempering)
+        return problem, problem.fit(fit.car, fit.free)
+
+    last = _closest({one: refitted(one) for one in options})
+    return found if last == first else search(stepped[last][0].windows, fit)
 
 
-def _stepped(
-    windows: SimulationWindows, car: CarEstimate, stepping: Stepping
-) -> tuple[SimulationWindows, IdentificationProblem, Fit]:
-    """The windows in steps that are short enough for the recalibrated car too; some of them, and that car's fit to these.
+def _stepped(windows: SimulationWindows, car: CarEstimate, integrator: Integrator) -> tuple[IdentificationProblem, Fit]:
+    """The windows in steps that are short enough for the recalibrated car too, and that car's fit to them.
 
     That car may be much stiffer than the one of the file, and a simulation whose steps are too long for it runs away.
     """
-    integrator, hold = stepping
-    windows = replace(windows, hold=hold)
-    some = windows.select(np.arange(0, len(windows), -(-len(windows) // _TRIED)))
-    trial = some.with_integrator(integrator, car.vehicle)
+    trial = windows.with_integrator(integrator, car.vehicle)
     problem = IdentificationProblem(trial, car.as_known)
     fit = problem.recalibrated(car)
     finer = trial.with_integrator(integrator, car.vehicle.with_nominal(np.array(fit.car.theta)))
     if finer.substeps > trial.substeps:
-        trial, problem = finer, IdentificationProblem(finer, car.as_known)
+        problem = IdentificationProblem(finer, car.as_known)
         fit = problem.fit(fit.car, ())
-    return replace(windows, integrator=integrator, substeps=trial.substeps), problem, fit
+    return problem, fit
 
 
-def _closest(fits: Mapping[Stepping, tuple[IdentificationProblem, Fit]]) -> Stepping:
+def _closest(fits: Mapping[tuple[Integrator, Hold], tuple[IdentificationProblem, Fit]]) -> tuple[Integrator, Hold]:
     """The steps in which the car, with what hides them, is closest to the data; those alone if there are no others."""
     if len(fits) == 1:
         return next(iter(fits))

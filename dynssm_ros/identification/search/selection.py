@@ -12,7 +12,8 @@ from functools import partial
 
 import numpy as np
 
-from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification import tuning
+from dynssm_ros.identification.problem.car import CarEstimate, Values
 from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem
 from dynssm_ros.identification.problem.recordings import CrossValidation
 from dynssm_ros.identification.search.candidates import Candidate, Responses, ScoredCandidate, ScoreTest
@@ -21,18 +22,6 @@ from dynssm_ros.identification.search.size_search import CandidateStart, SizeSea
 from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
-
-DECISIVE_DELTA_BIC = 10.0  # difference in the information criterion that counts as very strong (Kass and Raftery 1995)
-AMBIGUITY_DELTA_BIC = 6.0  # candidates within this delta BIC are reported as alternatives
-_SHORTLIST = 9  # candidates of which several sizes are tried in each round
-_SHORTLIST_WINDOWS = 150  # windows on which they are tried
-_REFINED = 4  # of them are fitted in full
-_SHORTLIST_SHARE = 0.15  # of the best scored, that another one must reach to be fitted in full
-_NEAR_BEST_SHARE = 0.9  # of the best evidence, near which others are fitted to the end as well
-_MAX_CAUSES = 4  # effects
-_WORTH_A_LOOK = 0.3  # of the best by the criterion, that another must reach to be tried on parts that are left out
-_SURE = 3.0  # standard deviations that a cause must be off neutral
-_ALIKE = 0.1  # logarithm of a ratio of inflations
 
 
 @dataclass(frozen=True)
@@ -58,15 +47,16 @@ class Refined:
     bounded: tuple[str, ...] = ()
 
     @property
-    def is_met(self) -> bool:
-        """Whether it is on a side of neutral on which it is met in cars that can be driven.
+    def values(self) -> Values:
+        """With which its effect was fitted."""
+        return self.fit.car.effects[self.candidate.effect]
 
-        Beside other recordings either side is.
-        """
-        effect, name = self.candidate.effect, self.candidate.amplitudes[0]
-        about = EFFECTS[effect]
-        side = np.sign(self.fit.car.effects[effect][name] - about.PARAMETERS[name].neutral)
-        return bool(self.candidate.only_in) or not about.DIRECTIONS or float(side) in about.DIRECTIONS
+    @property
+    def is_met(self) -> bool:
+        """Whether it is on a side of neutral on which cars that can be driven have it; beside other recordings either."""
+        name, directions = self.candidate.amplitudes[0], EFFECTS[self.candidate.effect].DIRECTIONS
+        side = np.sign(self.values[name] - self.candidate.about[name].neutral)
+        return bool(self.candidate.only_in) or not directions or float(side) in directions
 
     @property
     def strangeness(self) -> tuple[bool, bool, bool, bool]:
@@ -78,9 +68,27 @@ class Refined:
         """Whether it is to act on a section of the lap and the section is as long as can be."""
         if not self.candidate.local:
             return False
-        length, effect = LOCATION[1], self.candidate.effect
-        about, value = EFFECTS[effect].PARAMETERS[length], self.fit.car.effects[effect][length]
+        about, value = self.candidate.about[LOCATION[1]], self.values[LOCATION[1]]
         return about.at_bound(value) and value > about.neutral
+
+    @property
+    def is_little(self) -> bool:
+        """Whether a cause of the car is nearer to neutral than what any car shows, one of another structure, or its file."""
+        least = self.fit.car.least(self.candidate.effect)
+        if not least or self.candidate.only_in:
+            return False
+        return EFFECTS[self.candidate.effect].amount({k: self.values[k] for k in self.candidate.amplitudes}) < least
+
+    @property
+    def is_asked_for(self) -> bool:
+        """Whether the fitted laps ask for it: it is worth its parameters, sure, large enough, and of a part of the lap."""
+        asked = self.delta_bic > tuning.DECISIVE_DELTA_BIC and self.sure > tuning.SURE_STD
+        return asked and not self.is_little and not self.is_everywhere
+
+    @property
+    def pays(self) -> bool:
+        """Whether it is asked for, and holds where it was not fitted."""
+        return self.is_confirmed and self.is_asked_for
 
     @property
     def is_confirmed(self) -> bool:
@@ -126,11 +134,6 @@ def _fitted_roughly(problem: IdentificationProblem, near: Fit, start: CandidateS
     return problem.fit(start.car, (*near.free, *start.candidate.free), near, rough=True)
 
 
-def _fitted_on(problem: IdentificationProblem, fit: Fit) -> Fit:
-    """The same, fitted to the end."""
-    return problem.fit(fit.car, fit.free, fit)
-
-
 class Search:
     """Selects effects by what they predict on parts of the data that were left out.
 
@@ -153,18 +156,21 @@ class Search:
         on_progress: OnProgress = lambda words: None,
         pool: Pool = IN_TURN,
     ) -> None:
-        self._study, self.found, self._report = problem, list(found), on_progress
-        self._known = car.as_known
-        self._folds, self._pool = left_out, pool
+        self._problem, self.found, self._report = problem, list(found), on_progress
+        self._known, self._folds, self._pool = car.as_known, left_out, pool
         self._price = np.log(3.0 * problem.windows.steps * len(problem.windows))
         on_progress("recalibrating the nominal car")
         self.base = problem.temper(problem.recalibrated(car))
         self._tempering = problem.tempering
         self._responses = Responses(problem, self.base.car, self.base.errors)
+        self.tried: dict[str, float] = {}
+        self._forget()
+
+    def _forget(self) -> None:
+        """Fits and candidates of other weights of the data."""
         self._ranked: dict[frozenset[Candidate], list[Refined]] = {}
         self._fits: dict[frozenset[Candidate], Fit] = {frozenset(): self.base}
-        self._left_out = LeaveOneOut(problem, left_out, pool)
-        self.tried: dict[str, float] = {}
+        self._left_out = LeaveOneOut(self._problem, self._folds, self._pool)
 
     def run(self, start: Fit | None = None) -> Selection:
         """Forward while it pays; then each effect is exchanged against all others, or dropped.
@@ -173,7 +179,7 @@ class Search:
             start: a fit of a like problem, whose effects are taken as chosen.
         """
         chosen = self._taken_over(start)
-        while len(chosen) < _MAX_CAUSES:
+        while len(chosen) < tuning.MAX_CAUSES:
             best = self._best(tuple(chosen))
             if best is None:
                 break
@@ -186,8 +192,8 @@ class Search:
     def reject(self, effect: str) -> Selection:
         """Selects anew without an effect."""
         self.found = [candidate for candidate in self.found if candidate.effect != effect]
-        self._study.tempering, self._fits, self._ranked = self._tempering, {frozenset(): self.base}, {}
-        self._left_out = LeaveOneOut(self._study, self._folds, self._pool)
+        self._problem.tempering = self._tempering
+        self._forget()
         return self.run()
 
     def eliminated(self, chosen: tuple[Candidate, ...]) -> Selection:
@@ -195,22 +201,22 @@ class Search:
         while True:
             found = [self._confirm(self._without(chosen, c), self._against(chosen, c)) for c in chosen]
             weakest = min(found, key=lambda r: (r.confirmed_improvement, r.delta_bic), default=None)
-            if weakest is None or _pays(weakest):
+            if weakest is None or weakest.pays:
                 break
             chosen = tuple(c for c in chosen if c != weakest.candidate)
         fit = self.fit(chosen) if chosen else self.base
         found = sorted(found, key=lambda r: -r.confirmed_improvement)
         others = {r.candidate.effect: self._alternatives(chosen, r.candidate) for r in found}
         doubtful = self._unconfirmed(chosen, fit)
-        return Selection(self.base, fit, found, others, self.tried, self._study.inflation(fit), doubtful)
+        return Selection(self.base, fit, found, others, self.tried, self._problem.inflation(fit), doubtful)
 
     def _unconfirmed(self, chosen: tuple[Candidate, ...], fit: Fit) -> Refined | None:
         """The best by the criterion of those that were tried beside ``chosen``, if it is large, sure, and not confirmed."""
         best = next(iter(self._ranked.get(frozenset(chosen), [])), None)
-        if best is None or best.delta_bic <= DECISIVE_DELTA_BIC:
+        if best is None or best.delta_bic <= tuning.DECISIVE_DELTA_BIC:
             return None
         tried = self._confirm(fit, best)
-        return tried if _is_asked_for(tried) and not tried.is_confirmed else None
+        return tried if tried.is_asked_for and not tried.is_confirmed else None
 
     def leave_out(self, selection: Selection, one: Refined) -> Fit:
         """The fit of everything chosen but ``one``."""
@@ -221,8 +227,7 @@ class Search:
         key = frozenset(chosen)
         if key not in self._fits:
             starts = [r.fit for c in chosen for r in self._ranked.get(key - {c}, []) if r.candidate == c]
-            start = min(starts, key=lambda fit: fit.objective)
-            self._fits[key] = self._study.fit(start.car, start.free, start)
+            self._fits[key] = self._problem.again(min(starts, key=lambda fit: fit.objective))
         return self._fits[key]
 
     def ranked(self, before: tuple[Candidate, ...]) -> list[Refined]:
@@ -231,33 +236,34 @@ class Search:
         if key in self._ranked:
             return self._ranked[key]
         fit = self.fit(before)
-        taken = {c.effect for c in before}
-        self._report("trying all effects" + (f" beside {', '.join(taken)}" if taken else ""))
-        score_test = ScoreTest(self._study, fit, self._responses)
-        scored_candidates = list(score_test.try_all([c for c in self.found if c.effect not in taken]))
-        best: dict[str, ScoredCandidate] = {}
-        for scored in sorted(scored_candidates, key=self._expected_delta_bic, reverse=True):
-            best.setdefault(scored.candidate.effect, scored)
-        if not before:
-            self.tried = {name: p.improvement for name, p in best.items()}
-        shortlist = [p for p in best.values() if self._expected_delta_bic(p) >= -self._price][:_SHORTLIST]
-        some, near = self._study.part(fit, max(1, len(self._study.windows) // _SHORTLIST_WINDOWS))
-        trial = SizeSearch(some, near, self._known, self._price, self._study.tempering)
-        starts = sorted(
-            self._pool.map(trial.start, shortlist), key=lambda start: start.expected_delta_bic, reverse=True
-        )
-        least = max([-self._price, *(_SHORTLIST_SHARE * start.expected_delta_bic for start in starts[:1])])
-        refined = self._refined(fit, [start for start in starts[:_REFINED] if start.expected_delta_bic >= least])
-        close = max(
-            [-AMBIGUITY_DELTA_BIC, *(_NEAR_BEST_SHARE * r.delta_bic - 2 * AMBIGUITY_DELTA_BIC for r in refined)]
-        )
-        self._polish(key, [r for r in refined if r.delta_bic > close])
-        refined = [
-            self._judge(fit, self._fits[key | {r.candidate}], r.candidate) if r.delta_bic > close else r
-            for r in refined
-        ]
+        refined = self._refined(fit, self._starts(before, fit))
+        share, apart = tuning.NEAR_BEST_SHARE, tuning.AMBIGUITY_DELTA_BIC
+        close = max([-apart, *(share * r.delta_bic - 2 * apart for r in refined)])
+        rough = [r for r in refined if r.delta_bic > close and key | {r.candidate} not in self._fits]
+        finished = self._pool.map(self._problem.again, [r.fit for r in rough])
+        self._fits |= {key | {r.candidate}: done for r, done in zip(rough, finished, strict=True)}
+        refined = [self._against((*before, r.candidate), r.candidate) if r.delta_bic > close else r for r in refined]
         self._ranked[key] = sorted(refined, key=lambda r: -r.delta_bic)
         return self._ranked[key]
+
+    def _starts(self, before: tuple[Candidate, ...], fit: Fit) -> list[CandidateStart]:
+        """Where to fit the most promising candidates beside ``before`` from, by a score test and in several sizes."""
+        taken = {c.effect for c in before}
+        self._report("trying all effects" + (f" beside {', '.join(taken)}" if taken else ""))
+        score_test = ScoreTest(self._problem, fit, self._responses)
+        scored = list(score_test.try_all([c for c in self.found if c.effect not in taken]))
+        best: dict[str, ScoredCandidate] = {}
+        for each in sorted(scored, key=self._expected_delta_bic, reverse=True):
+            best.setdefault(each.candidate.effect, each)
+        if not before:
+            self.tried = {name: each.improvement for name, each in best.items()}
+        shortlist = [each for each in best.values() if self._expected_delta_bic(each) >= -self._price]
+        some, near = self._problem.part(fit, max(1, len(self._problem.windows) // tuning.SHORTLIST_WINDOWS))
+        trial = SizeSearch(some, near, self._known, self._price, self._problem.tempering)
+        starts = self._pool.map(trial.start, shortlist[: tuning.SHORTLIST])
+        starts.sort(key=lambda start: start.expected_delta_bic, reverse=True)
+        least = max([-self._price, *(tuning.SHORTLIST_SHARE * start.expected_delta_bic for start in starts[:1])])
+        return [start for start in starts[: tuning.REFINED] if start.expected_delta_bic >= least]
 
     def _best(self, before: tuple[Candidate, ...]) -> Refined | None:
         """The candidate that improves most; of those that cannot be told from it the most ordinary one.
@@ -278,7 +284,7 @@ class Search:
             Candidate(name, tuple(p for effect, p in start.free if effect == name), start.car.only_in.get(name, ()))
             for name in effects
         ]
-        self._fits[frozenset(chosen)] = self._study.fit(start.car, start.free)
+        self._fits[frozenset(chosen)] = self._problem.fit(start.car, start.free)
         self._temper(tuple(chosen))
         return chosen
 
@@ -286,53 +292,39 @@ class Search:
         """The candidates beside ``before`` that hold where they were not fitted."""
         without = self.fit(before)
         ranked = self.ranked(before)
-        least = max([DECISIVE_DELTA_BIC, *(_WORTH_A_LOOK * r.delta_bic for r in ranked[:1])])
-        return [r for r in (self._confirm(without, r) for r in ranked if r.delta_bic > least) if _pays(r)]
+        least = max([tuning.DECISIVE_DELTA_BIC, *(tuning.LOOK_SHARE * r.delta_bic for r in ranked[:1])])
+        return [r for r in (self._confirm(without, r) for r in ranked if r.delta_bic > least) if r.pays]
 
     def _confirm(self, without: Fit, refined: Refined) -> Refined:
         self._report(f"leaving parts out: {refined.candidate.effect}")
         confirmation = self._left_out.compare(without, refined.fit)
-        values, about = refined.fit.car.effects[refined.candidate.effect], EFFECTS[refined.candidate.effect].PARAMETERS
-        bounded = tuple(name for name in refined.candidate.amplitudes if about[name].at_bound(values[name]))
-        return replace(refined, confirmation=confirmation, sure=self._sure(refined), bounded=bounded)
-
-    def _sure(self, refined: Refined) -> float:
-        fit, effect = refined.fit, refined.candidate.effect
-        off = np.abs(fit.position) / np.sqrt(np.diag(self._study.covariance(fit)))
-        of_free = off[len(fit.car.moved) :]
-        return float(max(of_free[fit.free.index((effect, name))] for name in refined.candidate.amplitudes))
+        fit, candidate = refined.fit, refined.candidate
+        bounded = tuple(name for name in candidate.amplitudes if candidate.about[name].at_bound(refined.values[name]))
+        off = np.abs(fit.position) / np.sqrt(np.diag(self._problem.covariance(fit)))
+        own = [off[len(fit.car.moved) + fit.free.index((candidate.effect, name))] for name in candidate.amplitudes]
+        return replace(refined, confirmation=confirmation, sure=float(max(own)), bounded=bounded)
 
     def _temper(self, chosen: tuple[Candidate, ...]) -> None:
         """Weighs the data anew, as the errors hang together now that ``chosen`` are known."""
         fit = self.fit(chosen)
-        inflation = self._study.inflation(fit)
-        if abs(np.log(inflation / self._study.tempering)) < _ALIKE:
-            return
-        self._study.tempering = inflation
-        self._ranked, self._left_out = {}, LeaveOneOut(self._study, self._folds, self._pool)
-        self._fits = {
-            frozenset(): self._study.refit(self.base),
-            frozenset(chosen): self._study.refit(fit),
-        }
-
-    def _polish(self, before: frozenset[Candidate], rough: Sequence[Refined]) -> None:
-        """Fits some to the end."""
-        new = {key: r.fit for r in rough if (key := before | {r.candidate}) not in self._fits}
-        fits = self._pool.map(partial(_fitted_on, self._study), list(new.values()))
-        self._fits |= dict(zip(new, fits, strict=True))
+        inflation = self._problem.inflation(fit)
+        if abs(np.log(inflation / self._problem.tempering)) >= tuning.TEMPERING_CHANGE:
+            self._problem.tempering = inflation
+            self._forget()
+            self._fits = {frozenset(): self._problem.refit(self.base), frozenset(chosen): self._problem.refit(fit)}
 
     def _expected_delta_bic(self, scored: ScoredCandidate) -> float:
-        return float(scored.improvement / self._study.tempering - self._price * len(scored.candidate.parameters))
+        return float(scored.improvement / self._problem.tempering - self._price * len(scored.candidate.parameters))
 
     def _refined(self, fit: Fit, starts: Sequence[CandidateStart]) -> list[Refined]:
         if starts:
             self._report(f"fitting {', '.join(start.candidate.effect for start in starts)}")
-        fits = self._pool.map(partial(_fitted_roughly, self._study, fit), starts)
+        fits = self._pool.map(partial(_fitted_roughly, self._problem, fit), starts)
         return [self._judge(fit, found, start.candidate) for found, start in zip(fits, starts, strict=True)]
 
     def _judge(self, without: Fit, fit: Fit, candidate: Candidate) -> Refined:
-        own = self._study.inflation(fit, len(fit.free) - len(without.free))
-        improvement = (without.objective - fit.objective) * min(1.0, self._study.tempering / own)
+        own = self._problem.inflation(fit, len(fit.free) - len(without.free))
+        improvement = (without.objective - fit.objective) * min(1.0, self._problem.tempering / own)
         delta = improvement - self._price * (len(fit.free) - len(without.free))
         return Refined(candidate, fit, improvement, delta)
 
@@ -346,20 +338,18 @@ class Search:
         if key not in self._fits:
             fit = self.fit(chosen)
             free = tuple(pair for pair in fit.free if pair[0] != one.effect)
-            self._fits[key] = self._study.fit(fit.car.without(one.effect), free, fit)
+            self._fits[key] = self._problem.fit(fit.car.without(one.effect), free, fit)
         return self._fits[key]
 
     def _exchange(self, chosen: list[Candidate]) -> None:
         """Replaces earlier effects by others that go better with the later ones."""
-        if len(chosen) < 2:
-            return
         for one in chosen[:-1]:
             rest = tuple(c for c in chosen if c != one)
             self._without(tuple(chosen), one)
             ranked = self.ranked(rest)
             if ranked and ranked[0].candidate.effect != one.effect:
                 here = next((r for r in ranked if r.candidate == one), None)
-                if here is None or ranked[0].delta_bic > here.delta_bic + AMBIGUITY_DELTA_BIC:
+                if here is None or ranked[0].delta_bic > here.delta_bic + tuning.AMBIGUITY_DELTA_BIC:
                     chosen[:] = [*rest, ranked[0].candidate]
                     return
 
@@ -377,24 +367,3 @@ class Search:
         fit = self.fit(chosen)
         others = [r for r in self._confirmed(rest) if r.candidate.effect != one.effect]
         return [r.candidate.effect for r in others if self._left_out.compare(r.fit, fit).alike]
-
-
-def _is_little(refined: Refined) -> bool:
-    """Whether a cause of the car is nearer to neutral than what any car shows, one of another structure, or its file."""
-    candidate, car = refined.candidate, refined.fit.car
-    least = car.least(candidate.effect)
-    if not least or candidate.only_in:
-        return False
-    values = {name: car.effects[candidate.effect][name] for name in candidate.amplitudes}
-    return EFFECTS[candidate.effect].amount(values) < least
-
-
-def _is_asked_for(refined: Refined) -> bool:
-    """Whether the fitted laps ask for a cause: it is worth its parameters, sure, large enough, and of a part of the lap."""
-    asked = refined.delta_bic > DECISIVE_DELTA_BIC and refined.sure > _SURE
-    return asked and not _is_little(refined) and not refined.is_everywhere
-
-
-def _pays(refined: Refined) -> bool:
-    """Whether a cause is asked for, and holds where it was not fitted."""
-    return refined.is_confirmed and _is_asked_for(refined)

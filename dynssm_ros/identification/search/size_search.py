@@ -7,15 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate, Values
 from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, position
-from dynssm_ros.identification.search.candidates import BOTH_SIDES_UNITS, Candidate, ScoredCandidate, steps_off
-from dynssm_ros.vehicle.effects import EFFECTS
-
-_WARM_STARTS = 3  # times that nominal values make room for an effect before it is fitted
-_SHARES = (1.6, 1.0, 0.6, 0.3)  # of what linearised errors promise
-_KEPT_PROMISE = 0.5  # of that, short of which a candidate is fitted before it is dropped
-_TRIAL_ROUNDS = 10  # of that fit, at most
+from dynssm_ros.identification.search.candidates import Candidate, ScoredCandidate, steps_off
 
 
 class CandidateStart(NamedTuple):
@@ -52,10 +47,10 @@ class SizeSearch:
         where they are and from where the vehicle file has them. Where none of these keeps the promise, a short fit follows.
         """
         some, near, candidate = self.some, self.near, scored.candidate
-        cars = [self._sized(scored, share) for share in _SHARES]
+        cars = [self._sized(scored, share) for share in tuning.SIZE_SHARES]
         cars += self._from_the_file(candidate, scored.values)
         warm_started = cars
-        for _ in range(_WARM_STARTS):
+        for _ in range(tuning.WARM_STARTS):
             warm_started = some.warm_started(warm_started, near)
         cars, free = cars + warm_started, (*near.free, *candidate.free)
         reached = [
@@ -64,8 +59,8 @@ class SizeSearch:
         ]
         best, objective = cars[int(np.argmin(reached))], min(reached)
         promised, paid = scored.improvement / self.tempering, self.price * len(candidate.parameters)
-        if promised > paid and near.objective - objective < _KEPT_PROMISE * promised:
-            fit = some.fit(self._sized(scored, 0.0), free, near, rounds=_TRIAL_ROUNDS, rough=True)
+        if promised > paid and near.objective - objective < tuning.KEPT_PROMISE * promised:
+            fit = some.fit(self._sized(scored, 0.0), free, near, rounds=tuning.TRIAL_ROUNDS, rough=True)
             if fit.objective < objective:
                 best, objective = fit.car, fit.objective
         return CandidateStart(candidate, best, near.objective - objective - paid)
@@ -74,7 +69,7 @@ class SizeSearch:
         """The car with a share of what is promised of the effect."""
         candidate, values = scored.candidate, dict(scored.values)
         for name in candidate.amplitudes:
-            about = EFFECTS[candidate.effect].PARAMETERS[name]
+            about = candidate.about[name]
             wanted = about.neutral + share * (values[name] - about.neutral)
             values[name] = float(np.clip(wanted, about.lower, about.upper))
         return self.near.car.with_effect(candidate.effect, values, candidate.only_in)
@@ -84,7 +79,7 @@ class SizeSearch:
         if candidate.local or len(candidate.amplitudes) > 1:
             return []
         (name,), effect = candidate.amplitudes, candidate.effect
-        neutral = EFFECTS[effect].PARAMETERS[name].neutral
+        neutral = candidate.about[name].neutral
         given = replace(self.near.car, moved=self.given.moved)
-        steps = steps_off(effect, name, BOTH_SIDES_UNITS)
+        steps = steps_off(effect, name, tuning.BOTH_SIDES)
         return [given.with_effect(effect, values | {name: neutral + step}, candidate.only_in) for step in steps]
