@@ -41,11 +41,7 @@ def config_directories() -> Iterator[Path]:
 
 
 def config_root() -> Path:
-    """The folder of the shipped configuration.
-
-    Raises:
-        ConfigurationError: the installation lacks it.
-    """
+    """The folder of the shipped configuration; a :class:`ConfigurationError` if the installation lacks it."""
     for directory in config_directories():
         if (directory / "vehicles").is_dir():
             return directory
@@ -62,8 +58,7 @@ def register_folder(kind: str, folder: Path) -> None:
 def find_config(kind: str, name_or_path: str | Path) -> Path:
     """Resolves the name of a file of ``kind`` (``vehicles``, ``signals``, ``models``), shipped or registered, or a path.
 
-    Raises:
-        ConfigurationError: neither a file nor a known name.
+    What is neither is a :class:`ConfigurationError`.
     """
     path = Path(name_or_path)
     if os.path.isfile(path):  # unlike Path.is_file, False where looking is forbidden or the name impossible
@@ -78,11 +73,7 @@ def find_config(kind: str, name_or_path: str | Path) -> Path:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Reads a YAML mapping with the safe loader.
-
-    Raises:
-        ConfigurationError: unreadable, not YAML, or not a mapping.
-    """
+    """Reads a YAML mapping with the safe loader; what is none, or unreadable, is a :class:`ConfigurationError`."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506 - derived from the safe loader
     except (OSError, UnicodeDecodeError) as error:
@@ -95,12 +86,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def validate(schema: type[_Model], content: dict[str, Any], source: str | Path) -> _Model:
-    """Builds ``schema`` from ``content``; the first violation becomes a one-line error naming file, field and value.
+    """Builds ``schema`` from ``content``; the first violation is a one-line ConfigurationError with file, field and value.
 
     Validators find ``source`` in their context, to read files that ``content`` refers to.
-
-    Raises:
-        ConfigurationError: ``content`` does not fit ``schema``.
     """
     try:
         return schema.model_validate(content, context={"source": source})
@@ -115,7 +103,8 @@ def describe(error: ValidationError) -> str:
     field = ".".join(str(part) for part in first["loc"])
     message = " ".join(first["msg"].removeprefix("Value error, ").split())
     if field and first["type"] != "missing":
-        message += f" (got {_short(first['input'])})"
+        got = repr(first["input"])
+        message += f" (got {got if len(got) <= 60 else got[:57] + '...'})"
     more = f"; {len(problems) - 1} more" if len(problems) > 1 else ""
     return f"{field}: {message}{more}" if field else f"{message}{more}"
 
@@ -139,8 +128,3 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
             raise yaml.constructor.ConstructorError(None, None, f"'{twice[0]}' is given twice", node.start_mark)
         content: dict[Any, Any] = super().construct_mapping(node, deep)
         return content
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

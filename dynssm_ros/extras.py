@@ -33,15 +33,7 @@ def missing_libraries(*extras: str) -> dict[str, str]:
 
 
 def require(what: str, *extras: str) -> None:
-    """Checks that the libraries of ``extras`` are installed, without importing them.
-
-    Args:
-        what: needs them, for the message.
-        extras: names out of :data:`EXTRAS`.
-
-    Raises:
-        MissingExtraError: one is not; names the extra and how to install it.
-    """
+    """Raises a :class:`MissingExtraError` that says what to install where ``what`` needs a missing library of ``extras``."""
     missing = missing_libraries(*extras)
     if missing:
         names = ",".join(sorted(set(missing.values())))
@@ -51,10 +43,7 @@ def require(what: str, *extras: str) -> None:
 def load_plugins() -> None:
     """Imports the modules that ``DYNSSM_PLUGINS`` names, apart by commas; they register effects, models or plants.
 
-    They are installed, on ``PYTHONPATH``, or in the current folder.
-
-    Raises:
-        ConfigurationError: one cannot be imported.
+    They are installed, on ``PYTHONPATH``, or in the current folder; else it is a :class:`ConfigurationError`.
     """
     names = [name.strip() for name in os.environ.get("DYNSSM_PLUGINS", "").split(",") if name.strip()]
     if names and os.getcwd() not in sys.path:

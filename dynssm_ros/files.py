@@ -44,26 +44,13 @@ def protecting(inputs: Collection[Path], force: bool = False) -> Iterator[None]:
 
 
 def require_replaceable(path: str | Path, ours: bool, what: str) -> None:
-    """Checks that ``path`` may be written: that nothing is there, or what we wrote.
-
-    Args:
-        path: of an output.
-        ours: whether what is there is of the kind that we write.
-        what: that kind, in words.
-
-    Raises:
-        UserError: something else is there, and nobody forces it.
-    """
+    """Raises a :class:`UserError` where something else than ``what`` we write is at ``path``, unless that is forced."""
     if os.path.lexists(path) and not ours and not _FORCED.get():
         raise UserError(f"{path}: exists and is not {what}; not replaced (another name, or --force)")
 
 
 def require_no_input(path: str | Path) -> None:
-    """Checks that writing ``path`` destroys nothing that the command reads, and nothing that is no file or folder.
-
-    Raises:
-        UserError: it would.
-    """
+    """Raises a :class:`UserError` if writing ``path`` destroys what the command reads, or what is no file or folder."""
     target = Path(path)
     if not os.path.lexists(target):
         return
@@ -71,18 +58,11 @@ def require_no_input(path: str | Path) -> None:
     if here.exists() and not stat.S_ISREG(here.stat().st_mode) and not here.is_dir():
         raise UserError(f"{target}: is neither a file nor a folder; not replaced")
     for one in _INPUTS.get():
-        if here == one or here in one.parents or _same(here, one):
+        linked = here.exists() and one.exists() and here.samefile(one)  # also by a hard link
+        if here == one or here in one.parents or linked:
             raise UserError(f"{target}: the command reads {one.name} there; an output never replaces an input")
     if here.is_file() and here.suffix in LOG_SUFFIXES and not _FORCED.get():
         raise UserError(f"{target}: exists and looks like a log; not replaced (another name, or --force)")
-
-
-def _same(one: Path, other: Path) -> bool:
-    """Whether two names are of one file, also by a hard link."""
-    try:
-        return os.path.samefile(one, other)
-    except OSError:
-        return False
 
 
 @contextmanager
@@ -102,8 +82,9 @@ def replacing(path: str | Path, may_hold: Collection[str] = ()) -> Iterator[Path
     require_no_input(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        _clear_away(target)
-        scratch = Path(tempfile.mkdtemp(prefix=f"{_scratch(target)}{os.getpid()}.", dir=target.parent))
+        begin = f".{target.name}.{socket.gethostname()}."
+        _clear_away(target, begin)
+        scratch = Path(tempfile.mkdtemp(prefix=f"{begin}{os.getpid()}.", dir=target.parent))
     except OSError as error:
         raise UserError(f"{target}: cannot be written ({error.strerror}: {error.filename})") from error
     try:
@@ -119,14 +100,8 @@ def replacing(path: str | Path, may_hold: Collection[str] = ()) -> Iterator[Path
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _scratch(target: Path) -> str:
-    """How the names of scratch folders for an output begin, on this machine."""
-    return f".{target.name}.{socket.gethostname()}."
-
-
-def _clear_away(target: Path) -> None:
-    """Removes scratch folders of processes of this machine that were killed."""
-    begin = _scratch(target)
+def _clear_away(target: Path, begin: str) -> None:
+    """Removes scratch folders for an output, which ``begin`` so, of processes of this machine that were killed."""
     for path in target.parent.iterdir():
         owner = path.name.removeprefix(begin).partition(".")[0]
         if path.name.startswith(begin) and owner.isdigit() and not Path(f"/proc/{owner}").exists():

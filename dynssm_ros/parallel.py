@@ -24,16 +24,11 @@ _TRIES = 3  # of a piece whose process died, as of one that the system killed fo
 
 @dataclass(frozen=True)
 class Workers:
-    """Where pieces of work are done.
+    """Where pieces of work are done, and how many at a time.
 
-    Attributes:
-        jobs: how many at a time; if not given, one in this process, or as many as a cluster has processors.
-        backend: processes of this machine, or a cluster's.
-        address: of a cluster that runs (Ray's ``auto`` or ``ray://HOST:10001``, Dask's ``tcp://HOST:8786``); if not given,
-            one is started on this machine for as long as the work takes.
-
-    Raises:
-        ConfigurationError: an address of no cluster, or no job.
+    Without ``jobs`` it is one in this process, or as many as a cluster has processors. ``address`` is of a cluster that runs
+    (Ray's ``auto`` or ``ray://HOST:10001``, Dask's ``tcp://HOST:8786``); if not given, one is started on this machine for
+    as long as the work takes. An address of no cluster, or no job, is a :class:`ConfigurationError`.
     """
 
     jobs: int | None = None
@@ -68,10 +63,13 @@ class Pool:
         if not self._workers.elsewhere or (self._workers.backend == "processes" and len(items) < 2):
             yield from ((k, function(item)) for k, item in enumerate(items))
             return
+        from joblib import Parallel, delayed
+
         left = dict(enumerate(items))
         for _ in range(_TRIES):
+            calls = [delayed(_at)(function, k, item) for k, item in left.items()]
             try:
-                for k, result in _unordered(function, left):
+                for k, result in Parallel(return_as="generator_unordered", pre_dispatch="n_jobs")(calls):
                     del left[k]
                     yield k, result
             except self._died:
@@ -93,11 +91,7 @@ IN_TURN = Pool()
 
 @contextmanager
 def connected(workers: Workers = HERE) -> Iterator[Pool]:
-    """Connects to ``workers`` once, for work that comes in many rounds.
-
-    Raises:
-        MissingExtraError: joblib or the cluster's library is not installed.
-    """
+    """Connects to ``workers`` once, for work in many rounds; a :class:`MissingExtraError` without the libraries."""
     if not workers.elsewhere:
         yield IN_TURN
         return
@@ -110,26 +104,11 @@ def each(
 ) -> Iterator[tuple[int, Result]]:
     """Places and results of ``function`` on all items, in the order in which they are done.
 
-    Where a process dies, the pieces that it took along are done again, at most twice.
-
-    Args:
-        function: of one item; for several processes it can be pickled, as its items and results can.
-        items: in the order in which they are begun.
-        workers: where.
-
-    Raises:
-        MissingExtraError: joblib or the cluster's library is not installed.
-        ProcessDiedError: processes died again and again.
+    For several processes, function, items and results can be pickled. Where a process dies, the pieces that it took along are
+    done again, at most twice; then it is a :class:`~dynssm_ros.errors.ProcessDiedError`.
     """
     with connected(workers) as pool:
         yield from pool.each(function, items)
-
-
-def _unordered(function: Callable[[Item], Result], items: dict[int, Item]) -> Iterator[tuple[int, Result]]:
-    from joblib import Parallel, delayed
-
-    calls = [delayed(_at)(function, k, item) for k, item in items.items()]
-    yield from Parallel(return_as="generator_unordered", pre_dispatch="n_jobs")(calls)
 
 
 def _at(function: Callable[[Item], Result], place: int, item: Item) -> tuple[int, Result]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from dynssm_ros.api.inputs import Log, PathLike, centre_line, joined, opened, vehicle_of
-from dynssm_ros.api.settings import MIN_SPEED_OTHERWISE, CommandsSettings, keywords, setting
+from dynssm_ros.api.settings import MIN_SPEED, CommandsSettings, keywords, setting
 from dynssm_ros.extras import require
 from dynssm_ros.progress import Progress
 from dynssm_ros.vehicle import Vehicle
@@ -28,7 +28,7 @@ class CalibrateSettings(CommandsSettings):
     integrator: Integrator | None = setting(
         None, "Steps of the model.", otherwise="rk4, unless euler is clearly closer to the laps"
     )
-    min_speed: float | None = setting(None, "Leave out slower rows (m/s).", otherwise=MIN_SPEED_OTHERWISE, ge=0.0)
+    min_speed: float | None = MIN_SPEED
     holdout: float = setting(0.0, "Leave the last fraction of each recording out.", ge=0.0, le=0.9)
     starts: int = setting(3, "Starting points of the search.", ge=1)
     seed: int = setting(0, "Of the random starting points.", ge=0)

@@ -6,14 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from dynssm_ros.api.inputs import Log, PathLike, opened, track_of, vehicle_of
-from dynssm_ros.api.settings import (
-    MIN_SPEED_HELP,
-    MIN_SPEED_OTHERWISE,
-    CommandsSettings,
-    WorkerSettings,
-    keywords,
-    setting,
-)
+from dynssm_ros.api.settings import MIN_SPEED, CommandsSettings, WorkerSettings, keywords, setting
 from dynssm_ros.extras import require
 from dynssm_ros.parallel import connected
 from dynssm_ros.progress import OnProgress
@@ -31,7 +24,7 @@ class DiagnoseSettings(CommandsSettings, WorkerSettings):
     holdout: float = setting(
         0.25, "Share at the end that only measures the improvement; whole laps if there are three.", le=0.8
     )
-    min_speed: float | None = setting(None, MIN_SPEED_HELP, otherwise=MIN_SPEED_OTHERWISE)
+    min_speed: float | None = MIN_SPEED
     integrator: Integrator | None = setting(
         None, "How the model steps.", otherwise="the file's, else rk4; others if clearly closer"
     )

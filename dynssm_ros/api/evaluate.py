@@ -7,14 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dynssm_ros.api.inputs import Log, PathLike, centre_line, joined, opened, several, vehicle_in_windows
-from dynssm_ros.api.settings import (
-    MIN_SPEED_HELP,
-    MIN_SPEED_OTHERWISE,
-    CommandsSettings,
-    WorkerSettings,
-    keywords,
-    setting,
-)
+from dynssm_ros.api.settings import MIN_SPEED, CommandsSettings, WorkerSettings, keywords, setting
 from dynssm_ros.extras import require
 from dynssm_ros.progress import Progress
 from dynssm_ros.vehicle import Vehicle
@@ -35,7 +28,7 @@ class EvaluateSettings(CommandsSettings, WorkerSettings):
         gt=0.0,
         le=1.0,
     )
-    min_speed: float | None = setting(None, MIN_SPEED_HELP, otherwise=MIN_SPEED_OTHERWISE)
+    min_speed: float | None = MIN_SPEED
     horizon: float = setting(PATH_HORIZON_S, "Length of the rollouts (s).", ge=0.0)
     stride: int = setting(1, "Start a rollout at every n-th row.", ge=1)
     track: Any = setting(

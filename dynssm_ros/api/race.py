@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Literal
 
 from dynssm_ros.api.inputs import PathLike, track_of, vehicle_of
 from dynssm_ros.api.settings import (
-    EFFECTS_HELP,
-    NOISE_HELP,
+    EFFECTS,
+    NOISE,
     PLANT_HELP,
     Effects,
     StandardDeviations,
     VerbSettings,
     keywords,
     setting,
-)
+)  # fmt: skip
 from dynssm_ros.errors import SettingError
 from dynssm_ros.extras import require
 from dynssm_ros.progress import NamedProgress
@@ -57,7 +57,7 @@ class RaceSettings(VerbSettings):
     as_is: bool = setting(
         False, "Plan with what each model says, whether or not it has predicted better than the calibrated car."
     )
-    effects: Effects = setting({}, EFFECTS_HELP, option="--effect")
+    effects: Effects = EFFECTS
     scale: float | None = setting(None, "Size of the track (factor), for other cars than it was made for.", gt=0.0)
     lap_length: float | None = setting(
         None, "Or scale it to this length (m): 401 for Austin, 291 for IMS with the 1:43 car.", gt=0.0
@@ -67,7 +67,7 @@ class RaceSettings(VerbSettings):
     start_speed: float | None = setting(
         None, "How fast it starts (m/s); 0: from standstill.", otherwise="the line's own speed"
     )
-    noise: StandardDeviations = setting((0.0, 0.0, 0.0), NOISE_HELP)
+    noise: StandardDeviations = NOISE
     pose_noise: StandardDeviations = setting((0.0, 0.0, 0.0), "Likewise of the measured x,y,theta (m, m, rad).")
     delay: float = setting(
         0.0,

@@ -104,11 +104,14 @@ StandardDeviations = Annotated[tuple[float, float, float], BeforeValidator(_thre
 """Of three channels; the text ``0.02,0.01,0.002`` serves too."""
 Effects = Annotated[dict[str, dict[str, float]], BeforeValidator(_effects)]
 """Parameters by effect; texts ``NAME:k=v,...`` serve too."""
-EFFECTS_HELP = "Physics that no model knows of; repeatable."
-NOISE_HELP = "Standard deviations of the measured v_x,v_y,omega (m/s, m/s, rad/s)."
 PLANT_HELP = "euler: one step per T_s, as in the published data; rk4: steps of 1 ms; double_track: four wheels."
-MIN_SPEED_HELP = "Leave out stretches below this speed (m/s)."
-MIN_SPEED_OTHERWISE = "the vehicle file's minimum_speed"
+# fields of several classes
+EFFECTS = setting({}, "Physics that no model knows of; repeatable.", option="--effect")
+EPOCHS = setting(None, "Epochs of each stage, instead of the model file's.", ge=1)
+MIN_SPEED = setting(
+    None, "Leave out stretches below this speed (m/s).", otherwise="the vehicle file's minimum_speed", ge=0.0
+)
+NOISE = setting((0.0, 0.0, 0.0), "Standard deviations of the measured v_x,v_y,omega (m/s, m/s, rad/s).")
 
 
 def keywords(schema: type[VerbSettings]) -> Callable[[Callable[..., Result]], Callable[..., Result]]:

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Literal
 
 from dynssm_ros.api.inputs import PathLike, track_of, vehicle_of
 from dynssm_ros.api.settings import (
-    EFFECTS_HELP,
-    NOISE_HELP,
+    EFFECTS,
+    NOISE,
     PLANT_HELP,
     Effects,
     StandardDeviations,
     VerbSettings,
     keywords,
     setting,
-)
+)  # fmt: skip
 from dynssm_ros.extras import require
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.recording import Recording
@@ -37,8 +37,8 @@ class SimulateSettings(VerbSettings):
     seed: int = setting(0, "Of the driver's variation and the noise.", ge=0)
     aggressiveness: float = setting(0.95, "Share of the car's limits in use.", ge=0.1, le=1.2)
     variation: float = setting(0.5, "How much speed and line vary.", ge=0.0, le=1.0)
-    noise: StandardDeviations = setting((0.0, 0.0, 0.0), NOISE_HELP)
-    effects: Effects = setting({}, EFFECTS_HELP, option="--effect")
+    noise: StandardDeviations = NOISE
+    effects: Effects = EFFECTS
     scale: float = setting(1.0, "Size of the track (factor), for other cars than it was made for.", gt=0.0)
 
 

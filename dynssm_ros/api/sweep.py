@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dynssm_ros.api.inputs import Log, PathLike, files, load_model, name_of, opened, vehicle_in_windows
-from dynssm_ros.api.settings import CommandsSettings, WorkerSettings, keywords, setting
-from dynssm_ros.api.train import EPOCHS_HELP, model_config, train
+from dynssm_ros.api.settings import EPOCHS, CommandsSettings, WorkerSettings, keywords, setting
+from dynssm_ros.api.train import model_config, train
 from dynssm_ros.errors import DataWarning
 from dynssm_ros.extras import require
 from dynssm_ros.progress import Progress
@@ -29,7 +29,7 @@ class SweepSettings(CommandsSettings, WorkerSettings):
     trials: int = setting(24, "Trainings in all; more later go on from those.", ge=1)
     holdout: float = setting(0.25, "Last fraction of each recording, which is left out and scored on.", ge=0.01, le=0.9)
     seed: int = setting(0, "Of the choices.", ge=0)
-    epochs: int | None = setting(None, EPOCHS_HELP, ge=1)
+    epochs: int | None = EPOCHS
 
 
 @keywords(SweepSettings)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dynssm_ros.api.inputs import Log, PathLike, files, joined, opened, vehicle_in_windows
-from dynssm_ros.api.settings import CommandsSettings, keywords, setting
+from dynssm_ros.api.settings import EPOCHS, CommandsSettings, keywords, setting
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
 from dynssm_ros.progress import NamedProgress
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from dynssm_ros.learning.stages import Trained
     from dynssm_ros.runtime.artifact import Artifact
 
-EPOCHS_HELP = "Epochs of each stage, instead of the model file's."
-
 
 class TrainSettings(CommandsSettings):
     """Settings of :func:`train`."""
@@ -29,7 +27,7 @@ class TrainSettings(CommandsSettings):
         0.0, "Leave the last fraction of each recording out, for an evaluation on it.", ge=0.0, le=0.9
     )
     seed: int | None = setting(None, "Instead of the model file's.", ge=0)
-    epochs: int | None = setting(None, EPOCHS_HELP, ge=1)
+    epochs: int | None = EPOCHS
     device: str = setting("cpu", "cpu or cuda.")
     memory: float | None = setting(
         None,

@@ -13,7 +13,6 @@ from dynssm_ros.api.season import ExtractSeasonSettings
 from dynssm_ros.cli.console import progress_bar, say
 from dynssm_ros.cli.options import SignalsOption, with_settings
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.signals.season import Season, Session
 from dynssm_ros.signals.standard import recording_to_bag
 
 
@@ -41,9 +40,7 @@ def extract(
             raise ConfigurationError(
                 f"--out {out}: a season's folder needs --car and --track and takes no --bag; expected those, or R.parquet"
             )
-        with progress_bar("extracting") as progress:
-            season, new = api.extract_season(bags, out, signals, settings=settings, on_progress=progress)
-        _say_season(season, new, bags)
+        _extract_season(bags, out, signals, settings)
         return
     one = ExtractSettings(**{name: getattr(settings, name) for name in ExtractSettings.model_fields})
     if settings != ExtractSeasonSettings(**dict(one)):
@@ -64,7 +61,9 @@ def extract(
     )
 
 
-def _say_season(season: Season, new: list[Session], bags: list[Path]) -> None:
+def _extract_season(bags: list[Path], out: Path, signals: str, settings: ExtractSeasonSettings) -> None:
+    with progress_bar("extracting") as progress:
+        season, new = api.extract_season(bags, out, signals, settings=settings, on_progress=progress)
     failed = [session for session in season.of_bags(bags) if session.failure]
     for session in failed:
         say(f"{session.bag}: not extracted: {session.failure}")

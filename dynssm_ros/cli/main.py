@@ -66,10 +66,7 @@ def _options(
 
 
 def main() -> None:
-    """Runs the command line; whatever is wrong with what the user gave is one line and exit status 1.
-
-    ``--force`` may stand anywhere: outputs then replace what others wrote, but never an input.
-    """
+    """Runs the command line; whatever is wrong with what the user gave is one line and exit status 1."""
     arguments = [word for word in sys.argv[1:] if word != "--force"]
     _give_memory_back()
     try:
@@ -89,11 +86,7 @@ def main() -> None:
 
 
 def _give_memory_back() -> None:
-    """Has large arrays given back to the system as soon as they are freed.
-
-    glibc does so at first, but keeps larger ones for itself once some were freed. What a command over a long log takes would
-    grow far faster than what it holds.
-    """
+    """Has large arrays given back to the system as soon as they are freed; glibc keeps them once some were freed."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:  # other C libraries have none
         mallopt(_M_MMAP_THRESHOLD, _LARGE)

@@ -1,8 +1,4 @@
-"""Options of a command, made from the fields of its settings class.
-
-typer stays: it brings completion, help by rich, click's one-line errors, and options that stand anywhere among arguments.
-cyclopts and pydantic-settings read such classes themselves, but their errors, flags (``--no-...``) and help are others.
-"""
+"""Options of a command, made from the fields of its settings class."""
 
 from __future__ import annotations
 

@@ -325,7 +325,10 @@ def horizon_steps(horizon_s: float, T_s: float) -> int:
 
 
 def shared_commands(models: Mapping[str, WindowModel]) -> Commands | None:
-    """The command protocol that the models were trained with; ``None`` if any will do, an error if it is not the same."""
+    """The command protocol that the models were trained with; ``None`` if any will do.
+
+    Different ones are an :class:`ArtifactError`.
+    """
     trained = {label: model.commands for label, model in models.items() if model.commands is not None}
     if len(set(trained.values())) > 1:
         listed = ", ".join(f"{label}: {commands}" for label, commands in trained.items())
@@ -334,7 +337,7 @@ def shared_commands(models: Mapping[str, WindowModel]) -> Commands | None:
 
 
 def check_fit(model: WindowModel, recording: Recording) -> None:
-    """Checks that a model is for the sampling time and the command protocol of a recording."""
+    """Raises an :class:`ArtifactError` if a model is for another sampling time or command protocol than a recording's."""
     where = f"model {model.name} on recording {', '.join(recording.info.source)}"
     if model.T_s > 0 and not math.isclose(model.T_s, recording.T_s, rel_tol=1e-3):
         raise ArtifactError(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -12,7 +12,6 @@ from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
 from dynssm_ros.arrays import Mask, Vector
@@ -30,6 +29,7 @@ RATE = 25.0  # frames per second, at most
 _TRAIL = 0.6  # s of the path behind a car
 _LENGTH = 1.5  # of a car in wheelbases
 _SMALLEST = 0.03  # of the picture: a car is drawn at least that long
+Show = Callable[[float], None]  # a part of the picture as it is at a time (s)
 _CHANGED = 0.02  # share of a coefficient's bounds by which a stretch of the road has to change it to be marked
 
 
@@ -49,56 +49,22 @@ def animate(races: Sequence[Race], path: str | Path) -> None:
         FigureCanvasAgg(figure)
         grid = figure.add_gridspec(3, 2, width_ratios=(3, 2))
         road, strips = figure.add_subplot(grid[:, 0]), [figure.add_subplot(grid[k, 1]) for k in range(3)]
-        show: list[Callable[[float], None]] = [
-            car.show for car in _cars(races, road, _changed_stretch(longest, name, truth))
-        ]
-        show += [curve.show for curve in _curves(races, strips, name, longest.time, truth)]
+        parts = _cars(races, road, _changed_stretch(longest, name, truth))
+        parts += _curves(races, strips, name, longest.time, truth)
         figure.legend(*road.get_legend_handles_labels(), loc="outside upper left", ncols=5)
         figure.draw_without_rendering()
     figure.set_layout_engine("none")  # it is laid out once, not for each frame
     writer = PillowWriter(fps=max(2, round(min(RATE, count / duration))))
     with replacing(path) as aside, writer.saving(figure, str(aside), dpi=90):
         for t in np.linspace(0.0, duration, count):
-            for part in show:
-                part(float(t))
+            for show in parts:
+                show(float(t))
             road.set_title(f"{t:.2f} s", fontsize=10)
             writer.grab_frame()
 
 
-class _Car:
-    """A car in the picture with the path behind it."""
-
-    def __init__(self, race: Race, body: Polygon, trail: Line2D, size: float) -> None:
-        width = CAR_WIDTH / _LENGTH * size
-        self._corners = np.array([[-size, -width], [size, -width], [size, width], [-size, width]]) / 2
-        self._race, self._body, self._trail = race, body, trail
-
-    def show(self, t: float) -> None:
-        """As it is at time ``t`` (s)."""
-        time, pose = self._race.time, self._race.pose
-        x, y, theta = (float(np.interp(t, time, column)) for column in pose.T)
-        c, s = np.cos(theta), np.sin(theta)
-        self._body.set_xy(self._corners @ np.array([[c, s], [-s, c]]) + [x, y])
-        behind = (time > t - _TRAIL) & (time <= t)
-        self._trail.set_data(*pose[behind, :2].T)
-
-
-@dataclass(frozen=True)
-class _Curve:
-    """A figure of a car over the time that has passed."""
-
-    line: Line2D
-    time: Vector
-    values: Vector
-
-    def show(self, t: float) -> None:
-        """Up to time ``t`` (s)."""
-        past = self.time <= t
-        self.line.set_data(self.time[past], self.values[past])
-
-
-def _cars(races: Sequence[Race], axes: Axes, changed: Mask) -> list[_Car]:
-    """The track, marked where it is ``changed``, and the cars on it."""
+def _cars(races: Sequence[Race], axes: Axes, changed: Mask) -> list[Show]:
+    """The track, marked where it is ``changed``, and the cars on it with the paths behind them."""
     course, track = races[0].course, races[0].course.track
     draw_borders(axes, track)
     extent = np.ptp(np.concatenate([track.left_border, track.right_border]), axis=0)
@@ -107,18 +73,37 @@ def _cars(races: Sequence[Race], axes: Axes, changed: Mask) -> list[_Car]:
         axes.plot(x, y, color=MEASURED, alpha=0.2, lw=8, solid_capstyle="butt", label="the car is another here")
     wheelbase = course.vehicle.constants.l_f + course.vehicle.constants.l_r
     size = max(_LENGTH * wheelbase, _SMALLEST * float(np.max(extent)))
-    cars = []
-    for race, style in race_lines(races):
-        (trail,) = axes.plot([], [], color=style["color"], lw=1.5 * style["lw"], label=race.name)
-        body = Polygon(np.zeros((4, 2)), closed=True, facecolor=style["color"], edgecolor="white", lw=0.5, zorder=3)
-        axes.add_patch(body)
-        cars.append(_Car(race, body, trail, size))
+    cars = [_car(race, axes, size, style) for race, style in race_lines(races)]
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
     axes.grid(visible=False)
     return cars
 
 
-def _curves(races: Sequence[Race], strips: Sequence[Axes], name: str, time: Vector, truth: Vector) -> list[_Curve]:
+def _car(race: Race, axes: Axes, size: float, style: Mapping[str, Any]) -> Show:
+    """A car of a length (m) in the picture with the path behind it."""
+    width = CAR_WIDTH / _LENGTH * size
+    corners = np.array([[-size, -width], [size, -width], [size, width], [-size, width]]) / 2
+    (trail,) = axes.plot([], [], color=style["color"], lw=1.5 * style["lw"], label=race.name)
+    body = Polygon(np.zeros((4, 2)), closed=True, facecolor=style["color"], edgecolor="white", lw=0.5, zorder=3)
+    axes.add_patch(body)
+
+    def show(t: float) -> None:
+        x, y, theta = (float(np.interp(t, race.time, column)) for column in race.pose.T)
+        c, s = np.cos(theta), np.sin(theta)
+        body.set_xy(corners @ np.array([[c, s], [-s, c]]) + [x, y])
+        behind = (race.time > t - _TRAIL) & (race.time <= t)
+        trail.set_data(*race.pose[behind, :2].T)
+
+    return show
+
+
+def _curve(strip: Axes, time: Vector, values: Vector, **style: Any) -> Show:
+    """Values over the time that has passed."""
+    (line,) = strip.plot(time, values, **style)
+    return lambda t: line.set_data(time[time <= t], values[time <= t])
+
+
+def _curves(races: Sequence[Race], strips: Sequence[Axes], name: str, time: Vector, truth: Vector) -> list[Show]:
     """The coefficient ``name`` as planned with, beside its ``truth`` over ``time`` (s), then speed and room."""
     of_the_car = f"{coefficient_label(name)} planned with; dashed: of the car"
     for strip, title in zip(
@@ -131,15 +116,12 @@ def _curves(races: Sequence[Race], strips: Sequence[Axes], name: str, time: Vect
         strip.tick_params(labelbottom=False)
     curves = []
     for race, style in race_lines(races):
-        room = race.course.track.room(race.s, race.lateral)
-        shown = (_planned(race, name), np.hypot(*race.state[:, :2].T), room)
-        for strip, values in zip(strips, shown, strict=True):
-            (line,) = strip.plot(race.time, values, **style)
-            curves.append(_Curve(line, race.time, values))
-    (line,) = strips[0].plot(time, truth, color=MEASURED, lw=1.0, ls="--", zorder=1)
+        shown = (_planned(race, name), np.hypot(*race.state[:, :2].T), race.course.track.room(race.s, race.lateral))
+        curves += [_curve(strip, race.time, values, **style) for strip, values in zip(strips, shown, strict=True)]
+    curves.append(_curve(strips[0], time, truth, color=MEASURED, lw=1.0, ls="--", zorder=1))
     for strip in strips:
         strip.set(xlim=(0.0, float(time[-1])), ylim=strip.get_ylim())
-    return [*curves, _Curve(line, time, truth)]
+    return curves
 
 
 def _planned(race: Race, name: str) -> Vector:
