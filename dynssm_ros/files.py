@@ -58,7 +58,7 @@ def require_no_input(path: str | Path) -> None:
     if here.exists() and not stat.S_ISREG(here.stat().st_mode) and not here.is_dir():
         raise UserError(f"{target}: is neither a file nor a folder; not replaced")
     for one in _INPUTS.get():
-        linked = here.exists() and one.exists() and here.samefile(one)  # also by a hard link
+        linked = os.path.exists(here) and os.path.exists(one) and os.path.samefile(here, one)  # by a hard link
         if here == one or here in one.parents or linked:
             raise UserError(f"{target}: the command reads {one.name} there; an output never replaces an input")
     if here.is_file() and here.suffix in LOG_SUFFIXES and not _FORCED.get():

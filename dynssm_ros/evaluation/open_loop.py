@@ -26,6 +26,7 @@ from dynssm_ros.evaluation.metrics import (
     latency_us,
     predict_rows,
     rmse,
+    silent,
 )
 from dynssm_ros.evaluation.regimes import Regime, driving_regimes, liveliest, regime_rmse
 from dynssm_ros.evaluation.rollout import Rollout, score_rollouts
@@ -191,17 +192,25 @@ def evaluate(
             f"(window {H}, horizon {steps}) without a gap at {speed:g} m/s or more among its {len(recording)} rows"
         )
     each_model = len(rows) + len(starts) * steps
-    tick = _counting(len(models) * each_model, progress)
+    done = 0
+
+    def tick(predictions: int) -> None:
+        nonlocal done
+        done += predictions
+        if progress is not None:
+            progress(done, len(models) * each_model)
+
     regimes = driving_regimes(recording.rows(rows))
     time = (recording.time[rows + 1] - recording.time[0]) / 1e9
     lively = rows[liveliest(time, recording.states(rows + 1), max(_DRAWN_S, steps * recording.T_s))]
     drawn = lively[: len(lively) - steps + 1 : steps]  # rollouts one after the other
-    on = _On(recording, rows, regimes, starts, drawn, steps, batch)
+    score_of = partial(
+        _score, recording=recording, rows=rows, regimes=regimes, starts=starts, drawn=drawn, steps=steps, batch=batch
+    )
     labels = list(models)
     found: dict[str, Score] = {}
-    for k, score in each(
-        on.score if workers.elsewhere else partial(on.score, tick=tick), list(models.values()), workers
-    ):
+    task = score_of if workers.elsewhere else partial(score_of, tick=tick)
+    for k, score in each(task, list(models.values()), workers):
         found[labels[k]] = replace(score, model=models[labels[k]])
         if workers.elsewhere:
             tick(each_model)
@@ -222,62 +231,46 @@ def evaluate(
     )
 
 
-def _counting(total: int, progress: Callable[[int, int], None] | None) -> Tick:
-    """Tells ``progress`` how many of ``total`` predictions are done."""
-    done = 0
-
-    def tick(predictions: int) -> None:
-        nonlocal done
-        done += predictions
-        if progress is not None:
-            progress(done, total)
-
-    return tick
-
-
-@dataclass(frozen=True)
-class _On:
-    """What models are scored on; see :func:`evaluate`."""
-
-    recording: Recording
-    rows: Indices
-    regimes: tuple[Regime, ...]
-    starts: Indices
-    drawn: Indices
-    steps: int
-    batch: int
-
-    def score(self, model: WindowModel, tick: Tick = lambda predictions: None) -> Score:
-        """What a model is worth, but for the time that it takes."""
-        recording, rows, batch = self.recording, self.rows, self.batch
-        measured = recording.states(rows + 1)
-        with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
-            predicted, rollouts, knowledge = _OneStep(model.vehicle, measured), [], []
-            for drive, (ends, starts, drawn) in drive_through(model, recording, (rows, self.starts, self.drawn), batch):
-                for prediction in predict_rows(model, recording, ends, batch=batch, tick=tick, drive=drive):
-                    predicted.add(prediction)
-                if len(starts):
-                    rollouts.append(
-                        score_rollouts(model, recording, starts, self.steps, batch=batch, tick=tick, drive=drive)
-                    )
-                if drive is not None:
-                    knowledge.append(drive.at(drawn))
-            errors = predicted.state - measured
-            increments = measured - recording.states(rows)
-            return Score(
-                model=model,
-                known=Learned.joined(knowledge) if knowledge else None,
-                state=predicted.state,
-                theta=predicted.theta,
-                rmse=rmse(errors),
-                max_error=np.abs(errors).max(axis=0),
-                explained=explained(increments, increments + errors),
-                coverage_90=predicted.coverage,
-                regime_rmse=regime_rmse(self.regimes, errors),
-                coefficients=predicted.coefficients.statistics,
-                rollout=Rollout.joined(rollouts),
-                latency_us=np.empty(0),
-            )
+def _score(
+    model: WindowModel,
+    *,
+    recording: Recording,
+    rows: Indices,
+    regimes: tuple[Regime, ...],
+    starts: Indices,
+    drawn: Indices,
+    steps: int,
+    batch: int,
+    tick: Tick = silent,
+) -> Score:
+    """What a model is worth, but for the time that it takes; see :func:`evaluate`."""
+    measured = recording.states(rows + 1)
+    with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
+        predicted, rollouts, knowledge = _OneStep(model.vehicle, measured), [], []
+        for drive, (ends, begins, shown) in drive_through(model, recording, (rows, starts, drawn), batch):
+            for prediction in predict_rows(model, recording, ends, batch=batch, tick=tick, drive=drive):
+                predicted.add(prediction)
+            if len(begins):
+                part = score_rollouts(model, recording, begins, steps, batch=batch, tick=tick, drive=drive)
+                rollouts.append(part)
+            if drive is not None:
+                knowledge.append(drive.at(shown))
+        errors = predicted.state - measured
+        increments = measured - recording.states(rows)
+        return Score(
+            model=model,
+            known=Learned.joined(knowledge) if knowledge else None,
+            state=predicted.state,
+            theta=predicted.theta,
+            rmse=rmse(errors),
+            max_error=np.abs(errors).max(axis=0),
+            explained=explained(increments, increments + errors),
+            coverage_90=predicted.coverage,
+            regime_rmse=regime_rmse(regimes, errors),
+            coefficients=predicted.coefficients.statistics,
+            rollout=Rollout.joined(rollouts),
+            latency_us=np.empty(0),
+        )
 
 
 class _OneStep:

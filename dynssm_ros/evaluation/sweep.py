@@ -51,21 +51,14 @@ class Choice(StrictModel):
 
     def contains(self, value: Any) -> bool:
         """Whether the field may be that."""
-        if self.values:
+        if self.low is None or self.high is None:
             return value in self.values
-        return (
-            isinstance(value, (int, float))
-            and self.low is not None
-            and self.high is not None
-            and self.low <= value <= self.high
-        )
+        return isinstance(value, (int, float)) and self.low <= value <= self.high
 
     def distribution(self, own: Any) -> BaseDistribution:
         """For Optuna; whole numbers if the field's ``own`` value is one."""
-        if self.values:
+        if self.low is None or self.high is None:
             return CategoricalDistribution(self.values)
-        assert self.low is not None
-        assert self.high is not None
         if isinstance(own, int):
             return IntDistribution(round(self.low), round(self.high), self.log, round(self.step or 1))
         return FloatDistribution(self.low, self.high, self.log, self.step)
@@ -78,11 +71,7 @@ class Space(StrictModel):
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> Space:
-        """Reads it from a file of ``config/sweeps`` or a path.
-
-        Raises:
-            ConfigurationError: not found or malformed.
-        """
+        """Reads it from a file of ``config/sweeps`` or a path."""
         path = configuration.find_config("sweeps", name_or_path)
         return configuration.validate(cls, {"choices": configuration.read_yaml(path)}, path)
 
@@ -102,15 +91,8 @@ Objective = Callable[[int, Mapping[str, Any]], Accuracy]
 class Sweep:
     """The state of a sweep in a folder.
 
-    Args:
-        folder: where its state is, or will be.
-        space: what is varied.
-        own: values of the model file's own fields, which are tried first.
-        seed: of the choices.
-        about: what else must be the same when the sweep goes on.
-
-    Raises:
-        ConfigurationError: the file's own values are not in the space, or the folder holds a sweep of another one.
+    The ``own`` values of the model file are tried first. When the sweep goes on, all must be the same, and what it is
+    ``about``. A :class:`ConfigurationError` says that it is another one, or that own values are not in the space.
     """
 
     def __init__(
@@ -143,11 +125,7 @@ class Sweep:
 
     @property
     def best(self) -> Trial:
-        """The one of the smallest displacement.
-
-        Raises:
-            UserError: all failed.
-        """
+        """The one of the smallest displacement; a :class:`UserError` if all failed."""
         scored = [(trial.errors.ade, trial) for trial in self.trials if trial.errors is not None]
         if not scored:
             raise UserError(
@@ -157,27 +135,14 @@ class Sweep:
 
     def to_json(self) -> dict[str, Any]:
         """The trials for programs."""
-        trials = [
-            {
-                "number": trial.number,
-                "settings": trial.settings,
-                "ade": trial.errors.ade if trial.errors else None,
-                "one_step_rmse": trial.errors.rmse if trial.errors else None,
-                "failure": trial.failure,
-            }
-            for trial in self.trials
-        ]
+        trials = [trial._asdict() for trial in self.trials]
+        for trial in trials:
+            errors = trial.pop("errors")
+            trial |= {"ade": errors and errors.ade, "one_step_rmse": errors and errors.rmse}
         return {"best": self.best.number, "trials": trials}
 
     def run(self, objective: Objective, count: int, workers: Workers = HERE, progress: Progress | None = None) -> None:
-        """Goes on until there are ``count`` trials.
-
-        Args:
-            objective: trains with settings and scores; a :class:`UserError` is a failed trial.
-            count: trials in all.
-            workers: where trials are done.
-            progress: told of each that is.
-        """
+        """Goes on until there are ``count`` trials; a :class:`UserError` of the ``objective`` is a failed one."""
         while True:
             self._ask(count)
             open_ones = self.study.get_trials(states=[TrialState.RUNNING])

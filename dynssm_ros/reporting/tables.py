@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, Literal
 
 import rich.box
@@ -99,13 +100,9 @@ class Table:
     @property
     def groups(self) -> list[tuple[str, int]]:
         """Headings over columns side by side: ``(group, number of columns)``; empty if no column has a group."""
-        spans: list[tuple[str, int]] = []
-        for column in self.columns:
-            if spans and column.group and spans[-1][0] == column.group:
-                spans[-1] = (column.group, spans[-1][1] + 1)
-            else:
-                spans.append((column.group, 1))
-        return spans if any(group for group, _ in spans) else []
+        spans = groupby(column.group or k for k, column in enumerate(self.columns))
+        groups = [(group if isinstance(group, str) else "", len([*same])) for group, same in spans]
+        return groups if any(group for group, _ in groups) else []
 
     @property
     def brief(self) -> Table:
