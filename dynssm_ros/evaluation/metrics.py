@@ -22,11 +22,17 @@ from dynssm_ros.signals.signal_map import STATE_SIGNALS
 Tick = Callable[[int], None]
 """Told how many predictions were just made."""
 
-BATCH = 4096
+_WARM_UP = 20  # unmeasured predictions before the measured ones
+BATCH = 4096  # windows that exist at a time
 
 
 def silent(predictions: int) -> None:
     """The :data:`Tick` that tells nobody."""
+
+
+def batches(rows: Indices) -> Iterator[Indices]:
+    """Rows in blocks of :data:`BATCH`."""
+    return (rows[start : start + BATCH] for start in range(0, len(rows), BATCH))
 
 
 def predict_rows(
@@ -34,16 +40,14 @@ def predict_rows(
     recording: Recording,
     rows: Indices,
     *,
-    batch: int = BATCH,
     tick: Tick = silent,
     drive: DriveThrough | None = None,
 ) -> Iterator[WindowPrediction]:
-    """The model's predictions of the rows that follow ``rows`` ``(M,)``, ``batch`` windows at a time.
+    """The model's predictions of the rows that follow ``rows`` ``(M,)``, batch by batch.
 
     The model's online layer corrects them by what it knew along a ``drive``; without one it stays out.
     """
-    for start in range(0, len(rows), batch):
-        chunk = rows[start : start + batch]
+    for chunk in batches(rows):
         windows = recording.windows(chunk, model.H)
         predicted = model.predict(windows)
         if model.online is not None and drive is not None:
@@ -65,12 +69,11 @@ class DriveThrough(NamedTuple):
 
 
 def drive_through(
-    model: WindowModel, recording: Recording, asked: Sequence[Indices], batch: int = BATCH
+    model: WindowModel, recording: Recording, asked: Sequence[Indices]
 ) -> Iterator[tuple[DriveThrough | None, list[Indices]]]:
     """Lets the model's online layer learn wherever its window is whole and the car not slower than its minimum speed.
 
-    It knows a kilobyte of numbers at each row, so it is asked in blocks of ``batch`` rows, and what it knew is given up
-    after each.
+    It knows a kilobyte of numbers at each row, so it is asked batch by batch, and what it knew is given up after each.
 
     Yields:
         What it knew, with those rows of each ``asked`` (ascending) that the block answers for. ``None``, once and with all
@@ -81,15 +84,14 @@ def drive_through(
         yield None, list(asked)
         return
     along, judge = Along(layer), PathJudge(layer, partial(seen_by, model))
-    blocks = [(np.searchsorted(ends, rows, side="right") - 1).clip(0) // batch for rows in asked]
-    for start in range(0, len(ends), batch):
-        chunk = ends[start : start + batch]
+    blocks = [(np.searchsorted(ends, rows, side="right") - 1).clip(0) // BATCH for rows in asked]
+    for k, chunk in enumerate(batches(ends)):
         windows = recording.windows(chunk, H)
         seen, rows = seen_by(model, windows), windows[:, -1]
         following = recording.states(np.minimum(chunk + 1, len(recording) - 1))
         learned = along.over(seen, rows, following - rows[:, :3], chunk)
         trusted = judge.along(windows, chunk, learned, seen)
-        own = [rows[block == start // batch] for rows, block in zip(asked, blocks, strict=True)]
+        own = [rows[block == k] for rows, block in zip(asked, blocks, strict=True)]
         yield DriveThrough(chunk, learned._replace(trusted=trusted)), own
 
 
@@ -108,28 +110,22 @@ def explained(increments: Vector, predicted: Vector) -> Vector:
     return np.asarray(1.0 - np.divide(left, total, out=np.full(len(total), np.nan), where=total > 0))
 
 
-def coverage(errors: Vector, variance: Vector, level: float = 0.9) -> Vector:
-    """Share of the errors ``(N, 3)`` inside the central Gaussian interval of probability ``level``.
-
-    Equals ``level`` for honest variances, which are of shape ``(N, 3)`` or, if the same for all, ``(3,)``.
-    """
-    z = NormalDist().inv_cdf(0.5 + level / 2)
+def coverage(errors: Vector, variance: Vector) -> Vector:
+    """Share of the errors ``(N, 3)`` inside the central 90 % interval, 0.9 for honest variances ``(N, 3)`` or ``(3,)``."""
+    z = NormalDist().inv_cdf(0.95)
     return np.asarray(np.mean(np.abs(errors) <= z * np.sqrt(variance), axis=0))
 
 
-def latency_us(model: WindowModel, windows: Vector, calls: int = 200, warm_up: int = 20) -> Vector:
-    """Wall-clock time of single predictions (us), shape ``(calls,)``, after ``warm_up`` unmeasured ones.
-
-    They cycle through real ``windows`` ``(M, H, 7)``.
-    """
+def latency_us(model: WindowModel, windows: Vector, calls: int = 200) -> Vector:
+    """Wall-clock time of single predictions (us), shape ``(calls,)``, cycling through real ``windows`` ``(M, H, 7)``."""
     single = [np.ascontiguousarray(window[None]) for window in windows]
-    samples = np.empty(warm_up + calls)
+    samples = np.empty(_WARM_UP + calls)
     for call in range(len(samples)):
         window = single[call % len(single)]
         begin = perf_counter_ns()
         model.predict(window)
         samples[call] = perf_counter_ns() - begin
-    return samples[warm_up:] / 1e3
+    return samples[_WARM_UP:] / 1e3
 
 
 def finite(value: float) -> float | None:

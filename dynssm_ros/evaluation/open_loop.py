@@ -16,7 +16,6 @@ from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError, RecordingError
 from dynssm_ros.evaluation.coefficients import CoefficientTally
 from dynssm_ros.evaluation.metrics import (
-    BATCH,
     Tick,
     by_channel,
     coverage,
@@ -152,7 +151,6 @@ def evaluate(
     min_speed: float | None = None,
     horizon_s: float = PATH_HORIZON_S,
     stride: int = 1,
-    batch: int = BATCH,
     calls: int = 200,
     line: ClosedLine | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -168,7 +166,6 @@ def evaluate(
         min_speed: stretches below are left out (m/s); if ``None``, the largest ``minimum_speed`` of the models' cars.
         horizon_s: length of the rollouts (s).
         stride: a rollout starts at every ``stride``-th usable row.
-        batch: windows per call of a model.
         calls: single predictions timed per model.
         line: closed line that the position on the lap is counted along; the recording's first full lap if ``None``.
         progress: told of the predictions done and all that will be made; with several workers once for each model.
@@ -204,9 +201,7 @@ def evaluate(
     time = (recording.time[rows + 1] - recording.time[0]) / 1e9
     lively = rows[liveliest(time, recording.states(rows + 1), max(_DRAWN_S, steps * recording.T_s))]
     drawn = lively[: len(lively) - steps + 1 : steps]  # rollouts one after the other
-    score_of = partial(
-        _score, recording=recording, rows=rows, regimes=regimes, starts=starts, drawn=drawn, steps=steps, batch=batch
-    )
+    score_of = partial(_score, recording=recording, rows=rows, regimes=regimes, starts=starts, drawn=drawn, steps=steps)
     labels = list(models)
     found: dict[str, Score] = {}
     task = score_of if workers.elsewhere else partial(score_of, tick=tick)
@@ -240,18 +235,17 @@ def _score(
     starts: Indices,
     drawn: Indices,
     steps: int,
-    batch: int,
     tick: Tick = silent,
 ) -> Score:
     """What a model is worth, but for the time that it takes; see :func:`evaluate`."""
     measured = recording.states(rows + 1)
     with np.errstate(over="ignore", invalid="ignore"):  # a model that diverges is a result: null, not a warning
         predicted, rollouts, knowledge = _OneStep(model.vehicle, measured), [], []
-        for drive, (ends, begins, shown) in drive_through(model, recording, (rows, starts, drawn), batch):
-            for prediction in predict_rows(model, recording, ends, batch=batch, tick=tick, drive=drive):
+        for drive, (ends, begins, shown) in drive_through(model, recording, (rows, starts, drawn)):
+            for prediction in predict_rows(model, recording, ends, tick=tick, drive=drive):
                 predicted.add(prediction)
             if len(begins):
-                part = score_rollouts(model, recording, begins, steps, batch=batch, tick=tick, drive=drive)
+                part = score_rollouts(model, recording, begins, steps, tick=tick, drive=drive)
                 rollouts.append(part)
             if drive is not None:
                 knowledge.append(drive.at(shown))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.evaluation.metrics import BATCH, DriveThrough, Tick, silent
+from dynssm_ros.evaluation.metrics import DriveThrough, Tick, batches, silent
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.online import Learned
 from dynssm_ros.runtime.rollout import RolloutCorrection, path_errors, roll_out, step_of
@@ -103,17 +103,15 @@ def score_rollouts(
     starts: Indices,
     steps: int,
     *,
-    batch: int = BATCH,
     tick: Tick = silent,
     drive: DriveThrough | None = None,
 ) -> Rollout:
-    """Rolls the model out from all ``starts`` (at least one), ``batch`` side by side, and compares with what was measured.
+    """Rolls the model out from all ``starts`` (at least one), batch by batch, and compares with what was measured.
 
     ``drive`` is what the model's online layer knew along these rows.
     """
     squares, distances, T_s = np.zeros((steps, 3)), np.zeros(steps), recording.T_s
-    for begin in range(0, len(starts), batch):
-        chunk = starts[begin : begin + batch]
+    for chunk in batches(starts):
         known = None if drive is None else drive.at(chunk)
         predicted, measured = predicted_states(model, recording, chunk, steps, known)
         squares += np.sum((predicted - measured) ** 2, axis=0)

@@ -60,14 +60,9 @@ class Score:
         return None if self.model.card is None else self.model.card.training.get("seed")
 
     @property
-    def latency_p50(self) -> float:
-        """Median time of a prediction (us)."""
-        return float(np.percentile(self.latency_us, 50))
-
-    @property
-    def latency_p99(self) -> float:
-        """99th percentile of the time of a prediction (us)."""
-        return float(np.percentile(self.latency_us, 99))
+    def latency(self) -> list[float]:
+        """Median and 99th percentile of the time of a prediction (us)."""
+        return [float(value) for value in np.percentile(self.latency_us, [50, 99])]
 
     def to_json(self, regimes: Sequence[Regime]) -> dict[str, Any]:
         """The entry of one model in ``results.json``, by the regimes of :attr:`regime_rmse`; not finite is ``None``."""
@@ -82,7 +77,7 @@ class Score:
             "fde": finite(self.rollout.fde),
             "parameters": self.model.parameters,
             "flops": self.model.flops,
-            "latency_us": {"p50": finite(self.latency_p50), "p99": finite(self.latency_p99)},
+            "latency_us": dict(zip(("p50", "p99"), map(finite, self.latency), strict=True)),
             "coverage_90": None if self.coverage_90 is None else by_channel(self.coverage_90),
             "explained": by_channel(self.explained),
             "regimes": by_quantity,

@@ -98,11 +98,9 @@ def model_lines(models: Mapping[str, Drawn]) -> Iterator[tuple[str, Drawn, dict[
 
 
 @styled
-def predicted_and_measured(
-    time: Vector, measured: Vector, predicted: Mapping[str, Vector], seconds: float = 12.0
-) -> Figure:
-    """One-step predictions over the liveliest ``seconds``: values at the left, errors at the right; ``time`` in s."""
-    shown = liveliest(time, measured, seconds)
+def predicted_and_measured(time: Vector, measured: Vector, predicted: Mapping[str, Vector]) -> Figure:
+    """One-step predictions over the liveliest 12 s: values at the left, errors at the right; ``time`` in s."""
+    shown = liveliest(time, measured, 12.0)
     figure, axes = sheet(6.2, 3, 2, sharex=True)
     t = time[shown]
     for k, channel in enumerate(STATE_SIGNALS):

@@ -49,7 +49,7 @@ def summary_table(evaluation: Evaluation) -> Table:
         (Column("FLOPs"), lambda group: group.first.model.flops),
         (
             (Column("p50", "µs", "latency", brief=True), Column("p99", "µs", "latency")),
-            lambda group: group.spreads(lambda score: [score.latency_p50, score.latency_p99]),
+            lambda group: group.spreads(lambda score: score.latency),
         ),
         caption=f"{len(evaluation.rows):,} one-step predictions and {evaluation.starts:,} rollouts over "
         f"{evaluation.horizon_s:g} s, the same rows for every model.{_seeds_in_words(evaluation)}",
@@ -183,19 +183,16 @@ def markdown(evaluation: Evaluation) -> str:
 
 
 def _prose(evaluation: Evaluation) -> Prose:
-    return Prose(
-        "evaluation", max_bar=percent(evaluation_figures.MAX_BAR), horizon=evaluation.horizon_s, cut=_CUT,
-        coasting=percent(COASTING),
-    )  # fmt: skip
+    bars, coasting = percent(evaluation_figures.MAX_BAR), percent(COASTING)
+    return Prose("evaluation", evaluation=evaluation, cut=_CUT, max_bar=bars, coasting=coasting)
 
 
 def _protocol(evaluation: Evaluation) -> dict[str, str]:
     recording = evaluation.recording
+    sources, commands = ", ".join(recording.info.source), COMMANDS_IN_WORDS[recording.info.commands]
     lines = _prose(evaluation).protocol(
-        recording=evaluation.name, sources=", ".join(recording.info.source), duration=recording.duration,
-        rate=1 / recording.T_s, split=evaluation.split, min_speed=evaluation.min_speed,
-        commands=COMMANDS_IN_WORDS[recording.info.commands], cores=os.cpu_count(),
-    )  # fmt: skip
+        sources=sources, rate=1 / recording.T_s, commands=commands, cores=os.cpu_count()
+    )
     return lines | {f"Model {name}": _origin(group) for name, group in evaluation.groups.items()}
 
 

@@ -112,26 +112,16 @@ def _laps(course: Course) -> str:
 
 
 def _protocol(course: Course, prose: Prose) -> dict[str, str]:
-    settings, effects, line = course.settings, course.vehicle.effects, course.reference
-    speed = course.starting()[1].v_x
+    settings, effects, speed = course.settings, course.vehicle.effects, course.starting()[1].v_x
     return prose.protocol(
-        track=course.track.name,
-        length=course.track.length,
+        course=course,
+        settings=settings,
+        line=course.reference,
         laps=_laps(course),
-        vehicle=course.vehicle.name,
-        plant=course.plant,
         effects=f", with {', '.join(entry.name for entry in effects)}" if effects else "",
         start="standing" if speed == 0 else f"rolling at {speed:.3g} m/s",
-        line=line.name,
-        line_length=line.line.length,
-        lap_time=line.lap_time,
-        full_throttle_time=line.full_throttle_time,
-        objective=settings.objective,
-        horizon=settings.N,
-        T_s=course.vehicle.sampling_time,
         deadline_ms=1e3 * settings.deadline,
         weights=", ".join(f"{name} {value:g}" for name, value in asdict(settings.weights).items()),
-        time_unit=settings.scale.time,
         followed=_FOLLOWED[settings.follows],
         adapted="where it was better over the last horizons" if settings.evidence else "as it is",
         measured=_measured(course),

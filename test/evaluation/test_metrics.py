@@ -29,21 +29,21 @@ class Average:
         return WindowPrediction(windows[:, :, :3].mean(axis=1), windows[:, -1, :1] * np.ones(17), None)
 
 
-def test_batches_predict_the_same_as_one_go(rng, recorded):
+def test_batches_predict_the_same_as_one_go(rng, recorded, monkeypatch):
     matrix, rows = rng.normal(size=(101, 7)), np.arange(3, 100)
-    (whole,) = metrics.predict_rows(Average(), recorded(matrix), rows, batch=1000)
-    batched = list(metrics.predict_rows(Average(), recorded(matrix), rows, batch=8))
+    (whole,) = metrics.predict_rows(Average(), recorded(matrix), rows)
+    monkeypatch.setattr(metrics, "BATCH", 8)
+    batched = list(metrics.predict_rows(Average(), recorded(matrix), rows))
     np.testing.assert_array_equal(whole.state, np.concatenate([each.state for each in batched]))
     np.testing.assert_array_equal(whole.theta, np.concatenate([each.theta for each in batched]))
     np.testing.assert_allclose(whole.state[10], matrix[10:14, :3].mean(axis=0))
     assert all(each.physics is None for each in batched)
 
 
-def test_windows_exist_for_one_batch_only(rng, recorded):
+def test_windows_exist_for_one_batch_only(rng, recorded, monkeypatch):
     model, done = Average(), []
-    predictions = metrics.predict_rows(
-        model, recorded(rng.normal(size=(101, 7))), np.arange(3, 100), batch=40, tick=done.append
-    )
+    monkeypatch.setattr(metrics, "BATCH", 40)
+    predictions = metrics.predict_rows(model, recorded(rng.normal(size=(101, 7))), np.arange(3, 100), tick=done.append)
     next(predictions)
     assert model.shapes == [(40, 4, 7)]
     assert [len(each.state) for each in predictions] == [40, 17]
@@ -75,13 +75,12 @@ def test_honest_gaussian_variances_cover_ninety_percent(rng):
     errors = rng.normal(size=(40_000, 3)) * np.sqrt(variances)
     three_sigma = 3 * np.sqrt(0.9 * 0.1 / len(errors))
     np.testing.assert_allclose(metrics.coverage(errors, variances), 0.9, atol=three_sigma)
-    np.testing.assert_allclose(metrics.coverage(errors, variances, level=0.5), 0.5, atol=0.01)
     assert (metrics.coverage(errors, variances / 4) < 0.65).all()
 
 
 def test_latency_times_single_windows_after_the_warm_up(rng):
     model = Average()
-    samples = metrics.latency_us(model, rng.normal(size=(5, 4, 7)), calls=30, warm_up=10)
+    samples = metrics.latency_us(model, rng.normal(size=(5, 4, 7)), calls=30)
     assert samples.shape == (30,)
     assert (samples > 0).all()
-    assert model.shapes == [(1, 4, 7)] * 40
+    assert model.shapes == [(1, 4, 7)] * 50

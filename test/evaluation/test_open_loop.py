@@ -58,7 +58,8 @@ def test_coefficients_are_kept_of_every_so_many_th_row_and_counted_in_all(record
             return super().predict(windows)._replace(theta=theta)
 
     monkeypatch.setattr("dynssm_ros.evaluation.open_loop._COEFFICIENT_ROWS", 40)
-    result = evaluate(recording, {"adapting": Adapting()}, min_speed=0.0, batch=16, calls=3)
+    monkeypatch.setattr("dynssm_ros.evaluation.metrics.BATCH", 16)
+    result = evaluate(recording, {"adapting": Adapting()}, min_speed=0.0, calls=3)
     score, driven = result.scores["adapting"], recording.matrix[result.rows, 0]
     assert result.every == 7
     np.testing.assert_array_equal(score.theta[:, 0], driven[::7])
@@ -94,10 +95,11 @@ def test_stride_thins_the_rollouts_and_not_the_one_step_rows(recording):
     assert tenth.starts == -(-every.starts // 10)
 
 
-def test_progress_counts_up_to_all_predictions(recording):
+def test_progress_counts_up_to_all_predictions(recording, monkeypatch):
     told = []
     models = {"a": Model(), "b": Model()}
-    evaluate(recording, models, batch=50, calls=3, progress=lambda *counts: told.append(counts))
+    monkeypatch.setattr("dynssm_ros.evaluation.metrics.BATCH", 50)
+    evaluate(recording, models, calls=3, progress=lambda *counts: told.append(counts))
     assert [done for done, _ in told] == sorted(done for done, _ in told)
     assert told[-1][0] == told[-1][1]
 

@@ -70,10 +70,11 @@ def test_longer_stretches_serve_models_with_shorter_windows(planted):
     np.testing.assert_array_equal(long, short)
 
 
-def test_batches_score_the_same_as_one_go(planted, recorded):
+def test_batches_score_the_same_as_one_go(planted, recorded, monkeypatch):
     starts = np.arange(2, 100)
     whole = score_rollouts(Truth(bias=0.1), recorded(planted), starts, 10)
-    batched = score_rollouts(Truth(bias=0.1), recorded(planted), starts, 10, batch=7)
+    monkeypatch.setattr("dynssm_ros.evaluation.metrics.BATCH", 7)
+    batched = score_rollouts(Truth(bias=0.1), recorded(planted), starts, 10)
     np.testing.assert_allclose(whole.rmse, batched.rmse, rtol=1e-12)
     np.testing.assert_allclose(whole.displacement, batched.displacement, rtol=1e-12)
     assert whole.starts == batched.starts == len(starts)
