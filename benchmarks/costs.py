@@ -39,12 +39,9 @@ _DRIVES = 8  # that are simulated; the others are copies, which cost the same
 class Cost(NamedTuple):
     """What a command took."""
 
-    clock: float
-    """Time until it ended (s)."""
-    cpu: float
-    """Time on the processor, of all its threads and processes (s)."""
-    memory: float
-    """The most that one of its processes held (MB)."""
+    clock: float  # time until it ended (s)
+    cpu: float  # time on the processor, of all its threads and processes (s)
+    memory: float  # the most that one of its processes held (MB)
 
 
 def run(arguments: Sequence[str]) -> Cost:

@@ -340,8 +340,7 @@ GROUPS: dict[str, tuple[Callable[[], Any], list[str]]] = {
     "hidden_causes": (HiddenCauses, ["case", "page"]),
     "generalisation": (Generalisation, ["drive", "train", "score", "page"]),
     "closed_loop": (ClosedLoop, ["page"]),
-}
-"""By name: what makes the tasks, and those that run if none is named."""
+}  # by name: what makes the tasks, and those that run if none is named
 if GROUP not in GROUPS:
     raise UserError(f"group={GROUP}: expected one of {', '.join(GROUPS)}")
 _make, _usual = GROUPS[GROUP]

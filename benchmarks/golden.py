@@ -44,12 +44,9 @@ class Golden(NamedTuple):
     """A command whose results are kept."""
 
     name: str
-    arguments: str
-    """With ``{folder}`` for where its inputs and outputs lie."""
-    written: tuple[str, ...]
-    """Files in that folder."""
-    kept: str
-    """Which places in these files, a regular expression."""
+    arguments: str  # with {folder} for where its inputs and outputs lie
+    written: tuple[str, ...]  # files in that folder
+    kept: str  # which places in these files, a regular expression
 
 
 def drives(car: str, plant: str, options: str, rate: int, min_speed: int) -> Iterator[Golden]:

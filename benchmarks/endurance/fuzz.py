@@ -48,21 +48,14 @@ _JOINTS: tuple[dict[str, float], ...] = (
 
 @dataclass
 class Fuzzed:
-    """What came of it.
+    """What came of it."""
 
-    Attributes:
-        messages: that went in.
-        spoilt: those that were damaged.
-        predictions: that came out.
-        refusals: by their reason.
-        violations: what must not happen, in words, the first of each kind with the number of its message.
-    """
-
-    messages: int = 0
-    spoilt: int = 0
-    predictions: int = 0
-    refusals: Counter[str] = field(default_factory=Counter)
+    messages: int = 0  # that went in
+    spoilt: int = 0  # those that were damaged
+    predictions: int = 0  # that came out
+    refusals: Counter[str] = field(default_factory=Counter)  # by their reason
     violations: dict[str, str] = field(default_factory=dict)
+    """What must not happen, in words, the first of each kind with the number of its message."""
 
 
 class Traffic:

@@ -31,36 +31,22 @@ _WEIGHTS = "*.safetensors"
 
 @dataclass(frozen=True)
 class Command:
-    """A command that writes an output.
+    """A command that writes an output."""
 
-    Attributes:
-        name: of the command.
-        arguments: of ``dynssm``, without the output.
-        out: name of the output.
-        resumes: whether it goes on after a kill; then the older output is taken away first.
-    """
-
-    name: str
-    arguments: tuple[str, ...]
-    out: str
-    resumes: bool = False
+    name: str  # of the command
+    arguments: tuple[str, ...]  # of ``dynssm``, without the output
+    out: str  # name of the output
+    resumes: bool = False  # whether it goes on after a kill; then the older output is taken away first
 
 
 @dataclass
 class Outcome:
-    """What came of the kills of one command.
+    """What came of the kills of one command."""
 
-    Attributes:
-        kills: processes that were killed before they ended.
-        older: after which the older output was there, or none if there was none.
-        newer: after which a complete newer one was.
-        faults: what must not happen, in words.
-    """
-
-    kills: int = 0
-    older: int = 0
-    newer: int = 0
-    faults: list[str] = field(default_factory=list)
+    kills: int = 0  # processes that were killed before they ended
+    older: int = 0  # after which the older output was there, or none if there was none
+    newer: int = 0  # after which a complete newer one was
+    faults: list[str] = field(default_factory=list)  # what must not happen, in words
 
 
 def commands(folder: Path) -> list[Command]:

@@ -34,8 +34,7 @@ from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.track.tracks import CSV_COLUMNS, Track
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 
-ROAD = ("club", 11)
-"""Built-in track and seed of its variation."""
+ROAD = ("club", 11)  # built-in track and seed of its variation
 SPEED_SCALE = 0.8
 CHANGE = "grip_patch"
 PLANT: PlantKind = "double_track"
@@ -46,25 +45,16 @@ _NODES = {"laps": "controller", "driven (laps)": "simulator", "model": "predicto
 
 @dataclass(frozen=True)
 class LiveLaps:
-    """What became of a drive.
+    """What became of a drive."""
 
-    Attributes:
-        lap_times: of the controller's laps (s).
-        least_room: the least distance of the true car's centre from the borders (m); negative outside of them.
-        plans: by what became of them.
-        step_p99: of a control step (ms), over the last ones.
-        held_up: by how much the simulated car fell behind real time (s), as it drives nothing that nobody could answer.
-        controller: its last words.
-        predictor: likewise; empty if there was none.
-    """
-
-    lap_times: list[float]
-    least_room: float
-    plans: dict[str, int]
-    step_p99: float
+    lap_times: list[float]  # of the controller's laps (s)
+    least_room: float  # the least distance of the true car's centre from the borders (m); negative outside of them
+    plans: dict[str, int]  # by what became of them
+    step_p99: float  # of a control step (ms), over the last ones
     held_up: float
-    controller: str
-    predictor: str
+    """By how much the simulated car fell behind real time (s), as it drives nothing that nobody could answer."""
+    controller: str  # its last words
+    predictor: str  # likewise; empty if there was none
 
 
 class _Listener:

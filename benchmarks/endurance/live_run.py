@@ -49,23 +49,17 @@ PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"  # environment variable that a proce
 
 @dataclass
 class LiveRun:
-    """What went in and what came out.
+    """What went in and what came out."""
 
-    Attributes:
-        sent: time at which each odometry message was published, by its stamp (ns).
-        predicted: predicted ``[v_x, v_y, omega]`` by the stamp of the predicted instant (ns).
-        received: time at which that prediction arrived.
-        parameters: adapted coefficients by the same stamp.
-        diagnostics: level, message and values of each status, in order.
-        T_s: from input stamp to predicted stamp (ns).
-    """
-
-    T_s: int
+    T_s: int  # from input stamp to predicted stamp (ns)
     sent: dict[int, float] = field(default_factory=dict)
+    """Time at which each odometry message was published, by its stamp (ns)."""
     predicted: dict[int, tuple[float, float, float]] = field(default_factory=dict)
-    received: dict[int, float] = field(default_factory=dict)
-    parameters: dict[int, list[float]] = field(default_factory=dict)
+    """Predicted ``[v_x, v_y, omega]`` by the stamp of the predicted instant (ns)."""
+    received: dict[int, float] = field(default_factory=dict)  # time at which that prediction arrived
+    parameters: dict[int, list[float]] = field(default_factory=dict)  # adapted coefficients by the same stamp
     diagnostics: list[tuple[int, str, dict[str, str]]] = field(default_factory=list)
+    """Level, message and values of each status, in order."""
 
     @property
     def latencies(self) -> npt.NDArray[np.float64]:

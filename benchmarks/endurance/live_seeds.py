@@ -39,12 +39,9 @@ class Seeded(NamedTuple):
     """What became of a drive."""
 
     seed: int
-    laps: int
-    """Complete ones."""
-    least_room: float
-    """The least distance of the true car's centre from the borders (m); negative outside of them."""
-    predictions: int
-    """That the controller heard."""
+    laps: int  # complete ones
+    least_room: float  # the least distance of the true car's centre from the borders (m); negative outside of them
+    predictions: int  # that the controller heard
 
 
 def drive_seeded(car: str, seed: int, laps: int, model: Path | None = None) -> Seeded:

@@ -52,23 +52,14 @@ _PAIRS, _NONE = (4, 10), (6, 12)
 
 @dataclass(frozen=True)
 class Case:
-    """A hidden cause.
+    """A hidden cause."""
 
-    Attributes:
-        hidden: effects of the simulated car, by name and parameter.
-        seed: of everything random.
-        plant: how the car was simulated.
-        duration: of the recording (s).
-        track: name of the track.
-        sampling_time: of the recording (s).
-    """
-
-    hidden: Hidden
-    seed: int
-    plant: PlantKind = "rk4"
-    duration: float = 120.0
-    track: str = "road_course"
-    sampling_time: float = 0.04
+    hidden: Hidden  # effects of the simulated car, by name and parameter
+    seed: int  # of everything random
+    plant: PlantKind = "rk4"  # how the car was simulated
+    duration: float = 120.0  # of the recording (s)
+    track: str = "road_course"  # name of the track
+    sampling_time: float = 0.04  # of the recording (s)
 
     @property
     def name(self) -> str:

@@ -20,17 +20,11 @@ _ROUNDS = 4  # of lateral force and steering that gives way, which hang on each 
 
 @dataclass(frozen=True)
 class BrushTyres(StageEffect):
-    """Puts brush tyres in the place of the Pacejka tyres.
+    """Puts brush tyres in the place of the Pacejka tyres."""
 
-    Attributes:
-        peak_exponent: of the axle load, with which the peak force grows.
-        stiffness_exponent: the same of the cornering stiffness.
-        compliance: angle (rad) by which the front wheels turn back under the front axle's peak force.
-    """
-
-    peak_exponent: float = 0.85
-    stiffness_exponent: float = 0.7
-    compliance: float = 0.01
+    peak_exponent: float = 0.85  # of the axle load, with which the peak force grows
+    stiffness_exponent: float = 0.7  # the same of the cornering stiffness
+    compliance: float = 0.01  # angle (rad) by which the front wheels turn back under the front axle's peak force
 
     def tyres(self, xp: Any, q: Motion) -> None:
         """Replaces the lateral forces of both axles."""

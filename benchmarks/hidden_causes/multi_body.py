@@ -26,8 +26,7 @@ from dynssm_ros.vehicle.parameters import EffectEntry
 from dynssm_ros.vehicle.single_track import GRAVITY, StageEffect
 
 NAME = "multi_body"
-FILE = Path(__file__).with_name("bmw_320i.yaml")
-"""Of the team that drives it."""
+FILE = Path(__file__).with_name("bmw_320i.yaml")  # of the team that drives it
 HIDES = (
     "steering_offset", "steering_gain", "steering_curve", "steering_lag", "throttle_dead_band", "throttle_lag", "drag",
     "rolling_resistance", "drive_gain", "mass", "yaw_inertia", "grip", "grip_patch", "road_bank", "odometry_lever_arm",

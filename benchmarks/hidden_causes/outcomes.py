@@ -19,37 +19,26 @@ _NINETY = 1.645  # standard deviations of a 90 % interval
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a case.
+    """What became of a case."""
 
-    Attributes:
-        case: its name.
-        hidden: effects that were hidden.
-        named: effects that were named, the strongest first.
-        first: whether the first one named, or an alternative to it, was hidden; without effects, whether none was named.
-        all: whether each hidden effect was named, or is an alternative to one that was.
-        sized: whether the parameters of those named are within 15 % or two standard deviations; ``None`` if none was
-            found.
-        values: what was hidden, with its parameters.
-        found: what was named, with its parameters.
-        alternatives: what is reported as explaining the data as well, by what was named.
-        evidence: difference in the information criterion, by what was named.
-        std: stated standard deviations of what was named, with its parameters.
-        too_small: effects that were hidden and missed, of which the diagnosis says that they would have to be larger to be
-            named.
-    """
-
-    case: str
-    hidden: tuple[str, ...]
-    named: tuple[str, ...]
+    case: str  # its name
+    hidden: tuple[str, ...]  # effects that were hidden
+    named: tuple[str, ...]  # effects that were named, the strongest first
     first: bool
-    all: bool
+    """Whether the first one named, or an alternative to it, was hidden; without effects, whether none was named."""
+    all: bool  # whether each hidden effect was named, or is an alternative to one that was
     sized: bool | None
-    values: Hidden = field(default_factory=dict)
-    found: Hidden = field(default_factory=dict)
+    """Whether the parameters of those named are within 15 % or two standard deviations; ``None`` if none was found."""
+    values: Hidden = field(default_factory=dict)  # what was hidden, with its parameters
+    found: Hidden = field(default_factory=dict)  # what was named, with its parameters
     alternatives: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """What is reported as explaining the data as well, by what was named."""
     evidence: dict[str, float] = field(default_factory=dict)
-    std: Hidden = field(default_factory=dict)
+    """Difference in the information criterion, by what was named."""
+    std: Hidden = field(default_factory=dict)  # stated standard deviations of what was named, with its parameters
     too_small: tuple[str, ...] = ()
+    """Effects that were hidden and missed, of which the diagnosis says that they would have to be larger to be
+    named."""
 
     @property
     def missed(self) -> tuple[str, ...]:

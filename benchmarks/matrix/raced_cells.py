@@ -31,12 +31,10 @@ CHANGES: dict[str, dict[str, dict[str, float]]] = {
     "steering": {"steering_offset": {"offset": 0.02}},
     "mass": {"mass": {"factor": 1.1}},
     "drag": {},
-}
-"""What is hidden. Of drag it is half of the car's own, see :attr:`Cell.effects`."""
+}  # what is hidden. Of drag it is half of the car's own, see effects
 PLANTS: tuple[PlantKind, ...] = ("rk4", "double_track")
 OBJECTIVES: tuple[Objective, ...] = ("tracking", "progress")
-PACE: dict[Objective, float] = {"tracking": 0.85, "progress": 0.9}
-"""Share of the car's limits in the line's speed."""
+PACE: dict[Objective, float] = {"tracking": 0.85, "progress": 0.9}  # share of the car's limits in the line's speed
 LAPS = 2
 _SCALES = {"orca": 1.0, "racer": 2.8, "av21": 110.0}
 _WIDTHS = {"orca": 0.4, "racer": 1.2, "av21": 15.0}  # m
@@ -50,19 +48,12 @@ _SEEDS = 100  # of the noise, between drives of a cell
 
 @dataclass(frozen=True)
 class Cell:
-    """What models drive.
+    """What models drive."""
 
-    Attributes:
-        car: one of the generalisation matrix' cars.
-        track: built-in track and seed of its variation.
-        change: what is hidden from the models.
-        again: counts drives of the cell with other noise.
-    """
-
-    car: str
-    track: tuple[str, int]
-    change: str
-    again: int = 0
+    car: str  # one of the generalisation matrix' cars
+    track: tuple[str, int]  # built-in track and seed of its variation
+    change: str  # what is hidden from the models
+    again: int = 0  # counts drives of the cell with other noise
 
     @property
     def name(self) -> str:

@@ -22,15 +22,11 @@ from dynssm_ros.runtime.registry import load_model
 
 CALIBRATED = "calibrated"
 BASELINES = (TRUE, CALIBRATED)
-LEARNS = "dynssm"
-"""What is driven faster every lap."""
-CALIBRATES = "rls"
-"""Whose folder has the calibrated car."""
-TRUE_PACES = (0.9, 1.0, 1.1, 1.2, 1.3)
-"""Shares of the car's limits among which the true model's best is looked for."""
+LEARNS = "dynssm"  # what is driven faster every lap
+CALIBRATES = "rls"  # whose folder has the calibrated car
+TRUE_PACES = (0.9, 1.0, 1.1, 1.2, 1.3)  # shares of the car's limits among which the true model's best is looked for
 LEARNING_LAPS = 10
-AS_IS = " as it is"
-"""Ends the name of a model that needs no evidence."""
+AS_IS = " as it is"  # ends the name of a model that needs no evidence
 
 
 def outcome_file(cell: Cell, model: str, out: Path) -> Path:

@@ -38,20 +38,13 @@ _PUTNAM_LAPS = (28.6, 248.9, 409.0)  # s: the gate is passed
 
 @dataclass(frozen=True)
 class Car:
-    """A simulated car.
+    """A simulated car."""
 
-    Attributes:
-        vehicle: its file.
-        train: track of the training with its scale; ``test``: of the test.
-        seconds: of training, and of a test.
-        noise: usual deviations of the measured v_x, v_y, omega (m/s, m/s, rad/s).
-    """
-
-    vehicle: str
-    train: tuple[str, float]
+    vehicle: str  # its file
+    train: tuple[str, float]  # track of the training with its scale; ``test``: of the test
     test: tuple[str, float]
-    seconds: tuple[float, float]
-    noise: tuple[float, float, float]
+    seconds: tuple[float, float]  # of training, and of a test
+    noise: tuple[float, float, float]  # usual deviations of the measured v_x, v_y, omega (m/s, m/s, rad/s)
 
 
 CARS = {
@@ -63,36 +56,22 @@ CARS = {
 
 @dataclass(frozen=True)
 class Training:
-    """What models are trained on: a simulated drive, or measured logs.
+    """What models are trained on: a simulated drive, or measured logs."""
 
-    Attributes:
-        name: of the training.
-        vehicle: file of the car.
-        simulated: car, plant and level of noise of a simulated one.
-        logs: of a measured one: names and parts (s) of prepared recordings.
-    """
-
-    name: str
-    vehicle: str
-    simulated: tuple[str, PlantKind, str] | None = None
-    logs: tuple[tuple[str, float, float], ...] = ()
+    name: str  # of the training
+    vehicle: str  # file of the car
+    simulated: tuple[str, PlantKind, str] | None = None  # car, plant and level of noise of a simulated one
+    logs: tuple[tuple[str, float, float], ...] = ()  # of a measured one: names and parts (s) of prepared recordings
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A drive that the models of a training are scored on.
+    """A drive that the models of a training are scored on."""
 
-    Attributes:
-        training: of the models.
-        change: what is hidden from them, or which log it is.
-        logs: of a measured one.
-        marked: the data's README marks it as *test*.
-    """
-
-    training: Training
-    change: str
-    logs: tuple[tuple[str, float, float], ...] = ()
-    marked: bool = field(default=False, compare=False)
+    training: Training  # of the models
+    change: str  # what is hidden from them, or which log it is
+    logs: tuple[tuple[str, float, float], ...] = ()  # of a measured one
+    marked: bool = field(default=False, compare=False)  # the data's README marks it as *test*
 
     @property
     def name(self) -> str:

@@ -29,21 +29,14 @@ NUMBERS = "results.json"
 
 @dataclass(frozen=True, kw_only=True)
 class DriveLaps(Step):
-    """Every model of a race in the controller in turn; the output is a folder with numbers and figures.
-
-    Attributes:
-        race: what is driven.
-        trained: keys of the trainings, by the models' names.
-        calibrated: key of the calibrated car.
-        data: folder with tracks and lines.
-    """
+    """Every model of a race in the controller in turn; the output is a folder with numbers and figures."""
 
     marker: ClassVar[str] = NUMBERS
 
-    race: Race
-    trained: Mapping[str, str]
-    calibrated: str
-    data: Path | None = field(repr=False)
+    race: Race  # what is driven
+    trained: Mapping[str, str]  # keys of the trainings, by the models' names
+    calibrated: str  # key of the calibrated car
+    data: Path | None = field(repr=False)  # folder with tracks and lines
 
     def recipe(self) -> dict[str, Any]:
         """The race, the car, and what is in the files of track and line."""

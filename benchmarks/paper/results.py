@@ -23,42 +23,30 @@ from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _NOT_MADE = "not made; `make paper` says why"
 
-Entry = Mapping[str, Any]
-"""Scores of one training of a model on one test, as :meth:`~dynssm_ros.evaluation.score.Score.to_json` writes them."""
+Entry = Mapping[str, Any]  # scores of one training of a model on one test, as to_json writes them
 
 
 @dataclass(frozen=True)
 class Results:
-    """All results of a run.
+    """All results of a run."""
 
-    Attributes:
-        plan: as it was run.
-        reference: the paper's numbers.
-        scores: content of the steps that evaluate, by their keys, as far as they are done.
-        races: what was driven in closed loop, by the plan's names, as ``dynssm race`` writes it, as far as it is done.
-        rates: by the plan's names of sweeps, then by learning rate: what the trainings of all seeds say of themselves, as far
-            as done.
-        losses: what a training of the paper's model says of itself, by the model's name, as far as done.
-        networks: of a shipping model's trainings, by its name: how many kept the network, and how many there are.
-        costs: of the models, by name: parameters, flops, latency_us, integrator.
-        missing: why steps are not done, by their titles; steps that only lack others are left out.
-        reasons: why scores are not there, by their keys.
-        made: machine, versions, date.
-        quick: whether the plan was shortened to try things out.
-    """
-
-    plan: Plan
-    reference: Entry
-    scores: Mapping[str, Entry]
+    plan: Plan  # as it was run
+    reference: Entry  # the paper's numbers
+    scores: Mapping[str, Entry]  # content of the steps that evaluate, by their keys, as far as they are done
     races: Mapping[str, Entry]
+    """What was driven in closed loop, by the plan's names, as ``dynssm race`` writes it, as far as it is done."""
     rates: Mapping[str, Mapping[float, Sequence[Entry]]]
+    """By the plan's names of sweeps, then by learning rate: what the trainings of all seeds say of themselves, as far
+    as done."""
     losses: Mapping[str, Entry]
+    """What a training of the paper's model says of itself, by the model's name, as far as done."""
     networks: Mapping[str, tuple[int, int]]
-    costs: Mapping[str, Entry]
-    missing: Mapping[str, str]
-    reasons: Mapping[str, str]
-    made: str
-    quick: bool = False
+    """Of a shipping model's trainings, by its name: how many kept the network, and how many there are."""
+    costs: Mapping[str, Entry]  # of the models, by name: parameters, flops, latency_us, integrator
+    missing: Mapping[str, str]  # why steps are not done, by their titles; steps that only lack others are left out
+    reasons: Mapping[str, str]  # why scores are not there, by their keys
+    made: str  # machine, versions, date
+    quick: bool = False  # whether the plan was shortened to try things out
 
     @property
     def comparisons(self) -> list[Comparison]:

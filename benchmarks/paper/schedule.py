@@ -52,8 +52,7 @@ def steps_of(plan: Plan, data: Path | None, given: Mapping[str, Path]) -> list[S
     return [*steps, timing]
 
 
-COSTS = "costs.json"
-"""Key of the step that times the models."""
+COSTS = "costs.json"  # key of the step that times the models
 
 
 def score_key(split: str, commands: Commands) -> str:

@@ -48,21 +48,13 @@ class UnavailableError(UserError):
 
 @dataclass(frozen=True, kw_only=True)
 class Step(ABC):
-    """A piece of work with one output.
+    """A piece of work with one output."""
 
-    Attributes:
-        key: path of the output below the run's folder.
-        title: what is done, for people.
-        needs: keys of steps whose outputs must be there.
-        uses: keys of steps whose outputs are taken as far as they are there.
-        marker: file of an output folder that is written last.
-    """
-
-    key: str
-    title: str
-    needs: tuple[str, ...] = ()
-    uses: tuple[str, ...] = ()
-    marker: ClassVar[str] = ""
+    key: str  # path of the output below the run's folder
+    title: str  # what is done, for people
+    needs: tuple[str, ...] = ()  # keys of steps whose outputs must be there
+    uses: tuple[str, ...] = ()  # keys of steps whose outputs are taken as far as they are there
+    marker: ClassVar[str] = ""  # file of an output folder that is written last
 
     @abstractmethod
     def recipe(self) -> dict[str, Any]:
@@ -182,29 +174,18 @@ class Calibrate(Step):
 
 @dataclass(frozen=True, kw_only=True)
 class Train(Step):
-    """A model on the training part of a split.
-
-    Attributes:
-        model: name in the plan.
-        config: its configuration.
-        seed: of the training.
-        epochs: in each stage, instead of the file's.
-        part: rows to train on.
-        commands: the command protocol.
-        vehicle: name of a vehicle file, or key of the step that calibrates one.
-        start: key of the step that trains what fine-tuning starts from, if there is one.
-    """
+    """A model on the training part of a split."""
 
     marker: ClassVar[str] = "model.yaml"
 
-    model: str
-    config: ModelConfig
-    seed: int
-    epochs: int | None
-    part: Part
-    commands: Commands
-    vehicle: str
-    start: str | None = None
+    model: str  # name in the plan
+    config: ModelConfig  # its configuration
+    seed: int  # of the training
+    epochs: int | None  # in each stage, instead of the file's
+    part: Part  # rows to train on
+    commands: Commands  # the command protocol
+    vehicle: str  # name of a vehicle file, or key of the step that calibrates one
+    start: str | None = None  # key of the step that trains what fine-tuning starts from, if there is one
 
     def recipe(self) -> dict[str, Any]:
         """Model file, rows and, unless calibrated, the car."""
@@ -234,23 +215,14 @@ class Train(Step):
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Step):
-    """All models of a split on its test parts.
+    """All models of a split on its test parts."""
 
-    Attributes:
-        vehicle: key of the calibrated car.
-        untrained: names of models without training.
-        trained: names by the keys of their steps.
-        tests: parts to predict, by the names to show.
-        commands: the command protocol.
-        stride: rollouts start at every ``stride``-th row.
-    """
-
-    vehicle: str
-    untrained: tuple[str, ...]
-    trained: Mapping[str, str]
-    tests: Mapping[str, Part]
-    commands: Commands
-    stride: int
+    vehicle: str  # key of the calibrated car
+    untrained: tuple[str, ...]  # names of models without training
+    trained: Mapping[str, str]  # names by the keys of their steps
+    tests: Mapping[str, Part]  # parts to predict, by the names to show
+    commands: Commands  # the command protocol
+    stride: int  # rollouts start at every ``stride``-th row
 
     def recipe(self) -> dict[str, Any]:
         """Models and rows."""
@@ -287,17 +259,12 @@ class Evaluate(Step):
 
 @dataclass(frozen=True, kw_only=True)
 class TimeModels(Step):
-    """All models side by side, while nothing else computes: it uses all that is made before.
-
-    Attributes:
-        trained: keys of steps that train a model, by its name; the first that is there is timed.
-        vehicle: name of the vehicle file for the models without training.
-        calls: predictions of each model.
-    """
+    """All models side by side, while nothing else computes: it uses all that is made before."""
 
     trained: Mapping[str, tuple[str, ...]]
-    vehicle: str
-    calls: int
+    """Keys of steps that train a model, by its name; the first that is there is timed."""
+    vehicle: str  # name of the vehicle file for the models without training
+    calls: int  # predictions of each model
 
     def recipe(self) -> dict[str, Any]:
         """Models and calls."""

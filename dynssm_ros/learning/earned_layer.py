@@ -29,8 +29,7 @@ the generalisation matrix, gains of 1 to 2 % on left-out laps did not carry over
 _STRETCHES = 4  # of the laps, for a layer without a network
 _STARTS = 400  # rollouts in a part, at most
 
-Part = tuple[TrainableModel, Recording]
-"""A part of the laps, and a model that does not know it."""
+Part = tuple[TrainableModel, Recording]  # a part of the laps, and a model that does not know it
 
 
 class LayerBase(NamedTuple):
@@ -39,8 +38,7 @@ class LayerBase(NamedTuple):
     vehicle: Vehicle
     physics: PhysicsConfig
     normalisation: Normalisation
-    H: int
-    """Rows of the model's window."""
+    H: int  # rows of the model's window
     config: OnlineConfig
 
     def features(self, network: bool) -> OnlineFeatures:

@@ -41,8 +41,7 @@ from dynssm_ros.runtime.artifact import (
 from dynssm_ros.runtime.online import save_layer
 
 LOSSES = "losses.png"
-TOLERANCE = 1e-5
-"""Largest difference between ONNX and torch, in units of each state's scale."""
+TOLERANCE = 1e-5  # largest difference between ONNX and torch, in units of each state's scale
 _GRU_INITIAL_STATE = 5  # among the inputs of ONNX's GRU
 
 

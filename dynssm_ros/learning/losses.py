@@ -17,16 +17,11 @@ from dynssm_ros.runtime.artifact import Normalisation
 class Output(NamedTuple):
     """What a model computes for ``B`` windows; all increments are ``s_{t+1} - s_t``."""
 
-    increment: Tensor
-    """Final prediction, Eq. (30), as an increment ``(B, 3)``."""
-    physics: Tensor | None
-    """The physics' increment, Eq. (26), ``(B, 3)``."""
-    theta: Tensor | None
-    """Adapted coefficients, Eq. (18), ``(B, 17)``."""
-    deviation: Tensor | None
-    """Normalised parameter deviation, Eq. (20), ``(B, 17)``."""
-    correction: Tensor | None
-    """Normalised output of the residual network, Eq. (28), ``(B, 3)``."""
+    increment: Tensor  # final prediction, Eq. (30), as an increment (B, 3)
+    physics: Tensor | None  # the physics' increment, Eq. (26), (B, 3)
+    theta: Tensor | None  # adapted coefficients, Eq. (18), (B, 17)
+    deviation: Tensor | None  # normalised parameter deviation, Eq. (20), (B, 17)
+    correction: Tensor | None  # normalised output of the residual network, Eq. (28), (B, 3)
     nominal: Tensor | None = None
     """Increments of the physics with nominal coefficients from the latest rows, ``(B, rows, 3)``, for who needs them too."""
 

@@ -138,12 +138,9 @@ class LayerDrive(NamedTuple):
 
     see: Callable[[slice], Seen]
     """Of some of the windows; computed anew each time, so that memory does not grow with the laps."""
-    recording: Recording
-    """The laps."""
-    ends: Indices
-    """The last row of each window, ``(N,)``, ascending."""
-    starts: Indices
-    """The windows from which paths are predicted, ascending."""
+    recording: Recording  # the laps
+    ends: Indices  # the last row of each window, (N,), ascending
+    starts: Indices  # the windows from which paths are predicted, ascending
 
     def measured(self, block: slice) -> tuple[Vector, Vector]:
         """The last rows of some windows, ``(n, 7)``, and the increments to the next, ``(n, 3)`` (m/s, m/s, rad/s)."""
@@ -162,18 +159,15 @@ class LeftOut(NamedTuple):
     """A layer along a part of the laps that its prior was fitted without."""
 
     layer: OnlineLayer
-    squares: Vector
-    """Sum of its squared one-step errors, ``(3,)``, in units of s_delta squared."""
-    known: Learned
-    """What it knew at the drive's starts."""
+    squares: Vector  # sum of its squared one-step errors, (3,), in units of s_delta squared
+    known: Learned  # what it knew at the drive's starts
 
 
 class FittedLayer(NamedTuple):
     """The layer with its prior, and what says how good it is."""
 
     layer: OnlineLayer
-    error: float
-    """Geometric mean over the channels of the RMSE on the parts that are left out, in units of s_delta."""
+    error: float  # geometric mean over the channels of the RMSE on the parts that are left out, in units of s_delta
     left_out: list[LeftOut]
 
 
@@ -262,12 +256,9 @@ class _Moments(NamedTuple):
     """What least squares needs of a drive; sums over its rows, which add up over drives."""
 
     rows: int
-    gram: Vector
-    """Of the features, ``(3, n, n)``."""
-    moment: Vector
-    """Of features with the physics' errors, ``(3, n)``."""
-    square: Vector
-    """Of the physics' errors, ``(3,)``, in units of s_delta squared."""
+    gram: Vector  # of the features, (3, n, n)
+    moment: Vector  # of features with the physics' errors, (3, n)
+    square: Vector  # of the physics' errors, (3,), in units of s_delta squared
 
 
 def _moments(drive: LayerDrive, s_delta: Vector) -> _Moments:

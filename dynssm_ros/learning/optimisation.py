@@ -35,21 +35,13 @@ _RESTART_RATE = 0.25  # of the learning rate, with each restart
 
 @dataclass
 class OptimisationResult:
-    """The best model of an optimisation.
+    """The best model of an optimisation."""
 
-    Attributes:
-        model: with the weights of the best epoch.
-        history: mean loss per epoch: ``train/TERM`` and ``validation/TERM`` for each of ``COMPONENTS``.
-        best_epoch: the one with the lowest validation loss; 0: the untrained model.
-        resumed_from: epochs that were done before.
-        restarts: times that it began anew, out of a plateau.
-    """
-
-    model: TrainableModel
-    history: History
-    best_epoch: int = 0
-    resumed_from: int = 0
-    restarts: int = 0
+    model: TrainableModel  # with the weights of the best epoch
+    history: History  # mean loss per epoch: ``train/TERM`` and ``validation/TERM`` for each of ``COMPONENTS``
+    best_epoch: int = 0  # the one with the lowest validation loss; 0: the untrained model
+    resumed_from: int = 0  # epochs that were done before
+    restarts: int = 0  # times that it began anew, out of a plateau
 
 
 @dataclass

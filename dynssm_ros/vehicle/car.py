@@ -33,11 +33,9 @@ from dynssm_ros.vehicle.single_track import (
     staged,
 )
 
-CARRIED_S = 0.64
-"""Length of the window over which effect states are carried (s); lags are far shorter."""
+CARRIED_S = 0.64  # length of the window over which effect states are carried (s); lags are far shorter
 
-EffectStates = Mapping[str, Array]
-"""The effects' own states (a lag, a relaxing tyre) by name."""
+EffectStates = Mapping[str, Array]  # the effects' own states (a lag, a relaxing tyre) by name
 
 
 @dataclass(frozen=True)
@@ -47,25 +45,16 @@ class CarModel:
     Throughout, ``state`` has the body-frame velocities and ``applied`` the throttle and steering that act now, each of
     shape ``(...)``. The coefficients ``theta`` are broadcastable to it. ``context`` has other signals that effects read, by
     the names of ``CONTEXT_UNITS``. Effect states that are not given start settled.
-
-    Attributes:
-        constants: mass and geometry.
-        T_s: length of a step (s).
-        effects: physics beyond the nominal model, in the order in which it acts.
-        integrator: of a step; the paper's is one forward Euler step.
-        substeps: integration steps per step.
-        xp: array namespace: numpy, torch, casadi or ``SCALAR``.
-        measured: whether states are measured ones, as models step them, or true ones, as a plant does.
     """
 
-    constants: Constants
-    T_s: float
-    effects: Sequence[StageEffect] = ()
-    integrator: Integrator = "euler"
-    substeps: int = 1
+    constants: Constants  # mass and geometry
+    T_s: float  # length of a step (s)
+    effects: Sequence[StageEffect] = ()  # physics beyond the nominal model, in the order in which it acts
+    integrator: Integrator = "euler"  # of a step; the paper's is one forward Euler step
+    substeps: int = 1  # integration steps per step
     _: KW_ONLY
-    xp: Any = np
-    measured: bool = True
+    xp: Any = np  # array namespace: numpy, torch, casadi or ``SCALAR``
+    measured: bool = True  # whether states are measured ones, as models step them, or true ones, as a plant does
 
     @classmethod
     def of(cls, vehicle: Vehicle, integrator: Integrator | None = None, substeps: int = 1, *, xp: Any = np) -> CarModel:

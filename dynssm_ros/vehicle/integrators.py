@@ -9,8 +9,7 @@ from dynssm_ros.vehicle.single_track import Array
 
 Integrator = Literal["euler", "rk4"]
 Values = tuple[Array, ...]
-Rates = Callable[[Sequence[Array]], Values]
-"""From quantities to their time derivatives."""
+Rates = Callable[[Sequence[Array]], Values]  # from quantities to their time derivatives
 
 
 def integrate(rates: Rates, start: Values, T_s: float, integrator: Integrator, substeps: int) -> Values:

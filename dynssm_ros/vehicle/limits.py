@@ -19,19 +19,12 @@ _CONTEXT = {**dict.fromkeys(CONTEXT_UNITS, 0.0), "lap_length": 1.0}  # at the st
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What a car can do, over its speed (a ggv diagram).
+    """What a car can do, over its speed (a ggv diagram)."""
 
-    Attributes:
-        speed: grid of speeds from near 0 to the top speed (m/s), increasing, shape ``(M,)``.
-        lateral: largest lateral acceleration in steady cornering (m/s^2), ``(M,)``.
-        drive: longitudinal acceleration under full throttle (m/s^2), ``(M,)``.
-        brake: deceleration under full brake (m/s^2, positive), ``(M,)``.
-    """
-
-    speed: Vector
-    lateral: Vector
-    drive: Vector
-    brake: Vector
+    speed: Vector  # grid of speeds from near 0 to the top speed (m/s), increasing, shape ``(M,)``
+    lateral: Vector  # largest lateral acceleration in steady cornering (m/s^2), ``(M,)``
+    drive: Vector  # longitudinal acceleration under full throttle (m/s^2), ``(M,)``
+    brake: Vector  # deceleration under full brake (m/s^2, positive), ``(M,)``
 
     @property
     def top_speed(self) -> float:

@@ -21,8 +21,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 GRAVITY = 9.81  # m/s^2
-INSTANT = 1e-3
-"""Time that a single evaluation stands for (s)."""
+INSTANT = 1e-3  # time that a single evaluation stands for (s)
 
 Array = Any  # float, numpy array, torch tensor or casadi expression: whatever ``xp`` computes with
 
@@ -289,8 +288,7 @@ def at_least(value: Array, floor: Array) -> Array:
     return (value + floor + abs(value - floor)) / 2
 
 
-Stage = Callable[[Any, Motion], None]
-"""Takes the array namespace and the motion, which it changes."""
+Stage = Callable[[Any, Motion], None]  # takes the array namespace and the motion, which it changes
 
 STAGES: tuple[Stage, ...] = (inputs, slip, drive, loads, tyres, forces, accelerations)
 """The nominal equations, in the order in which they run."""

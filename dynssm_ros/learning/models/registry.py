@@ -17,8 +17,7 @@ from dynssm_ros.learning.models.rls import Rls
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import Vehicle
 
-MODELS: dict[str, type[TrainableModel]] = {}
-"""Model classes by kind."""
+MODELS: dict[str, type[TrainableModel]] = {}  # model classes by kind
 
 
 def register_model(model: type[TrainableModel]) -> type[TrainableModel]:

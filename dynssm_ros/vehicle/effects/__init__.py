@@ -65,8 +65,7 @@ __all__ = [
     "require_context",
 ]
 
-EFFECTS: dict[str, type[Effect]] = {}
-"""All effects by name: the library, and what :func:`register_effect` adds."""
+EFFECTS: dict[str, type[Effect]] = {}  # all effects by name: the library, and what register_effect adds
 
 
 def register_effect(effect: type[Effect]) -> type[Effect]:

@@ -43,28 +43,19 @@ SLOWEST = 1e-3  # m/s; what divides by the speed does not divide by less
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of an effect.
+    """A parameter of an effect."""
 
-    Attributes:
-        unit: SI unit; ``1`` for a plain number, ``lap`` for a fraction of the lap.
-        lower: smallest admissible value.
-        upper: largest admissible value.
-        neutral: the value at which the effect vanishes; also the default.
-        shape: it says where or how the effect acts and not how much. The effect vanishes with its other parameters, at
-            whatever value this one has.
-        context: the signals that the effect needs once this parameter is not neutral.
-        local: it says how much the effect acts within the section of the lap that ``centre`` and ``length`` give.
-        tried: values at which a search tries a parameter that shapes.
-    """
-
-    unit: str
-    lower: float
-    upper: float
-    neutral: float
+    unit: str  # SI unit; ``1`` for a plain number, ``lap`` for a fraction of the lap
+    lower: float  # smallest admissible value
+    upper: float  # largest admissible value
+    neutral: float  # the value at which the effect vanishes; also the default
     shape: bool = False
-    context: tuple[str, ...] = ()
+    """It says where or how the effect acts and not how much. The effect vanishes with its other parameters, at whatever
+    value this one has."""
+    context: tuple[str, ...] = ()  # the signals that the effect needs once this parameter is not neutral
     local: bool = False
-    tried: tuple[float, ...] = ()
+    """It says how much the effect acts within the section of the lap that ``centre`` and ``length`` give."""
+    tried: tuple[float, ...] = ()  # values at which a search tries a parameter that shapes
 
     @property
     def span(self) -> float:
@@ -88,10 +79,8 @@ class Parameter:
 
 CENTRE = Parameter("lap", 0.0, 1.0, 0.5, shape=True, tried=tuple(k / 32 for k in range(32)))
 """Middle of the section of the lap on which a local effect acts."""
-LENGTH = Parameter("lap", 0.01, 0.8, 0.1, shape=True, tried=(0.03, 0.06, 0.12, 0.25))
-"""Length of that section."""
-LOCATION = ("centre", "length")
-"""Names of the parameters that place a local effect."""
+LENGTH = Parameter("lap", 0.01, 0.8, 0.1, shape=True, tried=(0.03, 0.06, 0.12, 0.25))  # length of that section
+LOCATION = ("centre", "length")  # names of the parameters that place a local effect
 
 
 @dataclass(frozen=True)
@@ -99,32 +88,22 @@ class Effect(StageEffect):
     """Base of all effects. The dataclass fields of a subclass are its parameters, described in ``PARAMETERS``.
 
     A subclass overrides the stages of :class:`~dynssm_ros.vehicle.single_track.StageEffect` at which it acts.
-
-    Attributes:
-        NAME: as in vehicle files.
-        SUMMARY: what it is, in one sentence.
-        ADVICE: what a team would do about it.
-        MANOEUVRE: the driving that shows it best.
-        PARAMETERS: the parameters by name.
-        VARIANTS: sets of parameters to be fitted together, the simplest first; empty: all of them.
-        OPEN_ROAD: those of them that cannot be on a closed lap.
-        EFFECT_STATES: names of its own states. :func:`lagged` settles and integrates them.
-        SENSOR: it changes what the sensors show; the car moves as without it.
-        TYPICAL: how far it is off neutral in a car that is badly set up: just noticeable in ordinary laps, and large.
-        DIRECTIONS: to which sides of neutral it is met in a car that can be driven; empty: those that its bounds admit.
     """
 
-    NAME: ClassVar[str] = ""
-    SUMMARY: ClassVar[str] = ""
-    ADVICE: ClassVar[str] = ""
-    MANOEUVRE: ClassVar[str] = ""
-    PARAMETERS: ClassVar[dict[str, Parameter]] = {}
+    NAME: ClassVar[str] = ""  # as in vehicle files
+    SUMMARY: ClassVar[str] = ""  # what it is, in one sentence
+    ADVICE: ClassVar[str] = ""  # what a team would do about it
+    MANOEUVRE: ClassVar[str] = ""  # the driving that shows it best
+    PARAMETERS: ClassVar[dict[str, Parameter]] = {}  # the parameters by name
     VARIANTS: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    OPEN_ROAD: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    EFFECT_STATES: ClassVar[tuple[str, ...]] = ()
-    SENSOR: ClassVar[bool] = False
+    """Sets of parameters to be fitted together, the simplest first; empty: all of them."""
+    OPEN_ROAD: ClassVar[tuple[tuple[str, ...], ...]] = ()  # those of them that cannot be on a closed lap
+    EFFECT_STATES: ClassVar[tuple[str, ...]] = ()  # names of its own states. :func:`lagged` settles and integrates them
+    SENSOR: ClassVar[bool] = False  # it changes what the sensors show; the car moves as without it
     TYPICAL: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    """How far it is off neutral in a car that is badly set up: just noticeable in ordinary laps, and large."""
     DIRECTIONS: ClassVar[tuple[float, ...]] = ()
+    """To which sides of neutral it is met in a car that can be driven; empty: those that its bounds admit."""
 
     @classmethod
     def variants(cls) -> tuple[tuple[str, ...], ...]:

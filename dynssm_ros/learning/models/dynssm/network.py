@@ -203,9 +203,7 @@ class DynSSM(TrainableModel):
 class _Step(NamedTuple):
     """What the physics says of the next step, for ``B`` windows."""
 
-    physics: Tensor | None = None
-    """Its increment ``(B, 3)``."""
-    expected: Tensor | None = None
-    """The same with its innovation filter, if it has one."""
+    physics: Tensor | None = None  # its increment (B, 3)
+    expected: Tensor | None = None  # the same with its innovation filter, if it has one
     features: Tensor | None = None
     """Physics with its mean error, and the last error about that mean, ``(B, 6)`` in units of ``s_delta``."""
