@@ -27,7 +27,6 @@ class BrushTyres(StageEffect):
     compliance: float = 0.01  # angle (rad) by which the front wheels turn back under the front axle's peak force
 
     def tyres(self, xp: Any, q: Motion) -> None:
-        """Replaces the lateral forces of both axles."""
         stiffness, peaks = cornering_stiffness(q.theta), (q.theta.D_f, q.theta.D_r)
         shifts = q.theta.S_vf, q.theta.S_vr
         front = 0.0
@@ -54,7 +53,6 @@ class ForeignPlant(Rk4Plant):
     """The car in steps of 1 ms."""
 
     def first(self, vehicle: Vehicle) -> tuple[StageEffect, ...]:
-        """Its tyres and its steering."""
         return (BrushTyres(),)
 
 

@@ -39,7 +39,6 @@ class DriveLaps(Step):
     data: Path | None = field(repr=False)  # folder with tracks and lines
 
     def recipe(self) -> dict[str, Any]:
-        """The race, the car, and what is in the files of track and line."""
         named = {self.race.track: named_track(self.data, self.race.track), self.race.line: self._line()}
         return {
             "race": self.race.model_dump(mode="json", exclude={"title", "text", "paper", "ablation"}),
@@ -48,7 +47,6 @@ class DriveLaps(Step):
         }
 
     def make(self, root: Path, there: frozenset[str]) -> None:
-        """Drives."""
         race, vehicle = self.race, load_vehicle(self.race.vehicle)
         driven = vehicle.with_effects((each.name, each.parameters) for each in race.effects)
         track = load_track(named_track(self.data, race.track))

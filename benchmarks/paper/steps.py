@@ -82,7 +82,6 @@ class Extract(Step):
     data: Path | None = field(repr=False)
 
     def recipe(self) -> dict[str, Any]:
-        """Signal map, rate and what the log holds."""
         signals = load_signal_map(self.log.signals).model_dump(mode="json")
         return {
             "log": self.log.model_dump(mode="json", exclude_none=True),
@@ -91,7 +90,6 @@ class Extract(Step):
         }
 
     def make(self, root: Path, there: frozenset[str]) -> None:
-        """Extracts it."""
         signals = load_signal_map(self.log.signals).with_commands(self.log.commands)
         extract([self._bag()], signals, self.log.rate).save(root / self.key)
 
@@ -107,7 +105,6 @@ class Simulate(Step):
     data: Path | None = field(repr=False)
 
     def recipe(self) -> dict[str, Any]:
-        """Car, track and driver."""
         track = named_track(self.data, self.drive.track)
         return {
             "drive": self.drive.model_dump(mode="json"),
@@ -116,7 +113,6 @@ class Simulate(Step):
         }
 
     def make(self, root: Path, there: frozenset[str]) -> None:
-        """Drives, through a bag like a real log."""
         drive = self.drive
         vehicle = load_vehicle(drive.vehicle).with_effects((each.name, each.parameters) for each in drive.effects)
         track = load_track(named_track(self.data, drive.track))
@@ -137,12 +133,10 @@ class Take(Step):
     path: Path
 
     def recipe(self) -> dict[str, Any]:
-        """What it holds."""
         Recording.load(self.path)
         return {"content": digest(self.path)}
 
     def make(self, root: Path, there: frozenset[str]) -> None:
-        """Copies it."""
         Recording.load(self.path).save(root / self.key)
 
 
@@ -155,14 +149,12 @@ class Calibrate(Step):
     commands: Commands
 
     def recipe(self) -> dict[str, Any]:
-        """Car and rows."""
         return _data(self.part, self.commands) | {
             "vehicle": self._start().model_dump(mode="json"),
             "min_speed": self.car.min_speed,
         }
 
     def make(self, root: Path, there: frozenset[str]) -> None:
-        """Calibrates it."""
         recording = _load(root, self.part, self.commands)
         found = calibrate(recording, self._start(), min_speed=self.car.min_speed)
         save_vehicle(found.vehicle, root / self.key, f"Calibrated on {', '.join(recording.info.source)}.")
@@ -225,12 +217,10 @@ class Evaluate(Step):
     stride: int  # rollouts start at every ``stride``-th row
 
     def recipe(self) -> dict[str, Any]:
-        """Models and rows."""
         tests = {name: part.model_dump(mode="json") for name, part in self.tests.items()}
         return {"models": [*self.untrained, *self.trained], "tests": tests, "stride": self.stride}
 
     def make(self, root: Path, there: frozenset[str]) -> None:
-        """Scores them on the same rows."""
         vehicle = load_vehicle(root / self.vehicle)
         models = {name: load_model(name, vehicle) for name in self.untrained}
         models |= {key: load_model(root / key) for key in self.trained if key in there}
@@ -267,11 +257,9 @@ class TimeModels(Step):
     calls: int  # predictions of each model
 
     def recipe(self) -> dict[str, Any]:
-        """Models and calls."""
         return {"models": sorted(self.trained), "calls": self.calls}
 
     def make(self, root: Path, there: frozenset[str]) -> None:
-        """Times them in turn, round by round."""
         vehicle = load_vehicle(self.vehicle)
         models = {name: load_model(name, vehicle) for name in UNTRAINED}
         for name, keys in self.trained.items():

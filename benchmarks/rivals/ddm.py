@@ -80,7 +80,6 @@ class DDM(TrainableModel):
         return self.lower + torch.sigmoid(self.dense[-1](hidden)) * self.admissible
 
     def forward(self, window: Tensor) -> Output:
-        """Raw windows ``(B, H, 7)`` to predictions that are all physics."""
         theta = self.coefficients(self.hidden(window))
         increment = self.physics.over(window, theta[:, None], 1)[:, 0]
         return Output(increment, increment, theta, None, None)

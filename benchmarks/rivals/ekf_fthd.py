@@ -67,7 +67,6 @@ class EkfFTHD(FTHD):
         self.register_buffer("nudges", nudges, persistent=False)
 
     def forward(self, window: Tensor) -> Output:
-        """Raw windows ``(B, H, 7)`` to predictions that are all physics, from filtered states on."""
         hidden = self.hidden(window)
         theta = self.coefficients(hidden)
         state = self.filtered(window, theta, *self.variances(hidden))

@@ -70,7 +70,6 @@ class GaussianProcess(TrainableModel):
         self.memory = nn.Parameter(torch.zeros(self.H - 1, CHANNELS))
 
     def forward(self, window: Tensor) -> Output:
-        """Raw windows ``(B, H, 7)`` to predictions."""
         over = self.physics.over(window, self.nominal, self.H)
         expected = self._over_states(self._inputs(window))
         slow = (self._left(window, over, expected) * self.memory).sum(1)
@@ -94,7 +93,6 @@ class GaussianProcess(TrainableModel):
 
     @torch.no_grad()
     def fit(self, training: TrainingWindows) -> bool:
-        """Scales and variances by marginal likelihood on a sample, the rest in closed form from all windows."""
         draw = torch.Generator().manual_seed(self.config.training.seed)
         chosen = torch.randperm(len(training), generator=draw)[: self.config.sample]
         window, increment = training.batch(chosen)

@@ -66,12 +66,10 @@ class OnTrack(TrainableModel):
         self.theta = nn.Parameter(config.physics.theta_0(vehicle), requires_grad=False)
 
     def forward(self, window: Tensor) -> Output:
-        """Raw windows ``(B, H, 7)`` to predictions that are all physics."""
         increment = self.physics.over(window, self.theta, 1)[:, 0]
         return Output(increment, increment, self.theta.expand(window.shape[0], -1), None, None)
 
     def fit(self, training: TrainingWindows) -> bool:
-        """All rounds, on a sample of the windows."""
         draw = torch.Generator().manual_seed(self.config.training.seed)
         chosen = torch.randperm(len(training), generator=draw)[: self.config.sample]
         window, increment = training.batch(chosen)

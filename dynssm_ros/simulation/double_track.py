@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from dynssm_ros.vehicle.effects.drivetrain import TRACK_WIDTH
-from dynssm_ros.vehicle.single_track import Array, Constants, Motion, StageEffect, front_force, rear_force
+from dynssm_ros.vehicle.single_track import Array, Motion, StageEffect, VehicleConstants, front_force, rear_force
 
 LOAD_SENSITIVITY = 0.15  # of a racing slick: grip per load that 100 % more load costs
 _ROUNDS = 2  # of lateral force and load transfer, which hang on each other weakly
@@ -41,7 +41,7 @@ class DoubleTrack(StageEffect):
     sensitivity: float = LOAD_SENSITIVITY  # k, grip per load that a wheel loses with load
 
     @classmethod
-    def of(cls, car: Constants) -> DoubleTrack:
+    def of(cls, car: VehicleConstants) -> DoubleTrack:
         """What is plausible for a car of which only the axles are known: neutral roll stiffness, as the static loads."""
         wheelbase = car.l_f + car.l_r
         return cls(width=TRACK_WIDTH * wheelbase, roll_front=car.l_r / wheelbase)

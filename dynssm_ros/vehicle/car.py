@@ -24,11 +24,11 @@ from dynssm_ros.vehicle.single_track import (
     Applied,
     Array,
     Coefficients,
-    Constants,
     Motion,
     Stage,
     StageEffect,
     State,
+    VehicleConstants,
     at_least,
     staged,
 )
@@ -47,7 +47,7 @@ class CarModel:
     the names of ``CONTEXT_UNITS``. Effect states that are not given start settled.
     """
 
-    constants: Constants  # mass and geometry
+    constants: VehicleConstants  # mass and geometry
     T_s: float  # length of a step (s)
     effects: Sequence[StageEffect] = ()  # physics beyond the nominal model, in the order in which it acts
     integrator: Integrator = "euler"  # of a step; the paper's is one forward Euler step

@@ -7,6 +7,7 @@ Names and units are the paper's (Table I); a file is checked completely when it 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from dynssm_ros.configuration import StrictModel
 from dynssm_ros.files import replacing
 from dynssm_ros.vehicle.effects import EFFECTS, Effect, build_effect
 from dynssm_ros.vehicle.integrators import Integrator
-from dynssm_ros.vehicle.single_track import Applied, Coefficients
+from dynssm_ros.vehicle.single_track import Applied, Coefficients, VehicleConstants
 
 COEFFICIENT_UNITS: dict[str, str] = {
     "B_f": "1/rad", "C_f": "1", "D_f": "N", "E_f": "1",
@@ -51,20 +52,6 @@ class Coefficient(StrictModel):
         if not lower <= self.nominal <= upper:
             raise ValueError(f"nominal {self.nominal:g} is outside its bounds [{lower:g}, {upper:g}]")
         return self
-
-
-class VehicleConstants(StrictModel):
-    """Mass and geometry, known and not adapted."""
-
-    m: float = Field(gt=0, description="mass (kg)")
-    m_std: float | None = Field(
-        default=None, ge=0, description="standard deviation with which it was weighed (kg); null: 1 % of it"
-    )
-    l_f: float = Field(gt=0, description="centre of gravity to front axle (m)")
-    l_r: float = Field(gt=0, description="centre of gravity to rear axle (m)")
-    h_cg: float = Field(ge=0, description="height of the centre of gravity (m)")
-    F_z0: float = Field(gt=0, description="nominal axle load (N) at which D and S_v hold")
-    load_transfer: bool = Field(description="scale lateral forces with the axle loads")
 
 
 class InputLimits(StrictModel):
@@ -205,6 +192,11 @@ class Vehicle(StrictModel):
         return np.array([self.coefficients[name].bounds[1] for name in COEFFICIENTS])
 
     @property
+    def std(self) -> list[float | None]:
+        """How well the nominal values are known, in that order; ``None``: by their bounds only."""
+        return [self.coefficients[name].std for name in COEFFICIENTS]
+
+    @property
     def active_effects(self) -> tuple[Effect, ...]:
         """The effects of the file, ready to act."""
         return tuple(build_effect(entry.name, entry.parameters) for entry in self.effects)
@@ -217,10 +209,8 @@ class Vehicle(StrictModel):
     @property
     def in_windows(self) -> Vehicle:
         """The same car without effects that read what rows of state and inputs do not tell, such as the place on the lap."""
-        of_windows = [
-            entry for entry, effect in zip(self.effects, self.active_effects, strict=True) if not effect.needs
-        ]
-        return self.model_copy(update={"effects": tuple(of_windows)})
+        both = zip(self.effects, self.active_effects, strict=True)
+        return self.model_copy(update={"effects": tuple(entry for entry, effect in both if not effect.needs)})
 
     def with_nominal(self, nominal: Vector, std: Vector | None = None, correlation: Vector | None = None) -> Vehicle:
         """The same car with other nominal values and, if given, what is known of them.
@@ -230,14 +220,17 @@ class Vehicle(StrictModel):
             std: standard deviations ``(17,)``; ``None``: what was known before.
             correlation: ``(17, 17)``; ``None``: with ``std`` they are independent.
         """
+        if std is None:
+            return self._known(nominal, self.std)
+        return self._known(nominal, std, correlation=None if correlation is None else _rows(correlation))
+
+    def _known(self, nominal: Iterable[float], std: Iterable[float | None], **others: Any) -> Vehicle:
+        """The same car with other values and standard deviations, in the order of ``COEFFICIENTS``, and other fields."""
         coefficients = {
-            name: self.coefficients[name].model_copy(
-                update={"nominal": float(nominal[k])} | ({} if std is None else {"std": float(std[k])})
-            )
-            for k, name in enumerate(COEFFICIENTS)
+            name: c.model_copy(update={"nominal": float(value), "std": None if known is None else float(known)})
+            for (name, c), value, known in zip(self.coefficients.items(), nominal, std, strict=True)
         }
-        known = {} if std is None else {"correlation": None if correlation is None else _rows(correlation)}
-        return self.model_copy(update={"coefficients": coefficients} | known)
+        return self.model_copy(update={"coefficients": coefficients, **others})
 
     def known_before(self, laps: Collection[str]) -> Vehicle:
         """The car as it was known before it was calibrated on ``laps`` (fingerprints).
@@ -247,18 +240,15 @@ class Vehicle(StrictModel):
         before = self.before
         if before is None or 3 * len({*before.laps} & {*laps}) < len(laps):
             return self
-        coefficients = {
-            name: c.model_copy(update={"nominal": before.nominal[name], "std": before.std[name]})
-            for name, c in self.coefficients.items()
-        }
-        return self.model_copy(update={"coefficients": coefficients, "correlation": before.correlation, "before": None})
+        nominal, std = ([known[name] for name in COEFFICIENTS] for known in (before.nominal, before.std))
+        return self._known(nominal, std, correlation=before.correlation, before=None)
 
     def calibrated_on(self, laps: Collection[str], given: Vehicle) -> Vehicle:
         """The same car, calibrated on ``laps`` (fingerprints) from the file ``given``."""
         before = given.before or KnownBefore(
             laps=(),
-            nominal={name: c.nominal for name, c in given.coefficients.items()},
-            std={name: c.std for name, c in given.coefficients.items()},
+            nominal=dict(zip(COEFFICIENTS, given.nominal.tolist(), strict=True)),
+            std=dict(zip(COEFFICIENTS, given.std, strict=True)),
             correlation=given.correlation,
         )
         known = before.model_copy(update={"laps": tuple(sorted({*before.laps, *laps})[:_LAPS])})
@@ -266,11 +256,8 @@ class Vehicle(StrictModel):
 
     def unmeasured(self) -> Vehicle:
         """The same car of which nothing but the bounds is known: values in their middle, no standard deviations."""
-        coefficients = {
-            name: c.model_copy(update={"nominal": sum(c.bounds) / 2, "std": None})
-            for name, c in self.coefficients.items()
-        }
-        return self.model_copy(update={"coefficients": coefficients, "correlation": None, "before": None})
+        middle, unknown = (self.lower + self.upper) / 2, [None] * len(COEFFICIENTS)
+        return self._known(middle, unknown, correlation=None, before=None)
 
     def with_effect(self, name: str, parameters: dict[str, float]) -> Vehicle:
         """The same car with one more effect.
@@ -278,17 +265,13 @@ class Vehicle(StrictModel):
         Raises:
             ConfigurationError: no such effect, a parameter outside its bounds, or an effect that the car already has.
         """
-        entry = {"name": name, "parameters": parameters}
         content = self.model_dump()
-        content["effects"] = [*content["effects"], entry]
+        content["effects"] = [*content["effects"], {"name": name, "parameters": parameters}]
         return configuration.validate(Vehicle, content, f"vehicle {self.name} with {name}")
 
     def with_effects(self, effects: Iterable[tuple[str, dict[str, float]]]) -> Vehicle:
         """The same car with more effects, each a name and its parameters; see :meth:`with_effect`."""
-        vehicle = self
-        for name, parameters in effects:
-            vehicle = vehicle.with_effect(name, parameters)
-        return vehicle
+        return reduce(lambda vehicle, effect: vehicle.with_effect(*effect), effects, self)
 
 
 def load_vehicle(name_or_path: str | Path) -> Vehicle:

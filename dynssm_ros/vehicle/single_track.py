@@ -18,7 +18,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
+
+from pydantic import Field
+
+from dynssm_ros.configuration import StrictModel
 
 GRAVITY = 9.81  # m/s^2
 INSTANT = 1e-3  # time that a single evaluation stands for (s)
@@ -66,32 +70,18 @@ class Applied(NamedTuple):
     delta: Array
 
 
-class Constants(Protocol):
-    """What is known of the car and not adapted."""
+class VehicleConstants(StrictModel):
+    """Mass and geometry, known and not adapted."""
 
-    @property
-    def m(self) -> float:
-        """Mass (kg)."""
-
-    @property
-    def l_f(self) -> float:
-        """Distance from the centre of gravity to the front axle (m)."""
-
-    @property
-    def l_r(self) -> float:
-        """Distance from the centre of gravity to the rear axle (m)."""
-
-    @property
-    def h_cg(self) -> float:
-        """Height of the centre of gravity (m)."""
-
-    @property
-    def F_z0(self) -> float:
-        """Nominal axle load (N) at which D and S_v are given."""
-
-    @property
-    def load_transfer(self) -> bool:
-        """Whether lateral forces scale with the axle loads; if not, F_z / F_z0 = 1."""
+    m: float = Field(gt=0, description="mass (kg)")
+    m_std: float | None = Field(
+        default=None, ge=0, description="standard deviation with which it was weighed (kg); null: 1 % of it"
+    )
+    l_f: float = Field(gt=0, description="centre of gravity to front axle (m)")
+    l_r: float = Field(gt=0, description="centre of gravity to rear axle (m)")
+    h_cg: float = Field(ge=0, description="height of the centre of gravity (m)")
+    F_z0: float = Field(gt=0, description="nominal axle load (N) at which D and S_v hold")
+    load_transfer: bool = Field(description="scale lateral forces with the axle loads")
 
 
 @dataclass
@@ -273,7 +263,7 @@ def cornering_stiffness(th: Coefficients) -> tuple[Array, Array]:
     return th.B_f * th.C_f * th.D_f, th.B_r * th.C_r * th.D_r
 
 
-def settling_rate(th: Coefficients, car: Constants) -> Array:
+def settling_rate(th: Coefficients, car: VehicleConstants) -> Array:
     """How fast sideslip and yaw of the linear car settle, times the speed (m/s^2).
 
     Their rates are about ``sum C / (m v_x)`` and ``sum C l^2 / (I_z v_x)``, ``C`` the cornering stiffness of an axle; this

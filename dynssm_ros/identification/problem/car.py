@@ -15,7 +15,7 @@ from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.identification import tuning
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, Effect
-from dynssm_ros.vehicle.parameters import VehicleConstants
+from dynssm_ros.vehicle.single_track import VehicleConstants
 
 Values = dict[str, float]
 

@@ -11,13 +11,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.vehicle.effects.actuators import (
-    SteeringCurve,
-    SteeringGain,
-    SteeringLag,
-    SteeringOffset,
-    ThrottleDeadBand,
-    ThrottleLag,
+from dynssm_ros.vehicle.effects import (
+    actuators,
+    drivetrain,
+    environment,
+    inertia,
+    loads,
+    longitudinal,
+    measurement,
+    tyres,
 )
 from dynssm_ros.vehicle.effects.base import (
     CONTEXT_UNITS,
@@ -27,27 +29,6 @@ from dynssm_ros.vehicle.effects.base import (
     Parameter,
     initial_effect_states,
     require_context,
-)
-from dynssm_ros.vehicle.effects.drivetrain import FrontDrive, LockedDifferential
-from dynssm_ros.vehicle.effects.environment import Crosswind, RoadBank, RoadGrade
-from dynssm_ros.vehicle.effects.inertia import Mass, YawInertia
-from dynssm_ros.vehicle.effects.loads import Downforce, LoadSensitivity, LoadTransfer
-from dynssm_ros.vehicle.effects.longitudinal import Drag, DriveGain, PowerLimit, RollingResistance
-from dynssm_ros.vehicle.effects.measurement import (
-    OdometryDelay,
-    OdometryLeverArm,
-    OdometryMisalignment,
-    YawRateBias,
-    YawRateLag,
-)
-from dynssm_ros.vehicle.effects.tyres import (
-    CombinedSlip,
-    FrontGrip,
-    Grip,
-    GripDrift,
-    GripPatch,
-    RearGrip,
-    TireRelaxation,
 )
 from dynssm_ros.vehicle.single_track import StageEffect
 
@@ -87,17 +68,13 @@ def register_effect(effect: type[Effect]) -> type[Effect]:
 
 
 for _effect in (
-
-        SteeringOffset, SteeringGain, SteeringCurve, SteeringLag, ThrottleDeadBand, ThrottleLag,
-        Drag, RollingResistance, DriveGain, PowerLimit,
-        Mass, YawInertia,
-        Grip, FrontGrip, RearGrip,
-        Downforce, LoadSensitivity, LoadTransfer,
-        TireRelaxation, CombinedSlip,
-        RoadBank, RoadGrade, Crosswind,
-        GripDrift, GripPatch,
-        FrontDrive, LockedDifferential,
-        OdometryLeverArm, OdometryMisalignment, OdometryDelay, YawRateBias, YawRateLag,
+    actuators.SteeringOffset, actuators.SteeringGain, actuators.SteeringCurve, actuators.SteeringLag,
+    actuators.ThrottleDeadBand, actuators.ThrottleLag, longitudinal.Drag, longitudinal.RollingResistance,
+    longitudinal.DriveGain, longitudinal.PowerLimit, inertia.Mass, inertia.YawInertia, tyres.Grip, tyres.FrontGrip,
+    tyres.RearGrip, loads.Downforce, loads.LoadSensitivity, loads.LoadTransfer, tyres.TireRelaxation,
+    tyres.CombinedSlip, environment.RoadBank, environment.RoadGrade, environment.Crosswind, tyres.GripDrift,
+    tyres.GripPatch, drivetrain.FrontDrive, drivetrain.LockedDifferential, measurement.OdometryLeverArm,
+    measurement.OdometryMisalignment, measurement.OdometryDelay, measurement.YawRateBias, measurement.YawRateLag,
 ):  # fmt: skip
     register_effect(_effect)
 

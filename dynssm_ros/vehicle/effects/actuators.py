@@ -22,7 +22,6 @@ class SteeringOffset(Effect):
     offset: Array = 0.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Shifts the steering that acts on the tyres."""
         q.delta = q.delta + self.offset
 
 
@@ -39,7 +38,6 @@ class SteeringGain(Effect):
     factor: Array = 1.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Scales the steering that acts on the tyres."""
         q.delta = q.delta * self.factor
 
 
@@ -63,7 +61,6 @@ class SteeringCurve(Effect):
     quadratic: Array = 0.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Bends the steering that acts on the tyres."""
         q.delta = q.delta * (1.0 + self.quadratic * q.delta + self.cubic * q.delta * q.delta)
 
 
@@ -81,7 +78,6 @@ class SteeringLag(Effect):
     time_constant: Array = 0.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Replaces the steering by its lagged value."""
         q.delta = lagged(q, self.EFFECT_STATES[0], q.delta, self.time_constant)
 
 
@@ -98,7 +94,6 @@ class ThrottleDeadBand(Effect):
     width: Array = 0.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Takes the dead zone off the throttle."""
         q.r = at_least(q.r - self.width, 0.0) - at_least(-q.r - self.width, 0.0)
 
 
@@ -116,5 +111,4 @@ class ThrottleLag(Effect):
     time_constant: Array = 0.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Replaces the throttle by its lagged value."""
         q.r = lagged(q, self.EFFECT_STATES[0], q.r, self.time_constant)

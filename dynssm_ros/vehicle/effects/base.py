@@ -20,10 +20,10 @@ from dynssm_ros.vehicle.single_track import (
     Applied,
     Array,
     Coefficients,
-    Constants,
     Motion,
     StageEffect,
     State,
+    VehicleConstants,
     at_least,
 )
 
@@ -145,12 +145,12 @@ class Effect(StageEffect):
         return math.hypot(*(values[name] - p.neutral for name, p in about.items()))
 
     @classmethod
-    def unusable(cls, constants: Constants) -> str | None:
+    def unusable(cls, constants: VehicleConstants) -> str | None:
         """What is wrong with a car of these constants for the effect to be able to act; ``None`` if nothing is."""
         return None
 
     @classmethod
-    def least(cls, constants: Constants) -> float:
+    def least(cls, constants: VehicleConstants) -> float:
         """How far it must be off neutral to be a cause in a car of these constants; less is in any car."""
         return 0.0
 

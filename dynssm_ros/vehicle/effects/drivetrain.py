@@ -24,7 +24,6 @@ class FrontDrive(Effect):
     share: Array = 0.0
 
     def forces(self, xp: Any, q: Motion) -> None:
-        """Turns that part of the force with the wheels."""
         front = self.share * q.F_d
         across = front * xp.sin(q.delta)
         q.F_x = q.F_x - front * (1.0 - xp.cos(q.delta))
@@ -54,7 +53,6 @@ class LockedDifferential(Effect):
     width: Array = TRACK_WIDTH
 
     def forces(self, xp: Any, q: Motion) -> None:
-        """Adds the moment."""
         w = self.width * (q.l_f + q.l_r)
         slip = q.omega * w / 2 / (abs(q.v_x) + SLOWEST)
         friction = q.theta.D_r / q.F_z0

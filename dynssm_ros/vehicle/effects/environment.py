@@ -96,7 +96,6 @@ class RoadBank(RoadAngle):
         return angle - self.camber * self.read(q, "bend") if "camber" in self.active else angle
 
     def forces(self, xp: Any, q: Motion) -> None:
-        """Adds the weight's part across the car."""
         bank = self.here(xp, q)
         if "roll_gain" in self.active:
             bank = bank + self.roll_gain * self.read(q, "roll")
@@ -117,7 +116,6 @@ class RoadGrade(RoadAngle):
     TYPICAL = (0.005, 0.05)
 
     def forces(self, xp: Any, q: Motion) -> None:
-        """Adds the weight's part along the car."""
         q.F_x = q.F_x - q.m * GRAVITY * xp.sin(self.here(xp, q))
 
     @classmethod
@@ -166,13 +164,11 @@ class Crosswind(Effect):
     arm: Array = 0.0
 
     def drive(self, xp: Any, q: Motion) -> None:
-        """Lets the drag follow the air."""
         w_x, _ = self._wind(xp, q)
         a_x = q.v_x - w_x
         q.F_rx = q.F_rx - q.theta.C_r2 * (a_x * abs(a_x) - q.v_x * abs(q.v_x))
 
     def forces(self, xp: Any, q: Motion) -> None:
-        """Adds the side force and its moment."""
         w_x, w_y = self._wind(xp, q)
         a_x, a_y = q.v_x - w_x, q.v_y - w_y
         push = self.side * q.theta.C_r2 * xp.sqrt(a_x * a_x + a_y * a_y + _CALM) * w_y

@@ -22,7 +22,6 @@ class Mass(Effect):
     factor: Array = 1.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Scales the mass."""
         q.m = q.m * self.factor
 
 
@@ -39,5 +38,4 @@ class YawInertia(Effect):
     factor: Array = 1.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Scales the yaw inertia."""
         q.theta = q.theta._replace(I_z=q.theta.I_z * self.factor)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dynssm_ros.vehicle.effects.base import Effect, Parameter
-from dynssm_ros.vehicle.single_track import Array, Constants, Motion, at_least
+from dynssm_ros.vehicle.single_track import Array, Motion, VehicleConstants, at_least
 
 _LEAST_LOAD = 0.05  # of the nominal axle load
 
@@ -29,7 +29,6 @@ class Downforce(Effect):
     balance: Array = 0.45
 
     def loads(self, xp: Any, q: Motion) -> None:
-        """Adds to the axle loads."""
         pressed = self.coefficient * q.v_x * q.v_x
         q.F_zf = q.F_zf + self.balance * pressed
         q.F_zr = q.F_zr + (1.0 - self.balance) * pressed
@@ -52,12 +51,11 @@ class LoadSensitivity(Effect):
     exponent: Array = 1.0
 
     @classmethod
-    def unusable(cls, constants: Constants) -> str | None:
+    def unusable(cls, constants: VehicleConstants) -> str | None:
         """Loads must change."""
         return None if constants.load_transfer else "load_transfer false; expected axle loads that change"
 
     def tyres(self, xp: Any, q: Motion) -> None:
-        """Scales the lateral forces."""
         both, wheelbase = 2.0 * q.F_z0, q.l_f + q.l_r
         front, rear = both * q.l_r / wheelbase, both * q.l_f / wheelbase
         q.F_fy = q.F_fy * at_least(q.F_zf / front, _LEAST_LOAD) ** (self.exponent - 1.0)
@@ -81,16 +79,14 @@ class LoadTransfer(Effect):
     height: Array = 0.0
 
     @classmethod
-    def least(cls, constants: Constants) -> float:
+    def least(cls, constants: VehicleConstants) -> float:
         """How well anybody knows the height of the centre of gravity."""
         return 0.01
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Raises the centre of gravity, from the ground at least."""
         q.h_cg = at_least(q.h_cg + self.height * (q.l_f + q.l_r), 0.0)
 
     def loads(self, xp: Any, q: Motion) -> None:
-        """Moves load between axles that have their nominal one."""
         if not q.load_transfer:
             transfer = q.h_cg / (q.l_f + q.l_r) * q.F_rx
             q.F_zf, q.F_zr = q.F_zf - transfer, q.F_zr + transfer

@@ -25,7 +25,6 @@ class Drag(Effect):
     coefficient: Array = 0.0
 
     def drive(self, xp: Any, q: Motion) -> None:
-        """Takes the extra drag off the longitudinal force."""
         q.F_rx = q.F_rx - self.coefficient * q.v_x * q.v_x
 
 
@@ -43,7 +42,6 @@ class RollingResistance(Effect):
     coefficient: Array = 0.0
 
     def drive(self, xp: Any, q: Motion) -> None:
-        """Takes the extra resistance off the longitudinal force."""
         q.F_rx = q.F_rx - self.coefficient * q.m * GRAVITY
 
 
@@ -60,7 +58,6 @@ class DriveGain(Effect):
     factor: Array = 1.0
 
     def drive(self, xp: Any, q: Motion) -> None:
-        """Scales the force of drive and brakes."""
         q.F_rx = q.F_rx + (self.factor - 1.0) * q.F_d
         q.F_d = q.F_d * self.factor
 
@@ -81,7 +78,6 @@ class PowerLimit(Effect):
     inverse_speed: Array = 0.0
 
     def drive(self, xp: Any, q: Motion) -> None:
-        """Takes off the force that there is no power for."""
         asked = at_least(q.F_d, 0.0) * self.inverse_speed * q.v_x / q.theta.C_m1  # of all the power
         missing = q.F_d * (1.0 - (1.0 + asked**_SHARP) ** (-1.0 / _SHARP))
         q.F_rx = q.F_rx - missing

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from dynssm_ros.vehicle.effects.base import Effect, Parameter, lagged
-from dynssm_ros.vehicle.single_track import Array, Constants, Motion, State, at_least
+from dynssm_ros.vehicle.single_track import Array, Motion, State, VehicleConstants, at_least
 
 _CENTRE_KNOWN = 0.02  # of the wheelbase
 
 
 @dataclass(frozen=True)
 class MeasurementEffect(Effect):
-    """Base of the effects that change what is measured."""
+    """Base of the effects that change what is measured, each by what it takes off again on the way back."""
 
     SENSOR = True
 
@@ -26,6 +26,16 @@ class MeasurementEffect(Effect):
     def measures(self) -> bool:
         """Whether there is anything to change."""
         return not self.is_neutral
+
+    def changed(self, xp: Any, state: State, effect_states: Mapping[str, Array], way: float) -> State:
+        """What is measured of the true ``state`` (``way`` 1), or what is true where it is measured (-1)."""
+        raise NotImplementedError
+
+    def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
+        return self.changed(xp, state, effect_states, 1.0)
+
+    def true(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
+        return self.changed(xp, state, effect_states, -1.0)
 
 
 @dataclass(frozen=True)
@@ -43,19 +53,13 @@ class OdometryLeverArm(MeasurementEffect):
     y: Array = 0.0
 
     @classmethod
-    def least(cls, constants: Constants) -> float:
+    def least(cls, constants: VehicleConstants) -> float:
         """How well anybody knows where the centre of gravity is."""
         return _CENTRE_KNOWN * (constants.l_f + constants.l_r)
 
-    def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
-        """Velocity at the sensor."""
+    def changed(self, xp: Any, state: State, effect_states: Mapping[str, Array], way: float) -> State:
         v_x, v_y, omega = state
-        return State(v_x - omega * self.y, v_y + omega * self.x, omega)
-
-    def true(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
-        """Velocity at the centre of gravity."""
-        v_x, v_y, omega = state
-        return State(v_x + omega * self.y, v_y - omega * self.x, omega)
+        return State(v_x - omega * (way * self.y), v_y + omega * (way * self.x), omega)
 
 
 @dataclass(frozen=True)
@@ -70,21 +74,11 @@ class OdometryMisalignment(MeasurementEffect):
     TYPICAL = (0.003, 0.04)
     angle: Array = 0.0
 
-    def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
-        """Velocity in the sensor's frame."""
-        return _turned(xp, state, -self.angle)
-
-    def true(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
-        """Velocity in the car's frame."""
-        return _turned(xp, state, self.angle)
-
-
-def _turned(xp: Any, state: State, angle: Array) -> State:
-    """The velocity turned by ``angle`` (rad, counter-clockwise)."""
-    v_x, v_y, omega = state
-    turn = angle + 0.0 * v_x  # torch takes no sine of a float
-    sin, cos = xp.sin(turn), xp.cos(turn)
-    return State(v_x * cos - v_y * sin, v_x * sin + v_y * cos, omega)
+    def changed(self, xp: Any, state: State, effect_states: Mapping[str, Array], way: float) -> State:
+        v_x, v_y, omega = state
+        turn = 0.0 * v_x - way * self.angle  # torch takes no sine of a float
+        sin, cos = xp.sin(turn), xp.cos(turn)
+        return State(v_x * cos - v_y * sin, v_x * sin + v_y * cos, omega)
 
 
 @dataclass(frozen=True)
@@ -115,7 +109,6 @@ class OdometryDelay(Effect):
         return float(self.delay)
 
     def inputs(self, xp: Any, q: Motion) -> None:
-        """Delays both inputs."""
         throttle, steering = self.EFFECT_STATES
         q.r = 2 * lagged(q, throttle, q.r, self.delay / 2) - q.r
         q.delta = 2 * lagged(q, steering, q.delta, self.delay / 2) - q.delta
@@ -133,13 +126,8 @@ class YawRateBias(MeasurementEffect):
     TYPICAL = (0.003, 0.03)
     bias: Array = 0.0
 
-    def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
-        """Adds the bias."""
-        return state._replace(omega=state.omega + self.bias)
-
-    def true(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
-        """Takes the bias off."""
-        return state._replace(omega=state.omega - self.bias)
+    def changed(self, xp: Any, state: State, effect_states: Mapping[str, Array], way: float) -> State:
+        return state._replace(omega=state.omega + way * self.bias)
 
 
 @dataclass(frozen=True)
@@ -161,16 +149,10 @@ class YawRateLag(MeasurementEffect):
     time_constant: Array = 0.0
 
     def accelerations(self, xp: Any, q: Motion) -> None:
-        """Says how the lag of the measurement changes."""
         (name,) = self.EFFECT_STATES
         resolved = at_least(self.time_constant, q.h)
         behind = q.effect_states.setdefault(name, self.time_constant * q.omega_dot)
         q.effect_state_rates[name] = (self.time_constant * q.omega_dot - behind) / resolved
 
-    def measured(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
-        """What the filter gives."""
-        return state._replace(omega=state.omega - effect_states.get(self.EFFECT_STATES[0], 0.0))
-
-    def true(self, xp: Any, state: State, effect_states: Mapping[str, Array]) -> State:
-        """What goes into the filter."""
-        return state._replace(omega=state.omega + effect_states.get(self.EFFECT_STATES[0], 0.0))
+    def changed(self, xp: Any, state: State, effect_states: Mapping[str, Array], way: float) -> State:
+        return state._replace(omega=state.omega - way * effect_states.get(self.EFFECT_STATES[0], 0.0))

@@ -9,7 +9,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, SLOWEST, Effect, Parameter, lagged, section
-from dynssm_ros.vehicle.single_track import Array, Constants, Motion, at_least
+from dynssm_ros.vehicle.single_track import Array, Motion, VehicleConstants, at_least
 
 _LEAST_GRIP = 0.1  # of the nominal, however far a drift has gone
 _LEAST_SHARE = 0.05  # squared share of the lateral force that the longitudinal one leaves at least
@@ -38,17 +38,15 @@ class Grip(Effect):
     similarity: Array = 0.0
 
     @classmethod
-    def least(cls, constants: Constants) -> float:
+    def least(cls, constants: VehicleConstants) -> float:
         """What axles with two wheels lose in bends."""
         return _LEANS
 
     def slip(self, xp: Any, q: Motion) -> None:
-        """Scales the slip angles at which the tyres are."""
         scale = self.factor**-self.similarity
         q.alpha_f, q.alpha_r = q.alpha_f * scale, q.alpha_r * scale
 
     def tyres(self, xp: Any, q: Motion) -> None:
-        """Scales the lateral forces."""
         q.F_fy, q.F_ry = q.F_fy * self.factor, q.F_ry * self.factor
 
 
@@ -65,12 +63,11 @@ class FrontGrip(Effect):
     factor: Array = 1.0
 
     @classmethod
-    def least(cls, constants: Constants) -> float:
+    def least(cls, constants: VehicleConstants) -> float:
         """What an axle with two wheels loses in bends."""
         return _LEANS
 
     def tyres(self, xp: Any, q: Motion) -> None:
-        """Scales the front lateral force."""
         q.F_fy = q.F_fy * self.factor
 
 
@@ -88,7 +85,6 @@ class RearGrip(Effect):
     factor: Array = 1.0
 
     def tyres(self, xp: Any, q: Motion) -> None:
-        """Scales the rear lateral force."""
         q.F_ry = q.F_ry * self.factor
 
 
@@ -109,7 +105,6 @@ class TireRelaxation(Effect):
     length: Array = 0.0
 
     def slip(self, xp: Any, q: Motion) -> None:
-        """Lets both slip angles lag."""
         front, rear = self.EFFECT_STATES
         time_constant = self.length / (abs(q.v_x) + SLOWEST)
         q.alpha_f = lagged(q, front, q.alpha_f, time_constant)
@@ -133,7 +128,6 @@ class CombinedSlip(Effect):
     strength: Array = 0.0
 
     def tyres(self, xp: Any, q: Motion) -> None:
-        """Takes from the rear lateral force what the longitudinal one uses."""
         used = self.strength * q.F_d / (q.theta.D_r * q.F_zr / q.F_z0)
         q.F_ry = q.F_ry * xp.sqrt(at_least(1.0 - used * used, _LEAST_SHARE))
 
@@ -152,7 +146,6 @@ class GripDrift(Effect):
     rate: Array = 0.0
 
     def tyres(self, xp: Any, q: Motion) -> None:
-        """Scales the lateral forces of both axles."""
         grip = at_least(1.0 + self.rate * self.read(q, "t"), _LEAST_GRIP)
         q.F_fy, q.F_ry = q.F_fy * grip, q.F_ry * grip
 
@@ -181,6 +174,5 @@ class GripPatch(Effect):
         return "grip (1)", np.asarray(1.0 + (self.factor - 1.0) * section(np, lap, self.centre, self.length))
 
     def tyres(self, xp: Any, q: Motion) -> None:
-        """Scales the lateral forces of both axles there."""
         grip = 1.0 + (self.factor - 1.0) * section(xp, self.lap(q), self.centre, self.length)
         q.F_fy, q.F_ry = q.F_fy * grip, q.F_ry * grip
