@@ -46,8 +46,6 @@ class DDM(TrainableModel):
 
     KIND = "ddm"
     CONFIG: ClassVar[type[ModelConfig]] = DdmConfig
-    mean: Tensor
-    std: Tensor
     lower: Tensor
     admissible: Tensor
 

@@ -53,7 +53,6 @@ class EkfFTHD(FTHD):
     KIND = "ekf_fthd"
     NEW = ("noises.weight", "noises.bias", "increment_scale")
     CONFIG: ClassVar[type[ModelConfig]] = EkfFthdConfig
-    increment_scale: Tensor
     nudges: Tensor
 
     def __init__(self, config: EkfFthdConfig, vehicle: Vehicle, normalisation: Normalisation) -> None:

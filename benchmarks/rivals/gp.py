@@ -52,9 +52,6 @@ class GaussianProcess(TrainableModel):
 
     KIND = "gp"
     CONFIG = GpConfig
-    mean: Tensor
-    std: Tensor
-    increment_scale: Tensor
     nominal: Tensor
 
     def __init__(self, config: GpConfig, vehicle: Vehicle, normalisation: Normalisation) -> None:

@@ -54,9 +54,6 @@ class OnTrack(TrainableModel):
 
     KIND = "on_track"
     CONFIG = OnTrackConfig
-    mean: Tensor
-    std: Tensor
-    increment_scale: Tensor
 
     def __init__(self, config: OnTrackConfig, vehicle: Vehicle, normalisation: Normalisation) -> None:
         super().__init__(config, vehicle, normalisation)

@@ -69,11 +69,7 @@ def earned_layer(
     The gain of a network is the share of the error that it takes away: the mean of one step and path, or of the path
     alone if that is less, since a controller needs the path.
 
-    Args:
-        base: what the layer stands on.
-        model: the trained model.
-        laps: that it was trained on.
-        left_out: parts of them; without any there is no evidence, and the layer rests on the physics alone.
+    Without ``left_out`` parts of the laps there is no evidence, and the layer rests on the physics alone.
 
     Returns:
         Features, layer, and the gain; ``None`` if there is no network or no evidence.

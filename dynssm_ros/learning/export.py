@@ -45,16 +45,6 @@ TOLERANCE = 1e-5  # largest difference between ONNX and torch, in units of each 
 _GRU_INITIAL_STATE = 5  # among the inputs of ONNX's GRU
 
 
-def deployed_outputs(output: Output) -> dict[str, Tensor]:
-    """What the deployed graph computes, by the names of its outputs."""
-    named = {
-        "increment": output.increment,
-        "theta": output.theta,
-        "physics": output.physics,
-    }
-    return {name: value for name, value in named.items() if value is not None}
-
-
 class _Deployed(nn.Module):
     """The outputs that are deployed, as a flat tuple."""
 
@@ -65,8 +55,9 @@ class _Deployed(nn.Module):
 
     def named(self, window: Tensor) -> dict[str, Tensor]:
         """The outputs by name."""
-        output = self.model(window)
-        named = deployed_outputs(output)
+        output: Output = self.model(window)
+        named = {name: getattr(output, name) for name in ("increment", "theta", "physics")}
+        named = {name: value for name, value in named.items() if value is not None}
         if self.features is not None:
             named["features"], named["nominal_physics"] = self.features(window, output)
         return named
@@ -123,8 +114,11 @@ def save_artifact(
             online=None if trained.online is None else trained.online.card,
             parameters=sum(p.numel() for p in model.parameters()),
             flops=count_flops(model, trained.H),
-            training={"recordings": list(trained.recording.info.source), "seed": config.training.seed}
-            | (training or {}),
+            training={
+                "recordings": list(trained.recording.info.source),
+                "seed": config.training.seed,
+                **(training or {}),
+            },
             checksums={each.name: checksum(each) for each in sorted(folder.iterdir())},
         )
         write_card(card, folder)
@@ -236,9 +230,7 @@ def load_torch(artifact: Artifact) -> TrainableModel:
         model.load_state_dict(load_file(artifact.weights))
     except RuntimeError as error:
         reason = " ".join(str(error).split())
-        raise ArtifactError(
-            f"{artifact.weights}: not the weights of the model that {CARD} describes ({reason})"
-        ) from error
+        raise ArtifactError(f"{artifact.weights}: not the weights of the model of {CARD} ({reason})") from error
     return model.eval()
 
 

@@ -61,13 +61,8 @@ def rollout_objective(
 ) -> dict[str, Tensor]:
     """The mean over a rollout of :func:`objective`, where the error of a state ``k`` steps ahead counts over ``k``.
 
-    Args:
-        model: from windows to outputs.
-        rows: measured, ``(B, H + steps - 1, 7)``: the window, and the rows through which the rollout leads.
-        target: measured increment from the last of them, ``(B, 3)``.
-        steps: length of the rollout.
-        config: weights and switches.
-        by: ``(s_y, s_delta)``.
+    ``rows`` are measured, ``(B, H + steps - 1, 7)``: the window, and the rows through which the rollout leads. ``target``
+    is the measured increment from the last of them, ``(B, 3)``.
     """
     H = rows.shape[1] - steps + 1
     following = torch.cat([rows[:, H:, :3], rows[:, -1:, :3] + target[:, None]], dim=1)
@@ -84,32 +79,21 @@ def rollout_objective(
 
 
 def objective(output: Output, target: Tensor, config: LossConfig, by: Scales) -> dict[str, Tensor]:
-    """All terms of the loss, weighted; their sum is the objective. Terms that are switched off are zero.
+    """All terms of the loss, weighted by ``config``; their sum is the objective. Terms that are switched off are zero.
 
-    Args:
-        output: of the model for ``B`` windows.
-        target: measured increments ``(B, 3)``.
-        config: weights and switches.
-        by: ``(s_y, s_delta)``.
+    ``target`` has the measured increments ``(B, 3)``; ``by`` is ``(s_y, s_delta)``.
     """
     s_y, s_delta = by
     error = (output.increment - target) / s_y
-    zero = error.new_zeros(())
-    squared = (
-        error.square().mean()
-        if config.robust == 0
-        else 2 * functional.huber_loss(error, torch.zeros_like(error), delta=config.robust)
-    )
-    deviation, correction, physics = output.deviation, output.correction, output.physics
-    return {
-        "prediction": squared,
-        "parameters": zero if deviation is None else config.parameters * deviation.square().mean(),
-        "correction": (
-            config.correction * correction.square().mean() if correction is not None and config.correction else zero
-        ),
-        "physics": (
-            config.physics * ((output.increment - physics) / s_delta).square().mean()
-            if physics is not None and config.physics
-            else zero
-        ),
-    }
+    if config.robust:
+        prediction = 2 * functional.huber_loss(error, torch.zeros_like(error), delta=config.robust)
+    else:
+        prediction = error.square().mean()
+    terms = dict.fromkeys(COMPONENTS, error.new_zeros(())) | {"prediction": prediction}
+    if output.deviation is not None:
+        terms["parameters"] = config.parameters * output.deviation.square().mean()
+    if output.correction is not None and config.correction:
+        terms["correction"] = config.correction * output.correction.square().mean()
+    if output.physics is not None and config.physics:
+        terms["physics"] = config.physics * ((output.increment - output.physics) / s_delta).square().mean()
+    return terms

@@ -7,6 +7,7 @@ how the inputs change, where the car is. All are in units that make one the usua
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.learning.losses import Output
-from dynssm_ros.learning.models.base import OnlineConfig, steps_of
+from dynssm_ros.learning.models.base import OnlineConfig, scale_buffers, steps_of
 from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
@@ -60,9 +61,7 @@ class OnlineFeatures(nn.Module):
             raise ConfigurationError(f"online: a window of {H} rows; expected at least 3 to see how it changes")
         self.physics = PhysicsLayer(vehicle, physics)
         self.register_buffer("nominal", physics.theta_0(vehicle))
-        self.register_buffer("mean", torch.tensor(scale.input_mean))
-        self.register_buffer("std", torch.tensor(scale.input_std))
-        self.register_buffer("increment_scale", torch.tensor(scale.increment_scale))
+        scale_buffers(self, scale)
         self.register_buffer("input_scale", 0.1 * self.std[3:5])  # what an input changes in a step, about
         self.network = network
         self.lags = min(config.lags, H - 1)
@@ -96,27 +95,16 @@ class OnlineFeatures(nn.Module):
         changes = (applied[:, 1:] - applied[:, :-1]) / self.input_scale
         level = (window[:, -1, :5] - self.mean[:5]) / self.std[:5]
         physics = over[:, -1]
-        parts = [
-            physics / self.increment_scale,
-            increments[:, -self.recent :].flatten(1),
-            changes.flatten(1),
-            level,
-            mean_error,
-        ]
-        if self.network:
-            parts.append(output.increment / self.increment_scale)
+        parts = [physics / self.increment_scale, increments[:, -self.recent :].flatten(1), changes.flatten(1), level]
+        parts += [mean_error, *([output.increment / self.increment_scale] if self.network else [])]
         found = torch.cat([*parts, self.one.expand(window.shape[0], -1)], -1)
         return found[:, self.places], physics
 
     def _places(self) -> Tensor:
         """Where the features of each channel stand among those of all, ``(3, n)``."""
-        at, begin = {}, 0
-        sizes = {
-            "physics": CHANNELS, "increments": CHANNELS * self.recent, "changes": 2 * self.input_lags, "level": 5,
-            "error": CHANNELS, "network": CHANNELS if self.network else 0, "one": 1,
-        }  # fmt: skip
-        for name, size in sizes.items():
-            at[name], begin = begin, begin + size
+        names = ("physics", "increments", "changes", "level", "error", "network", "one")
+        sizes = (CHANNELS, CHANNELS * self.recent, 2 * self.input_lags, 5, CHANNELS, CHANNELS * self.network)
+        at = dict(zip(names, accumulate(sizes, initial=0), strict=True))
         rows = []
         for c in range(CHANNELS):
             following = [(c + k) % CHANNELS for k in range(CHANNELS)]  # the channel itself, the next, the one after
@@ -178,15 +166,9 @@ def fit_layer(
 
     The prior's mean is the least-squares solution on the training laps. Its covariance is that of so many
     rows of them, and no weight is expected to change by more than one.
-    The number of rows is the least of :data:`_PRIOR_ROWS` with which the layer predicts parts of the laps, each with a
+    The number of rows is the least of :data:`_PRIOR_ROWS` with which the layer predicts ``parts`` of the laps, each with a
     prior that was fitted without it, at most 1 % worse than with the best: another track asks for a weaker prior than
-    another part of the same one.
-
-    Args:
-        parts: of the training laps; their network features by models that do not know them.
-        features: that it sees.
-        scale: gives s_delta.
-        config: of the layer.
+    another part of the same one. Their network features are of models that do not know them.
 
     Raises:
         RecordingError: there are no windows to fit it to.

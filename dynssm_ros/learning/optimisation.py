@@ -57,18 +57,10 @@ class _TrainingState:
 
 
 class Optimisation:
-    """Adam over shuffled batches.
+    """Adam over shuffled batches of ``training``; windows of ``validation`` say which epoch is best.
 
-    Args:
-        config: the model file.
-        vehicle: the car.
-        model: to be trained.
-        scale: units of the losses.
-        training: windows to train on.
-        validation: windows that say which epoch is best.
-        checkpoint: file that is kept up to date.
-        anew: gives the model with other weights, for a restart; ``None``: it is not restarted.
-        device: to compute on.
+    ``scale`` gives the units of the losses. ``anew`` gives the model with other weights, for a restart; without it there
+    is none. The file ``checkpoint`` is kept up to date.
     """
 
     def __init__(
@@ -125,11 +117,8 @@ class Optimisation:
             self.schedule.step()
             self._save()
             if progress is not None:
-                progress(
-                    state.epoch,
-                    settings.epochs,
-                    f"validation {validated['prediction']:.4g}, best {state.best_loss:.4g}",
-                )
+                words = f"validation {validated['prediction']:.4g}, best {state.best_loss:.4g}"
+                progress(state.epoch, settings.epochs, words)
             if self._on_plateau():
                 state = self._restart()
         if state.epoch == 0:

@@ -240,7 +240,8 @@ class Vehicle(StrictModel):
         before = self.before
         if before is None or 3 * len({*before.laps} & {*laps}) < len(laps):
             return self
-        nominal, std = ([known[name] for name in COEFFICIENTS] for known in (before.nominal, before.std))
+        std = [before.std[name] for name in COEFFICIENTS]
+        nominal = [before.nominal[name] for name in COEFFICIENTS]
         return self._known(nominal, std, correlation=before.correlation, before=None)
 
     def calibrated_on(self, laps: Collection[str], given: Vehicle) -> Vehicle:

@@ -136,6 +136,9 @@ class TrainableModel(nn.Module):
     CONFIG: ClassVar[type[ModelConfig]] = ModelConfig
     EXTRA_ROWS: ClassVar[int] = 0
     LEARNS: ClassVar[bool] = True
+    mean: Tensor  # of those that take scale_buffers, as the next
+    std: Tensor
+    increment_scale: Tensor
 
     def __init__(self, config: Any, vehicle: Vehicle, normalisation: Normalisation) -> None:
         super().__init__()

@@ -30,9 +30,6 @@ class Ridge(TrainableModel):
 
     KIND = "ridge"
     CONFIG = RidgeConfig
-    mean: Tensor
-    std: Tensor
-    increment_scale: Tensor
 
     def __init__(self, config: RidgeConfig, vehicle: Vehicle, normalisation: Normalisation) -> None:
         super().__init__(config, vehicle, normalisation)
@@ -67,7 +64,5 @@ class Ridge(TrainableModel):
     def _scaled(self, training: TrainingWindows) -> Iterator[tuple[Tensor, Tensor]]:
         """Features and targets, batch by batch."""
         for windows, increments in training.batches():
-            yield (
-                ((windows - self.mean) / self.std).flatten(1).double(),
-                (increments / self.increment_scale).double(),
-            )
+            features = ((windows - self.mean) / self.std).flatten(1)
+            yield features.double(), (increments / self.increment_scale).double()

@@ -13,12 +13,7 @@ from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import TrainableModel, scale_buffers, steps_of
 from dynssm_ros.learning.models.dynssm.config import DynssmConfig
 from dynssm_ros.learning.models.dynssm.encoders import Fusion
-from dynssm_ros.learning.models.dynssm.innovation import (
-    Increments,
-    InnovationFilter,
-    centred,
-    limited,
-)
+from dynssm_ros.learning.models.dynssm.innovation import Increments, InnovationFilter, centred, limited
 from dynssm_ros.learning.models.physics import INPUTS, PhysicsLayer
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
@@ -83,9 +78,6 @@ class DynSSM(TrainableModel):
 
     KIND = "dynssm"
     CONFIG = DynssmConfig
-    mean: Tensor
-    std: Tensor
-    increment_scale: Tensor
     nominal: Tensor
 
     def __init__(self, config: DynssmConfig, vehicle: Vehicle, normalisation: Normalisation) -> None:
@@ -102,9 +94,8 @@ class DynSSM(TrainableModel):
         self.fusion = Fusion(width, config.ssm, config.gru, config.fusion)
         self.physics = PhysicsLayer(vehicle, config.physics) if config.physics else None
         self.head = ParameterHead(config, vehicle, latent + width) if config.adaptation else None
-        self.innovation = (
-            InnovationFilter(config.innovation, steps_of(config.innovation.history, T_s)) if config.innovation else None
-        )
+        filtered = config.innovation
+        self.innovation = InnovationFilter(filtered, steps_of(filtered.history, T_s)) if filtered else None
         conditioned = config.adaptation.hidden if config.adaptation else latent
         self.residual = None
         if config.residual:
@@ -165,9 +156,8 @@ class DynSSM(TrainableModel):
         over = over / self.increment_scale
         q, error, mean = self.innovation(increments, over)
         physics = over[:, -1]
-        return _Step(
-            physics * self.increment_scale, q * self.increment_scale, torch.cat([physics + mean, error - mean], dim=-1)
-        )
+        features = torch.cat([physics + mean, error - mean], dim=-1)
+        return _Step(physics * self.increment_scale, q * self.increment_scale, features)
 
     def _residual_input(
         self, conditioned: Tensor, deviation: Tensor | None, window: Tensor, latest: Tensor, step: _Step
