@@ -33,7 +33,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 def cause(effect: str, values: dict[str, float], *alternatives: str, std: float = 0.0) -> Cause:
     confirmation = Confirmation(np.ones(4), 1.0, 0.0, np.zeros(3))
-    return Cause(effect, values, dict.fromkeys(values, std), 50.0, 40.0, 0.1, confirmation, (), alternatives)
+    return Cause(effect, values, dict.fromkeys(values, std), 40.0, 0.1, confirmation, (), alternatives)
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))

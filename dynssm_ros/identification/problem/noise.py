@@ -119,11 +119,8 @@ def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Ve
     count = np.bincount(spread.group, minlength=len(G)).astype(float)
     moment = np.stack([errors[spread.group == m].T @ errors[spread.group == m] for m in groups])
     # which variance each column of W has, as an indicator (columns, 9)
-    rows, channel = G.shape[1], np.eye(3)
-    of_column = np.zeros((rows + G.shape[2], 9))
-    of_column[:rows, 0:3] = np.tile(channel, (rows // 3, 1))
-    of_column[rows : rows + 3, 6:9] = channel
-    of_column[rows + 3 :, 3:6] = np.tile(channel, (rows // 3, 1))
+    steps = G.shape[1] // 3
+    of_column = np.eye(9)[[*(0, 1, 2) * steps, 6, 7, 8, *(3, 4, 5) * steps]]
     low = np.log(floor)
     high = low + tuning.NOISE_RANGE
 

@@ -251,13 +251,6 @@ def steps_of(horizon: float, T_s: float) -> int:
     return int(np.ceil(horizon / T_s - 1e-9))
 
 
-def rounded_steps(horizon: float, T_s: float) -> tuple[int, int]:
-    """Sampling times that cover ``horizon`` (s) in a fit, and of how many one is compared, of which they are a multiple."""
-    steps = max(1, steps_of(horizon, T_s))
-    every = -(-steps // tuning.COMPARED_ROWS)
-    return every * -(-steps // every), every
-
-
 def fit_windows(
     recording: Recording, data: RecordedRows, horizon: float, min_speed: float, held_out: Mask | None = None
 ) -> SimulationWindows:
@@ -273,7 +266,9 @@ def fit_windows(
     Raises:
         RecordingError: too few stretches.
     """
-    steps, every = rounded_steps(horizon, recording.T_s)
+    steps = max(1, steps_of(horizon, recording.T_s))
+    every = -(-steps // tuning.COMPARED_ROWS)
+    steps = every * -(-steps // every)
     warm = round(tuning.WARM_UP_S / recording.T_s)
     ends = recording.window_ends(warm + 1, horizon=steps, min_speed=min_speed)
     starts: list[int] = []

@@ -1,13 +1,9 @@
 """Calibration: the nominal coefficients of a vehicle from measured laps, with their uncertainty.
 
-It is a diagnosis without candidates: the same prediction errors, noise model and covariance. Simulations of half a second
-start all along the recording. Their errors are whitened by the noise of measurement, start and disturbances that is
-estimated with them. What the vehicle file knows of a coefficient (its standard deviation, else its bounds) is its prior.
-
-How the model steps belongs to what is calibrated. Coefficients that are fitted in Euler steps to a car that moves
-continuously are those of no car: the yaw inertia of an AV-21 comes out a quarter too large. So the data choose. A car that
-differs from the model in another way may be closer to Euler steps, as the race log of the AV-21 is, although its paths are
-not. They are taken only if they explain the data: only simulators move in them.
+It is a diagnosis without candidates: the same prediction errors, noise model and covariance. What the vehicle file knows of a
+coefficient (its standard deviation, else its bounds) is its prior. The data choose how the model steps. Coefficients that
+are fitted in Euler steps to a car that moves continuously are those of no car: the yaw inertia of an AV-21 comes out a
+quarter too large. So Euler steps are taken only if they explain the data, as those of some simulators do.
 """
 
 from __future__ import annotations
@@ -145,8 +141,7 @@ def _calibration(
 def _rmse(one_step: SimulationWindows, car: CarEstimate) -> Vector:
     """RMSE of each state over all rows, ``(3,)``, some at a time: a long recording has many."""
     squares = sum(np.sum(one_step.select(block).errors(car)[:, 0] ** 2, axis=0) for block in one_step.blocks())
-    rmse: Vector = np.sqrt(squares / len(one_step))
-    return rmse
+    return np.asarray(np.sqrt(squares / len(one_step)))
 
 
 def _context(recording: Recording, vehicle: Vehicle, line: ClosedLine | None) -> dict[str, Vector]:
@@ -181,11 +176,7 @@ def _counter(on_progress: Progress | None, of: int) -> Callable[[], None]:
 def _windows(
     recording: Recording, data: RecordedRows, horizons: Sequence[float], min_speed: float
 ) -> SimulationWindows:
-    """Simulations of the longest of ``horizons`` (s) for which there are stretches enough.
-
-    Raises:
-        RecordingError: none of them.
-    """
+    """Simulations of the longest of ``horizons`` (s) for which there are stretches enough."""
     for horizon in horizons[:-1]:
         with suppress(RecordingError):
             return fit_windows(recording, data, horizon, min_speed)
@@ -254,8 +245,8 @@ def _starting_points(vehicle: Vehicle, count: int, seed: int) -> list[Vector]:
 
 def _unidentified(problem: IdentificationProblem, fit: Fit) -> tuple[dict[str, float], ...]:
     """Eigenvectors of the information with less of it than was known before."""
-    information = problem.information(fit)[: len(COEFFICIENTS), : len(COEFFICIENTS)]
-    values, vectors = np.linalg.eigh(information)
+    n = len(COEFFICIENTS)
+    values, vectors = np.linalg.eigh(problem.information(fit)[:n, :n])
     return tuple(
         {COEFFICIENTS[k]: round(float(v), 2) for k, v in enumerate(vectors[:, d]) if abs(v) > tuning.WEIGHT_SHOWN}
         for d in np.flatnonzero(values < 1.0)

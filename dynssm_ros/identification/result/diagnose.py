@@ -12,17 +12,11 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.extras import missing_libraries
 from dynssm_ros.identification import tuning
-from dynssm_ros.identification.problem.car import CarEstimate, Values
+from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, per_unit
 from dynssm_ros.identification.problem.levels import Levels
 from dynssm_ros.identification.problem.recordings import CrossValidation, RecordingSet, driven_alike
-from dynssm_ros.identification.problem.windows import (
-    SimulationWindows,
-    fit_windows,
-    held_out_windows,
-    rounded_steps,
-    steps_of,
-)
+from dynssm_ros.identification.problem.windows import SimulationWindows, fit_windows, held_out_windows, steps_of
 from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis
 from dynssm_ros.identification.result.formula import Formula, formulas
 from dynssm_ros.identification.result.gate import Gated, Without, gated
@@ -80,7 +74,6 @@ def diagnose(
     if unknown := sorted(set(exclude) - set(EFFECTS)):
         raise ConfigurationError(f"exclude {', '.join(unknown)}: no such effect; expected some of {', '.join(EFFECTS)}")
     at = _prepare(first, list(suspect), vehicle, horizon=horizon, holdout=holdout, min_speed=min_speed, line=line)
-
     found = search_causes(
         at.fitted,
         at.car,
@@ -133,7 +126,6 @@ def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle
         sizes,
         selection,
         fit.car,
-        std[:18],
         notes,
         at.protocol | {"Integrator": windows.integrator, "Inputs between samples": _HELD[windows.hold]},
         windows,
@@ -259,8 +251,8 @@ def _prepare(
     speed = vehicle.minimum_speed if min_speed is None else min_speed
     data, source = together.rows(), ", ".join(recording.info.source)
     require_context(vehicle.active_effects, data.context, f"recording {source}")
-    steps, _ = rounded_steps(horizon, T_s)
-    fitted = fit_windows(recording, data, steps * T_s, speed, together.held_out)
+    fitted = fit_windows(recording, data, horizon, speed, together.held_out)
+    steps = fitted.steps
     unseen = held_out_windows(recording, data, steps=steps, long=2 * asked, min_speed=speed, held_out=together.held_out)
     protocol = {
         "Recording": source,
@@ -292,7 +284,6 @@ def _cause(one: Refined, without: Without, selection: Selection, recordings: Rec
         effect,
         dict(fit.car.effects[effect]),
         known,
-        one.improvement,
         float(one.delta_bic),
         without.improvement,
         one.confirmation,
@@ -325,21 +316,18 @@ def _steps_otherwise(
             f"calibrate with --integrator {windows.integrator}, else what the steps differ by may be named"
         )
     if windows.hold == "first":
+        differ = (
+            f"; {effect}: {name} {live.effects[effect][name]:.3g} there, {value:.3g} in a simulation"
+            for effect, values in car.effects.items()
+            for name, value in values.items()
+            if abs(live.effects[effect][name] - value) > tuning.NOTED_CHANGE * abs(value)
+        )
         samples = " and ".join(f"{n * windows.data.T_s:g}" for n in dict.fromkeys(windows.data.rows_per_sample))
         yield (
             "the car answers to the inputs half a sample earlier than if they were held, so that they are taken for lines "
             f"from sample to sample ({samples} s apart); a live prediction cannot, and errs by that: record them faster, or "
-            "take the commands. The vehicle file is fitted to inputs that are held"
-            + "".join(_differently(car.effects, live.effects))
+            "take the commands. The vehicle file is fitted to inputs that are held" + "".join(differ)
         )
-
-
-def _differently(effects: Mapping[str, Values], live: Mapping[str, Values]) -> Iterator[str]:
-    """Effects whose sizes are others with inputs that are held."""
-    for effect, values in effects.items():
-        for name, value in values.items():
-            if abs(live[effect][name] - value) > tuning.NOTED_CHANGE * abs(value):
-                yield f"; {effect}: {name} {live[effect][name]:.3g} there, {value:.3g} in a simulation"
 
 
 def _hidden(sizes: Mapping[str, float]) -> Iterator[str]:

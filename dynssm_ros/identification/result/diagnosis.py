@@ -36,8 +36,7 @@ class Cause:
         effect: its name.
         values: parameters with which it acts.
         std: standard deviations of those that were fitted.
-        improvement: decrease of twice the negative log-likelihood by it.
-        delta_bic: what is left when its parameters are paid for.
+        delta_bic: decrease of twice the negative log-likelihood by it, less what its parameters cost.
         heldout_improvement: share of the error on the held-out rows that is gone by it.
         confirmation: what it improves on parts of the fitted rows that were left out.
         on_bound: its parameters that the data push against a bound: they are at least that far off.
@@ -50,7 +49,6 @@ class Cause:
     effect: str
     values: dict[str, float]
     std: dict[str, float]
-    improvement: float
     delta_bic: float
     heldout_improvement: float
     confirmation: Confirmation
@@ -88,7 +86,6 @@ class Diagnosis:
             first parameter).
         selection: how it was found.
         car: the extended car as fitted.
-        std: standard deviations of the 17 coefficients and of the mass, relative to what was known of them.
         notes: what limits the diagnosis.
         protocol: how it was obtained, by name.
         windows: of the fit.
@@ -105,7 +102,6 @@ class Diagnosis:
     minimum_detectable: Mapping[str, float]
     selection: Selection
     car: CarEstimate
-    std: Vector
     notes: tuple[str, ...]
     protocol: Mapping[str, str]
     windows: SimulationWindows
@@ -132,13 +128,11 @@ class Diagnosis:
     @property
     def recalibrated(self) -> dict[str, tuple[float, float]]:
         """What :attr:`moved` names: as the vehicle file has it, and now."""
-        given, now = self.car.vehicle, self.vehicle
-        return {
-            name: (given.constants.m, now.constants.m)
-            if name == "m"
-            else (given.coefficients[name].nominal, now.coefficients[name].nominal)
-            for name in self.moved
-        }
+        given, now = (
+            {name: c.nominal for name, c in car.coefficients.items()} | {"m": car.constants.m}
+            for car in (self.car.vehicle, self.vehicle)
+        )
+        return {name: (given[name], now[name]) for name in self.moved}
 
     def to_json(self, vehicle_path: str) -> dict[str, Any]:
         """For programs; ``vehicle_path`` is where the extended vehicle was written."""

@@ -161,6 +161,5 @@ def _pursued(X: Vector, y: Vector) -> Vector:
     """Coefficients ``(P, n)`` with one term, with two, and so on."""
     from sklearn.linear_model import orthogonal_mp
 
-    return np.asarray(orthogonal_mp(X, y, n_nonzero_coefs=tuning.FORMULA_TERMS, return_path=True)).reshape(
-        X.shape[1], -1
-    )
+    path = orthogonal_mp(X, y, n_nonzero_coefs=tuning.FORMULA_TERMS, return_path=True)
+    return np.asarray(path).reshape(X.shape[1], -1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -57,12 +58,9 @@ class Improvement:
     def ending_with(self, name: str) -> Improvement:
         """The same with another car of it in the place of the last."""
         last = list(self.cars)[-1]
-        return replace(
-            self,
-            cars={**self.cars, last: self.cars[name]},
-            errors={**self.errors, last: self.errors[name]},
-            explained_variance={**self.explained_variance, last: self.explained_variance[name]},
-        )
+        by_car = {field: getattr(self, field) for field in ("cars", "errors", "explained_variance")}
+        changed: dict[str, Any] = {field: {**cars, last: cars[name]} for field, cars in by_car.items()}
+        return replace(self, **changed)
 
     def interval_from(self, name: str) -> Vector:
         """95 % interval of :meth:`reduction_from` by a bootstrap over blocks in time, shape ``(2, n, 3)``."""

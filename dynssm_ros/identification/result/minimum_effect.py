@@ -119,7 +119,7 @@ class _Nearby:
         """
         if not sizes:
             return np.empty(0)
-        car = self._fit.car
+        fit, car = self._fit, self._fit.car
         present = np.concatenate(
             [
                 self._problem.errors_of([car.with_effect(name, {**car.effects.get(name, {}), **each.values}) for each in own])
@@ -127,7 +127,7 @@ class _Nearby:
             ]
         )  # fmt: skip
         followed = np.zeros((len(sizes), len(self._H)))
-        rest = present - self._fit.errors
+        rest = present - fit.errors
         told = self._told(rest, followed)
         for k in range(1 + tuning.FOLLOW_ROUNDS):
             if k:  # as if errors were linear in the fitted values
@@ -136,8 +136,9 @@ class _Nearby:
             else:  # as for the size before
                 move = np.stack([one.size * one.follows for one in sizes])
             for share in tuning.FOLLOW_SHARES if k else (1.0,):
-                tried = np.clip(self._fit.position + followed + share * move, *self._limits) - self._fit.position
-                other = present - self._errors(tried)
+                tried = np.clip(fit.position + followed + share * move, *self._limits) - fit.position
+                moved = [with_values(car, fit.free, fit.position + each) for each in tried]
+                other = present - self._problem.errors_of(moved)
                 less = self._told(other, tried)
                 better = less < told
                 rest[better], followed[better], told[better] = other[better], tried[better], less[better]
@@ -148,11 +149,6 @@ class _Nearby:
         share = np.max((rest[..., -3:] ** 2).sum(axis=1) / self._error, axis=1)
         matters = share / (tuning.SMALL_SHARE / (1 - tuning.SMALL_SHARE))
         return np.asarray(np.minimum(told / self._needed, np.where(2 * seen < told, np.inf, matters)))
-
-    def _errors(self, followed: Vector) -> Vector:
-        """Errors of the car of the fit with its values moved by ``(n, P)``: ``(n, W, 3 K)``."""
-        fit = self._fit
-        return self._problem.errors_of([with_values(fit.car, fit.free, fit.position + each) for each in followed])
 
     def _told(self, rest: Vector, followed: Vector) -> Vector:
         """Twice the logarithm of the likelihood of what is left and of how far the fitted values moved, ``(n,)``."""

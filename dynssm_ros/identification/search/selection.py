@@ -141,9 +141,7 @@ class Search:
         problem: the windows.
         car: where to start.
         found: the candidates.
-        left_out: how windows are left out: recordings in turn, and parts of each.
-        on_progress: told what is being done.
-        pool: where candidates are tried.
+        left_out, on_progress, pool: see :func:`~dynssm_ros.identification.search.integrator.search_causes`.
     """
 
     def __init__(

@@ -26,8 +26,7 @@ class SizeSearch:
     """Candidates in several sizes, on some of the windows.
 
     Attributes:
-        some: those windows.
-        near: the fit without the candidate, there.
+        some: those windows; ``near``: the fit without the candidate, there.
         given: the car as it was known.
         price: of a parameter.
         tempering: with all windows, of which a promise is made.
