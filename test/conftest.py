@@ -232,6 +232,17 @@ def dynssm(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.fixture
+def told(dynssm: Callable[..., tuple[int, str, str]]) -> Callable[..., tuple[int, str]]:
+    """Runs the command line; exit status and all that it says, in one line."""
+
+    def run(*arguments: object) -> tuple[int, str]:
+        status, out, err = dynssm(*arguments)
+        return status, " ".join((out + err).split())
+
+    return run
+
+
+@pytest.fixture
 def drawn() -> Callable[[Any], list[Any]]:
     """Draws a figure and returns its visible axes."""
 

@@ -7,12 +7,12 @@ import random
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dynssm_ros.cli.main import main
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.bags import write_bag
 from dynssm_ros.signals.recording import Recording
@@ -43,17 +43,9 @@ Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+def run(dynssm: Run) -> Run:
     """Runs ``dynssm extract`` with the given arguments; gives exit status, stdout and stderr."""
-
-    def extract(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["dynssm", "extract", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        return int(ended.value.code or 0), out, err
-
-    return extract
+    return partial(dynssm, "extract")
 
 
 def assert_refused(ended: tuple[int, str, str], folder: Path, *said: str) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
-from dynssm_ros.cli.main import main
 from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track
@@ -15,17 +13,8 @@ from dynssm_ros.vehicle import load_vehicle
 from examples import what_a_sweep_tells
 
 
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: object) -> tuple[int, str]:
-    """Exit status and all that the command says."""
-    monkeypatch.setattr("sys.argv", ["dynssm", "sweep", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    said = capsys.readouterr()
-    return int(ended.value.code or 0), " ".join((said.out + said.err).split())
-
-
 def test_a_sweep_finds_goes_on_and_refuses_what_the_model_file_lacks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, told: Callable[..., tuple[int, str]]
 ) -> None:
     laps = simulate(load_vehicle("orca"), load_track("club"), duration=12.0, noise=(0.01, 0.01, 0.03))
     as_recording(laps).save(tmp_path / "laps.parquet")
@@ -33,11 +22,11 @@ def test_a_sweep_finds_goes_on_and_refuses_what_the_model_file_lacks(
     space.write_text("penalty: {low: 0.001, high: 10000.0, log: true}")
     out = tmp_path / "sweep"
     command = (tmp_path / "laps.parquet", "--vehicle", "orca", "--model", "ridge", "--space", space, "--out", out)
-    status, said = run(capsys, monkeypatch, *command, "--trials", 3)
+    status, said = told("sweep", *command, "--trials", 3)
     assert status == 0, said
     assert "of 3 is best: ADE" in said
     first = json.loads((out / "results.json").read_text())
-    status, said = run(capsys, monkeypatch, *command, "--trials", 6)
+    status, said = told("sweep", *command, "--trials", 6)
     assert status == 0, said
     found = json.loads((out / "results.json").read_text())
     assert found["trials"][:3] == first["trials"]
@@ -49,5 +38,5 @@ def test_a_sweep_finds_goes_on_and_refuses_what_the_model_file_lacks(
     assert (out / "trials" / "005" / "model.yaml").is_file()
     assert what_a_sweep_tells.main(out, tmp_path / "sweep.png").stat().st_size > 10_000
     space.write_text("penalties: {low: 0.001, high: 10.0}")
-    status, said = run(capsys, monkeypatch, *command, "--trials", 3)
+    status, said = told("sweep", *command, "--trials", 3)
     assert (status, "penalties: no field of the model file" in said) == (1, True)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from dynssm_ros.cli.main import main
 from dynssm_ros.evaluation.open_loop import Accuracy
 from dynssm_ros.evaluation.season_review import Estimate, Found, Review, Stretch, alarms
 from dynssm_ros.reporting.season_report import season_report, session_table
@@ -52,7 +52,7 @@ def test_several_cars_are_told_apart() -> None:
 
 
 def test_the_command_writes_it_though_nothing_can_be_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, dynssm: Callable[..., tuple[int, str, str]]
 ) -> None:
     season = Season(tmp_path / "season")
     laps = as_recording(simulate(ORCA, load_track("club"), duration=0.4))
@@ -64,9 +64,6 @@ def test_the_command_writes_it_though_nothing_can_be_done(
     season.file(session.place).parent.mkdir(parents=True)
     laps.save(season.file(session.place))
     season.save()
-    words = ["dynssm", "season", season.path, "--vehicle", "orca", "--out", tmp_path / "review"]
-    monkeypatch.setattr("sys.argv", list(map(str, words)))
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert not ended.value.code, capsys.readouterr().err
+    status, _, err = dynssm("season", season.path, "--vehicle", "orca", "--out", tmp_path / "review")
+    assert status == 0, err
     assert "Not done" in (tmp_path / "review" / "report.html").read_text()

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -21,7 +21,6 @@ import pytest
 from dask import config
 from distributed import LocalCluster
 
-from dynssm_ros.cli.main import main
 from dynssm_ros.errors import ConfigurationError, RecordingError, UserError
 from dynssm_ros.parallel import Backend, Workers
 from dynssm_ros.signals.extraction import extract
@@ -256,40 +255,27 @@ def test_a_damaged_manifest_is_named(bags: list[Path], tmp_path: Path) -> None:
         Season.load(tmp_path / "season")
 
 
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: object) -> tuple[int, str]:
-    """Exit status and all that a command says."""
-    monkeypatch.setattr("sys.argv", ["dynssm", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    said = capsys.readouterr()
-    return int(ended.value.code or 0), " ".join((said.out + said.err).split())
-
-
-def test_the_commands_take_a_season(
-    bags: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_commands_take_a_season(bags: list[Path], tmp_path: Path, told: Callable[..., tuple[int, str]]) -> None:
     season = tmp_path / "season"
     extracting = ("extract", *bags, "--signals", "default", "--rate", 50, "--out", season)
-    status, said = run(capsys, monkeypatch, *extracting)
+    status, said = told(*extracting)
     assert (status, "--car and --track" in said) == (1, True)
-    status, said = run(capsys, monkeypatch, *extracting, "--car", "orca", "--track", "club")
+    status, said = told(*extracting, "--car", "orca", "--track", "club")
     assert status == 0
     assert "broken: not extracted:" in said
     assert "4 sessions; of 4 bags 3 extracted, 0 as they were, 1 not readable" in said
     (tmp_path / "day_2").mkdir()
     shutil.copytree(bags[2], tmp_path / "day_2" / "run_0")
     again = ("extract", tmp_path / "day_2" / "run_0", bags[0], *extracting[1 + len(bags) :])
-    status, said = run(capsys, monkeypatch, *again, "--car", "orca", "--track", "club")
+    status, said = told(*again, "--car", "orca", "--track", "club")
     assert status == 0, said
     assert "of 2 bags 0 extracted, 1 as they were, 1 not readable" in said
-    status, said = run(capsys, monkeypatch, "inspect", season, "--json", tmp_path / "listed.json")
+    status, said = told("inspect", season, "--json", tmp_path / "listed.json")
     assert status == 0
     assert len(json.loads((tmp_path / "listed.json").read_text())["sessions"]) == 5
     evaluating = ("evaluate", "--model", "single_track", "--vehicle", "orca", "--out", tmp_path / "report")
     club = season / "car=orca" / "track=club"
-    status, said = run(
-        capsys, monkeypatch, *evaluating, club / "session=run_1", club / "session=run_2" / "recording.parquet"
-    )
+    status, said = told(*evaluating, club / "session=run_1", club / "session=run_2" / "recording.parquet")
     assert status == 0, said
     text = (tmp_path / "report" / "results.md").read_text()
     assert "run_1, run_2" in text
