@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dynssm_ros.api.extract import ExtractSettings
-from dynssm_ros.api.inputs import PathLike, signal_map_of, vehicle_of
+from dynssm_ros.api.inputs import PathLike, signal_map_of, vehicle_in_windows, vehicle_of
 from dynssm_ros.api.settings import WorkerSettings, keywords, setting
 from dynssm_ros.errors import SettingError
 from dynssm_ros.extras import require
@@ -106,7 +106,9 @@ def review_season(
 
     whole, chosen = (season, season.chosen()) if isinstance(season, Season) else season_part(season)
     names = [*dict.fromkeys([*map(str, models), *SIMPLE])]
-    task = partial(review_again, names, vehicle_of(vehicle), Path(out), settings.stretch)
+    car = vehicle_of(vehicle)
+    vehicle_in_windows(car)  # says once what models of windows leave out of it
+    task = partial(review_again, names, car, Path(out), settings.stretch)
     sessions = [(session, whole.file(session.place)) for session in chosen]
     found: dict[int, Review] = {}
     for k, review in each(task, sessions, settings.workers):
