@@ -243,6 +243,20 @@ def told(dynssm: Callable[..., tuple[int, str, str]]) -> Callable[..., tuple[int
 
 
 @pytest.fixture
+def refused(dynssm: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
+    """Runs the command line, which ends with status 1; the one line that says why."""
+
+    def run(*arguments: object) -> str:
+        status, _, err = dynssm(*arguments)
+        (line,) = err.strip().splitlines()
+        assert status == 1
+        assert line.startswith("error: ")
+        return line
+
+    return run
+
+
+@pytest.fixture
 def drawn() -> Callable[[Any], list[Any]]:
     """Draws a figure and returns its visible axes."""
 

@@ -74,25 +74,22 @@ def test_the_commands_lead_from_a_bag_to_predictions(dynssm, laps_bag: Path, tin
     ],
 )
 def test_what_does_not_fit_is_one_line_and_leaves_nothing(
-    dynssm, laps_bag: Path, tmp_path: Path, changes: dict[str, str], words: str
+    dynssm, refused, laps_bag: Path, tmp_path: Path, changes: dict[str, str], words: str
 ) -> None:
     laps = tmp_path / "laps.parquet"
     assert dynssm("extract", laps_bag, "--signals", "default", "--rate", 50, "--out", laps)[0] == 0
     given = {"recording": str(laps), "model": "ridge", "vehicle": "orca"} | changes
     recording = given.pop("recording")
     options = [part for name, value in given.items() for part in (f"--{name}", value)]
-    status, _, err = dynssm("train", recording, *options, "--out", tmp_path / "model")
-    assert status == 1
-    (line,) = err.strip().splitlines()
+    line = refused("train", recording, *options, "--out", tmp_path / "model")
     assert any(word in line for word in words.split("|"))
     assert [path.name for path in tmp_path.iterdir()] == ["laps.parquet"]
 
 
-def test_a_model_file_with_a_wrong_field_names_it(dynssm, laps_bag: Path, tmp_path: Path) -> None:
+def test_a_model_file_with_a_wrong_field_names_it(dynssm, refused, laps_bag: Path, tmp_path: Path) -> None:
     laps, model = tmp_path / "laps.parquet", tmp_path / "model.yaml"
     dynssm("extract", laps_bag, "--signals", "default", "--rate", 50, "--out", laps)
     model.write_text(yaml.safe_dump({"base": "dynssm", "name": "x", "gru": {"hidden": -1}}))
-    status, _, err = dynssm("train", laps, "--model", model, "--vehicle", "orca", "--out", tmp_path / "m")
-    assert status == 1
-    assert "model.yaml: gru.hidden" in err
-    assert "-1" in err
+    line = refused("train", laps, "--model", model, "--vehicle", "orca", "--out", tmp_path / "m")
+    assert "model.yaml: gru.hidden" in line
+    assert "-1" in line
