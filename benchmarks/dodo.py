@@ -195,12 +195,7 @@ class HiddenCauses:
 
 
 class Matrix:
-    """Trainings, and models that are trained on them.
-
-    Args:
-        variables: of the group.
-        trained: folder of the trainings.
-    """
+    """Trainings, and models that are trained on them in the folder ``trained``."""
 
     def __init__(self, variables: Variables, trained: Path) -> None:
         self.variables, self.trained = variables, trained

@@ -48,10 +48,7 @@ _TEMPLATES.filters |= {"several": several}
 def save_figure(figure: Figure, path: Path, *, tight: bool = False) -> str:
     """Writes a figure of a page aside as PNG and renames it; equal figures are equal files. Returns the file's name.
 
-    Args:
-        figure: to write.
-        path: of the file.
-        tight: the picture ends where the outermost labels do.
+    A ``tight`` picture ends where the outermost labels do.
     """
     with replacing(path) as aside:
         figure.savefig(

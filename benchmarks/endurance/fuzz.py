@@ -59,13 +59,10 @@ class Fuzzed:
 
 
 class Traffic:
-    """The messages of a car that drives straight on, some of them spoilt.
+    """The messages of a car that drives straight on, every ``period`` (ns) one of odometry.
 
-    Args:
-        vehicle: what it can do says what is beyond it, and how fast it drives.
-        seed: what the messages are.
-        period: between odometry messages (ns).
-        spoilt: share of messages that are damaged; a hundredth of all is lost and as many come twice, if any are.
+    A share ``spoilt`` is damaged. A hundredth of all is lost and as many come twice, if any are. What ``vehicle`` can
+    do says what is beyond it, and how fast it drives.
     """
 
     def __init__(self, vehicle: Vehicle, seed: int, period: int = _PERIOD, spoilt: float = _SPOILT) -> None:

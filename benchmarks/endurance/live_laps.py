@@ -89,14 +89,8 @@ def drive_live(
 ) -> LiveLaps:
     """Drives laps with the live stack: usual noise, odometry a step late, a patch with four fifths of the grip.
 
-    Args:
-        car: of the robustness matrix.
-        laps: to drive.
-        model: of the predictor; ``None``: there is none, and the car's file is planned with.
-        busy: processes that keep a core busy each.
-        rate: speed of the car's time over real time.
-        lockstep: whether the car's time waits for the controller.
-        progress: told of laps.
+    Without a ``model`` there is no predictor, and the car's file is planned with. ``busy`` processes keep a core busy
+    each. ``rate`` is the speed of the car's time over real time, or it waits for the controller (``lockstep``).
 
     Raises:
         UserError: the car does not come round in time, or a node stopped.
@@ -144,15 +138,8 @@ def drive_live(
 def _parameters(
     cell: Cell, vehicle: Vehicle, known: Vehicle, folder: Path, rate: float, lockstep: bool
 ) -> dict[str, dict[str, object]]:
-    """Of the simulator and the controller, by node.
-
-    Args:
-        cell: track and change.
-        vehicle: the car that is driven.
-        known: the car as the controller knows it.
-        folder: for their files.
-        rate: speed of the car's time.
-        lockstep: whether it waits for the controller.
+    """Of the simulator, which drives ``vehicle``, and of the controller, which knows ``known``, by node; files in
+    ``folder``.
     """
     (name, values), sensed = next(iter(CHANGES[cell.change].items())), sensing(cell.car, 1.0, True)
     road = {"track": _save_track(cell.road, folder / "road.csv"), "rate": rate, "watchdog": WATCHDOG}

@@ -175,13 +175,8 @@ def node_process(
     environment: Mapping[str, str] | None = None,
     namespace: str = "",
 ) -> Iterator[subprocess.Popen[str]]:
-    """Starts a node of this package as a process of its own; interrupts it in the end.
-
-    Args:
-        node: its module: ``predictor``, ``simulator``, ``controller``.
-        parameters: ROS parameters.
-        environment: of the process.
-        namespace: of the node; none if empty.
+    """Starts a node of this package (``predictor``, ``simulator``, ``controller``) with ROS parameters as a process
+    of its own; interrupts it in the end.
 
     Raises:
         UserError: it crashed, or it did not end when it was interrupted.
@@ -308,10 +303,7 @@ def _finds(diagnostics: list[tuple[int, str, dict[str, str]]], topics: tuple[str
 
 def wait_for_the_last(run: LiveRun, wait_for: Callable[[Callable[[], bool], float], bool]) -> None:
     """Waits until the last message is answered, or nothing is for a while: a predictor that was held up has a queue.
-
-    Args:
-        run: all of whose messages are sent.
-        wait_for: as :meth:`Collector.wait_for`.
+    ``wait_for``: as :meth:`Collector.wait_for`.
     """
     last, answered = max(run.sent, default=0) + run.T_s, -1
     while last not in run.predicted and len(run.predicted) > answered:

@@ -45,13 +45,8 @@ class Seeded(NamedTuple):
 
 
 def drive_seeded(car: str, seed: int, laps: int, model: Path | None = None) -> Seeded:
-    """Drives laps with the live controller, and with the live predictor if there is a ``model`` folder.
-
-    Args:
-        car: of the robustness matrix.
-        seed: of the noise.
-        laps: to drive; a car that leaves the road ends the drive.
-        model: of the predictor.
+    """Drives laps with the live controller, and with the live predictor if there is a ``model`` folder; a car that
+    leaves the road ends the drive. ``seed`` is that of the noise.
 
     Raises:
         UserError: the model is damaged, or of another car.
@@ -95,18 +90,7 @@ def _observe(predictor: Predictor, stamp: int, kind: str, inputs: Applied) -> No
 
 
 def _predict(predictor: Predictor, controller: LiveController, stamp: int, pose: Pose, seen: State) -> bool:
-    """Tells the controller what the predictor says of odometry.
-
-    Args:
-        predictor: to ask.
-        controller: to tell.
-        stamp: of the odometry (ns).
-        pose: as measured.
-        seen: likewise.
-
-    Returns:
-        Whether it says anything.
-    """
+    """Tells the controller what the predictor says of odometry at ``stamp`` (ns); returns whether it says anything."""
     said = predictor.predict(stamp, {**pose._asdict(), **seen._asdict()})
     if not isinstance(said, Prediction):
         return False

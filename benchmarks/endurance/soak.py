@@ -57,36 +57,25 @@ _MB = 1e6
 
 @dataclass
 class Soaked:
-    """What came of it.
+    """What came of it. Times are of no meaning where messages are spoilt, and are left empty."""
 
-    Attributes:
-        messages, spoilt, odometry: that were sent, how many of them damaged, and how many of them odometry.
-        predictions: that came back.
-        lost: odometry messages without a prediction, after the first one; of no meaning where messages are spoilt.
-        latency_ms: percentiles, odometry published to prediction received; like all times empty where messages are spoilt.
-        late: predictions that took longer than T_s.
-        longest_gap_ms: the longest time between two predictions.
-        rss_mb, open_files: of the node's process: after the first minute (or at the start of a shorter run), the most since
-            then, and at the end.
-        swaps: models that were taken.
-        slowest_at_swap_ms, slowest_else_ms: the largest latency in the second after a swap, and at other times.
-        violations: what must not happen, in words, the first of each kind.
-    """
-
-    messages: int = 0
-    spoilt: int = 0
-    odometry: int = 0
-    predictions: int = 0
-    lost: int = 0
-    latency_ms: dict[str, float] = field(default_factory=dict)
-    late: int = 0
-    longest_gap_ms: float | None = None
+    messages: int = 0  # that were sent
+    spoilt: int = 0  # how many of them damaged
+    odometry: int = 0  # and how many of them odometry
+    predictions: int = 0  # that came back
+    lost: int = (
+        0  # odometry messages without a prediction, after the first one; of no meaning where messages are spoilt
+    )
+    latency_ms: dict[str, float] = field(default_factory=dict)  # percentiles, odometry published to prediction received
+    late: int = 0  # predictions that took longer than T_s
+    longest_gap_ms: float | None = None  # the longest time between two predictions
+    # of the node's process: after the first minute (or at the start of a shorter run), the most since then, at the end
     rss_mb: tuple[float, float, float] = (0.0, 0.0, 0.0)
     open_files: tuple[int, int, int] = (0, 0, 0)
-    swaps: int = 0
-    slowest_at_swap_ms: float | None = None
-    slowest_else_ms: float | None = None
-    violations: dict[str, str] = field(default_factory=dict)
+    swaps: int = 0  # models that were taken
+    slowest_at_swap_ms: float | None = None  # the largest latency in the second after a swap
+    slowest_else_ms: float | None = None  # and at other times
+    violations: dict[str, str] = field(default_factory=dict)  # what must not happen, in words, the first of each kind
 
 
 class _Drive:
@@ -186,16 +175,10 @@ def soak(
     swap_every: float = 5.0,
     progress: Progress | None = None,
 ) -> Soaked:
-    """Drives for so long.
+    """Drives for so long, with odometry at ``rate`` (Hz) and a share ``spoilt`` of damaged messages.
 
-    Args:
-        models: folder of the model; with further ones the node is given each in turn.
-        seconds: to drive.
-        rate: of the odometry (Hz).
-        seed: what the messages are.
-        spoilt: share of messages that are damaged.
-        swap_every: time between swaps (s).
-        progress: told of the seconds.
+    The node has the first of the model folders; with further ones it is given each in turn, every ``swap_every``
+    seconds.
 
     Raises:
         UserError: the node does not start, or stops.

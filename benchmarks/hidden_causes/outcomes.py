@@ -70,10 +70,7 @@ class Outcome:
 def judge(case: Case, causes: Sequence[Cause], minimum_detectable: Mapping[str, float] | None = None) -> Outcome:
     """Compares what was found with what was hidden.
 
-    Args:
-        case: what was hidden.
-        causes: what was named.
-        minimum_detectable: how far off neutral each effect that is not named would have to be to be named.
+    ``minimum_detectable`` says how far off neutral each effect that is not named would have to be to be named.
     """
     hidden = set(case.hidden)
     reach = [{cause.effect, *cause.alternatives} for cause in causes]

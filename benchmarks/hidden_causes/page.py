@@ -36,12 +36,8 @@ _PLANTS = {
 
 
 def hidden_causes_page(outcomes: Sequence[tuple[Case, Outcome | None]], arguments: Sequence[str], figure: str) -> str:
-    """The results as Markdown.
-
-    Args:
-        outcomes: of the cases; ``None``: the car could not be driven.
-        arguments: of doit's command that differ from the usual.
-        figure: name of the figure's file.
+    """The results as Markdown; an outcome is ``None`` where the car could not be driven. ``arguments``: of doit's
+    command.
     """
     known = [outcome for _, outcome in outcomes if outcome is not None]
     plants = {plant: words for plant, words in _PLANTS.items() if any(case.plant == plant for case, _ in outcomes)}
@@ -87,13 +83,7 @@ def _with_values(effects: Hidden) -> str:
 
 @styled
 def confusion(hidden: Sequence[str], named: Sequence[str], count: npt.NDArray[np.intp]) -> Figure:
-    """Which effect was named first where which was hidden.
-
-    Args:
-        hidden: labels of the rows.
-        named: labels of the columns.
-        count: cases, shape ``(len(hidden), len(named))``.
-    """
+    """Which effect was named first (columns) where which was hidden (rows); ``count`` has the cases."""
     figure, panel = sheet(0.72 * WIDTH + 1.2)
     share = count / np.maximum(count.sum(axis=1, keepdims=True), 1)
     panel.imshow(share, cmap="Blues", vmin=0, vmax=1.2)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+
+from pydantic import TypeAdapter
 
 from benchmarks.hidden_causes.cases import Case, drive, vehicle_file
 from benchmarks.hidden_causes.outcomes import Outcome, judge
@@ -37,14 +38,8 @@ def read_outcome(case: Case, folder: Path) -> Outcome | None:
     """What became of a case; ``None``: it cannot be driven, or was not."""
     file = outcome_file(case, folder)
     content = json.loads(file.read_text(encoding="utf-8"))["outcome"] if file.exists() else None
-    return None if content is None else _outcome(content)
+    return TypeAdapter(Outcome | None).validate_python(content)
 
 
 def _name(case: Case) -> str:
     return case.name.replace("/", "_")
-
-
-def _outcome(content: dict[str, Any]) -> Outcome:
-    lists = {key: tuple(content[key]) for key in ("hidden", "named", "too_small")}
-    alternatives = {name: tuple(others) for name, others in content["alternatives"].items()}
-    return Outcome(**content | lists | {"alternatives": alternatives})

@@ -114,13 +114,8 @@ class Cell:
 
 
 def sensing(car: str, level: float, late: bool, seed: int = 0) -> Sensing:
-    """What comes between a car and its controller.
-
-    Args:
-        car: of the generalisation matrix.
-        level: of the noise; 1: usual.
-        late: whether measurements are a step late.
-        seed: of the noise.
+    """What comes between a car and its controller: noise (``level`` 1 is the usual), and whether measurements are a
+    step late.
     """
     velocities, pose = ((level * a, level * b, level * c) for a, b, c in (CARS[car].noise, _POSE_NOISE[car]))
     return Sensing(velocities, pose, load_vehicle(CARS[car].vehicle).sampling_time if late else 0.0, seed)
@@ -148,10 +143,6 @@ def named(name: str) -> Cell:
 
 def variation(track: Track, seed: int) -> Track:
     """A track of the same kind: its centre line is bent by a few waves around the lap.
-
-    Args:
-        track: to vary.
-        seed: of the waves.
 
     Raises:
         ValueError: none was found that can be driven.

@@ -35,13 +35,8 @@ def outcome_file(cell: Cell, model: str, out: Path) -> Path:
 
 
 def race_model(cell: Cell, name: str, out: Path, trained: Path) -> None:
-    """Drives a cell with one of :data:`BASELINES`, or with a trained model: with evidence and as it is.
-
-    Args:
-        cell: to drive.
-        name: of the model.
-        out: folder of the outcomes.
-        trained: folder of the generalisation matrix, which has the models.
+    """Drives a cell with one of :data:`BASELINES`, or with a trained model: with evidence and as it is. ``trained``
+    is the folder of the generalisation matrix, which has the models.
     """
     outcomes = {name: drive(cell, name, trained).to_json()}
     if name not in BASELINES:
@@ -84,13 +79,8 @@ def learning_file(cell: Cell, out: Path) -> Path:
 
 
 def learn_cell(cell: Cell, out: Path, trained: Path, model: str) -> None:
-    """Drives a cell faster every lap with ``model``, and with the true model at several paces.
-
-    Args:
-        cell: to drive.
-        out: folder of the outcomes.
-        trained: folder of the generalisation matrix, which has the model.
-        model: its name.
+    """Drives a cell faster every lap with ``model`` of the folder ``trained``, and with the true model at several
+    paces.
     """
     best, learned = true_best(cell), learn(cell, trained, model)
     write_json(learning_file(cell, out), {"true_best_s": best, "learned": learned.to_json()})

@@ -110,14 +110,7 @@ def lap_times(known: Known) -> Figure:
 
 
 def closed_loop_page(known: Known, arguments: Sequence[str], figure: str, asked: Sequence[Cell]) -> str:
-    """The results as Markdown.
-
-    Args:
-        known: outcomes.
-        arguments: of doit's command that differ from the usual.
-        figure: name of the figure's file.
-        asked: the cells that the command drives, whether or not it has come to them.
-    """
+    """The results as Markdown; ``asked``: the cells that the command with these arguments drives, done or not."""
     compared = _with_evidence(known)
     parts = []
     for label, part, missing in _parts(known, asked):

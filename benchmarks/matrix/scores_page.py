@@ -27,13 +27,7 @@ def errors(content: Mapping[str, Any], model: str) -> np.ndarray:
 
 
 def ratios(content: Mapping[str, Any], model: str, without: tuple[str, ...] = ()) -> np.ndarray:
-    """Errors of a model over those of the best baseline for each quantity; NaN where that is exact.
-
-    Args:
-        content: of the cell.
-        model: the model.
-        without: baselines that do not count.
-    """
+    """Errors of a model over those of the best baseline but some for each quantity; NaN where that is exact."""
     best = np.min([errors(content, name) for name in BASELINES if name not in without], axis=0)
     return np.where(best < EXACT, np.nan, errors(content, model) / np.maximum(best, 1e-300))
 
@@ -108,14 +102,7 @@ def heat_map(known: Known, model: str = "dynssm") -> Figure:
 
 
 def generalisation_page(known: Known, arguments: Sequence[str], figure: str, missing: int) -> str:
-    """The results as Markdown.
-
-    Args:
-        known: outcomes.
-        arguments: of doit's command that differ from the usual.
-        figure: name of the figure's file.
-        missing: how many cells were not scored.
-    """
+    """The results as Markdown; ``missing``: how many cells were not scored."""
     return render(
         "generalisation", arguments=arguments, baselines=BASELINES, figure=figure, gain_wanted=NETWORK_GAIN_WANTED,
         missing=missing, over_noise=_over_noise, parts=summary(known), quantities=list(QUANTITIES), rows=_rows,

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from benchmarks.page import render, save_figure
 from benchmarks.paper.document import write_signed
+from benchmarks.paper.figures import lap_over_speed_scale
 from benchmarks.paper.plan import MID_RANGE, Race
-from benchmarks.paper.race_figures import lap_over_speed_scale
 from benchmarks.paper.results import Entry, Results
 from benchmarks.paper.schedule import race_key
 from dynssm_ros.control.race_models import TRUE

@@ -24,12 +24,8 @@ from dynssm_ros.signals.signal_map import Commands
 
 
 def steps_of(plan: Plan, data: Path | None, given: Mapping[str, Path]) -> list[Step]:
-    """The steps of a plan, in the order in which it asks for them.
-
-    Args:
-        plan: what is wanted.
-        data: folder with logs and tracks; ``None`` if there is none.
-        given: recordings that the user gives, by name.
+    """The steps of a plan, in the order in which it asks for them; ``data``: folder with logs and tracks, ``given``:
+    recordings that the user gives, by name.
     """
     wanted = dict.fromkeys(
         (split, study.commands) for study in plan.studies.values() for split in study.splits if plan.splits[split].test

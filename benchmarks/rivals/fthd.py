@@ -131,14 +131,8 @@ def consecutive(model: DDM, windows: Tensor) -> tuple[Output, Output]:
 
 
 def physics_loss(model: DDM, windows: Tensor, before: Output, output: Output, unit: Tensor) -> Tensor:
-    """``L_2`` above.
-
-    Args:
-        model: the network that is fine-tuned.
-        windows: raw, with the row before the model's window, ``(B, H + 1, 7)``.
-        before: of the model for the first ``H`` rows.
-        output: of the model for the last ``H`` rows.
-        unit: in which the error of each state counts, ``(3,)``.
+    """``L_2`` above, in units ``unit`` of each state, ``(3,)``, from the outputs for the first (``before``) and the
+    last ``H`` rows of raw windows ``(B, H + 1, 7)``.
     """
     assert output.theta is not None
     state = windows[:, -2, :3] + before.increment

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
+from benchmarks.paper.figures import lap_over_speed_scale
 from benchmarks.paper.plan import load_plan
 from benchmarks.paper.race_document import claimed, write_races
-from benchmarks.paper.race_figures import lap_over_speed_scale
 from benchmarks.paper.racing import NUMBERS
 from benchmarks.paper.results import read_results
 from benchmarks.paper.schedule import race_key, steps_of

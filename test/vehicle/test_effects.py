@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +21,8 @@ from dynssm_ros.vehicle.effects import (
     parse_effect,
     require_context,
 )
-from dynssm_ros.vehicle.effects.base import lagged
 from dynssm_ros.vehicle.integrators import Integrator
-from dynssm_ros.vehicle.single_track import GRAVITY, Array, Motion, StageEffect
+from dynssm_ros.vehicle.single_track import Array, Motion, StageEffect
 
 VEHICLE = load_vehicle("av21_paper")
 CONSTANTS = VEHICLE.constants
@@ -37,22 +36,6 @@ def act(*effects: Effect, effect_states: dict[str, Array] | None = None) -> Moti
 
 
 @dataclass(frozen=True)
-class YawRateBias(Effect):
-    bias: float = 0.0
-
-    def inputs(self, xp: Any, q: Motion) -> None:
-        q.omega = q.omega + self.bias
-
-
-@dataclass(frozen=True)
-class Camber(Effect):
-    angle: float = 0.0
-
-    def slip(self, xp: Any, q: Motion) -> None:
-        q.alpha_f = q.alpha_f + self.angle
-
-
-@dataclass(frozen=True)
 class Push(Effect):
     force: float = 0.0
 
@@ -60,85 +43,11 @@ class Push(Effect):
         q.F_rx = q.F_rx + self.force
 
 
-@dataclass(frozen=True)
-class Downforce(Effect):
-    coefficient: float = 0.0
-
-    def loads(self, xp: Any, q: Motion) -> None:
-        q.F_zf = q.F_zf + 0.5 * self.coefficient * q.v_x**2
-        q.F_zr = q.F_zr + 0.5 * self.coefficient * q.v_x**2
-
-
-@dataclass(frozen=True)
-class FrontGone(Effect):
-    def tyres(self, xp: Any, q: Motion) -> None:
-        q.F_fy = 0.0 * q.F_fy
-
-
-@dataclass(frozen=True)
-class Bank(Effect):
-    angle: float = 0.0
-
-    def forces(self, xp: Any, q: Motion) -> None:
-        q.F_y = q.F_y - q.m * GRAVITY * xp.sin(self.angle)
-
-
-@dataclass(frozen=True)
-class YawTorque(Effect):
-    angular: float = 0.0
-
-    def accelerations(self, xp: Any, q: Motion) -> None:
-        q.omega_dot = q.omega_dot + self.angular
-
-
-@dataclass(frozen=True)
-class ThrottleLag(Effect):
-    EFFECT_STATES: ClassVar[tuple[str, ...]] = ("throttle_lag.r",)
-    time_constant: float = 0.2
-
-    def inputs(self, xp: Any, q: Motion) -> None:
-        q.r = lagged(q, self.EFFECT_STATES[0], q.r, self.time_constant)
-
-
-def test_an_effect_on_the_inputs_is_a_motion_under_other_inputs() -> None:
-    biased = CarModel(CONSTANTS, 0.04).motion(STATE._replace(omega=STATE.omega + 0.1), APPLIED, THETA)
-    found = act(YawRateBias(0.1))
-    assert (found.a_x, found.a_y, found.omega_dot) == (biased.a_x, biased.a_y, biased.omega_dot)
-
-
-def test_an_effect_on_the_slip_is_a_shift_of_the_slip() -> None:
-    shifted = CarModel(CONSTANTS, 0.04).motion(STATE, APPLIED, THETA._replace(S_hf=THETA.S_hf + 0.01))
-    assert act(Camber(0.01)).F_fy == pytest.approx(shifted.F_fy, rel=1e-12)
-
-
 def test_an_effect_on_the_drive_also_moves_the_loads_that_follow() -> None:
     plain, pushed = act(), act(Push(1000.0))
     assert pushed.F_rx - plain.F_rx == 1000.0
     wheelbase = CONSTANTS.l_f + CONSTANTS.l_r
     assert pushed.F_zr - plain.F_zr == pytest.approx(CONSTANTS.h_cg * 1000.0 / wheelbase, rel=1e-9)
-
-
-def test_an_effect_on_the_loads_scales_the_tyres_that_follow() -> None:
-    plain, pressed = act(), act(Downforce(2.0))
-    assert pressed.F_fy / plain.F_fy == pytest.approx((plain.F_zf + 30.0**2) / plain.F_zf, rel=1e-12)
-    assert pressed.F_rx == plain.F_rx
-
-
-def test_an_effect_on_the_tyres_leaves_only_the_other_axle() -> None:
-    q = act(FrontGone())
-    assert q.F_y == q.F_ry
-    assert q.M_z == -CONSTANTS.l_r * q.F_ry
-    assert q.F_x == q.F_rx
-
-
-def test_an_effect_on_the_forces_reaches_only_its_own_acceleration() -> None:
-    plain, banked = act(), act(Bank(0.1))
-    assert banked.a_y - plain.a_y == pytest.approx(-GRAVITY * np.sin(0.1), rel=1e-12)
-    assert (banked.a_x, banked.omega_dot) == (plain.a_x, plain.omega_dot)
-
-
-def test_an_effect_on_the_accelerations_has_the_last_word() -> None:
-    assert act(YawTorque(0.5)).omega_dot == act().omega_dot + 0.5
 
 
 def test_each_stage_of_the_equations_can_be_entered_and_in_order() -> None:
@@ -166,12 +75,11 @@ def test_effects_act_in_the_order_given() -> None:
 @pytest.mark.parametrize(
     ("effect", "target", "start"),
     [
-        (ThrottleLag(0.2), APPLIED.r, 0.1),
         (build_effect("throttle_lag", {"time_constant": 0.2}), APPLIED.r, 0.1),
         (build_effect("steering_lag", {"time_constant": 0.2}), APPLIED.delta, 0.02),
         (build_effect("odometry_delay", {"delay": 0.2}), APPLIED.r, 0.1),
     ],
-    ids=["own", "throttle_lag", "steering_lag", "odometry_delay"],
+    ids=["throttle_lag", "steering_lag", "odometry_delay"],
 )
 def test_a_lag_approaches_its_input_exponentially(effect: Effect, target: float, start: float) -> None:
     name, T, tau = effect.EFFECT_STATES[0], 0.3, 0.1 if effect.NAME == "odometry_delay" else 0.2
