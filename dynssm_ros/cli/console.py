@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,27 +50,9 @@ class Update(Protocol):
         """Shows how much is done, of how much, and a few words about it."""
 
 
-def _progress_lines(description: str) -> Update:
-    """Writes how much is done at most every :data:`_LINE_EVERY_S`; nothing for what is done sooner."""
-    last = time.monotonic()
-
-    def update(done: int, total: int, words: str = "") -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last >= _LINE_EVERY_S:
-            last = now
-            share = 100 * done / max(total, 1)
-            errors.print(f"{description}: {share:.0f} % {words}".rstrip(), markup=False, soft_wrap=True)
-
-    return update
-
-
 @contextmanager
 def progress_bar(description: str) -> Iterator[Update]:
     """Shows a progress bar on stderr, or a line now and then if that is no terminal; yields the function that moves it."""
-    if not errors.is_terminal:
-        yield _progress_lines(description)
-        return
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -80,15 +61,20 @@ def progress_bar(description: str) -> Iterator[Update]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=errors, transient=True) as progress:
+    drawn, shown = errors.is_terminal, time.monotonic()
+    where = errors if drawn else Console(quiet=True)  # at its end it would print a blank line there
+    with Progress(*columns, console=where, transient=True, disable=not drawn) as progress:
         task = progress.add_task(description, total=None, words="")
-        shown = -math.inf
 
         def update(done: int, total: int, words: str = "") -> None:
             nonlocal shown
             now = time.monotonic()
-            if done >= total or now - shown >= _SHOWN_EVERY_S:  # drawing costs more than reading a message does
-                shown = now
-                progress.update(task, completed=done, total=total, words=words)
+            if now - shown < (_SHOWN_EVERY_S if drawn else _LINE_EVERY_S) and not (drawn and done >= total):
+                return  # drawing costs more than reading a message does
+            shown = now
+            progress.update(task, completed=done, total=total, words=words)
+            if not drawn:
+                share = 100 * done / max(total, 1)
+                errors.print(f"{description}: {share:.0f} % {words}".rstrip(), markup=False, soft_wrap=True)
 
         yield update
