@@ -66,6 +66,7 @@ def test_line_and_plant_are_chosen_and_said(dynssm, tmp_path):
         (["--noise", "0,-1,0"], "expected finite numbers of at least 0"),
         (["--laps", "1", "--duration", "5"], "expected one of them, positive"),
         (["--scale", "0"], "--scale: Input should be greater than 0"),
+        (["--duration", "-1"], "--duration: Input should be greater than 0"),
         (["--scale", "0.2"], "orca leaves track club"),
         (["--scale", "0.1", "--line", "racing"], "track club is 0.04 m wide"),
     ],
