@@ -1,4 +1,4 @@
-"""What a diagnosis shows: gains with intervals, systematic parts, just detectable sizes, words, figures."""
+"""What a diagnosis shows: improvements with intervals, systematic parts, just detectable sizes, words, figures."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from scipy.optimize import lsq_linear
 from dynssm_ros.arrays import Indices, Mask, Vector, normal_equations, sums_by
 from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate
-from dynssm_ros.identification.problem.noise import Noise, NoiseResponse, fit_noise, weights
+from dynssm_ros.identification.problem.noise import Noise, NoiseResponse, fit_noise
 from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.vehicle.effects import EFFECTS
 
@@ -231,7 +231,7 @@ class IdentificationProblem:
             else:
                 jacobian, stale = self.columns(car, errors, free), False
             H, g = self._normal(errors, jacobian, p, noise)
-            before, promised, gained = best, 0.0, 0.0
+            before, promised, kept = best, 0.0, 0.0
             for damping in tuning.DAMPING:
                 step = _step(H + damping * np.diag(np.diag(H)), g, lower - p, upper - p)
                 other = with_values(car, free, p + step)
@@ -239,16 +239,16 @@ class IdentificationProblem:
                 value = self.objective(there, position(other, free), noise)
                 if value < best:
                     promised = -float(2 * g @ step + step @ H @ step)
-                    gained = best - value
+                    kept = best - value
                     car, errors, p = other, there, position(other, free)
-                    if gained > tuning.CONVERGED and not given:
+                    if kept > tuning.CONVERGED and not given:
                         noise = self.noise(errors)
                     best = self.objective(errors, p, noise)
                     break
             settled = before - best < tuning.CONVERGED
             if settled and (rough or not stale):
                 break
-            if stale and (settled or gained < tuning.KEPT_PROMISE * promised):
+            if stale and (settled or kept < tuning.KEPT_PROMISE * promised):
                 nominal = None
             elif not stale:
                 nominal = jacobian[..., :n]
@@ -292,12 +292,9 @@ class IdentificationProblem:
 
     def _normal(self, errors: Vector, jacobian: Vector, p: Vector, noise: Noise) -> tuple[Vector, Vector]:
         """Second and first derivatives of half the objective, as Gauss and Newton approximate them."""
-        white = noise.whiten(errors)
-        root = np.sqrt(weights(white))[:, None]
-        J = (noise.whiten(jacobian) * root[..., None]).reshape(-1, len(p))
-        known = self.prior_precision(p)
-        weight = self.tempering**-0.5
-        H, g = normal_equations(weight * J, weight * (white * root).ravel(), known)
+        weighed, J, _ = noise.robust(errors, jacobian)
+        known, weight = self.prior_precision(p), self.tempering**-0.5
+        H, g = normal_equations(weight * J.reshape(-1, len(p)), weight * weighed.ravel(), known)
         return H, g + known @ p
 
     def covariance(self, fit: Fit) -> Vector:
@@ -349,10 +346,8 @@ class IdentificationProblem:
 
     def _scores(self, fit: Fit, cluster: Indices) -> tuple[Vector, Vector]:
         """The information on the fitted values, and what clusters of errors make of it, both ``(P, P)``."""
-        white = fit.noise.whiten(fit.errors)
-        root = np.sqrt(weights(white))
-        J = fit.noise.whiten(fit.jacobian) * root[:, None, None]
-        scores = np.einsum("wnp,wn->wp", J, white * root[:, None])
+        weighed, J, _ = fit.noise.robust(fit.errors, fit.jacobian)
+        scores = np.einsum("wnp,wn->wp", J, weighed)
         flat = J.reshape(-1, J.shape[2])
         information = flat.T @ flat
         sums = sums_by(cluster, scores)

@@ -83,6 +83,12 @@ class Noise:
             out[member] = np.matmul(inverse, flat[member])
         return out.reshape(errors.shape)
 
+    def robust(self, errors: Vector, jacobian: Vector) -> tuple[Vector, Vector, Vector]:
+        """Errors and derivatives, whitened and with outliers weighed down, and the roots of the weights, ``(W, 1)``."""
+        white = self.whiten(errors)
+        root = np.sqrt(weights(white))[:, None]
+        return white * root, self.whiten(jacobian) * root[..., None], root
+
 
 def weights(white: Vector) -> Vector:
     """Weight of each window, 1 unless its whitened errors ``(W, 3 K)`` are far out."""

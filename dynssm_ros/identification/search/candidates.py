@@ -18,7 +18,6 @@ from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate, Values
 from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, unit
 from dynssm_ros.identification.problem.levels import ONE_RECORDING, Levels
-from dynssm_ros.identification.problem.noise import weights
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 from dynssm_ros.vehicle.effects.base import LAP, Parameter, section
 
@@ -207,14 +206,12 @@ class ScoreTest:
         self._fit, self._responses = fit, responses
         self._columns: dict[int, _Whitened] = {}
         self._products: dict[tuple[int, int], Vector] = {}
-        white = fit.noise.whiten(fit.errors)
-        self._root = np.sqrt(weights(white))[:, None]
-        J = fit.noise.whiten(fit.jacobian) * self._root[..., None]
+        weighed, J, self._root = fit.noise.robust(fit.errors, fit.jacobian)
         # what is known of the values as further rows, so that projecting is plain least squares
         known = np.sqrt(problem.tempering) * np.linalg.cholesky(problem.prior_precision(fit.position)).T
         tall = np.concatenate([J.reshape(-1, J.shape[2]), known])
         basis = np.linalg.qr(tall)[0]
-        left = np.concatenate([(white * self._root).ravel(), known @ fit.position])
+        left = np.concatenate([weighed.ravel(), known @ fit.position])
         left = left - basis @ (basis.T @ left)
         rows = J.shape[0] * J.shape[1]
         self._basis = basis[:rows].reshape(*J.shape[:2], -1)

@@ -33,7 +33,7 @@ class Refined:
         fit: with it.
         improvement: decrease of twice the negative logarithm of likelihood and prior, by the errors' true freedom.
         delta_bic: what is left of it when its parameters are paid for.
-        confirmation: what it gains on parts of the drive that were left out; ``None``: it was not worth a look.
+        confirmation: what it improves on parts of the drive that were left out; ``None``: it was not worth a look.
         sure: by how many standard deviations one of its amplitudes is off neutral.
         bounded: its amplitudes that are at a bound: the data ask for more than such a thing can be.
     """
@@ -97,7 +97,7 @@ class Refined:
 
     @property
     def confirmed_improvement(self) -> float:
-        """Logarithm of the predictive likelihood that it gains, nothing where it is not confirmed."""
+        """Logarithm of the predictive likelihood by which it improves, nothing where it is not confirmed."""
         return self.confirmation.total if self.confirmation is not None and self.is_confirmed else 0.0
 
 
