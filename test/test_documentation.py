@@ -299,7 +299,7 @@ def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_fi
     declared = declared_parameters("predictor")
     described = {name: cells[0].strip("`") for name, cells in table("parameter", PAGES["predictor.md"]).items()}
     assert described == as_ros_writes(declared)
-    shipped = yaml.safe_load((ROOT / "config" / "predictor.yaml").read_text())["/**"]["ros__parameters"]
+    shipped = yaml.safe_load((ROOT / "config" / "predictor.yaml").read_text())["/**/dynssm"]["ros__parameters"]
     assert shipped == declared
 
 

@@ -212,11 +212,21 @@ def test_shipped_models_are_valid(name: str) -> None:
     assert load_model_config(name).name == name
 
 
+NAMES = {"predictor": "dynssm", "controller": "controller", "simulator": "simulator", "player": "player"}
+
+
+def parameters_file(node: str) -> dict[str, object]:
+    """What a shipped parameters file says, of its node alone."""
+    content = yaml.safe_load((ROOT / "config" / f"{node}.yaml").read_text(encoding="utf-8"))
+    assert list(content) == [f"/**/{NAMES[node]}"], "a launch file hands one file to several nodes"
+    return content[f"/**/{NAMES[node]}"]["ros__parameters"]
+
+
 @pytest.mark.parametrize("node", ["predictor", "controller", "simulator", "player"])
 def test_each_node_has_a_parameters_file_with_its_defaults(
     declared_parameters: Callable[[str], dict[str, object]], node: str
 ) -> None:
-    content = yaml.safe_load((ROOT / "config" / f"{node}.yaml").read_text(encoding="utf-8"))["/**"]["ros__parameters"]
+    content = parameters_file(node)
     declared = declared_parameters(node)
     assert content == declared
     assert {name: type(value) for name, value in content.items()} == {n: type(v) for n, v in declared.items()}
@@ -239,30 +249,28 @@ def test_the_aggregator_takes_the_status_of_each_node_once() -> None:
     assert {a["type"] for a in analyzers} == {"diagnostic_aggregator/GenericAnalyzer"}
 
 
-def test_parameters_file_fits_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same parser as the node's reads it, and the types are those that the node declares."""
+@pytest.mark.parametrize("node", NAMES)
+@pytest.mark.parametrize("namespace", ["", "car1"])
+def test_of_all_parameters_files_a_node_takes_its_own_alone(
+    monkeypatch: pytest.MonkeyPatch, node: str, namespace: str
+) -> None:
+    """The same parser as the node's reads them, in any namespace, with the types that the node declares."""
     rclpy = pytest.importorskip("rclpy")
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
-    path = ROOT / "config" / "predictor.yaml"
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))["/**"]["ros__parameters"]
-    context = rclpy.Context()
-    rclpy.init(args=["--ros-args", "--params-file", str(path)], context=context)
+    files = [part for each in NAMES for part in ("--params-file", str(ROOT / "config" / f"{each}.yaml"))]
+    context, expected = rclpy.Context(), parameters_file(node)
+    rclpy.init(args=["--ros-args", *files], context=context)
     try:
-        node = rclpy.create_node("dynssm", context=context, automatically_declare_parameters_from_overrides=True)
-        read = {name: node.get_parameter(name).value for name in content}
-        node.destroy_node()
+        options = {"namespace": namespace, "automatically_declare_parameters_from_overrides": True}
+        made = rclpy.create_node(NAMES[node], context=context, **options)
+        read = {name: parameter.value for name, parameter in made.get_parameters_by_prefix("").items()}
+        made.destroy_node()
     finally:
         context.try_shutdown()
-    assert read == content
-    assert read == {
-        "model": "", "model_root": "", "signals": "default", "max_age": 0.2, "online": True, "online_state": "",
-        "horizon": 0.0, "markers": False, "tf": False, "diagnostics_period": 1.0, "autostart": True,
-    }  # fmt: skip
-    assert {name for name, value in read.items() if isinstance(value, float)} == {
-        "max_age",
-        "horizon",
-        "diagnostics_period",
-    }
+    of_every_node = ("use_sim_time", "start_type_description_service")
+    read = {name: list(v) if name.endswith("noise") else v for name, v in read.items() if name not in of_every_node}
+    assert read == expected
+    assert {name: type(value) for name, value in read.items()} == {name: type(v) for name, v in expected.items()}
 
 
 class Recorder:

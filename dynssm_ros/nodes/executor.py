@@ -83,7 +83,8 @@ class EnduringExecutor(SingleThreadedExecutor):
         self._node = node
         self.add_node(node)
         for service in node.services:
-            service.callback = partial(self._answer, service.srv_name, service.callback)
+            answer: Any = partial(self._answer, service.srv_name, service.callback)  # rclpy awaits it
+            service.callback = answer
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Serves what is ready.
