@@ -1,1 +1,1 @@
-"""What a model is worth, for people and for programs: error measures, tables, figures, HTML reports."""
+"""What a model is worth on recordings, for people and for programs: error measures, no figures."""
