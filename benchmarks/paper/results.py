@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.paper.plan import Car, Plan, Study, Sweep
 from benchmarks.paper.racing import NUMBERS
 from benchmarks.paper.reference import load_reference
-from benchmarks.paper.schedule import COSTS, model_key, race_key, rate_key, score_key
+from benchmarks.paper.schedule import COSTS, Site, race_key
 from benchmarks.paper.steps import Step
 from benchmarks.tasks import output, split_available
 from dynssm_ros.arrays import Vector
@@ -67,7 +67,7 @@ class Comparison:
         self.study: Study = plan.studies[name]
         self.car: Car = plan.car(self.study)
         self.planned = plan.tests(self.study)
-        keys = [score_key(split, self.study.commands) for split in self.study.splits if plan.splits[split].test]
+        keys = [Site(plan, split, self.study.commands).scores for split in self.study.splits if plan.splits[split].test]
         self._tests: dict[str, Entry] = {}
         for key in keys:
             self._tests |= results.scores.get(key, {"tests": {}})["tests"]
@@ -182,7 +182,7 @@ def read_results(plan: Plan, root: Path, steps: Sequence[Step], made: str = "", 
         reference=load_reference(),
         scores=scores,
         races={name: _read(root / race_key(name) / NUMBERS) for name in plan.races if race_key(name) in done},
-        rates={name: _rates(sweep, root, done) for name, sweep in plan.sweeps.items()},
+        rates={name: _rates(plan, sweep, root, done) for name, sweep in plan.sweeps.items()},
         losses=_losses(plan, root, done),
         networks=_networks(plan, root, done),
         costs=_read(root / COSTS)["models"] if COSTS in done else {},
@@ -201,14 +201,15 @@ def _losses(plan: Plan, root: Path, done: Container[str]) -> dict[str, Entry]:
         model = plan.car(study).paper
         for split in study.splits:
             if model and model in study.models and model not in found:
-                key = model_key(split, study.commands, model, 0)
+                key = Site(plan, split, study.commands).model(model, 0)
                 found |= {model: _read(root / key / METRICS)} if key in done else {}
     return found
 
 
-def _rates(sweep: Sweep, root: Path, done: Container[str]) -> dict[float, list[Entry]]:
+def _rates(plan: Plan, sweep: Sweep, root: Path, done: Container[str]) -> dict[float, list[Entry]]:
     """The trainings with each learning rate, one for each seed; rates without one are left out."""
-    keys = {rate: [rate_key(sweep, rate, seed) for seed in range(sweep.seeds)] for rate in sweep.rates}
+    site = Site(plan, sweep.split, sweep.commands)
+    keys = {rate: [site.rate(sweep, rate, seed) for seed in range(sweep.seeds)] for rate in sweep.rates}
     there = {rate: [key for key in each if key in done] for rate, each in keys.items()}
     return {rate: [_read(root / key / METRICS) for key in each] for rate, each in there.items() if each}
 
@@ -219,7 +220,8 @@ def _networks(plan: Plan, root: Path, done: Container[str]) -> dict[str, tuple[i
     for study in plan.studies.values():
         model = plan.car(study).full
         seeds = plan.seeds(study, model) if model in study.models else ()
-        for key in (model_key(split, study.commands, model, seed) for split in study.splits for seed in seeds):
+        sites = [Site(plan, split, study.commands) for split in study.splits]
+        for key in (site.model(model, seed) for site in sites for seed in seeds):
             if key in done and (layer := read_card(root / key).online):
                 kept.setdefault(model, {})[key] = "network" in layer.features
     return {model: (sum(each.values()), len(each)) for model, each in kept.items()}

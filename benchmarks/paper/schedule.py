@@ -30,17 +30,18 @@ def steps_of(plan: Plan, data: Path | None, given: Mapping[str, Path]) -> list[S
     wanted = dict.fromkeys(
         (split, study.commands) for study in plan.studies.values() for split in study.splits if plan.splits[split].test
     )
-    sites = [_Site(plan, *each) for each in wanted]
+    sites = [Site(plan, *each) for each in wanted]
     recordings = dict.fromkeys(name for site in sites for name in site.recordings)
     steps: list[Step] = [_recording_step(plan, name, data, given) for name in recordings]
     steps += [step for site in sites for step in site.steps()]
-    trained: dict[str, tuple[str, ...]] = {}
+    trained: dict[str, list[str]] = {}
     for step in steps:
         if isinstance(step, Train):
-            trained[step.model] = (*trained.get(step.model, ()), step.key)
+            trained.setdefault(step.model, []).append(step.key)
     for sweep in plan.sweeps.values():
-        steps += _Site(plan, sweep.split, sweep.commands).rates(sweep)
-    steps += [_race_step(name, race, data) for name, race in plan.races.items()]
+        steps += Site(plan, sweep.split, sweep.commands).rates(sweep)
+    for name, race in plan.races.items():
+        steps.append(_race_step(name, race, Site(plan, race.split, race.commands), data))
     timing = TimeModels(  # last, while nothing else computes
         key=COSTS, title="time the models", uses=tuple(step.key for step in steps), trained=trained, calls=plan.calls,
         vehicle=next(iter(plan.cars.values())).vehicle,
@@ -51,37 +52,16 @@ def steps_of(plan: Plan, data: Path | None, given: Mapping[str, Path]) -> list[S
 COSTS = "costs.json"  # key of the step that times the models
 
 
-def score_key(split: str, commands: Commands) -> str:
-    """Where the scores of a split lie."""
-    return f"scores/{split}.{commands}.json"
-
-
-def model_key(split: str, commands: Commands, model: str, seed: int) -> str:
-    """Where a training lies."""
-    return f"models/{split}.{commands}/{model}.{seed}"
-
-
-def rate_key(sweep: Sweep, rate: float, seed: int) -> str:
-    """Where the training of a sweep with a learning rate and a seed lies."""
-    return f"rates/{sweep.split}.{sweep.commands}/{sweep.model}.{rate:g}.{seed}"
-
-
-def vehicle_key(split: str, commands: Commands) -> str:
-    """Where the car lies that is calibrated on the training part of a split."""
-    return f"vehicles/{split}.{commands}.yaml"
-
-
 def race_key(name: str) -> str:
     """Where the outcome of a race lies."""
     return f"races/{name}"
 
 
-def _race_step(name: str, race: Race, data: Path | None) -> DriveLaps:
-    models = {model: model_key(race.split, race.commands, model, 0) for model in race.models if model not in FIXED}
+def _race_step(name: str, race: Race, site: Site, data: Path | None) -> DriveLaps:
+    models = {model: site.model(model, 0) for model in race.models if model not in FIXED}
     return DriveLaps(
-        key=race_key(name), title=f"race {name}", needs=(vehicle_key(race.split, race.commands),),
-        uses=tuple(models.values()), race=race, trained=models, calibrated=vehicle_key(race.split, race.commands),
-        data=data,
+        key=race_key(name), title=f"race {name}", needs=(site.vehicle,), uses=tuple(models.values()), race=race,
+        trained=models, calibrated=site.vehicle, data=data,
     )  # fmt: skip
 
 
@@ -95,15 +75,19 @@ def _recording_step(plan: Plan, name: str, data: Path | None, given: Mapping[str
 
 
 @dataclass(frozen=True)
-class _Site:
+class Site:
     """A split under a command protocol."""
 
     plan: Plan
     name: str
     commands: Commands
 
+    def __str__(self) -> str:
+        return f"{self.name}.{self.commands}"
+
     @property
     def split(self) -> Split:
+        """The split itself."""
         return self.plan.splits[self.name]
 
     @property
@@ -117,12 +101,21 @@ class _Site:
 
     @property
     def vehicle(self) -> str:
-        """Key of the car that is calibrated here."""
-        return vehicle_key(self.name, self.commands)
+        """Where the car lies that is calibrated on the training part."""
+        return f"vehicles/{self}.yaml"
+
+    @property
+    def scores(self) -> str:
+        """Where the scores lie."""
+        return f"scores/{self}.json"
 
     def model(self, name: str, seed: int) -> str:
-        """Key of a training here."""
-        return model_key(self.name, self.commands, name, seed)
+        """Where a training lies."""
+        return f"models/{self}/{name}.{seed}"
+
+    def rate(self, sweep: Sweep, rate: float, seed: int) -> str:
+        """Where the training of a sweep with a learning rate and a seed lies."""
+        return f"rates/{self}/{sweep.model}.{rate:g}.{seed}"
 
     @property
     def models(self) -> dict[str, range]:
@@ -148,7 +141,7 @@ class _Site:
         trained = {self.model(name, seed): name for name, seeds in models.items() for seed in seeds}
         tested = dict.fromkeys(recording_key(part.recording) for part in self.split.test.values())
         yield Evaluate(
-            key=score_key(self.name, self.commands), title=f"evaluate on {self.shown}", needs=(*tested, self.vehicle),
+            key=self.scores, title=f"evaluate on {self.shown}", needs=(*tested, self.vehicle),
             uses=tuple(trained), vehicle=self.vehicle, untrained=tuple(name for name in models if name in UNTRAINED),
             trained=trained, tests=self.split.test, commands=self.commands, stride=self.plan.stride,
         )  # fmt: skip
@@ -182,4 +175,4 @@ class _Site:
             for rate in sweep.rates:
                 config = plain.config.with_training(learning_rate=rate, restarts=0)
                 title = f"train {sweep.model} at the rate {rate:g}, seed {seed}, on {self.shown}"
-                yield replace(plain, key=rate_key(sweep, rate, seed), title=title, config=config)
+                yield replace(plain, key=self.rate(sweep, rate, seed), title=title, config=config)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -251,7 +251,7 @@ class Evaluate(Step):
 class TimeModels(Step):
     """All models side by side, while nothing else computes: it uses all that is made before."""
 
-    trained: Mapping[str, tuple[str, ...]]
+    trained: Mapping[str, Sequence[str]]
     """Keys of steps that train a model, by its name; the first that is there is timed."""
     vehicle: str  # name of the vehicle file for the models without training
     calls: int  # predictions of each model

@@ -88,14 +88,8 @@ def split_windows(
 ) -> tuple[TrainingWindows, TrainingWindows]:
     """Training and validation windows: by alternating blocks in time, so that no row serves both, or at random.
 
-    The random split is drawn for the last rows of the windows, so that it is the same one for windows of any length.
-
-    Args:
-        recording: training data.
-        H: rows of a window.
-        config: how to split.
-        min_speed: windows that are slower anywhere are left out (m/s).
-        least: training windows that are needed.
+    The random split is drawn for the last rows of the windows, so that it is the same one for windows of any length
+    ``H``. Windows that are slower than ``min_speed`` (m/s) anywhere are left out; ``least`` training windows are needed.
 
     Raises:
         RecordingError: too little motion to train on.
@@ -126,8 +120,7 @@ def split_ends(
     if len(training) < least or len(held) == 0:
         raise RecordingError(
             f"recording {', '.join(recording.info.source)}: {len(training)} training and {len(held)} validation windows "
-            f"of {H} rows at {min_speed:g} m/s or more; expected at least {least} and 1 - "
-            "more driving is needed"
+            f"of {H} rows at {min_speed:g} m/s or more; expected at least {least} and 1 - more driving is needed"
         )
     return training, held
 

@@ -34,26 +34,15 @@ _RESTART_RATE = 0.25  # of the learning rate, with each restart
 
 
 @dataclass
-class OptimisationResult:
-    """The best model of an optimisation."""
-
-    model: TrainableModel  # with the weights of the best epoch
-    history: History  # mean loss per epoch: ``train/TERM`` and ``validation/TERM`` for each of ``COMPONENTS``
-    best_epoch: int = 0  # the one with the lowest validation loss; 0: the untrained model
-    resumed_from: int = 0  # epochs that were done before
-    restarts: int = 0  # times that it began anew, out of a plateau
-
-
-@dataclass
-class _TrainingState:
-    """All that changes while training, and so all that a checkpoint holds."""
+class TrainingState:
+    """All that changes while training but the model, and so all that a checkpoint holds beside it."""
 
     epoch: int = 0
-    best_epoch: int = 0
+    best_epoch: int = 0  # the one with the lowest validation loss; 0: the untrained model
     best_loss: float = float("inf")
     best: dict[str, Tensor] = field(default_factory=dict)
-    history: History = field(default_factory=dict)
-    restarts: int = 0
+    history: History = field(default_factory=dict)  # mean loss per epoch: train/TERM and validation/TERM of COMPONENTS
+    restarts: int = 0  # times that it began anew, out of a plateau
 
 
 class Optimisation:
@@ -92,10 +81,13 @@ class Optimisation:
         self.shuffle = torch.Generator().manual_seed(config.training.seed)
         self.checkpoint = checkpoint
         self.identity = _identity(config, vehicle, training)
-        self.state = _TrainingState(history=_empty_history())
+        self.state = TrainingState(history=_empty_history())
 
-    def run(self, progress: NamedProgress | None) -> OptimisationResult:
-        """Trains until the validation loss stops falling; returns the best model.
+    def run(self, progress: NamedProgress | None) -> int:
+        """Trains until the validation loss stops falling; the model is the best one then.
+
+        Returns:
+            Epochs that were done before.
 
         Raises:
             ConfigurationError: it diverges before there is a best one.
@@ -127,7 +119,7 @@ class Optimisation:
                 f"{settings.learning_rate:g}"
             )
         self.model.load_state_dict(state.best)
-        return OptimisationResult(self.model, state.history, state.best_epoch, resumed_from, state.restarts)
+        return resumed_from
 
     def _on_plateau(self) -> bool:
         """Whether the loss has stopped falling without the model being any good, and the training can begin anew."""
@@ -143,13 +135,13 @@ class Optimisation:
         self.model.eval()
         return unexplained(self.model, self.training, replace(self.validation, H=self.H)) >= 1.0
 
-    def _restart(self) -> _TrainingState:
+    def _restart(self) -> TrainingState:
         """Begins anew, from other weights and with a smaller learning rate."""
         assert self.anew is not None
         restarts = self.state.restarts + 1
         self.model.load_state_dict(self.anew(restarts).state_dict())
         self.optimiser, self.schedule = self._optimiser(_RESTART_RATE**restarts)
-        self.state = _TrainingState(history=_empty_history(), restarts=restarts)
+        self.state = TrainingState(history=_empty_history(), restarts=restarts)
         self._keep_if_better(self._validate()["prediction"])
         return self.state
 
@@ -231,7 +223,7 @@ class Optimisation:
         self.optimiser.load_state_dict(content["optimiser"])
         self.schedule.load_state_dict(content["schedule"])
         self.shuffle.set_state(content["shuffle"].cpu())
-        self.state = _TrainingState(**{name: content[name] for name in vars(self.state)})
+        self.state = TrainingState(**{name: content[name] for name in vars(self.state)})
         return self.state.epoch
 
 

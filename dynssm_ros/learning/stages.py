@@ -20,7 +20,7 @@ from dynssm_ros.learning.online import OnlineFeatures
 from dynssm_ros.learning.optimisation import (
     History,
     Optimisation,
-    OptimisationResult,
+    TrainingState,
     rollout_steps,
     squared_errors,
     unexplained,
@@ -265,18 +265,18 @@ def _train(
     training, validation = split_windows(recording, rows, config.training, vehicle.minimum_speed, least)
     if start is not None:
         model.take_over(start.model)
-    if model.fit(training):
-        run = OptimisationResult(model, {})
-    else:
-        run = Optimisation(
+    state, resumed_from = TrainingState(), start.resumed_from if start else 0
+    if not model.fit(training):
+        optimisation = Optimisation(
             config, vehicle, model, scale=scale, training=training, validation=validation, checkpoint=checkpoint,
             anew=anew if start is None else None, device=device,
-        ).run(progress)  # fmt: skip
-    model = run.model.cpu().eval()
+        )  # fmt: skip
+        resumed_from += optimisation.run(progress)
+        state = optimisation.state
+    model.cpu().eval()
     held = replace(validation, H=H)
     v_x, v_y, omega = squared_errors(model, held).sqrt().tolist()
     return Trained(
-        config, vehicle, recording, model, scale, run.history, run.best_epoch, (v_x, v_y, omega),
-        unexplained(model, training, held),
-        (len(training), len(validation)), run.resumed_from + (start.resumed_from if start else 0), run.restarts, start,
+        config, vehicle, recording, model, scale, state.history, state.best_epoch, (v_x, v_y, omega),
+        unexplained(model, training, held), (len(training), len(validation)), resumed_from, state.restarts, start,
     )  # fmt: skip
