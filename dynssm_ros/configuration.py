@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sysconfig
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from dynssm_ros.errors import ConfigurationError
 
 PACKAGE = "dynssm_ros"
+_DEEPEST, _MOST_VALUES = 50, 100_000
 _REGISTERED: dict[str, list[Path]] = {}
 _Model = TypeVar("_Model", bound=BaseModel)
 
@@ -75,8 +77,23 @@ def find_config(kind: str, name_or_path: str | Path) -> Path:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Reads a YAML mapping with the safe loader; what is none, or unreadable, is a :class:`ConfigurationError`."""
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506 - derived from the safe loader
-    except (OSError, UnicodeDecodeError) as error:
+        return parse_yaml(path.read_bytes(), path)
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read ({error})") from error
+
+
+def parse_yaml(data: bytes, path: Path) -> dict[str, Any]:
+    """The YAML mapping in ``data``, which was read from ``path``.
+
+    Raises:
+        ConfigurationError: not YAML, not a mapping, nested deeper than 50, or of more than 100,000 values, each alias
+            counted as what it stands for.
+    """
+    try:
+        text = data.decode("utf-8")
+        _check_extent(text)
+        content = yaml.load(text, _Loader)  # noqa: S506 - derived from the safe loader
+    except UnicodeDecodeError as error:
         raise ConfigurationError(f"{path}: cannot be read ({error})") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date that does not exist is a ValueError
         raise ConfigurationError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
@@ -115,6 +132,22 @@ def load(schema: type[_Model], kind: str, name_or_path: str | Path) -> _Model:
     return validate(schema, read_yaml(path), path)
 
 
+def _check_extent(text: str) -> None:
+    """Looks at the events of a YAML text, from which nothing is built yet."""
+    count, sizes, begun = 0, dict[str | None, int](), list[tuple[str | None, int]]()
+    for event in yaml.parse(text, _Loader):
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = begun.pop()
+            if anchor is not None:
+                sizes[anchor] = count - before
+        elif isinstance(event, yaml.NodeEvent):
+            if isinstance(event, yaml.CollectionStartEvent):
+                begun.append((event.anchor, count))
+            count += sizes.get(event.anchor, 0) if isinstance(event, yaml.AliasEvent) else 1
+        if len(begun) > _DEEPEST or count > _MOST_VALUES:
+            raise ValueError(f"more than {_DEEPEST} levels or {_MOST_VALUES} values")
+
+
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """The safe loader, which here refuses a field that is given twice instead of taking the last.
 
@@ -122,9 +155,9 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        twice = [name for name in names if names.count(name) > 1]
-        if twice:
-            raise yaml.constructor.ConstructorError(None, None, f"'{twice[0]}' is given twice", node.start_mark)
+        names = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        name, count = names.most_common(1)[0] if names else ("", 0)
+        if count > 1:
+            raise yaml.constructor.ConstructorError(None, None, f"'{name}' is given twice", node.start_mark)
         content: dict[Any, Any] = super().construct_mapping(node, deep)
         return content

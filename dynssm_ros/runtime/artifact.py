@@ -7,20 +7,24 @@ opened, not when the car drives.
 
 from __future__ import annotations
 
+import hashlib
+import math
+import os
+import stat
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
 from pydantic import Field, model_validator
-from safetensors import SafetensorError, safe_open
 
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError, ConfigurationError
-from dynssm_ros.files import checksum
 from dynssm_ros.runtime.online import OnlineLayer, OnlineLayerCard, load_layer
+from dynssm_ros.runtime.tensors import read_tensors
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle.integrators import Integrator
@@ -29,6 +33,11 @@ from dynssm_ros.vehicle.parameters import Vehicle
 FORMAT_VERSION = 1
 CARD, WEIGHTS, ONNX, METRICS = "model.yaml", "weights.safetensors", "model.onnx", "metrics.json"
 ONLINE = "online.safetensors"
+_LARGEST = {CARD: 1 << 20, METRICS: 10 << 20, ONLINE: 10 << 20, WEIGHTS: 100 << 20, ONNX: 100 << 20}
+"""Bytes of each file."""
+
+
+Variance = Annotated[float, Field(gt=0)]
 
 
 class Normalisation(StrictModel):
@@ -66,7 +75,7 @@ class ModelCard(StrictModel):
     integrator: Integrator = "euler"
     substeps: int = Field(default=1, ge=1)
     normalisation: Normalisation
-    covariance: tuple[float, float, float] = Field(description="one-step error variances on validation data")
+    covariance: tuple[Variance, Variance, Variance] = Field(description="one-step error variances on validation data")
     online: OnlineLayerCard | None = Field(default=None, description="the online layer, if it has one")
     parameters: int = Field(ge=0, description="weights that training finds")
     flops: int = Field(ge=0, description="floating-point operations per prediction")
@@ -77,6 +86,10 @@ class ModelCard(StrictModel):
     def _consistent(self) -> ModelCard:
         if self.columns != WINDOW_COLUMNS:
             raise ValueError(f"columns {self.columns} are not {WINDOW_COLUMNS}")
+        if not math.isclose(self.sampling_time, self.vehicle.sampling_time):
+            raise ValueError(
+                f"sampling_time {self.sampling_time:g} s is not the vehicle's ({self.vehicle.sampling_time:g} s)"
+            )
         if set(self.checksums) != set(self.files):
             raise ValueError(f"checksums {sorted(self.checksums)} are not those of {', '.join(self.files)}")
         return self
@@ -89,10 +102,19 @@ class ModelCard(StrictModel):
 
 @dataclass(frozen=True)
 class Artifact:
-    """A checked model folder."""
+    """A checked model folder.
+
+    Attributes:
+        path: of the folder.
+        card: its ``model.yaml``.
+        graph: content of its ``model.onnx``, as it was checked.
+        prior: content of its ``online.safetensors``; empty without an online layer.
+    """
 
     path: Path
     card: ModelCard
+    graph: bytes
+    prior: bytes
 
     @property
     def onnx(self) -> Path:
@@ -108,14 +130,20 @@ class Artifact:
         """The online layer as trained, if it has one.
 
         Raises:
-            ArtifactError: its file is damaged.
+            ArtifactError: its file is damaged, or its numbers are none of such a layer.
         """
         card = self.card
         if card.online is None:
             return None
         scale = np.array(card.normalisation.increment_scale)
         return load_layer(
-            self.path / ONLINE, card.online, scale, card.vehicle, integrator=card.integrator, substeps=card.substeps
+            self.prior,
+            self.path / ONLINE,
+            card.online,
+            scale=scale,
+            vehicle=card.vehicle,
+            integrator=card.integrator,
+            substeps=card.substeps,
         )
 
 
@@ -123,28 +151,62 @@ def open_artifact(path: str | Path) -> Artifact:
     """Opens and checks a model folder.
 
     Raises:
-        ArtifactError: a file is missing, changed or damaged, the format is newer, or a weight is not finite.
+        ArtifactError: a file is missing, changed, damaged or too large, the format is newer, or a weight is not finite.
     """
-    path = Path(path)
-    if not path.is_dir():
+    return parse_artifact(Path(path), read_folder(path))
+
+
+def read_folder(path: str | Path, root: str = "") -> dict[str, bytes]:
+    """Reads the files of a model folder, each once: what is checked is what is used, whoever writes there meanwhile.
+
+    Args:
+        path: of the folder.
+        root: folder below which all files must be, links followed; empty: anywhere.
+
+    Raises:
+        ArtifactError: no such folder, a file that cannot be read, is too large or none at all, or lies elsewhere.
+    """
+    if not os.path.isdir(path):  # unlike Path.is_dir, False where looking is forbidden or the name impossible
         raise ArtifactError(f"{path}: no such model folder; `dynssm train` writes one")
-    _require(path, CARD)
-    card = read_card(path)
+    return {name: _read(Path(path) / name, root) for name in _LARGEST if os.path.lexists(Path(path) / name)}
+
+
+def parse_artifact(path: Path, files: Mapping[str, bytes]) -> Artifact:
+    """Checks the ``files`` of a model folder, as :func:`read_folder` gives them.
+
+    Raises:
+        ArtifactError: as :func:`open_artifact`.
+    """
+    card = _parse_card(path, files)
     for name, expected in card.checksums.items():
-        _require(path, name)
-        try:
-            found = checksum(path / name)
-        except OSError as error:
-            raise ArtifactError(f"{path / name}: cannot be read ({error.strerror})") from error
-        if found != expected:
+        if hashlib.sha256(_content(path, files, name)).hexdigest() != expected:
             raise ArtifactError(f"{path / name}: does not match its checksum in {CARD}; damaged or exchanged")
-    _check_weights(path / WEIGHTS)
-    return Artifact(path, card)
+    weights, _ = read_tensors(files[WEIGHTS], f"{path / WEIGHTS}: not a readable safetensors file")
+    for name, weight in weights.items():
+        if not np.isfinite(weight).all():
+            raise ArtifactError(f"{path / WEIGHTS}: weight {name} holds NaN or infinity")
+    return Artifact(path, card, files[ONNX], files[ONLINE] if card.online else b"")
 
 
-def _require(path: Path, name: str) -> None:
-    if not (path / name).is_file():
+def _read(file: Path, root: str) -> bytes:
+    """The content of a file of a model folder; without waiting where it is none."""
+    try:
+        handle = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(handle, "rb") as opened:
+            status, largest = os.fstat(handle), _LARGEST[file.name]
+            if not stat.S_ISREG(status.st_mode) or status.st_size > largest:
+                raise ArtifactError(f"{file}: {status.st_size} bytes; expected a file of at most {largest}")
+            if root and not Path(os.readlink(f"/proc/self/fd/{handle}")).is_relative_to(os.path.realpath(root)):
+                raise ArtifactError(f"{file}: is a link out of {root}; expected a file in it (parameter model_root)")
+            return opened.read(largest)
+    except OSError as error:
+        raise ArtifactError(f"{file}: cannot be read ({error.strerror})") from error
+
+
+def _content(path: Path, files: Mapping[str, bytes], name: str) -> bytes:
+    if name not in files:
         raise ArtifactError(f"{path}: incomplete model folder, {name} is missing")
+    return files[name]
 
 
 def read_card(path: Path) -> ModelCard:
@@ -153,8 +215,12 @@ def read_card(path: Path) -> ModelCard:
     Raises:
         ArtifactError: malformed, or of a newer format.
     """
+    return _parse_card(path, {CARD: _read(path / CARD, "")})
+
+
+def _parse_card(path: Path, files: Mapping[str, bytes]) -> ModelCard:
     try:
-        content = configuration.read_yaml(path / CARD)
+        content = configuration.parse_yaml(_content(path, files, CARD), path / CARD)
         version = content.get("format_version")
         if isinstance(version, int) and version > FORMAT_VERSION:
             raise ArtifactError(
@@ -169,13 +235,3 @@ def write_card(card: ModelCard, folder: Path) -> None:
     """Writes ``model.yaml`` into ``folder``, which is being put together."""
     text = yaml.safe_dump(card.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=110)
     (folder / CARD).write_text(text, encoding="utf-8")
-
-
-def _check_weights(file: Path) -> None:
-    try:
-        with safe_open(file, framework="numpy") as weights:
-            for name in weights.keys():  # noqa: SIM118 - not a mapping
-                if not np.isfinite(weights.get_tensor(name)).all():
-                    raise ArtifactError(f"{file}: weight {name} holds NaN or infinity")
-    except (SafetensorError, OSError) as error:
-        raise ArtifactError(f"{file}: not a readable safetensors file ({error})") from error

@@ -22,14 +22,14 @@ from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import save_file
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import replacing
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
+from dynssm_ros.runtime.tensors import read_tensors
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.integrators import Integrator
@@ -307,7 +307,8 @@ class OnlineState:
         coefficients = self.coefficients.kept()
         expected = {name: getattr(self, name) for name in _SAVED}
         expected |= {f"coefficients.{name}": value for name, value in coefficients.items()}
-        arrays, about = _read(path, "online state", {name: value.shape for name, value in expected.items()}, owner)
+        shapes = {name: value.shape for name, value in expected.items()}
+        arrays, about = _parsed(_state_in(path), path, "online state", shapes, owner)
         for name in _SAVED:
             setattr(self, name, arrays[name])
         self.coefficients.restore({name: arrays[f"coefficients.{name}"] for name in coefficients})
@@ -317,6 +318,22 @@ class OnlineState:
 _FROM_PRIOR = ("mean", "covariance", "noise", "physics")
 _SAVED = (*_FROM_PRIOR, "recent", "width")
 _PRIOR = (*_FROM_PRIOR, "block_noise", "block_slow")
+_VARIANCES = ("noise", "recent", "width", "block_noise", "block_slow")
+_ABSURD = 1e6  # no number of a layer is larger: it is in units that make one the usual size
+_LARGEST_STATE = 10 << 20  # bytes
+_ROUNDING = 1e-9  # of eigenvalues
+
+
+def _state_in(path: Path) -> bytes:
+    """The content of a file of what was learned; without waiting where it is none."""
+    try:
+        if not path.is_file() or path.stat().st_size > _LARGEST_STATE:
+            raise ArtifactError(
+                f"{path}: not a readable online state (expected a file of at most {_LARGEST_STATE} bytes)"
+            )
+        return path.read_bytes()
+    except OSError as error:
+        raise ArtifactError(f"{path}: not a readable online state ({error})") from error
 
 
 def save_layer(layer: OnlineLayer, path: Path) -> None:
@@ -325,29 +342,31 @@ def save_layer(layer: OnlineLayer, path: Path) -> None:
 
 
 def load_layer(
-    path: Path, card: OnlineLayerCard, scale: Vector, vehicle: Vehicle, *, integrator: Integrator, substeps: int
+    data: bytes,
+    path: Path,
+    card: OnlineLayerCard,
+    *,
+    scale: Vector,
+    vehicle: Vehicle,
+    integrator: Integrator,
+    substeps: int,
 ) -> OnlineLayer:
-    """Reads what :func:`save_layer` wrote.
+    """The layer in ``data``, which :func:`save_layer` wrote to ``path``.
 
     Raises:
-        ArtifactError: unreadable, or of other sizes than the card says.
+        ArtifactError: unreadable, of other sizes than the card says, or a variance that is not positive.
     """
     n = len(card.features)
     shapes = dict.fromkeys(_PRIOR, (CHANNELS,)) | {"mean": (CHANNELS, n), "covariance": (CHANNELS, n, n)}
-    prior, _ = _read(path, "online layer", shapes)
+    prior, _ = _parsed(data, path, "online layer", shapes)
     return OnlineLayer(card, **prior, scale=scale, vehicle=vehicle, integrator=integrator, substeps=substeps)
 
 
-def _read(
-    path: Path, what: str, shapes: Mapping[str, tuple[int, ...]], owner: str | None = None
+def _parsed(
+    data: bytes, path: Path, what: str, shapes: Mapping[str, tuple[int, ...]], owner: str | None = None
 ) -> tuple[dict[str, Vector], dict[str, str]]:
     """Finite arrays of the expected shapes from a safetensors file of an ``owner``, and what it says of itself."""
-    try:
-        with safe_open(path, framework="numpy") as content:
-            about = content.metadata() or {}
-        arrays = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise ArtifactError(f"{path}: not a readable {what} ({error})") from error
+    arrays, about = read_tensors(data, f"{path}: not a readable {what}")
     if owner is not None and about.get("prior") != owner:
         raise ArtifactError(f"{path}: was learned by another model; expected the {what} of prior {owner[:12]}")
     if "recent" in shapes:
@@ -356,6 +375,13 @@ def _read(
         value = arrays.get(name)
         if value is None or value.shape != shape or not np.isfinite(value).all():
             raise ArtifactError(f"{path}: {name} is missing, not finite or of another shape; expected {shape}")
+        if (largest := float(np.abs(value).max(initial=0.0))) > _ABSURD:
+            raise ArtifactError(f"{path}: {name} is as large as {largest:.3g}; expected at most {_ABSURD:g}")
+        if name in _VARIANCES and value.min() <= 0:
+            raise ArtifactError(f"{path}: {name} = {value.min():.3g}; expected variances above zero")
+    eigenvalues = np.linalg.eigvalsh(arrays["covariance"])
+    if (eigenvalues[:, 0] < -_ROUNDING * eigenvalues[:, -1]).any() or eigenvalues.max() <= 0:
+        raise ArtifactError(f"{path}: covariance has the eigenvalue {eigenvalues.min():.3g}; expected none below zero")
     return {name: arrays[name] for name in shapes}, about
 
 

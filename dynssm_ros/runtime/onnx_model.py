@@ -18,6 +18,7 @@ from dynssm_ros.signals.signal_map import Commands
 _AT_ONCE = 32
 """Windows that a graph sees at once. Memory that it has used stays with it: two megabytes for each of them with the paper's
 encoders. More at once are no faster."""
+_WEIGHTS_ELSEWHERE = "session.model_external_initializers_file_folder_path"
 
 
 class OnnxModel:
@@ -66,7 +67,9 @@ class OnnxModel:
         options.enable_mem_reuse = False  # small tensors: planning their reuse costs more than their effect states
         options.log_severity_level = 3
         try:
-            self._session = ort.InferenceSession(self.artifact.onnx, options, providers=["CPUExecutionProvider"])
+            # of the bytes that were checked; a graph whose weights are in other files finds none here
+            options.add_session_config_entry(_WEIGHTS_ELSEWHERE, str(self.artifact.onnx / "none"))
+            self._session = ort.InferenceSession(self.artifact.graph, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime raises its own unrelated classes
             raise ArtifactError(
                 f"{self.artifact.onnx}: ONNX Runtime refuses it ({' '.join(str(error).split())})"

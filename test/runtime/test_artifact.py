@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,16 @@ from safetensors.numpy import load_file, save_file
 
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import checksum
-from dynssm_ros.runtime.artifact import CARD, FORMAT_VERSION, METRICS, ONNX, WEIGHTS, open_artifact, read_card
+from dynssm_ros.runtime.artifact import (
+    CARD,
+    FORMAT_VERSION,
+    METRICS,
+    ONNX,
+    WEIGHTS,
+    open_artifact,
+    read_card,
+    read_folder,
+)
 from dynssm_ros.runtime.artifact import write_card as write
 from dynssm_ros.runtime.onnx_model import OnnxModel
 
@@ -91,6 +101,8 @@ def test_a_newer_format_is_refused_before_its_fields_are_judged(folder: Path) ->
         (lambda card: card["normalisation"]["input_std"].__setitem__(3, 0.0), "input_std must be positive everywhere"),
         (lambda card: card["normalisation"]["input_mean"].pop(), "normalisation.input_mean"),
         (lambda card: card["covariance"].__setitem__(1, float("nan")), "covariance.1: Input should be a finite number"),
+        (lambda card: card["covariance"].__setitem__(1, 0.0), "covariance.1: Input should be greater than 0"),
+        (lambda card: card.update(sampling_time=0.08), "sampling_time 0.08 s is not the vehicle's (0.02 s)"),
         (lambda card: card["vehicle"]["coefficients"].pop("B_f"), "missing B_f"),
         (
             lambda card: card["vehicle"]["constants"].update(m=0.0),
@@ -126,6 +138,89 @@ def test_a_card_that_is_no_mapping_is_refused_and_nothing_is_executed(
     (folder / CARD).write_text(text)
     assert expected in refusal(folder)
     assert not (folder.parent / "executed").exists()
+
+
+BOMB = "a0: &a0 [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"a{k}: &a{k} [{','.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12)
+)
+MERGED = "a0: &a0 {a: 1, b: 2}\n" + "".join(
+    f"a{k}: &a{k} {{<<: [{', '.join([f'*a{k - 1}'] * 9)}]}}\n" for k in range(1, 12)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (BOMB, "more than 50 levels or 100000 values"),
+        (MERGED, "more than 50 levels or 100000 values"),
+        ("name: " + "[" * 5000 + "]" * 5000, "more than 50 levels"),
+        ("name: " + "[" * 200_000 + "]" * 200_000, "more than 50 levels"),
+        ("- " * 5000, "more than 50 levels"),
+        ("".join(f"k{k}: 1\n" for k in range(40_000)), "name: Field required"),
+        ("#" * (1 << 20) + "\n", "expected a file of at most 1048576"),
+    ],
+    ids=["aliases", "merged aliases", "deep", "deeper", "deep lines", "many fields", "large"],
+)
+@pytest.mark.timeout(10)
+def test_a_card_that_would_take_for_ever_is_refused_at_once(folder: Path, text: str, expected: str) -> None:
+    (folder / CARD).write_text(text)
+    assert expected in refusal(folder)
+
+
+def test_a_card_may_repeat_itself_by_aliases(folder: Path) -> None:
+    change_card(folder, lambda card: card.update(training={"a": (same := {"b": [1, 2]}), "c": same}))
+    assert "&id001" in (folder / CARD).read_text()
+    assert open_artifact(folder).card.training["c"] == {"b": [1, 2]}
+
+
+@pytest.mark.parametrize("name", [CARD, WEIGHTS, ONNX])
+def test_what_is_no_file_or_too_large_is_refused_unread(folder: Path, name: str) -> None:
+    with (folder / name).open("ab") as content:
+        content.truncate(30 * 10**9)
+    assert f"{name}: 30000000000 bytes; expected a file of at most" in refusal(folder)
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    assert f"{name}: 0 bytes; expected a file" in refusal(folder)
+    (folder / name).unlink()
+    (folder / name).symlink_to("/dev/zero")
+    assert f"{name}: 0 bytes; expected a file" in refusal(folder)
+
+
+@pytest.mark.parametrize("name", ["m" * 256, "/a" * 2500, "\0"])
+def test_names_that_no_folder_can_have_are_none(name: str) -> None:
+    with pytest.raises(ArtifactError, match="no such model folder"):
+        open_artifact(name)
+
+
+def test_links_out_of_the_root_are_refused_and_those_inside_it_followed(folder: Path, small_model: Path) -> None:
+    content = read_folder(folder, str(folder.parent))
+    (folder / ONNX).rename(folder.parent / "shared.onnx")
+    (folder / ONNX).symlink_to("../shared.onnx")
+    assert read_folder(folder, str(folder.parent)) == content
+    (folder / ONNX).unlink()
+    (folder / ONNX).symlink_to(small_model / ONNX)
+    assert read_folder(folder) == content
+    assert "model.onnx: is a link out of" in refusal(folder, lambda path: read_folder(path, str(folder.parent)))
+
+
+def test_what_was_checked_is_what_runs_though_the_file_is_exchanged_meanwhile(folder: Path) -> None:
+    window = np.random.default_rng(0).normal(size=(1, 5, 7))
+    expected, artifact = deploy(folder).predict(window).state, open_artifact(folder)
+    (folder / ONNX).write_bytes(b"another graph")
+    np.testing.assert_array_equal(OnnxModel(artifact).predict(window).state, expected)
+
+
+@pytest.mark.parametrize("location", ["weights.safetensors", "../secret", "/etc/passwd"])
+def test_a_graph_reads_no_other_files(folder: Path, location: str) -> None:
+    graph = onnx.load(folder / ONNX)
+    tensor = max(graph.graph.initializer, key=lambda each: len(each.raw_data))
+    size = len(tensor.raw_data)
+    (folder.parent / "secret").write_bytes(tensor.raw_data)
+    onnx.external_data_helper.set_external_data(tensor, location, offset=0, length=size)
+    tensor.ClearField("raw_data")
+    (folder / ONNX).write_bytes(graph.SerializeToString())
+    certify(folder)
+    assert "ONNX Runtime refuses it" in refusal(folder, deploy)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

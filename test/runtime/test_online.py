@@ -8,7 +8,7 @@ from safetensors.numpy import load_file, save_file
 
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.coefficients import SPREAD
-from dynssm_ros.runtime.online import Along, OnlineLayer, OnlineLayerCard, Seen
+from dynssm_ros.runtime.online import Along, OnlineLayer, OnlineLayerCard, Seen, load_layer, save_layer
 from dynssm_ros.vehicle import load_vehicle
 
 N = 4
@@ -182,3 +182,23 @@ def test_what_was_learned_is_kept_and_belongs_to_its_prior(tmp_path):
     state.save(file, "mine")
     with pytest.raises(ArtifactError, match="of another shape"):
         wider.load(file, "mine")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "expected"),
+    [
+        ("mean", lambda prior: prior * 1e30, "mean is as large as 1e+30; expected at most 1e+06"),
+        ("covariance", lambda prior: -prior, "covariance has the eigenvalue -0.1; expected none below zero"),
+        ("noise", lambda prior: 0.0 * prior, "noise = 0; expected variances above zero"),
+        ("mean", lambda prior: prior[:2], "mean is missing, not finite or of another shape"),
+    ],
+)
+def test_an_absurd_prior_is_refused(tmp_path, name, change, expected):
+    layer, path = make_layer(), tmp_path / "online.safetensors"
+    how = {"scale": SCALE, "vehicle": layer.vehicle, "integrator": "euler", "substeps": 1}
+    save_layer(layer, path)
+    np.testing.assert_array_equal(load_layer(path.read_bytes(), path, layer.card, **how).mean, layer.mean)
+    save_layer(dataclasses.replace(layer, **{name: change(getattr(layer, name))}), path)
+    with pytest.raises(ArtifactError) as refused:
+        load_layer(path.read_bytes(), path, layer.card, **how)
+    assert expected in str(refused.value)
