@@ -113,7 +113,6 @@ class Paper:
         return page_task(self.write)
 
     def write(self) -> None:
-        """The tables of the models, and those of the races."""
         path = Path(get_var("results", str(PAGES / "results.md")))
         results = read_results(self.plan, OUT, self.steps, f"Page written: {origin()}", self.quick)
         write(results, path)
@@ -182,7 +181,6 @@ class HiddenCauses:
         return page_task(self.write)
 
     def write(self) -> None:
-        """The rates as JSON, the figure, and the page."""
         of = [(case, read_outcome(case, OUT)) for case in self.cases]
         outcomes = [outcome for _, outcome in of if outcome is not None]
         if not outcomes:
@@ -203,7 +201,6 @@ class Matrix:
         self.trainings: dict[str, scored_cells.Training] = {}
 
     def wanted(self, name: str, is_test: bool) -> bool:
-        """Whether a cell is asked for."""
         only = self.variables.several("only")
         return (not only or name.startswith(only)) and (self.variables["part"] == "all" or not is_test)
 
@@ -260,7 +257,6 @@ class Generalisation(Matrix):
         return page_task(self.write, ["score"])
 
     def write(self) -> None:
-        """The summary as JSON, the heat map and the pages."""
         known = self.known({cell: scores.read_cell(cell, OUT) for cell in self.cells})
         write_json(OUT / "summary.json", scores_page.summary(known))
         figure = save_figure(scores_page.heat_map(known), PAGES / "generalisation.png")
@@ -314,7 +310,6 @@ class ClosedLoop(Matrix):
         return page_task(self.write_learning, ["learn"])
 
     def write(self) -> None:
-        """The summary as JSON, the figure and the page."""
         read = partial(races.read_cell, models=self.driven, out=OUT)
         known = self.known({cell: read(cell) for cell in self.cells})
         write_json(OUT / "summary.json", races_page.summary(known))
@@ -323,7 +318,6 @@ class ClosedLoop(Matrix):
         save_page(words, PAGES / f"{self.page}.md")
 
     def write_learning(self) -> None:
-        """The page of the cells that were driven faster every lap, with its figure."""
         known = self.known({cell: races.read_learning(cell, OUT) for cell in self.cells})
         figure = save_figure(races_page.learned_laps(known), PAGES / "lap_learning.png")
         words = races_page.learning_page(known, self.variables.changed, figure, self.cells)

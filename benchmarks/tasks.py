@@ -30,12 +30,10 @@ class NotingDB(JsonDB):  # type: ignore[misc]
     """doit's JSON state, written after every task; a kill costs the task under way."""
 
     def set(self, task_id: str, dependency: str, value: Any) -> None:
-        """Notes a value of a task."""
         super().set(task_id, dependency, value)
         self.dump()
 
     def dump(self) -> None:
-        """Writes the file aside and renames it."""
         with replacing(self.name) as aside:
             aside.write_text(self.codec.encode(self._db), encoding="utf-8")
 

@@ -135,7 +135,6 @@ class _Predicting:
         self.done = Fuzzed()
 
     def step(self) -> None:
-        """The messages of a period."""
         for topic, message, spoilt in self.traffic.step():
             self.done.messages += 1
             self.done.spoilt += spoilt

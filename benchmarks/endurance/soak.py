@@ -114,7 +114,6 @@ class _Drive:
         run.sent.clear()
 
     def step(self, run: LiveRun, done: Soaked) -> None:
-        """Sends the messages of a period."""
         for topic, message, spoilt in self.traffic.step():
             try:
                 raw = bytes(_TYPESTORE.serialize_cdr(message, message.__msgtype__))
@@ -149,7 +148,6 @@ class _Swapper:
         self.due = time.monotonic() + every
 
     def step(self) -> None:
-        """Asks for a swap if one is due."""
         if len(self.models) < 2 or time.monotonic() < self.due:
             return
         self.due += self.every

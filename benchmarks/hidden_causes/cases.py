@@ -63,13 +63,11 @@ class Case:
 
     @property
     def name(self) -> str:
-        """For humans."""
         where = f"{self.plant}/{self.track}/{1 / self.sampling_time:.0f}Hz"
         return f"{'+'.join(self.hidden) or 'none'}/{where}/{self.seed}"
 
     @property
     def road(self) -> Track:
-        """The track as it is driven."""
         return load_track(self.track).scaled(TRACKS[self.track])
 
 
@@ -106,7 +104,6 @@ def cases(seed: int, count: int, effects: Sequence[str] = tuple(EFFECTS), health
 
 
 def _can_be(effect: str, plant: PlantKind) -> bool:
-    """Whether an effect can be hidden in a car."""
     return plant != multi_body.NAME or effect in multi_body.HIDES
 
 

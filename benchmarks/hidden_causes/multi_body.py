@@ -85,17 +85,14 @@ class MultiBody:
 
     @property
     def pose(self) -> Pose:
-        """Where it is."""
         return Pose(self._x[0], self._x[1], self._x[_THETA])
 
     @property
     def state(self) -> State:
-        """How it moves."""
         return State(self._x[_V_X], self._x[_V_Y], self._x[_OMEGA])
 
     @property
     def measured(self) -> State:
-        """What its sensors say of that."""
         changed = self._changed
         late = round(changed("odometry_delay", "delay") / RK4_STEP)
         v_x, v_y, omega = self._past[max(-1 - late, -len(self._past))]
@@ -126,7 +123,6 @@ class MultiBody:
             self._past.append(self.state)
 
     def _wanted(self, applied: Applied) -> Applied:
-        """What wheels and engine are asked for."""
         changed = self._changed
         delta = applied.delta * changed("steering_gain", "factor") + changed("steering_offset", "offset")
         bent = changed("steering_curve", "quadratic") * delta + changed("steering_curve", "cubic") * delta * delta

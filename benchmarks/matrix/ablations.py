@@ -53,7 +53,6 @@ class Earned(NamedTuple):
 
     @property
     def earns(self) -> bool:
-        """Whether it is worth keeping."""
         return max(self.one_step, self.ade) > 1.0 + _EARNS
 
 

@@ -11,6 +11,7 @@ from argparse import ArgumentTypeError
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product, starmap
 
 import numpy as np
 
@@ -57,7 +58,6 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Of the cell."""
         return f"{self.car}-{self.track[0]}_{self.track[1]}-{self.change}"
 
     def _drawn(self, what: str, options: int) -> int:
@@ -70,27 +70,22 @@ class Cell:
 
     @property
     def plant(self) -> PlantKind:
-        """How the car is simulated."""
         return PLANTS[self._drawn("plant", len(PLANTS))]
 
     @property
     def objective(self) -> Objective:
-        """Of the controller."""
         return OBJECTIVES[self._drawn("objective", len(OBJECTIVES))]
 
     @property
     def noise(self) -> str:
-        """Level of the sensors' noise."""
         return list(NOISE_LEVELS)[self._drawn("noise", len(NOISE_LEVELS))]
 
     @property
     def late(self) -> bool:
-        """Whether measurements are a step late."""
         return bool(self._drawn("delay", 2))
 
     @property
     def sensing(self) -> Sensing:
-        """What comes between the car and its controller."""
         return sensing(self.car, NOISE_LEVELS[self.noise], self.late, self.track[1] + _SEEDS * self.again)
 
     @property
@@ -100,14 +95,12 @@ class Cell:
 
     @property
     def effects(self) -> dict[str, dict[str, float]]:
-        """What is hidden, by name, with parameters."""
         if self.change != "drag":
             return CHANGES[self.change]
         return {"drag": {"coefficient": 0.5 * simulated_car(self.car).coefficients["C_r2"].nominal}}
 
     @property
     def road(self) -> Track:
-        """The track."""
         road = variation(load_track(self.track[0]), self.track[1]).scaled(_SCALES[self.car])
         half = np.full(len(road.width_left), _WIDTHS[self.car] / 2)
         return replace(road, width_left=half, width_right=half)
@@ -123,10 +116,7 @@ def sensing(car: str, level: float, late: bool, seed: int = 0) -> Sensing:
 
 def cells() -> Iterator[Cell]:
     """All of them."""
-    for car in CARS:
-        for track in TRACKS:
-            for change in CHANGES:
-                yield Cell(car, track, change)
+    return starmap(Cell, product(CARS, TRACKS, CHANGES))
 
 
 def named(name: str) -> Cell:

@@ -11,6 +11,7 @@ import hashlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +76,6 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Of the cell."""
         return f"{self.training.name}-{self.change}"
 
     @property
@@ -96,32 +96,26 @@ class Cell:
 
 def simulated_cells() -> Iterator[Cell]:
     """All of them."""
-    for name, car in CARS.items():
-        for plant in PLANTS:
-            for level in NOISE_LEVELS:
-                training = Training(f"{name}-{plant}-{level}", car.vehicle, (name, plant, level))
-                for change in CHANGES:
-                    yield Cell(training, change)
+    for name, plant, level, change in product(CARS, PLANTS, NOISE_LEVELS, CHANGES):
+        yield Cell(Training(f"{name}-{plant}-{level}", CARS[name].vehicle, (name, plant, level)), change)
 
 
 def measured_cells() -> Iterator[Cell]:
     """Those of the real logs."""
-    whole = (("putnam", 16.0, 1e9),)
-    one, two, three = _PUTNAM_LAPS
-    for lap, (start, end) in {"lap_1": (one, two), "lap_2": (two, three), "lap_3": (three, 1e9)}.items():
-        rest = Training(f"putnam-without-{lap}", "av21", logs=(("putnam", 16.0, start), ("putnam", end, 1e9)))
-        yield Cell(rest, lap, (("putnam", start, end),))
-    slow = Training("putnam-slow", "av21", logs=(("putnam:slow", 16.0, 1e9),))
-    yield Cell(slow, "fast", (("putnam:fast", *whole[0][1:]),))
-    right = Training("putnam-right", "av21", logs=(("putnam:right", 16.0, 1e9),))
-    yield Cell(right, "left", (("putnam:left", *whole[0][1:]),))
-    every = 0.0, 1e9
-    free, circles = ("free_driving_1002", *every), ("circles_1223", *every)
-    yield Cell(Training("dart-free", RACER, logs=(free,)), "circles_1223", (circles,))
-    yield Cell(Training("dart-circles", RACER, logs=(circles,)), "free_driving_1002", (free,))
-    rubber = Training("dart-rubber", RACER, logs=(free, circles))
+    start, end = 16.0, 1e9
+    gates = (*_PUTNAM_LAPS, end)
+    for k, (begins, ends) in enumerate(pairwise(gates), 1):
+        rest = (("putnam", start, begins), ("putnam", ends, end))
+        yield Cell(Training(f"putnam-without-lap_{k}", "av21", logs=rest), f"lap_{k}", (("putnam", begins, ends),))
+    for way, other in (("slow", "fast"), ("right", "left")):
+        driven = Training(f"putnam-{way}", "av21", logs=((f"putnam:{way}", start, end),))
+        yield Cell(driven, other, ((f"putnam:{other}", start, end),))
+    free, circles = (("free_driving_1002", 0.0, end),), (("circles_1223", 0.0, end),)
+    yield Cell(Training("dart-free", RACER, logs=free), "circles_1223", circles)
+    yield Cell(Training("dart-circles", RACER, logs=circles), "free_driving_1002", free)
+    rubber = Training("dart-rubber", RACER, logs=free + circles)
     for log in ("free_driving_1027", "circles_right_03_ramp_1653", "tape_and_tiles_right_03_ramp_1758"):
-        yield Cell(rubber, log, ((log, *every),), marked=True)
+        yield Cell(rubber, log, ((log, 0.0, end),), marked=True)
 
 
 def cells(data: Path) -> list[Cell]:

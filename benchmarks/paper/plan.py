@@ -48,27 +48,25 @@ VehicleName = Annotated[str, AfterValidator(_of_the_repository)]
 class Log(StrictModel):
     """A race log."""
 
-    bag: str = Field(description="rosbag2 folder or file, relative to the data folder")
-    signals: str = Field(description="signal map, by name")
-    rate: float = Field(gt=0, description="of the recording (Hz)")
-    commands: Commands | None = Field(default=None, description="source of the command inputs; null: the signal map's")
+    bag: str  # rosbag2 folder or file, relative to the data folder
+    signals: str  # signal map, by name
+    rate: float = Field(gt=0)  # of the recording (Hz)
+    commands: Commands | None = None  # source of the command inputs; null: the signal map's
 
 
 class Drive(StrictModel):
     """A simulated drive; fields as the options of ``dynssm simulate``."""
 
     vehicle: str
-    effects: tuple[EffectEntry, ...] = Field(default=(), description="physics that the models do not know of")
-    track: str = Field(description="built-in name, or file relative to the data folder")
-    duration: float = Field(gt=0, description="(s)")
+    effects: tuple[EffectEntry, ...] = ()  # physics that the models do not know of
+    track: str  # built-in name, or file relative to the data folder
+    duration: float = Field(gt=0)  # (s)
     plant: PlantKind
     line: LineKind = "centre"
     seed: int = 0
     aggressiveness: float = Field(default=0.95, gt=0)
     variation: float = Field(default=0.5, ge=0, le=1)
-    noise: tuple[float, float, float] = Field(
-        default=(0.0, 0.0, 0.0), description="on v_x, v_y, omega (m/s, m/s, rad/s)"
-    )
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)  # on v_x, v_y, omega (m/s, m/s, rad/s)
 
 
 class Range(StrictModel):
@@ -80,9 +78,7 @@ class Range(StrictModel):
     )
     at_least: float | None = None
     below: float | None = None
-    outside: tuple[float, float] | None = Field(
-        default=None, description="not from the first value to below the second"
-    )
+    outside: tuple[float, float] | None = None  # not from the first value to below the second
 
     @model_validator(mode="after")
     def _limited(self) -> Range:
@@ -111,44 +107,34 @@ class Split(StrictModel):
 class Car(StrictModel):
     """A car, and the models whose names have a meaning in the tables."""
 
-    vehicle: VehicleName = Field(
-        description="vehicle that is calibrated on each training part: name, or file relative to the repository"
-    )
+    vehicle: VehicleName  # vehicle that is calibrated on each training part: name, or file relative to the repository
     start: Literal["vehicle", "mid_range"] = Field(
         default="vehicle", description="where calibration starts: the file's nominal values, or mid-range"
     )
-    min_speed: float = Field(ge=0, description="rows that are slower are not calibrated on (m/s)")
-    reference: Literal["real", "sim", "other"] = Field(
-        description="which of the paper's data sets is comparable, if any"
-    )
-    full: str = Field(
-        description="the model that ships; models named after it, with an underscore and more, are its ablations"
-    )
-    paper: str | None = Field(default=None, description="the paper's model; its ablations are named likewise")
+    min_speed: float = Field(ge=0)  # rows that are slower are not calibrated on (m/s)
+    reference: Literal["real", "sim", "other"]  # which of the paper's data sets is comparable, if any
+    full: str  # the model that ships; models named after it, with an underscore and more, are its ablations
+    paper: str | None = None  # the paper's model; its ablations are named likewise
     ddm: str
     fthd: str | None = None
-    coefficients: str = Field(description="study that the coefficient table is about")
+    coefficients: str  # study that the coefficient table is about
 
 
 class Model(StrictModel):
     """A model: a shipped model file, or changes of one or of another model of the plan; and how it is trained."""
 
-    base: str | None = Field(
-        default=None, description="model of the plan, else shipped file; null: the file of its name"
-    )
-    change: dict[str, Any] = Field(default_factory=dict, description="fields instead of the base's, block by block")
-    variant: str = Field(default="", description="of an ablation: what it is, as the table shows it; empty: its name")
-    vehicle: VehicleName | None = Field(
-        default=None, description="vehicle as it is, name or file; null: the calibrated car"
-    )
-    seeds: int | None = Field(default=None, ge=1, description="at most so many, also where a study wants more")
+    base: str | None = None  # model of the plan, else shipped file; null: the file of its name
+    change: dict[str, Any] = Field(default_factory=dict)  # fields instead of the base's, block by block
+    variant: str = ""  # of an ablation: what it is, as the table shows it; empty: its name
+    vehicle: VehicleName | None = None  # vehicle as it is, name or file; null: the calibrated car
+    seeds: int | None = Field(default=None, ge=1)  # at most so many, also where a study wants more
 
 
 class Study(StrictModel):
     """Models that are compared on some splits."""
 
     title: str
-    text: str = Field(description="what is asked, in a sentence or two")
+    text: str  # what is asked, in a sentence or two
     remark: Annotated[str, AfterValidator(_no_results)] = Field(
         default="", description="what its authors make of the outcome in words, with the date"
     )
@@ -164,35 +150,35 @@ class Study(StrictModel):
 class Sweep(StrictModel):
     """A model that is trained with several learning rates, without restarts; which is best, validation windows say."""
 
-    split: str = Field(description="on whose training part")
+    split: str  # on whose training part
     commands: Commands
     model: str
-    rates: tuple[float, ...] = Field(min_length=2, description="learning rates, in order")
-    seeds: int = Field(default=1, ge=1, description="trainings with each; more than one where one would mislead")
+    rates: tuple[float, ...] = Field(min_length=2)  # learning rates, in order
+    seeds: int = Field(default=1, ge=1)  # trainings with each; more than one where one would mislead
 
 
 class Race(StrictModel):
     """Laps in closed loop; fields as the options of ``dynssm race``."""
 
     title: str
-    text: str = Field(description="what is asked, in a sentence or two")
+    text: str  # what is asked, in a sentence or two
     vehicle: str
-    effects: tuple[EffectEntry, ...] = Field(default=(), description="physics that only the model true knows of")
-    track: str = Field(description="built-in name, or file relative to the data folder")
-    lap_length: float | None = Field(default=None, gt=0, description="that it is scaled to (m)")
+    effects: tuple[EffectEntry, ...] = ()  # physics that only the model true knows of
+    track: str  # built-in name, or file relative to the data folder
+    lap_length: float | None = Field(default=None, gt=0)  # that it is scaled to (m)
     plant: PlantKind = "euler"
     objective: Objective = "tracking"
-    line: str = Field(default="racing", description="centre, racing, or file relative to the data folder")
+    line: str = "racing"  # centre, racing, or file relative to the data folder
     speed_scale: float = Field(default=1.0, gt=0)
-    horizon: int | None = Field(default=None, ge=2, description="null: as the car needs")
-    offset_free: bool = Field(default=False, description="whether what a model mispredicts is added to it")
+    horizon: int | None = Field(default=None, ge=2)  # null: as the car needs
+    offset_free: bool = False  # whether what a model mispredicts is added to it
     laps: int = Field(default=1, ge=1)
-    speed: float | None = Field(default=None, ge=0, description="at the start (m/s); null: the line's own")
-    split: str = Field(description="on whose training part the models were trained, with seed 0")
+    speed: float | None = Field(default=None, ge=0)  # at the start (m/s); null: the line's own
+    split: str  # on whose training part the models were trained, with seed 0
     commands: Commands = "topics"
     models: tuple[str, ...] = Field(min_length=1)
-    paper: str | None = Field(default=None, description="the paper's closed-loop table to set beside: a track")
-    ablation: bool = Field(default=False, description="whether it is the paper's closed-loop ablation")
+    paper: str | None = None  # the paper's closed-loop table to set beside: a track
+    ablation: bool = False  # whether it is the paper's closed-loop ablation
     figures: tuple[Literal["trajectories", "profiles", "forces", "coefficients"], ...] = ()
 
 
@@ -202,7 +188,7 @@ class Quick(StrictModel):
     epochs: int = Field(ge=1)
     seeds: int = Field(ge=1)
     stride: int = Field(ge=1)
-    duration: float = Field(gt=0, description="longest drive (s)")
+    duration: float = Field(gt=0)  # longest drive (s)
 
 
 class Plan(StrictModel):
@@ -216,9 +202,9 @@ class Plan(StrictModel):
     studies: dict[str, Study]
     sweeps: dict[str, Sweep] = Field(default_factory=dict)
     races: dict[str, Race] = Field(default_factory=dict)
-    stride: int = Field(ge=1, description="rollouts start at every stride-th row")
-    calls: int = Field(ge=1, description="predictions of each model that are timed")
-    epochs: int | None = Field(default=None, ge=1, description="in each stage, instead of the model files'")
+    stride: int = Field(ge=1)  # rollouts start at every stride-th row
+    calls: int = Field(ge=1)  # predictions of each model that are timed
+    epochs: int | None = Field(default=None, ge=1)  # in each stage, instead of the model files'
     quick: Quick
 
     @model_validator(mode="after")
@@ -248,7 +234,6 @@ class Plan(StrictModel):
         return self
 
     def _trained(self, split: str, commands: Commands) -> list[str]:
-        """Models that any study trains there."""
         return [
             model
             for study in self.studies.values()
@@ -277,16 +262,13 @@ class Plan(StrictModel):
         return load_model_config(base, change | {"name": name})
 
     def car(self, study: Study) -> Car:
-        """The car of a study."""
         return self.cars[self.splits[study.splits[0]].car]
 
     def seeds(self, study: Study, model: str) -> range:
-        """Seeds with which ``model`` is trained in a study."""
         limit = self.models[model].seeds
         return range(study.seeds if limit is None else min(limit, study.seeds))
 
     def tests(self, study: Study) -> tuple[str, ...]:
-        """What is predicted in a study, by the names to show."""
         return tuple(test for split in study.splits for test in self.splits[split].test)
 
     def with_tests(self, recordings: Iterable[str]) -> Plan:

@@ -84,7 +84,6 @@ def _over_pace(results: Results, names: list[str]) -> Figure:
 
 
 def _race(results: Results, name: str, pictures: Mapping[str, str]) -> dict[str, Any]:
-    """What the page says of a race."""
     race, driven = results.plan.races[name], results.races.get(name)
     about: dict[str, Any] = {"plan": race, "driven": driven, "pictures": pictures}
     if driven is None:
@@ -126,7 +125,6 @@ def race_table(race: Race, driven: Entry, published: Mapping[str, Entry]) -> Tab
 
 
 def _published(results: Results, race: Race) -> dict[str, Entry]:
-    """The paper's rows for a race."""
     rows = dict(results.reference["closed_loop"][race.paper]) if race.paper else {}
     if race.ablation:
         rows |= {f"DynSSM, {name}": row for name, row in results.reference["closed_loop_ablation"].items()}

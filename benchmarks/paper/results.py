@@ -50,7 +50,6 @@ class Results:
 
     @property
     def comparisons(self) -> list[Comparison]:
-        """One for each study."""
         return [Comparison(self, name) for name in self.plan.studies]
 
 
@@ -77,12 +76,10 @@ class Comparison:
 
     @property
     def label(self) -> str:
-        """Title of the study, with its command protocol."""
         return f"{self.study.title}, {self.study.commands}"
 
     @property
     def tests(self) -> tuple[str, ...]:
-        """Tests with results."""
         return tuple(test for test in self.planned if test in self._tests)
 
     @property
@@ -91,7 +88,6 @@ class Comparison:
         return tuple(model for model, runs in self._runs.items() if runs)
 
     def those(self, *models: str | None) -> list[str]:
-        """Those of some models that have results."""
         return [model for model in models if model in self.models]
 
     @property
@@ -117,7 +113,6 @@ class Comparison:
         return tuple(model for model in self.models if model not in left_out)
 
     def seeds(self, model: str) -> int:
-        """Number of trainings that the results of ``model`` are of."""
         return len(self._runs[model])
 
     def test(self, name: str) -> Entry:
@@ -125,15 +120,12 @@ class Comparison:
         return self._tests[name]
 
     def entries(self, model: str) -> list[Entry]:
-        """Those of all trainings and tests."""
         return [entry for run in self._runs[model] for entry in run]
 
     def rmse(self, model: str) -> list[SeedSpread]:
-        """One-step RMSE of each state."""
         return self._pooled(model, lambda entry: by_name(entry["rmse"]), lambda each: np.sqrt((each**2).mean(axis=0)))
 
     def max_error(self, model: str) -> list[SeedSpread]:
-        """Largest one-step error of each state."""
         return self._pooled(model, lambda entry: by_name(entry["max_error"]), lambda each: each.max(axis=0))
 
     def displacement(self, model: str) -> list[SeedSpread]:

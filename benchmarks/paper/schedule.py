@@ -87,7 +87,6 @@ class Site:
 
     @property
     def split(self) -> Split:
-        """The split itself."""
         return self.plan.splits[self.name]
 
     @property
@@ -96,7 +95,6 @@ class Site:
 
     @property
     def recordings(self) -> list[str]:
-        """Those of its parts."""
         return [part.recording for part in (self.split.train, *self.split.test.values())]
 
     @property
@@ -106,11 +104,9 @@ class Site:
 
     @property
     def scores(self) -> str:
-        """Where the scores lie."""
         return f"scores/{self}.json"
 
     def model(self, name: str, seed: int) -> str:
-        """Where a training lies."""
         return f"models/{self}/{name}.{seed}"
 
     def rate(self, sweep: Sweep, rate: float, seed: int) -> str:
@@ -169,7 +165,6 @@ class Site:
         )
 
     def rates(self, sweep: Sweep) -> Iterator[Train]:
-        """The trainings of a sweep."""
         for seed in range(sweep.seeds):
             plain = self._training(sweep.model, seed, {})
             for rate in sweep.rates:

@@ -81,7 +81,6 @@ class FthdConfig(DdmConfig):
 
     @property
     def start(self) -> DdmConfig:
-        """The DDM."""
         return self.fine_tuning.starts_from
 
     def with_training(self, **changes: Any) -> Self:
@@ -114,7 +113,6 @@ class FTHD(DDM):
             layer.requires_grad_(False)
 
     def terms(self, window: Tensor, target: Tensor, loss: LossConfig, scales: Scales) -> dict[str, Tensor]:
-        """The supervised terms, and the physics loss."""
         before, output = consecutive(self, window)
         disagreement = physics_loss(self, window, before, output, scales[0])
         return objective(output, target, loss, scales) | {"physics": self.fine_tuning.physics * disagreement}
