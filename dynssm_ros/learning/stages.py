@@ -44,27 +44,20 @@ class Trained:
     """The outcome of a training."""
 
     config: ModelConfig
-    vehicle: Vehicle
-    """The car as the model has it; see :meth:`PhysicsConfig.modelled`."""
+    vehicle: Vehicle  # the car as the model has it; see PhysicsConfig.modelled
     recording: Recording
     model: TrainableModel
     normalisation: Normalisation
-    history: History
-    """Mean loss per epoch: ``train/TERM`` and ``validation/TERM`` for each of ``COMPONENTS``."""
+    history: History  # mean loss per epoch: train/TERM and validation/TERM for each of COMPONENTS
     best_epoch: int
     validation_rmse: tuple[float, float, float]
     unexplained: float
     """Mean squared error on validation windows over that of predicting the mean change, mean of the states."""
-    windows: tuple[int, int]
-    """Number of training and validation windows."""
-    resumed_from: int = 0
-    """Epochs that were already done, of all stages together."""
-    restarts: int = 0
-    """Times that it began anew, out of a plateau."""
-    start: Trained | None = None
-    """The model that fine-tuning started from."""
-    features: OnlineFeatures | None = None
-    """What the online layer sees; ``None`` without one, as the next."""
+    windows: tuple[int, int]  # number of training and validation windows
+    resumed_from: int = 0  # epochs that were already done, of all stages together
+    restarts: int = 0  # times that it began anew, out of a plateau
+    start: Trained | None = None  # the model that fine-tuning started from
+    features: OnlineFeatures | None = None  # what the online layer sees; None without one, as the next
     online: OnlineLayer | None = None
     network_gain: float | None = None
     """Share of the online layer's error on left-out parts that the network takes away; ``None`` without either."""
@@ -95,10 +88,8 @@ class _Stages:
     device: str
     progress: NamedProgress | None
     calibrate: Calibrate | None
-    files: list[Path]
-    """The checkpoint of each stage."""
-    epochs: tuple[int, ...]
-    """Of each stage at most."""
+    files: list[Path]  # the checkpoint of each stage
+    epochs: tuple[int, ...]  # of each stage at most
 
     def run(
         self, data: Recording, config: ModelConfig, stage: int, name: str, integrator: Integrator | None

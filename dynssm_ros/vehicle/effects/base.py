@@ -53,8 +53,7 @@ class Parameter:
     """It says where or how the effect acts and not how much. The effect vanishes with its other parameters, at whatever
     value this one has."""
     context: tuple[str, ...] = ()  # the signals that the effect needs once this parameter is not neutral
-    local: bool = False
-    """It says how much the effect acts within the section of the lap that ``centre`` and ``length`` give."""
+    local: bool = False  # it says how much the effect acts within the section of the lap that centre and length give
     tried: tuple[float, ...] = ()  # values at which a search tries a parameter that shapes
 
     @property
