@@ -103,6 +103,7 @@ class Effect(StageEffect):
     """How far it is off neutral in a car that is badly set up: just noticeable in ordinary laps, and large."""
     DIRECTIONS: ClassVar[tuple[float, ...]] = ()
     """To which sides of neutral it is met in a car that can be driven; empty: those that its bounds admit."""
+    LEAST: ClassVar[float] = 0.0  # how far it is off neutral in any car
 
     @classmethod
     def variants(cls) -> tuple[tuple[str, ...], ...]:
@@ -151,7 +152,7 @@ class Effect(StageEffect):
     @classmethod
     def least(cls, constants: VehicleConstants) -> float:
         """How far it must be off neutral to be a cause in a car of these constants; less is in any car."""
-        return 0.0
+        return cls.LEAST
 
     @property
     def parameters(self) -> dict[str, Array]:

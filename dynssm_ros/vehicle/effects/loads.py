@@ -76,12 +76,8 @@ class LoadTransfer(Effect):
     PARAMETERS = {"height": Parameter("wheelbase", -0.2, 0.4, 0.0)}
     TYPICAL = (0.012, 0.19)
     DIRECTIONS = (1.0,)  # a car that can be driven
+    LEAST = 0.01  # how well anybody knows the height of the centre of gravity
     height: Array = 0.0
-
-    @classmethod
-    def least(cls, constants: VehicleConstants) -> float:
-        """How well anybody knows the height of the centre of gravity."""
-        return 0.01
 
     def inputs(self, xp: Any, q: Motion) -> None:
         q.h_cg = at_least(q.h_cg + self.height * (q.l_f + q.l_r), 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.vehicle.effects.base import CENTRE, LAP, LENGTH, SLOWEST, Effect, Parameter, lagged, section
-from dynssm_ros.vehicle.single_track import Array, Motion, VehicleConstants, at_least
+from dynssm_ros.vehicle.single_track import Array, Motion, at_least
 
 _LEAST_GRIP = 0.1  # of the nominal, however far a drift has gone
 _LEAST_SHARE = 0.05  # squared share of the lateral force that the longitudinal one leaves at least
@@ -34,13 +34,9 @@ class Grip(Effect):
     }
     VARIANTS = (("factor",), ("factor", "similarity"))
     TYPICAL = (0.13, 0.3)
+    LEAST = _LEANS
     factor: Array = 1.0
     similarity: Array = 0.0
-
-    @classmethod
-    def least(cls, constants: VehicleConstants) -> float:
-        """What axles with two wheels lose in bends."""
-        return _LEANS
 
     def slip(self, xp: Any, q: Motion) -> None:
         scale = self.factor**-self.similarity
@@ -60,12 +56,8 @@ class FrontGrip(Effect):
     MANOEUVRE = "steady cornering up to the limit"
     PARAMETERS = {"factor": Parameter("1", 0.3, 1.7, 1.0)}
     TYPICAL = (0.1, 0.25)
+    LEAST = _LEANS
     factor: Array = 1.0
-
-    @classmethod
-    def least(cls, constants: VehicleConstants) -> float:
-        """What an axle with two wheels loses in bends."""
-        return _LEANS
 
     def tyres(self, xp: Any, q: Motion) -> None:
         q.F_fy = q.F_fy * self.factor
