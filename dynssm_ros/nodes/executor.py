@@ -5,21 +5,25 @@ Whoever asked a service whose callback fails is answered that it did not succeed
 
 from __future__ import annotations
 
+import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import Parameter, SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, await_or_execute
 from rclpy.node import Node
+from rclpy.task import Future
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.runtime.health import Level
 
+_Result = TypeVar("_Result")
 _RECENT_S = 10.0  # for which the verdict speaks of an exception
 
 
@@ -117,3 +121,40 @@ def refused(request: Any, response: Any, reason: str) -> Any:
     elif isinstance(response, SetParametersAtomically.Response):
         response.result = refusal
     return response
+
+
+def let_wait(node: Node, prepare: Callable[[list[Parameter]], Awaitable[None]]) -> None:
+    """Lets requests for parameters of ``node`` wait for ``prepare``, while all else of the node goes on.
+
+    Args:
+        node: whose parameters are set.
+        prepare: takes the parameters that are asked for.
+    """
+    alone = MutuallyExclusiveCallbackGroup()
+
+    async def prepared(callback: Callable[..., Any], request: Any, response: Any) -> Any:
+        await prepare(request.parameters)
+        return callback(request, response)
+
+    for service in node.services:
+        if service.srv_type in (SetParameters, SetParametersAtomically):
+            callback: Any = partial(prepared, service.callback)  # rclpy awaits it
+            service.callback, service.callback_group = callback, alone
+            alone.add_entity(service)
+
+
+async def in_thread(node: Node, work: Callable[[], _Result]) -> _Result:
+    """What ``work`` returns in a thread of its own, while the executor of ``node`` serves others."""
+    future: Future = Future()
+
+    def act() -> None:
+        try:
+            future.set_result(work())
+        except Exception as error:
+            future.set_exception(error)
+        if (executor := node.executor) is not None:
+            executor.wake()
+
+    threading.Thread(target=act, daemon=True).start()
+    result: _Result = await future
+    return result

@@ -7,6 +7,7 @@ it already predicts and learns, but publishes only its diagnostics: a stand-by t
 
 from __future__ import annotations
 
+import os
 import pathlib
 import time
 from functools import partial
@@ -15,12 +16,15 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.nodes.display import Markers, frame_sender
+from dynssm_ros.nodes.executor import in_thread, let_wait
 from dynssm_ros.nodes.managed import ManagedNode
 from dynssm_ros.nodes.support import (
     describe,
@@ -34,10 +38,11 @@ from dynssm_ros.nodes.support import (
     set_pose,
     set_stamp,
 )
-from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.health import Health
+from dynssm_ros.runtime.artifact import parse_artifact, read_folder
+from dynssm_ros.runtime.health import Health, Level
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
+from dynssm_ros.runtime.trial import try_model
 from dynssm_ros.runtime.wiring import Wiring
 from dynssm_ros.signals.decoding import TopicDecoder, header_stamp_ns, live_decoders
 from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, planar_covariance
@@ -89,6 +94,8 @@ class PredictorNode(ManagedNode):
             self, "diagnostics_period", 1.0, "Time between /diagnostics (s).", (0.1, 60.0), read_only=True
         )
         self._swap: OnnxModel | None = None
+        self._tried: dict[str, OnnxModel | UserError] = {}
+        let_wait(self, self._try_models)
         self._prediction = Odometry()
         self._prediction.pose.covariance = planar_covariance(None)
         self._adapted = JointState(name=list(COEFFICIENTS))
@@ -102,8 +109,7 @@ class PredictorNode(ManagedNode):
         if not path:
             raise ConfigurationError("parameter model: not set; expected a model folder, e.g. -p model:=out/model")
         self._predictor = Predictor(self._open(path), load_signal_map(self._signals), self._max_age, self._online)
-        if self._state and pathlib.Path(self._state).exists():
-            self._predictor.load_online(pathlib.Path(self._state))
+        self._notice = self._load_state(pathlib.Path(self._state)) if self._state else ""
         self._publish_prediction = output(self, Odometry, PREDICTION_TOPIC).publish
         self._publish_parameters = output(self, JointState, PARAMETERS_TOPIC).publish
         self._publish_horizon = output(self, Path, HORIZON_TOPIC).publish
@@ -121,18 +127,38 @@ class PredictorNode(ManagedNode):
             f"{model.name} ({model.parameters} parameters): {model.H} rows of {model.T_s:g} s, commands {model.commands}"
         )
 
-    def _open(self, path: str) -> OnnxModel:
+    def _open(self, path: str, rows: Vector | None = None) -> OnnxModel:
         """The model in a folder.
+
+        Args:
+            path: of the folder.
+            rows: that it is tried on in a process of its own before, to take the place of the present model.
 
         Raises:
             ConfigurationError: the folder is not below ``model_root``.
             ArtifactError: there is no usable model in it.
         """
-        if self._root and not pathlib.Path(path).resolve().is_relative_to(pathlib.Path(self._root).resolve()):
+        if self._root and not pathlib.Path(os.path.realpath(path)).is_relative_to(os.path.realpath(self._root)):
             raise ConfigurationError(
                 f"{path}: is not below {self._root}; expected a folder in it (parameter model_root)"
             )
-        return OnnxModel(open_artifact(path))
+        files = read_folder(path, self._root)
+        if rows is not None:
+            try_model(pathlib.Path(path), files, self._predictor.model.card, rows)
+        return OnnxModel(parse_artifact(pathlib.Path(path), files))
+
+    async def _try_models(self, parameters: list[ParameterMessage]) -> None:
+        """Opens and tries the models that are asked for, while the node goes on predicting."""
+        for parameter in parameters:
+            if parameter.name == "model" and self.prepared:
+                path = expanded(parameter.value.string_value)
+                self._tried[path] = await in_thread(self, partial(self._try, path, self._predictor.recent()))
+
+    def _try(self, path: str, rows: Vector) -> OnnxModel | UserError:
+        try:
+            return self._open(path, rows)
+        except UserError as error:
+            return error
 
     def _listen(self) -> None:
         """Subscribes to what the signal map names, none of which may be silent for longer than ``max_age`` or its gap."""
@@ -215,12 +241,15 @@ class PredictorNode(ManagedNode):
         return int(self.get_clock().now().nanoseconds) if stamp is None else stamp
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Opens a new model before it is accepted; a bad one changes nothing."""
+        """Accepts a new model that was opened and tried; a bad one changes nothing."""
         self._swap = None  # what was refused with others is not to be installed by a later set
         for parameter in parameters:
             if parameter.name == "model" and self.prepared:
+                path = expanded(parameter.value)
                 try:
-                    model = self._open(expanded(parameter.value))
+                    model = self._tried.pop(path, None) or self._try(path, self._predictor.recent())
+                    if isinstance(model, UserError):
+                        raise model
                     self._predictor.check_swap(model)
                 except UserError as error:
                     self.get_logger().error(str(error))
@@ -240,6 +269,27 @@ class PredictorNode(ManagedNode):
                 f"model swapped: {self._predictor.model.name} from {self._predictor.model.artifact.path}"
             )
 
+    def _load_state(self, path: pathlib.Path) -> str:
+        """Goes on from what was learned before, if that is there; else from the prior, and says why.
+
+        What was learned is a convenience: a file that cannot be used is set aside, and the node predicts.
+        """
+        if not os.path.lexists(path):
+            return ""
+        try:
+            self._predictor.load_online(path)
+        except UserError as error:
+            words = f"{error}; learns from the prior"
+            if self._predictor.online is not None and (path.is_file() or path.is_fifo()):
+                try:
+                    path.rename(f"{path}.bad")
+                    words += f"; set aside as {path.name}.bad"
+                except OSError as refusal:
+                    words += f"; cannot be set aside ({refusal.strerror})"
+            self.get_logger().warning(words)
+            return words
+        return ""
+
     def keep(self) -> None:
         """Writes what the online layer has learned, if a file is named for it."""
         if self._state:
@@ -253,6 +303,8 @@ class PredictorNode(ManagedNode):
         self._health.wiring = self._wiring.verdict()
         self._health.publishers = {topic: self.count_publishers(topic) for topic in self._health.topics}
         level, words = self._health.verdict(now)
+        if self._notice:
+            level, words = max(level, Level.WARN), f"{words}; {self._notice}"
         if not self.active:
             words = f"inactive, publishes nothing: {words}"
         values = self._predictor.figures() | self._health.values(now)

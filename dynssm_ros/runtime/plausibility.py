@@ -6,15 +6,17 @@ A jump is believed when a second sample confirms it, as after a collision or whe
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.limits import vehicle_limits
 
 _BEYOND = 1.5  # times a limit
@@ -23,6 +25,7 @@ _HARD = 4.0  # times the car's accelerations: kerbs, hits
 _NOISE = 0.5  # jump that is no sign of anything, in units of the car's own speed and yaw rate
 _COLUMNS = {"throttle_feedback": "r_fb", "steering_feedback": "delta_fb"}
 _COMMANDED = {"throttle_command", "steering_command"}  # not measured: a controller may ask for anything
+_SINGLE = 1e-6  # rounding of what a graph computes
 _ACTUATOR_RANGE_S = 0.01  # an actuator that crosses its range faster than this, does not
 
 
@@ -91,6 +94,10 @@ class Plausibility:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._ranges = ranges(vehicle)
+        rounding = _SINGLE * np.maximum(np.abs(vehicle.lower), np.abs(vehicle.upper))
+        self._lower, self._upper = vehicle.lower - rounding, vehicle.upper + rounding
+        self.top = self._ranges["v_x"].high if self._ranges else 0.0
+        """Largest plausible speed (m/s); 0 where it is not known."""
         self.last = ""
         """What was refused last, in words."""
         self.forget()
@@ -130,6 +137,40 @@ class Plausibility:
             self._suspect.pop(name, None)
             self._accepted[name] = stamp, value
         return refusal
+
+    def of_prediction(
+        self,
+        now: Iterable[float],
+        following: Iterable[float],
+        T_s: float,
+        *,
+        variance: Vector | None,
+        theta: Vector | None,
+    ) -> str:
+        """What is wrong with a prediction, in words; empty if the car can do it.
+
+        Args:
+            now: measured ``v_x, v_y, omega``.
+            following: predicted, ``T_s`` later.
+            T_s: sampling time (s).
+            variance: stated, ``(3,)``, as far as the model states it.
+            theta: coefficients ``(17,)``, as far as it has them.
+        """
+        for name, before, after in zip(STATE_SIGNALS, now, following, strict=True):
+            limit = self._ranges.get(name)
+            if limit is None:
+                continue
+            if not limit.low <= after <= limit.high:
+                return f"predicted {name} = {after:.4g}; expected {limit.low:.4g} to {limit.high:.4g}"
+            if abs(after - before) > limit.noise + limit.rate * T_s:
+                return f"predicted {name} = {after:.4g} after {before:.4g}"
+        if variance is not None and variance.min() <= 0:
+            return f"predicted variance {variance.min():.4g}; expected more than zero"
+        if theta is not None and ((theta < self._lower) | (theta > self._upper)).any():
+            beyond = np.maximum(self._lower - theta, theta - self._upper)
+            k = int(np.argmax(beyond))
+            return f"{COEFFICIENTS[k]} = {theta[k]:.4g}; expected {self._lower[k]:.4g} to {self._upper[k]:.4g}"
+        return ""
 
 
 def _can_follow(before: tuple[int, float], stamp: int, value: float, limit: Range) -> bool:

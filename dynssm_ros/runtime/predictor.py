@@ -7,6 +7,7 @@ predicts one sampling time ahead. Bad data never yields a prediction but a :clas
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -22,11 +23,15 @@ from dynssm_ros.runtime.online import OnlineState, expert_weights
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.plausibility import Plausibility
 from dynssm_ros.runtime.rollout import states_ahead, step_of
+from dynssm_ros.runtime.trial import require_same_use
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import SignalMap
 from dynssm_ros.vehicle import State, Vehicle
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose, advance_pose
+
+_RECENT_S = 10.0  # of driving, that a model to be swapped in is tried on
+_KEPT_ROWS = 2000  # as long at 200 Hz
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,7 @@ class Predictor:
         self._learner: OnlineLearner | None = None
         self._learns = online
         self._window = np.zeros((model.H, len(WINDOW_COLUMNS)))
+        self._rows: deque[tuple[int, Vector]] = deque(maxlen=_KEPT_ROWS)
         self._set_model(model)
 
     @property
@@ -79,23 +85,33 @@ class Predictor:
         """What the online layer has learned so far; ``None`` without one."""
         return None if self._learner is None else self._learner.state
 
+    def recent(self) -> Vector:
+        """What was predicted from lately, without a gap: rows T_s apart, the newest last, ``(N, 7)``."""
+        if not self._rows:
+            return np.zeros((0, len(WINDOW_COLUMNS)))
+        stamps, rows = (np.array(part) for part in zip(*self._rows, strict=True))
+        seconds = (stamps - stamps[-1]) / 1e9
+        first = int(np.max(np.flatnonzero(np.diff(seconds) > self.signal_map.max_gap), initial=-1)) + 1
+        count = 1 + int(min(-seconds[first], _RECENT_S) / self.model.T_s)
+        grid = self.model.T_s * np.arange(1.0 - count, 1.0)
+        return np.stack([np.interp(grid, seconds[first:], column[first:]) for column in rows.T], axis=1)
+
     def check_swap(self, model: OnnxModel) -> None:
         """Checks that ``model`` can take the place of the present one, and predicts from what is measured now.
 
+        How well it predicts is tried in a process of its own before: :func:`~dynssm_ros.runtime.trial.try_model`.
+
         Raises:
-            ArtifactError: it needs other commands, or what it predicts is not finite.
+            ArtifactError: it is for other commands or another car, or what it predicts is not finite or implausible.
         """
-        if model.commands != self.model.commands:
-            raise ArtifactError(
-                f"{model.artifact.path}: trained with commands '{model.commands}', but the node runs with "
-                f"'{self.model.commands}'; restart it with this model"
-            )
+        require_same_use(model, self.model.card)
         rows = np.zeros((model.H, len(WINDOW_COLUMNS)))
         recent = self._window[-model.H :]
         if np.all(np.isfinite(recent)):
             rows[-len(recent) :] = recent
             rows[: -len(recent)] = recent[0]
-        for part in model.predict(rows[None])[:4]:
+        predicted = model.predict(rows[None])
+        for part in predicted[:4]:
             if part is not None and not np.all(np.isfinite(part)):
                 raise ArtifactError(f"{model.artifact.path}: what it predicts is not finite; expected numbers")
 
@@ -171,6 +187,7 @@ class Predictor:
         refusal = self._plausibility.check(stamp, values) or self._history.add(stamp, values)
         if refusal is Refusal.JUMPED_BACK:
             self._plausibility.forget()
+            self._rows.clear()
             if self._learner is not None:
                 self._learner.reset()
                 self._learned_at = None
@@ -187,6 +204,7 @@ class Predictor:
         if isinstance(window, Refusal):
             return window
         self._window = window
+        self._rows.append((stamp, window[-1].copy()))
         predicted = self.model.predict(window[None])
         if self._learner is not None:
             self._learn(self._learner, stamp, window, predicted)
@@ -195,13 +213,17 @@ class Predictor:
         now, following = window[-1, :3].tolist(), state[0].tolist()  # a few floats are faster than a small array
         if not (_finite(following) and _finite_row(theta) and _finite_row(variance)):
             return Refusal.BAD_PREDICTION
+        stated, adapted = None if variance is None else variance[0], None if theta is None else theta[0]
+        if words := self._plausibility.of_prediction(now, following, self.model.T_s, variance=stated, theta=adapted):
+            self._plausibility.last = words
+            return Refusal.IMPLAUSIBLE_PREDICTION
         return Prediction(
             stamp + self._period,
             state[0],
             propagate_pose(values, now, following, self.model.T_s),
-            None if theta is None else theta[0],
+            adapted,
             None if self.online is None else self.online.coefficients.std,
-            None if variance is None else variance[0],
+            stated,
             0.0 if physics is None else self._residual_share(now, following, physics[0].tolist()),
         )
 

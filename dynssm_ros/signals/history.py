@@ -30,6 +30,7 @@ class Refusal(Enum):
     IMPLAUSIBLE = "a sample is beyond what the car can do"
     JUMPED = "a sample is farther from the last one than the car can move"
     BAD_PREDICTION = "the model's output is not finite"
+    IMPLAUSIBLE_PREDICTION = "the model's output is beyond what the car can do"
 
 
 class RingBuffer:

@@ -1,5 +1,6 @@
 """The online layer from training to prediction: exact cars stay exact, live equals evaluation, changed cars are learned."""
 
+import os
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -225,6 +226,13 @@ def test_a_second_stint_starts_where_the_first_ended(noisy_laps, noisy_model, tm
     np.testing.assert_array_equal(second.online.mean, first.online.mean)
     with pytest.raises(ArtifactError, match="switched off"):
         Predictor(noisy_model, SIGNALS, online=False).load_online(tmp_path / "state")
+    before = second.online.mean.copy()
+    (tmp_path / "damaged").write_bytes((tmp_path / "state").read_bytes()[:-9])
+    os.mkfifo(tmp_path / "fifo")
+    for name in ("damaged", "fifo", "none"):
+        with pytest.raises(ArtifactError, match=f"{name}: not a readable online state"):
+            second.load_online(tmp_path / name)
+    np.testing.assert_array_equal(second.online.mean, before)
 
 
 def test_a_swap_keeps_what_was_learned_only_for_the_same_prior(

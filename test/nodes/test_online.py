@@ -125,3 +125,17 @@ def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(mode
                 process.send_signal(stop)
                 assert process.wait(10) == 0, process.communicate()[1]
             assert state.is_file()
+
+
+def test_a_state_that_cannot_be_read_is_set_aside_and_the_node_begins_from_the_prior(model, stints, tmp_path: Path):
+    bag, state = tmp_path / "first", tmp_path / "online.safetensors"
+    recording_to_bag(stints[0], bag)
+    state.write_bytes(b"")
+    run = run_live(model, bag, 0.02, rate=2.5, duration=5.0, parameters={"online_state": str(state)})
+    assert len(run.predicted) > 100
+    level, words, _ = run.diagnostics[-1]
+    assert level >= 1
+    assert "not a readable online state" in words
+    assert words.endswith("; learns from the prior; set aside as online.safetensors.bad")
+    assert (tmp_path / "online.safetensors.bad").read_bytes() == b""
+    assert state.stat().st_size > 0, "what is learned now"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -225,7 +226,15 @@ def test_a_model_is_swapped_while_running_and_a_bad_one_is_refused(
     assert "no such model folder" in reason
     assert car.answered(car.step())
     other = shutil.copytree(small_model, tmp_path / "other")
-    assert car.set_parameter("model", str(other)) == (True, "")
+    answers: list[tuple[bool, str]] = []
+    asking = threading.Thread(target=lambda: answers.append(car.set_parameter("model", str(other))))
+    asking.start()
+    meanwhile = 0
+    while asking.is_alive():
+        assert car.answered(car.step()), "it predicts while the model is tried"
+        meanwhile += 1
+    assert answers == [(True, "")]
+    assert meanwhile > 10
     assert car.answered(car.step()), "the window survives the swap"
     assert car.diagnosed("")
     assert car.run.diagnostics[-1][2]["model folder"] == str(other)

@@ -189,6 +189,41 @@ def test_a_model_that_yields_nan_yields_no_prediction_until_it_is_well_again(
     np.testing.assert_allclose(outcome.state, expected.state)
 
 
+@pytest.mark.parametrize(
+    ("spoilt", "value", "words"),
+    [
+        ("state", [1e29, 0.0, 0.0], "predicted v_x = 1e+29; expected -"),
+        ("state", [2.5, 0.0, 0.1], "predicted v_x = 2.5 after 1"),
+        ("variance", [1e-4, -1e-4, 1e-4], "predicted variance -0.0001; expected more than zero"),
+        ("theta", [1e3] * 17, "= 1000; expected"),
+    ],
+)
+def test_what_the_car_cannot_do_is_no_prediction_and_named(
+    drive: Drive, monkeypatch: pytest.MonkeyPatch, spoilt: str, value: list[float], words: str
+) -> None:
+    drive.fill()
+    with monkeypatch.context() as ill:
+        well = drive.predictor.model.predict
+        ill.setattr(drive.predictor.model, "predict", lambda w: well(w)._replace(**{spoilt: np.array([value])}))
+        assert drive.step() is Refusal.IMPLAUSIBLE_PREDICTION
+    assert words in drive.predictor.figures()["implausible"]
+    assert isinstance(drive.step(), Prediction)
+
+
+def test_the_rows_of_the_last_seconds_are_those_since_the_last_gap_a_sampling_time_apart(drive: Drive) -> None:
+    assert drive.predictor.recent().shape == (0, 7)
+    drive.fill()
+    drive.stamp += 10 * 10**9
+    for k in range(40):  # odometry at 100 Hz, speeding up
+        drive.actuators()
+        drive.odometry(v_x=1.0 + 0.01 * k)
+        drive.stamp += PERIOD // 2
+    recent = drive.predictor.recent()
+    np.testing.assert_allclose(np.diff(recent[:, 0]), 0.02, atol=1e-12)
+    assert recent[-1, 0] == pytest.approx(1.39)
+    assert len(recent) == (40 - 2 * (H - 1) + 1) // 2
+
+
 def test_a_gap_in_the_odometry_restarts_the_window(drive: Drive) -> None:
     drive.fill()
     drive.stamp += round(DEFAULT.max_gap * 1e9)

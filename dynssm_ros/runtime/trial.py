@@ -1,0 +1,219 @@
+"""A model that is to take the place of another while the car drives, tried before in a process of its own.
+
+There it is opened, predicts the last seconds, and is compared with what was measured and with the calibrated car. That
+process has limits of memory and time: a model that takes all of either ends it, and not the node.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.errors import ArtifactError, UserError
+from dynssm_ros.extras import load_plugins
+from dynssm_ros.runtime.artifact import ModelCard, parse_artifact
+from dynssm_ros.runtime.baselines import SingleTrack
+from dynssm_ros.runtime.contract import WindowPrediction
+from dynssm_ros.runtime.learner import OnlineLearner
+from dynssm_ros.runtime.onnx_model import OnnxModel
+from dynssm_ros.runtime.plausibility import Plausibility
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.vehicle import Vehicle
+
+TIME_LIMIT_S = 15.0
+"""From the start of the process to its answer."""
+_TRIAL_S = 5  # without the start of Python
+_PROCESSOR_S = 3  # likewise, of a core
+_MEMORY = 1 << 30  # bytes, likewise
+_TOO_SLOW = "takes too long or too much memory"
+_MASS, _WHEELBASE = 0.25, 0.1  # relative differences of one car from day to day
+_FEWEST = 25  # windows that are compared
+_MANY = 5.0  # times as large errors
+_USUAL_ERROR = 0.2  # of a good model, in s_delta
+_TOLERATED = 0.05  # share of implausible predictions
+_STEADY_SPEEDS = 0.1, 0.3, 0.5  # of a car that has not driven yet, in top speeds of the plausible range
+
+
+def try_model(path: Path, files: Mapping[str, bytes], present: ModelCard, rows: Vector) -> None:
+    """Tries the model in ``files``, as :func:`~dynssm_ros.runtime.artifact.read_folder` gives them, in another process.
+
+    Args:
+        path: of the folder.
+        files: its content.
+        present: card of the model that it is to replace.
+        rows: of the last seconds, T_s of ``present`` apart, ``(N, 7)``.
+
+    Raises:
+        ArtifactError: it is not usable, or predicts worse by far than the calibrated car.
+    """
+    command = [sys.executable, "-m", __name__]
+    task = pickle.dumps((path, dict(files), present, rows))
+    try:
+        done = subprocess.run(  # noqa: S603 - this module
+            command, input=task, capture_output=True, timeout=TIME_LIMIT_S, start_new_session=True, check=False
+        )
+    except (subprocess.TimeoutExpired, OSError) as error:
+        raise ArtifactError(f"{path}: {_TOO_SLOW} ({error})") from error
+    if done.returncode in (-signal.SIGXCPU, -signal.SIGALRM, -signal.SIGKILL):
+        raise ArtifactError(f"{path}: {_TOO_SLOW}; expected {_PROCESSOR_S} s and {_MEMORY >> 20} MB to be enough")
+    if done.returncode:
+        raise ArtifactError(f"{path}: the process that tried it ended with status {done.returncode}")
+    if refusal := json.loads(done.stdout):
+        raise ArtifactError(refusal)
+
+
+def require_same_use(model: OnnxModel, present: ModelCard) -> None:
+    """Checks that ``model`` is for the commands, the sampling time and the car of the ``present`` one.
+
+    Raises:
+        ArtifactError: it is not.
+    """
+    path, card = model.artifact.path, model.card
+    if model.commands != present.commands:
+        raise ArtifactError(
+            f"{path}: trained with commands '{model.commands}', but the node runs with '{present.commands}'; restart it "
+            "with this model"
+        )
+    m, wheelbase = card.vehicle.constants.m, _wheelbase(card.vehicle)
+    own = present.vehicle.constants.m, _wheelbase(present.vehicle)
+    for what, value, expected, tolerance in (
+        ("T_s = {:g} s", card.sampling_time, present.sampling_time, 1e-6),
+        ("m = {:g} kg", m, own[0], _MASS),
+        ("wheelbase {:g} m", wheelbase, own[1], _WHEELBASE),
+    ):
+        if abs(value - expected) > tolerance * expected:
+            raise ArtifactError(
+                f"{path}: {what.format(value)} is another car's, of vehicle {card.vehicle.name}; the node runs with "
+                f"{expected:g}; restart it with this model"
+            )
+
+
+def _wheelbase(vehicle: Vehicle) -> float:
+    return vehicle.constants.l_f + vehicle.constants.l_r
+
+
+def judge(model: OnnxModel, present: ModelCard, rows: Vector) -> None:
+    """Compares what ``model`` predicts of ``rows`` ``(N, 7)`` with what was measured and with the calibrated car.
+
+    Before a car has driven for long enough, only whether its predictions are plausible is looked at.
+
+    Raises:
+        ArtifactError: errors many times as large as those of the physics, implausible predictions, or later than T_s.
+    """
+    windows = np.moveaxis(np.lib.stride_tricks.sliding_window_view(rows, model.H, axis=0), -1, 1) if (
+        len(rows) >= model.H
+    ) else np.empty((0, model.H, len(WINDOW_COLUMNS)))  # fmt: skip
+    measured, windows = rows[model.H :, :3], windows[:-1]
+    fast = windows[:, :, 0].min(axis=1, initial=np.inf) >= present.vehicle.minimum_speed
+    compared = int(fast.sum()) >= _FEWEST
+    if not compared:
+        windows = _steady_windows(model)
+    predicted = _predicted(model, windows)
+    _require_plausible(model, windows, predicted)
+    if not compared:
+        return
+    physics = SingleTrack(present.vehicle, present.integrator, present.substeps)
+    scale = np.array(present.normalisation.increment_scale)
+    followed = np.array([each.state[0] for each in predicted])
+    own, calibrated, unchanged = (
+        np.sqrt(np.mean((states - measured)[fast] ** 2, axis=0))
+        for states in (followed, physics.predict(windows).state, windows[:, -1, :3])
+    )
+    ratio = own / np.maximum(calibrated, _USUAL_ERROR * scale)
+    worst = int(np.argmax(ratio))
+    if ratio[worst] > _MANY and own[worst] > unchanged[worst]:
+        raise ArtifactError(
+            f"{model.artifact.path}: its error of {STATE_SIGNALS[worst]} over the last {len(rows) * model.T_s:.1f} s is "
+            f"{own[worst]:.3g}, that of the calibrated car {calibrated[worst]:.3g}; restart the node with this model to "
+            "use it all the same"
+        )
+
+
+def _steady_windows(model: OnnxModel) -> Vector:
+    """Straight drives at constant speeds ``(3, H, 7)``."""
+    windows = np.zeros((len(_STEADY_SPEEDS), model.H, len(WINDOW_COLUMNS)))
+    windows[:, :, 0] = model.vehicle.minimum_speed + np.array(_STEADY_SPEEDS)[:, None] * Plausibility(model.vehicle).top
+    return windows
+
+
+def _predicted(model: OnnxModel, windows: Vector) -> list[WindowPrediction]:
+    """What the model and its online layer, from the prior on, say of successive windows ``(N, H, 7)``."""
+    learner = None if model.online is None else OnlineLearner(model, model.online, judges=False)
+    found, seconds = [], np.inf
+    for window in windows:
+        begin = time.thread_time()
+        predicted = model.predict(window[None])
+        if learner is not None:
+            learner.learn(window, predicted)
+            predicted = learner.corrected(window, predicted)
+        seconds = min(seconds, time.thread_time() - begin)
+        found.append(predicted)
+    if seconds > model.T_s:
+        raise ArtifactError(f"{model.artifact.path}: takes {seconds:.3g} s for a prediction; expected less than T_s")
+    return found
+
+
+def _require_plausible(model: OnnxModel, windows: Vector, predicted: list[WindowPrediction]) -> None:
+    plausibility, reasons = Plausibility(model.vehicle), []
+    for window, each in zip(windows, predicted, strict=True):
+        state, theta, _, variance = (None if part is None else part[0] for part in each[:4])
+        if not all(np.isfinite(part).all() for part in (state, theta, variance) if part is not None):
+            raise ArtifactError(f"{model.artifact.path}: what it predicts is not finite; expected numbers")
+        now = window[-1, :3].tolist()
+        reasons.append(
+            plausibility.of_prediction(now, each.state[0].tolist(), model.T_s, variance=variance, theta=theta)
+        )
+    wrong = [reason for reason in reasons if reason]
+    if len(wrong) > _TOLERATED * len(reasons):
+        raise ArtifactError(f"{model.artifact.path}: {wrong[0]}; {len(wrong)} of {len(reasons)} predictions are so")
+
+
+def _refusal(path: Path, files: Mapping[str, bytes], present: ModelCard, rows: Vector) -> str:
+    try:
+        model = OnnxModel(parse_artifact(path, files))
+        require_same_use(model, present)
+        judge(model, present, rows)
+    except UserError as error:
+        return str(error)
+    except Exception as error:  # of ONNX Runtime, or no memory
+        return f"{path}: cannot be used ({' '.join(f'{type(error).__name__}: {error}'.split())[:200]})"
+    return ""
+
+
+def _limit() -> None:
+    """Bounds what this process may take from here on; where memory is short, it goes first."""
+    with open("/proc/self/statm", encoding="ascii") as status:
+        pages = int(status.read().split()[0])
+    with open("/proc/self/oom_score_adj", "w", encoding="ascii") as score:
+        score.write("1000")
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + _MEMORY,) * 2)
+    resource.setrlimit(resource.RLIMIT_CPU, (int(used.ru_utime + used.ru_stime) + _PROCESSOR_S,) * 2)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.alarm(_TRIAL_S)
+
+
+def main() -> None:
+    """Tries what standard input brings; the refusal, empty if there is none, goes to standard output."""
+    answer = os.dup(1)
+    os.dup2(2, 1)  # what libraries print is no answer
+    load_plugins()
+    task = pickle.load(sys.stdin.buffer)  # noqa: S301 - from the process that started this one
+    _limit()
+    os.write(answer, json.dumps(_refusal(*task)).encode())
+
+
+if __name__ == "__main__":
+    main()
