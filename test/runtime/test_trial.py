@@ -61,7 +61,7 @@ def test_errors_many_times_those_of_the_calibrated_car_are_refused(
         return said._replace(state=now + 8.0 * (said.state - now))
 
     words = refusal(lambda: judge(spoilt(model, monkeypatch, farther), model.card, rows))
-    assert "over the last 6.0 s is" in words
+    assert "over the last 5.0 s is" in words
     assert "that of the calibrated car" in words
     judge(model, model.card, rows[:0])  # but who can tell before it drives
 
