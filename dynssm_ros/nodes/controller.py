@@ -23,6 +23,7 @@ from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.nodes.executor import failures
 from dynssm_ros.nodes.managed import ManagedNode
+from dynssm_ros.nodes.rivals import Output
 from dynssm_ros.nodes.support import (
     NEWEST_QOS,
     actuators,
@@ -30,7 +31,6 @@ from dynssm_ros.nodes.support import (
     describe,
     diagnostics,
     listen,
-    output,
     relative,
     repeat,
     run,
@@ -72,7 +72,8 @@ class ControllerNode(ManagedNode):
         self._newest: int | None = None  # stamp of the odometry
         self._stuck = False  # whether the last odometry could not be planned from
 
-        self._publish_command = output(self, JointState, COMMAND_TOPIC).publish
+        self._command = Output(self, JointState, COMMAND_TOPIC)
+        self._publish_command = self._command.publish
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
         # when several messages wait, the executor serves subscriptions in this order
         listen(self, Odometry, relative(PREDICTION_TOPIC), self._on_prediction)
@@ -199,6 +200,8 @@ class ControllerNode(ManagedNode):
             age = health.age(ODOMETRY_TOPIC, now)
             silence = "nothing received" if math.isinf(age) else f"silent for {age:.1f} s"
             level, words = Level.ERROR, f"{ODOMETRY_TOPIC}: {silence}: brakes"
+        if (rival := self._command.rival()) and self.active:
+            level, words = Level.ERROR, f"{words}; {rival}"
         values = driver.values()
         for topic in health.topics:
             values[f"{topic} rate (Hz)"] = f"{health.rate(topic, now):.1f}"

@@ -26,6 +26,7 @@ from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.nodes.display import Markers, frame_sender
 from dynssm_ros.nodes.executor import in_thread, let_wait
 from dynssm_ros.nodes.managed import ManagedNode
+from dynssm_ros.nodes.rivals import Output
 from dynssm_ros.nodes.support import (
     describe,
     diagnostics,
@@ -110,7 +111,7 @@ class PredictorNode(ManagedNode):
             raise ConfigurationError("parameter model: not set; expected a model folder, e.g. -p model:=out/model")
         self._predictor = Predictor(self._open(path), load_signal_map(self._signals), self._max_age, self._online)
         self._notice = self._load_state(pathlib.Path(self._state)) if self._state else ""
-        self._publish_prediction = output(self, Odometry, PREDICTION_TOPIC).publish
+        self._output = Output(self, Odometry, PREDICTION_TOPIC)
         self._publish_parameters = output(self, JointState, PARAMETERS_TOPIC).publish
         self._publish_horizon = output(self, Path, HORIZON_TOPIC).publish
         self._markers = Markers(self) if self._draws else None
@@ -210,7 +211,7 @@ class PredictorNode(ManagedNode):
         odometry.twist.covariance = planar_covariance(prediction.variance)
         if prediction.pose is not None:
             set_pose(odometry.pose.pose, *prediction.pose)
-        self._publish_prediction(odometry)
+        self._output.publish(odometry)
         if prediction.theta is not None:
             self._adapted.header.stamp = odometry.header.stamp
             self._adapted.position = prediction.theta.tolist()
@@ -303,6 +304,8 @@ class PredictorNode(ManagedNode):
         self._health.wiring = self._wiring.verdict()
         self._health.publishers = {topic: self.count_publishers(topic) for topic in self._health.topics}
         level, words = self._health.verdict(now)
+        if (rival := self._output.rival()) and self.active:
+            level, words = Level.ERROR, f"{words}; {rival}"
         if self._notice:
             level, words = max(level, Level.WARN), f"{words}; {self._notice}"
         if not self.active:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
@@ -179,6 +180,17 @@ def car(parked_car: Callable[[], Car]) -> Car:
 def call_service() -> Callable[..., Any]:
     """Calls a service with the fields of a request by name; returns what it answers."""
     return call
+
+
+@pytest.fixture(scope="module")
+def ros() -> Iterator[None]:
+    """rclpy in this process, apart from other buses."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in isolated_environment().items():
+            patch.setenv(name, value)
+        rclpy.init()
+        yield
+        rclpy.shutdown()
 
 
 RefusedStart = Callable[..., str]

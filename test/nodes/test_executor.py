@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +15,6 @@ from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomi
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter as Value
 
-from benchmarks.endurance.live_run import isolated_environment
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.nodes.controller import ControllerNode
 from dynssm_ros.nodes.executor import EnduringExecutor, Failures, failures, refused
@@ -94,16 +92,6 @@ class Failing(ManagedNode):
             raise RuntimeError("of the timer")
 
 
-@pytest.fixture(scope="module")
-def ros() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in isolated_environment().items():
-            patch.setenv(name, value)
-        rclpy.init()
-        yield
-        rclpy.shutdown()
-
-
 @pytest.mark.live
 @pytest.mark.timeout(60)
 def test_a_node_survives_its_timers_forbidden_transitions_and_parameters_of_no_type(ros: None) -> None:
@@ -166,4 +154,8 @@ def test_a_controller_that_cannot_plan_brakes_says_so_and_drives_on_when_it_can(
     node._on_odometry(message)
     node._diagnose()
     assert "cannot plan" not in told[-1].message
+    node._command.rival = lambda: "another node publishes on /vehicle/actuator_command: /joystick"
+    node._diagnose()
+    assert told[-1].level == b"\x02"
+    assert "; another node publishes on /vehicle/actuator_command: /joystick" in told[-1].message
     node.destroy_node()

@@ -15,10 +15,11 @@ from benchmarks.endurance.live_run import LiveRun, collecting, isolated_environm
 pytestmark = [pytest.mark.live, pytest.mark.timeout(240)]
 
 POLICY = Path(__file__).parents[2] / "config" / "sros2" / "policy.xml"
-# allowed, but used only with a parameter: simulated time, frames, markers, a driver of its own
+# allowed, but used only with a parameter - simulated time, frames, markers, a driver of its own - or while another node
+# publishes the same
 ON_REQUEST = {
-    "dynssm": {"/clock", "/tf", "/dynssm/markers"},
-    "controller": {"/clock"},
+    "dynssm": {"/clock", "/tf", "/dynssm/markers", "/dynssm/prediction"},
+    "controller": {"/clock", "/vehicle/actuator_command"},
     "simulator": {"/clock", "/vehicle/actuator_command"},
 }
 

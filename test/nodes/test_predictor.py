@@ -171,6 +171,21 @@ def test_more_than_one_publisher_of_an_input_is_named(car) -> None:
     car.collector.destroy_publisher(second)
 
 
+def test_another_predictor_of_the_same_car_is_named(car) -> None:
+    second = car.collector.create_publisher(Odometry, PREDICTION_TOPIC, SENSOR_QOS)
+
+    def is_named() -> bool:
+        car.drive_until_answered()
+        message = Odometry()
+        message.header.stamp.sec = 1
+        second.publish(message)
+        return car.diagnosed("another node publishes on /dynssm/prediction: /", timeout=0.3)
+
+    assert any(is_named() for _ in range(100)), car.run.diagnostics[-1]
+    assert car.run.diagnostics[-1][0] == 2
+    car.collector.destroy_publisher(second)
+
+
 def test_a_refused_set_of_parameters_leaves_no_model_behind(start_car, small_model: Path, tmp_path: Path) -> None:
     """The first model is good, but another one in the same atomic set is not; a later set is of something else."""
     car = start_car()
