@@ -27,6 +27,7 @@ from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, Commands
 METADATA_KEY = b"dynssm"
 _ROWS_AT_ONCE = 65536  # that are written
 _FINGERPRINT_NS, _FINGERPRINT_ROWS = 10_000_000_000, 5
+_MOST_ROWS = 50_000_000  # five days at 100 Hz
 _OFF_GRID = 0.01  # of T_s that rows may be off their grid
 COLUMN_UNITS = {
     "v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "r_fb": "1", "delta_fb": "rad", "r_cmd": "1", "delta_cmd": "rad",
@@ -220,6 +221,8 @@ class Recording:
             raise RecordingError(f"{path}: column {missing[0]} is missing")
         if file.metadata.num_rows == 0:
             raise RecordingError(f"{path}: the recording is empty")
+        if file.metadata.num_rows > _MOST_ROWS:
+            raise RecordingError(f"{path}: {file.metadata.num_rows} rows; expected at most {_MOST_ROWS}")
         time, segment = (_column(file, name, kind, path) for name, kind in (("time", "int64"), ("segment", "int32")))
         known = [name for name in COLUMN_UNITS if name in file.schema_arrow.names]
         columns = {name: _column(file, name, "double", path) for name in known}

@@ -29,6 +29,7 @@ from mcap.writer import Writer as McapWriter
 SQLITE_LOGS = ("-wal", "-journal")
 _HEAD = 9  # bytes in front of an MCAP record: what it is, and its length
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_UNPACKED, _RATIO = 64 << 20, 100  # bytes that may always be unpacked, and times the packed size
 _ROS_ENCODINGS = ("ros2msg", "ros2idl", "omgidl", "")
 _TABLE_LEAF = 0x0D
 _TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
@@ -114,16 +115,42 @@ def unpack(compressed: Path, unpacked: Path) -> None:
     """Unpacks a zstd file as far as it goes.
 
     Raises:
-        OSError: ``compressed`` cannot be read or ``unpacked`` not be written.
+        OSError: ``compressed`` cannot be read or ``unpacked`` not be written, or it would be far larger than a log can be,
+            or than the disk.
     """
+    room = min(_largest(compressed.stat().st_size), shutil.disk_usage(unpacked.parent).free)
     with compressed.open("rb") as source, unpacked.open("wb") as sink:
-        for piece in _pieces(source, "zstd"):
+        for piece in _bounded(_pieces(source, "zstd"), room):
             sink.write(piece)
 
 
 def unpacked_message(raw: bytes) -> bytes:
-    """A message as its publisher serialised it, also from a bag with compressed messages; CDR never looks like zstd."""
-    return b"".join(_pieces(io.BytesIO(raw), "zstd")) if raw.startswith(_ZSTD_MAGIC) else raw
+    """A message as its publisher serialised it, also from a bag with compressed messages; CDR never looks like zstd.
+
+    Raises:
+        OSError: it would be far larger than a message can be.
+    """
+    if not raw.startswith(_ZSTD_MAGIC):
+        return raw
+    return b"".join(_bounded(_pieces(io.BytesIO(raw), "zstd"), _largest(len(raw))))
+
+
+def _largest(packed: int) -> int:
+    """Bytes that so many ``packed`` ones may unpack to."""
+    return max(_UNPACKED, _RATIO * packed)
+
+
+def _bounded(pieces: Iterator[bytes], room: int) -> Iterator[bytes]:
+    """Yields pieces as long as there is room (bytes).
+
+    Raises:
+        OSError: there is not.
+    """
+    for piece in pieces:
+        room -= len(piece)
+        if room < 0:
+            raise OSError(f"unpacks to more than {_UNPACKED >> 20} MB, {_RATIO} times its size, or the free disk")
+        yield piece
 
 
 def _until_cut(records: Iterator[_T]) -> Iterator[_T]:

@@ -29,6 +29,15 @@ def recording(segments: list[int], commands: Any = "topics", pose: bool = True, 
     )
 
 
+def test_a_file_of_more_rows_than_anybody_drives_is_refused_unread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dynssm_ros.signals.recording._MOST_ROWS", 4)
+    recording([0] * 5).save(tmp_path / "r.parquet")
+    with pytest.raises(RecordingError, match=r"r.parquet: 5 rows; expected at most 4"):
+        Recording.load(tmp_path / "r.parquet")
+
+
 def test_saving_and_loading_gives_the_same_recording(tmp_path: Path) -> None:
     original = recording([0, 0, 1, 1, 1])
     file = tmp_path / "new" / "r.parquet"

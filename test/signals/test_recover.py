@@ -6,11 +6,14 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dynssm_ros.signals.recover import is_unindexed, log_left, recover, unpacked_message
+from dynssm_ros.errors import BagError
+from dynssm_ros.signals.bags import open_bag
+from dynssm_ros.signals.recover import is_unindexed, log_left, recover, unpack, unpacked_message
 
 Row = tuple[int, int, int, bytes]
 TABLES = """
@@ -117,3 +120,23 @@ def test_only_mcap_files_can_lack_an_index_and_only_sqlite_leaves_logs(tmp_path:
 def test_messages_that_are_not_compressed_are_left_alone() -> None:
     raw = b"\x00\x01\x00\x00payload"
     assert unpacked_message(raw) is raw
+
+
+def test_what_unpacks_to_far_more_than_it_is_is_refused_before_it_fills_memory_or_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dynssm_ros.signals.recover._UNPACKED", 1 << 20)
+    bomb = bytes(pa.compress(bytes(10 << 20), "zstd"))
+    assert len(bomb) < 10_000
+    with pytest.raises(OSError, match="unpacks to more than 1 MB, 100 times its size"):
+        unpacked_message(bomb)
+    assert unpacked_message(bytes(pa.compress(bytes(1 << 20), "zstd"))) == bytes(1 << 20)
+    (tmp_path / "log.mcap.zstd").write_bytes(bomb)
+    with pytest.raises(OSError, match="unpacks to more"):
+        unpack(tmp_path / "log.mcap.zstd", tmp_path / "log.mcap")
+    assert (tmp_path / "log.mcap").stat().st_size <= 1 << 20
+    with (
+        pytest.raises(BagError, match=r"log.mcap.zstd: cannot be read \(unpacks to more"),
+        open_bag(tmp_path / "log.mcap.zstd"),
+    ):
+        pass
