@@ -61,9 +61,19 @@ def test_errors_many_times_those_of_the_calibrated_car_are_refused(
         return said._replace(state=now + 8.0 * (said.state - now))
 
     words = refusal(lambda: judge(spoilt(model, monkeypatch, farther), model.card, rows))
-    assert "over the last 5.0 s is" in words
+    assert "its error of " in words
     assert "that of the calibrated car" in words
     judge(model, model.card, rows[:0])  # but who can tell before it drives
+
+
+def test_a_model_that_cannot_keep_up_is_refused_and_a_slow_one_compared_over_less(
+    model: OnnxModel, rows: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = iter(np.arange(0.0, 1e3, 0.015))
+    monkeypatch.setattr("dynssm_ros.runtime.trial.time.perf_counter", lambda: next(times))
+    judge(model, model.card, rows)
+    times = iter(np.arange(0.0, 1e3, 0.025))
+    assert "takes 0.025 s for a prediction; expected less than T_s" in refusal(lambda: judge(model, model.card, rows))
 
 
 @pytest.mark.parametrize("driven", [300, 0])
