@@ -42,16 +42,6 @@ class Decision(NamedTuple):
     weights: Vector  # of evidence.SOURCES in that, (3,)
     seconds: float  # of model and plan together, by the controller's clock; see Controller.learn
 
-    @property
-    def theta(self) -> Vector:
-        """Coefficients of the horizon's first step, ``(17,)``."""
-        return self.adapted.first.theta
-
-    @property
-    def correction(self) -> Vector:
-        """Likewise the correction (m/s, m/s, rad/s), ``(3,)``."""
-        return self.adapted.first.correction
-
 
 class _Sent(NamedTuple):
     """What was sent at a measurement."""

@@ -9,6 +9,7 @@ A plan that steers to the stop and still goes beyond a soft bound may be a local
 second program, and a few other manoeuvres are driven ahead by the model. The best is the plan if the model, not
 linearised, says that it is clearly better.
 
+Ugray et al., "Scatter search and local NLP solvers: a multistart framework for global optimization", 2007.
 Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control", 2005.
 """
 
@@ -17,6 +18,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -25,7 +27,6 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.control.buffered import QuadraticSolver
 from dynssm_ros.control.caution import Margins
 from dynssm_ros.control.horizon_model import CONTEXT, INPUTS, PARAMETERS, HorizonModel
-from dynssm_ros.control.manoeuvres import manoeuvres
 from dynssm_ros.control.program import DELTA, V_X, HorizonProgram, R, Whereabouts
 from dynssm_ros.control.reference import Reference
 from dynssm_ros.control.settings import Settings
@@ -39,6 +40,10 @@ _FIRST_ROUNDS = 10  # programs that the first plan takes to settle
 _AT_STOP = 0.01  # rad
 _BEYOND = 1e-3  # wheelbases or rad: less is the solver's tolerance
 _CLEARLY = 0.2  # share of its cost by which a plan is to be undercut
+
+_STEERING = (-1.0, -0.4, 0.0, 0.4, 1.0)  # shares of the range on that side to which manoeuvres turn, and hold
+_BRAKES = (False, True)  # the throttle is held, or the brakes are full on
+COUNT = len(_STEERING) * len(_BRAKES)  # of manoeuvres
 
 
 class Adapted(NamedTuple):
@@ -262,3 +267,23 @@ def _condensed(x: Vector, u: Vector, following: Vector, by_x: Vector, by_u: Vect
         slope[k + 1] = by_x[k] @ slope[k]
         slope[k + 1, :, 2 * k : 2 * k + 2] += by_u[k]
     return offset, slope
+
+
+def manoeuvres(now: Applied, limits: InputLimits, N: int, T_s: float) -> Vector:
+    """Starting points where the last plan may be caught, from what the actuators do ``now``.
+
+    With the front wheels beyond the slip that their tyres make use of, no small change of a plan leads out of a turn that
+    has become too tight, where a large one does, such as steering to the other side at once.
+
+    Returns:
+        Increments of throttle (fraction) and steering (rad) within ``limits``, in steps of ``T_s`` (s), ``(COUNT, N, 2)``.
+    """
+    increments = np.zeros((COUNT, N, 2))
+    right, left = limits.steering
+    reach = limits.steering_rate * T_s * np.arange(1, N + 1)
+    for each, (share, brakes) in zip(increments, product(_STEERING, _BRAKES), strict=True):
+        turn = share * left if share >= 0 else -share * right
+        each[:, 1] = np.diff(now.delta + np.clip(turn - now.delta, -reach, reach), prepend=now.delta)
+        if brakes:
+            each[0, 0] = limits.throttle[0] - now.r
+    return increments

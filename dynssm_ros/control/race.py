@@ -206,8 +206,8 @@ class _Drive:
         began = time.thread_time()
         self.pilot.learn()
         self._rows.append(
-            (t, car.pose, car.state, decision.command, self.s, self._lateral, decision.theta, decision.correction,
-             decision.weights, decision.seconds, time.thread_time() - began)
+            (t, car.pose, car.state, decision.command, self.s, self._lateral, *decision.adapted.first, decision.weights,
+             decision.seconds, time.thread_time() - began)
         )  # fmt: skip
         self._log(t, decision)
         failure = self._failure(t)

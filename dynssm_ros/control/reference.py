@@ -12,7 +12,7 @@ import numpy.typing as npt
 from dynssm_ros.arrays import Vector
 from dynssm_ros.track.lines import ClosedLine, Floats
 from dynssm_ros.track.racing_line import line_of
-from dynssm_ros.track.speed_profile import speed_profile, terminal_speed_profile
+from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.track.tracks import Track, TrackError
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.limits import Limits, vehicle_limits
@@ -42,7 +42,7 @@ class Reference:
         """A line as fast as a car within ``limits`` drives it with a ``share`` of its accelerations, of all points or
         ``(N,)``.
         """
-        speed, terminal_speed = (each(line, limits, share) for each in (speed_profile, terminal_speed_profile))
+        speed, terminal_speed = (speed_profile(line, limits, share, reached=reached) for reached in (True, False))
         return cls(name, line, speed, limits, None if isinstance(share, np.ndarray) else share, terminal_speed)
 
     @property

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import IO, NamedTuple, TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 from urllib.parse import quote
 
 import pyarrow as pa
@@ -31,6 +31,7 @@ _HEAD = 9  # bytes in front of an MCAP record: what it is, and its length
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _UNPACKED, _RATIO = 64 << 20, 100  # bytes that may always be unpacked, and times the packed size
 _ROS_ENCODINGS = ("ros2msg", "ros2idl", "omgidl", "")
+_RECORDS: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.DATA_END: DataEnd}
 _TABLE_LEAF = 0x0D
 _TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
 _T = TypeVar("_T")
@@ -44,11 +45,8 @@ class Recovered(NamedTuple):
     bad_chunks: int = 0
 
 
-class _BadChunk(NamedTuple):
-    """Stands for a chunk that is left out."""
-
-
-_McapRecord = Schema | Channel | Message | DataEnd | _BadChunk
+_McapRecord = Schema | Channel | Message | DataEnd | None
+"""``None`` stands for a chunk that is left out."""
 
 
 def recover(damaged: Path, recovered: Path) -> Recovered:
@@ -188,7 +186,7 @@ def _recover_mcap(damaged: Path, recovered: Path) -> Recovered:
         source.seek(len(b"\x89MCAP0\r\n"))
         in_order = _until_cut(_mcap_records(source, damaged.stat().st_size))
         for r in in_order if summary is None else _indexed_records(source, summary):
-            if isinstance(r, _BadChunk):
+            if r is None:
                 bad += 1
             elif isinstance(r, Schema) and r.id not in schemas and r.encoding in _ROS_ENCODINGS:
                 schemas[r.id] = writer.register_schema(r.name, r.encoding, r.data)
@@ -219,10 +217,7 @@ def _indexed_records(source: IO[bytes], summary: Summary) -> Iterator[_McapRecor
 
 
 def _chunk_records(content: bytes | None) -> Iterator[_McapRecord]:
-    if content is None:
-        yield _BadChunk()
-    else:
-        yield from _until_cut(_mcap_records(io.BytesIO(content), len(content)))
+    yield from [None] if content is None else _until_cut(_mcap_records(io.BytesIO(content), len(content)))
 
 
 def _mcap_records(source: IO[bytes], size: int) -> Iterator[_McapRecord]:
@@ -241,14 +236,10 @@ def _mcap_records(source: IO[bytes], size: int) -> Iterator[_McapRecord]:
         if len(body) < length:
             return
         stream = ReadDataStream(io.BytesIO(body))
-        if opcode == Opcode.SCHEMA:
-            last = Schema.read(stream)
-        elif opcode == Opcode.CHANNEL:
-            last = Channel.read(stream)
-        elif opcode == Opcode.MESSAGE:
+        if opcode == Opcode.MESSAGE:
             last = Message.read(stream, length)
-        elif opcode == Opcode.DATA_END:
-            last = DataEnd.read(stream)
+        elif opcode in _RECORDS:
+            last = _RECORDS[opcode].read(stream)
     if last is not None and not head.startswith(b"\0"):  # zeros are what a power cut fills a file, and records, up with
         yield last
 

@@ -162,22 +162,12 @@ def simulate(
             progress(min(round(1000 * done), round(1000 * goal)), round(1000 * goal))
         if done >= goal - 1e-9:
             break
-    state, measured = (np.array([getattr(sample, name) for sample in samples]) for name in ("state", "measured"))
+    names = ("state", "measured", "pose", "feedback", "command", "s", "lateral")
+    columns = {name: np.array([getattr(sample, name) for sample in samples]) for name in names}
     rng = np.random.default_rng([seed, 1])  # apart from the driver's, so that noise does not change the drive
-    return Run(
-        vehicle=vehicle,
-        track=track,
-        plant=plant,
-        seed=seed,
-        time=START_TIME + np.round(1e9 * np.array([sample.time for sample in samples])).astype(np.int64),
-        state=state,
-        measured=measured + rng.standard_normal(state.shape) * np.array(noise),
-        pose=np.array([sample.pose for sample in samples]),
-        feedback=np.array([sample.feedback for sample in samples]),
-        command=np.array([sample.command for sample in samples]),
-        s=np.array([sample.s for sample in samples]),
-        lateral=np.array([sample.lateral for sample in samples]),
-    )
+    columns["measured"] = columns["measured"] + rng.standard_normal((len(samples), 3)) * np.array(noise)
+    time = START_TIME + np.round(1e9 * np.array([sample.time for sample in samples])).astype(np.int64)
+    return Run(vehicle, track, plant, seed, time, **columns)
 
 
 def as_recording(run: Run) -> Recording:

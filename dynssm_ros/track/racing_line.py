@@ -151,9 +151,6 @@ def box_qp(H: sparse.csc_array, g: Vector, lower: Vector, upper: Vector, rounds:
 
 def _step_inside(*pairs: tuple[Vector, npt.NDArray[np.float64]]) -> float:
     """The largest step, at most 1, that keeps every ``value + step * change`` well above 0."""
-    step = 1.0
-    for value, change in pairs:
-        falling = change < 0
-        if np.any(falling):
-            step = min(step, 0.95 * float(np.min(-value[falling] / change[falling])))
-    return step
+    value, change = (np.concatenate(each) for each in zip(*pairs, strict=True))
+    falling = change < 0
+    return min(1.0, 0.95 * float(np.min(-value[falling] / change[falling], initial=np.inf)))

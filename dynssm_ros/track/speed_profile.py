@@ -11,8 +11,8 @@ from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle.limits import Limits
 
 
-def speed_profile(line: ClosedLine, limits: Limits, share: float | Vector = 1.0) -> Vector:
-    """Fastest speed (m/s) at the points of ``line``, shape ``(N,)``.
+def speed_profile(line: ClosedLine, limits: Limits, share: float | Vector = 1.0, *, reached: bool = True) -> Vector:
+    """Fastest speed (m/s) at the points of ``line`` by cornering, brakes and drive, shape ``(N,)``.
 
     Lateral and longitudinal acceleration share the grip: they stay on the ellipse of their limits.
 
@@ -20,20 +20,8 @@ def speed_profile(line: ClosedLine, limits: Limits, share: float | Vector = 1.0)
         line: to drive.
         limits: of the car.
         share: of its accelerations that are used, for all points or ``(N,)``.
+        reached: by the drive. Else the greatest speed from which the car can go on along the line.
     """
-    return _profile(line, limits, share, limits.drive)
-
-
-def terminal_speed_profile(line: ClosedLine, limits: Limits, share: float | Vector = 1.0) -> Vector:
-    """Greatest speed (m/s) at the points of ``line`` from which the car can go on along it, shape ``(N,)``.
-
-    Cornering and brakes bound it; the drive need not reach it, unlike in :func:`speed_profile`, whose arguments it takes.
-    """
-    return _profile(line, limits, share, None)
-
-
-def _profile(line: ClosedLine, limits: Limits, share: float | Vector, drive: Vector | None) -> Vector:
-    """The speed that cornering, brakes and ``drive`` (over ``limits.speed``; ``None``: of any strength) allow."""
     share = np.broadcast_to(np.asarray(share, dtype=np.float64), line.s.shape)
     curvature = np.abs(line.curvature(line.s)) / share
     v = limits.cornering_speed(curvature)
@@ -41,8 +29,8 @@ def _profile(line: ClosedLine, limits: Limits, share: float | Vector, drive: Vec
     # from the slowest corner around once, the end meets the start; then the same in reverse for the brakes
     start = int(np.argmin(v))
     order = np.asarray((start + np.arange(len(v) + 1)) % len(v), dtype=np.intp)
-    if drive is not None:
-        v = _forward(v, order, share * ds, curvature, limits, drive)
+    if reached:
+        v = _forward(v, order, share * ds, curvature, limits, limits.drive)
     return _forward(v, order[::-1], share * np.roll(ds, 1), curvature, limits, limits.brake)
 
 

@@ -112,16 +112,11 @@ def load_track(name_or_path: str | Path) -> Track:
     if path.is_file():
         return read_track(path)
     if str(name_or_path) in LAYOUTS:
-        return built_in_track(str(name_or_path))
+        layout = LAYOUTS[str(name_or_path)]()
+        centre = ClosedLine(closed_loop(layout.segments, layout.spacing))
+        half = np.full(len(centre.points), layout.width / 2)
+        return Track(str(name_or_path), centre, half, half)
     raise TrackError(f"track '{name_or_path}' is neither a file nor a built-in name ({', '.join(sorted(LAYOUTS))})")
-
-
-def built_in_track(name: str) -> Track:
-    """Builds one of the project's own tracks."""
-    layout = LAYOUTS[name]()
-    centre = ClosedLine(closed_loop(layout.segments, layout.spacing))
-    half = np.full(len(centre.points), layout.width / 2)
-    return Track(name, centre, half, half)
 
 
 def read_track(path: str | Path) -> Track:

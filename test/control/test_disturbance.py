@@ -109,7 +109,7 @@ def test_a_wrong_coefficient_leaves_no_steady_offset(orca, circle, settings):
     _, exact = steady(orca, (track, reference, settings), true_model(orca, "euler"))
     for follows in ("never", "always", "chosen"):
         decision, radius = steady(orca, (track, reference, replace(settings, follows=follows)), believed)
-        beside[follows], found[follows] = abs(radius - exact), decision.correction
+        beside[follows], found[follows] = abs(radius - exact), decision.adapted.first.correction
     assert beside["never"] > 1e-3
     assert max(beside["always"], beside["chosen"]) < 0.05 * beside["never"]
     np.testing.assert_array_equal(found["never"], 0.0)

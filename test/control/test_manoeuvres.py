@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dynssm_ros.control.manoeuvres import COUNT, manoeuvres
+from dynssm_ros.control.nmpc import COUNT, manoeuvres
 from dynssm_ros.vehicle import Applied
 
 

@@ -11,9 +11,9 @@ from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.windows import SimulationWindows, recorded_rows
 from dynssm_ros.identification.result.calibration import _context, calibrate
-from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
+from dynssm_ros.track.lap_position import lap_context
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 
@@ -30,7 +30,7 @@ def windy() -> Recording:
 
 
 def errors(recording: Recording, car: Vehicle) -> np.ndarray:
-    data = recorded_rows(recording, recording_context(recording))
+    data = recorded_rows(recording, lap_context(recording, None))
     return SimulationWindows(data, recording.window_ends(1, horizon=3), 3, 0, "euler").errors(CarEstimate.of(car))
 
 

@@ -9,7 +9,6 @@ from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.fit import IdentificationProblem
 from dynssm_ros.identification.problem.windows import fit_windows, recorded_rows
 from dynssm_ros.identification.search.candidates import Candidate, Responses, ScoreTest, candidates
-from dynssm_ros.signals.context import recording_context
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.lap_position import lap_context
 from dynssm_ros.track.tracks import load_track
@@ -21,7 +20,7 @@ ORCA, CLUB = load_vehicle("orca"), load_track("club")
 def problem(with_lap: bool = True, **effects: dict[str, float]) -> IdentificationProblem:
     car = ORCA.with_effects(effects.items())
     recording = as_recording(simulate(car, CLUB, duration=25.0, noise=(0.005, 0.005, 0.02)))
-    context = lap_context(recording, CLUB.centre) if with_lap else recording_context(recording)
+    context = lap_context(recording, CLUB.centre if with_lap else None)
     windows = fit_windows(recording, recorded_rows(recording, context), 0.3, 0.0)
     return IdentificationProblem(windows.with_integrator("euler", ORCA), CarEstimate.of(ORCA))
 

@@ -18,9 +18,9 @@ from dynssm_ros.identification.search.integrator import _with_what_hides, search
 from dynssm_ros.identification.search.selection import Refined, Search
 from dynssm_ros.identification.search.size_search import SizeSearch
 from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC
-from dynssm_ros.signals.context import recording_context
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
+from dynssm_ros.track.lap_position import lap_context
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
@@ -43,7 +43,7 @@ def windows(
     car = ORCA.with_effects(effects.items())
     run = simulate(car, load_track("club"), duration=25.0, plant=plant, noise=noise)
     recording = as_recording(run)
-    data = recorded_rows(recording, recording_context(recording))
+    data = recorded_rows(recording, lap_context(recording, None))
     return fit_windows(recording, data, 0.3, 0.0)
 
 
@@ -189,7 +189,7 @@ def test_what_no_car_has_gives_way_to_what_cannot_be_told_from_it() -> None:
     car = av21.with_effect("load_sensitivity", {"exponent": 0.5})
     run = simulate(car, load_track("road_course"), duration=60.0, plant="rk4", noise=(0.005, 0.005, 0.001))
     recording = as_recording(run)
-    data = recorded_rows(recording, recording_context(recording))
+    data = recorded_rows(recording, lap_context(recording, None))
     given = fit_windows(recording, data, 0.5, 0.0).with_integrator("rk4", av21)
     known = CarEstimate.of(av21.with_nominal(av21.nominal, 0.001 * (av21.upper - av21.lower)))
     lower, sensitive = Candidate("load_transfer", ("height",)), Candidate("load_sensitivity", ("exponent",))
@@ -273,7 +273,7 @@ def test_another_yaw_inertia_is_not_taken_for_euler_steps() -> None:
     recording = as_recording(
         simulate(car, load_track("road_course"), duration=60.0, plant="rk4", noise=(0.01, 0.01, 0.002))
     )
-    given = fit_windows(recording, recorded_rows(recording, recording_context(recording)), 0.5, 0.0)
+    given = fit_windows(recording, recorded_rows(recording, lap_context(recording, None)), 0.5, 0.0)
     found = search_causes(given, known, quarters(given), exclude=OTHERS)
     assert found.problem.windows.integrator == "rk4"
     assert [one.candidate.effect for one in found.selection.chosen] == ["yaw_inertia"]
@@ -292,7 +292,7 @@ def test_inputs_that_changed_between_the_rows_go_on_a_line() -> None:
         recording.segment[::4],
         {name: values[::4] for name, values in recording.columns.items()},
     )
-    given = fit_windows(every, recorded_rows(every, recording_context(every)), 0.3, 0.0)
+    given = fit_windows(every, recorded_rows(every, lap_context(every, None)), 0.3, 0.0)
     found = search_causes(given, CarEstimate.of(ORCA), quarters(given), exclude=OTHERS)
     windows = found.problem.windows
     assert (windows.integrator, windows.hold) == ("rk4", "first")

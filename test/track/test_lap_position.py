@@ -9,7 +9,7 @@ from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import load_signal_map
-from dynssm_ros.track.lap_position import first_lap, rms_along, track_position
+from dynssm_ros.track.lap_position import first_lap, lap_context, rms_along, track_position
 
 
 def drive(positions, segment=None):
@@ -85,6 +85,16 @@ def test_positions_in_blocks_are_those_at_once(monkeypatch):
     at_once = track_position(line, recording)
     monkeypatch.setattr("dynssm_ros.track.lap_position._AT_ONCE", 7)
     np.testing.assert_allclose(track_position(line, recording), at_once, atol=1e-6)
+
+
+def test_effects_may_read_time_from_the_first_row_and_what_else_was_recorded() -> None:
+    columns = {name: np.arange(5) + 10.0 * k for k, name in enumerate((*WINDOW_COLUMNS, "x", "y", "theta", "s"))}
+    time = np.array([7, 8, 9, 30, 31], dtype=np.int64) * 40_000_000
+    info = RecordingInfo(sampling_time=0.04, commands="none")
+    found = lap_context(Recording(info, time, np.array([0, 0, 0, 1, 1], dtype=np.int32), columns), None)
+    assert set(found) == {"t", "x", "y", "theta", "s"}
+    np.testing.assert_allclose(found["t"], np.array([0, 1, 2, 23, 24]) * 0.04)
+    np.testing.assert_array_equal(found["theta"], np.arange(5) + 90.0)
 
 
 def test_errors_are_averaged_over_stretches_of_the_lap():

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.track.tracks import built_in_track
+from dynssm_ros.track.tracks import load_track
 
 
 def circle(radius: float, count: int = 200, direction: int = 1) -> ClosedLine:
@@ -25,7 +25,7 @@ def test_circle_has_its_length_curvature_and_heading(direction):
 
 @pytest.mark.parametrize("size", [1.0, 250.0])
 def test_the_bend_goes_with_the_curvature_up_to_the_sharpest_places_whatever_the_size_of_the_track(size):
-    line = built_in_track("oval").centre.scaled(size)
+    line = load_track("oval").centre.scaled(size)
     s = np.linspace(0.0, line.length, 300)
     bend, curvature = line.bend(s), line.curvature(s)
     assert bend.max() == 1.0
@@ -64,14 +64,14 @@ def test_the_frame_is_the_position_and_the_heading_and_left_of_it():
 @settings(max_examples=60, deadline=None)
 @given(share=st.floats(0, 0.999999), lateral=st.floats(-0.19, 0.19))
 def test_projection_inverts_position(share, lateral):
-    line = built_in_track("club").centre
+    line = load_track("club").centre
     s, d = line.project(line.position(share * line.length, lateral))
     assert (s - share * line.length + line.length / 2) % line.length - line.length / 2 == pytest.approx(0, abs=1e-8)
     assert d == pytest.approx(lateral, abs=1e-8)
 
 
 def test_many_points_project_like_one_by_one():
-    line = built_in_track("club_b").centre
+    line = load_track("club_b").centre
     points = line.position(np.linspace(0, line.length, 50), 0.1)
     s, lateral = line.project(points)
     assert s.shape == lateral.shape == (50,)

@@ -7,8 +7,8 @@ import pytest
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.track.speed_profile import speed_profile, terminal_speed_profile
-from dynssm_ros.track.tracks import built_in_track
+from dynssm_ros.track.speed_profile import speed_profile
+from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
 from dynssm_ros.vehicle.limits import Limits, vehicle_limits
 
@@ -29,7 +29,7 @@ def test_circle_is_driven_at_the_lateral_limit():
 @pytest.mark.parametrize(("limits", "share"), [(CONSTANT, 1.0), (vehicle_limits(load_vehicle("av21")), 0.8)])
 @pytest.mark.parametrize("name", ["oval", "road_course"])
 def test_profile_keeps_all_limits(name, limits, share):
-    line = built_in_track(name).centre
+    line = load_track(name).centre
     v = speed_profile(line, limits, share)
     lateral = share * np.interp(v, limits.speed, limits.lateral)
     used = np.abs(line.curvature(line.s)) * v**2 / lateral
@@ -41,7 +41,7 @@ def test_profile_keeps_all_limits(name, limits, share):
 
 
 def test_a_section_with_a_smaller_share_is_slower_and_is_braked_for():
-    line = built_in_track("club").centre
+    line = load_track("club").centre
     limits = vehicle_limits(load_vehicle("orca"))
     careful = np.where(np.abs(line.s - line.length / 2) < line.length / 10, 0.5, 1.0)
     full, v = speed_profile(line, limits), speed_profile(line, limits, careful)
@@ -53,7 +53,7 @@ def test_a_section_with_a_smaller_share_is_slower_and_is_braked_for():
 
 
 def test_straights_are_driven_at_full_throttle_or_full_brake():
-    line = built_in_track("road_course").centre
+    line = load_track("road_course").centre
     a = slopes(line, speed_profile(line, CONSTANT))
     straight = np.abs(line.curvature(line.s)) < 1e-6
     full = np.isclose(a, 3.0, atol=1e-3) | np.isclose(a, -6.0, atol=1e-3)
@@ -64,13 +64,13 @@ def test_straights_are_driven_at_full_throttle_or_full_brake():
 
 @pytest.mark.parametrize("share", [1.0, 0.7])
 def test_terminal_speed_is_bounded_by_cornering_and_brakes_alone(share):
-    line = built_in_track("road_course").centre
-    terminal = terminal_speed_profile(line, CONSTANT, share)
+    line = load_track("road_course").centre
+    terminal = speed_profile(line, CONSTANT, share, reached=False)
     used = np.abs(line.curvature(line.s)) * terminal**2 / (share * CONSTANT.lateral[0])
     assert np.max(used) <= 1 + 1e-3
     assert np.all(slopes(line, terminal) >= -share * CONSTANT.brake[0] - 1e-9)
     weak = replace(CONSTANT, drive=0.5 * CONSTANT.drive)
-    np.testing.assert_array_equal(terminal_speed_profile(line, weak, share), terminal)
+    np.testing.assert_array_equal(speed_profile(line, weak, share, reached=False), terminal)
     v = speed_profile(line, CONSTANT, share)
     assert np.all(v <= terminal)
     assert np.max(terminal - v) > 10  # at the end of a corner, before a straight
@@ -78,7 +78,7 @@ def test_terminal_speed_is_bounded_by_cornering_and_brakes_alone(share):
 
 
 def test_profile_does_not_depend_on_the_first_point():
-    line = built_in_track("club").centre
+    line = load_track("club").centre
     limits = vehicle_limits(load_vehicle("orca"))
     shifted = ClosedLine(np.roll(line.points, -137, axis=0))
     np.testing.assert_allclose(speed_profile(shifted, limits), np.roll(speed_profile(line, limits), -137), rtol=1e-6)
