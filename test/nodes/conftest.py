@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import subprocess
@@ -203,6 +204,7 @@ def refused_start(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyP
         monkeypatch.setenv(name, value)
 
     def start(node: str, *parameters: str) -> str:
+        gc.collect()  # the node of a start before; rclpy warns of a second one of its name
         capfd.readouterr()
         with pytest.raises(SystemExit) as stopped:
             importlib.import_module(f"dynssm_ros.nodes.{node}").main(
