@@ -23,6 +23,7 @@ def test_a_log_becomes_a_prediction_that_beats_persistence(tmp_path: Path) -> No
     assert ade["rls"] < ade["single_track"] < 0.5 * ade["persistence"]
 
 
+@pytest.mark.slow
 def test_the_hidden_cause_is_found() -> None:
     (cause,) = a_hidden_cause_found.main().causes
     assert cause.effect == "steering_offset"

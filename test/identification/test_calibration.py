@@ -95,7 +95,7 @@ def test_effects_of_the_vehicle_are_part_of_the_model(drive: Drive, orca: Vehicl
 @pytest.mark.parametrize(("plant", "chosen"), [("euler", "euler"), ("rk4", "rk4")])
 def test_the_data_choose_how_the_model_steps(orca: Vehicle, plant: PlantKind, chosen: str) -> None:
     """Euler steps fitted to a continuous car make a yaw inertia of their own."""
-    laps = dynssm_ros.recorded(dynssm_ros.simulate(orca, "club", duration=40.0, plant=plant, noise=SENSORS, seed=3))
+    laps = dynssm_ros.recorded(dynssm_ros.simulate(orca, "club", duration=30.0, plant=plant, noise=SENSORS, seed=3))
     found = calibrate(laps, mid_range(orca), starts=1)
     assert (found.vehicle.integrator, found.vehicle.model_integrator) == (chosen, chosen)
     assert found.vehicle.coefficients["I_z"].nominal == pytest.approx(orca.coefficients["I_z"].nominal, rel=0.05)

@@ -49,6 +49,7 @@ def test_from_the_shipped_file_the_extended_car_also_errs_less_sideways(recordin
     assert found.improvement.reduction_from(RECALIBRATED)[at, 1] >= 0.3
 
 
+@pytest.mark.slow
 def test_a_race_car_is_not_taken_for_one_that_moves_in_euler_steps(putnam: Path) -> None:
     """Euler steps are closer to its one-step errors, and explain them no better than Runge-Kutta."""
     recording = extract([putnam], load_signal_map("av21"), 25.0)
