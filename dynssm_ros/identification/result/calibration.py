@@ -231,7 +231,7 @@ def _nearest_start(
     best = min(found, key=lambda fit: float(fit.cost))
     left = float(np.median(np.abs(best.fun[: 3 * len(few)])))
     for _ in range(tuning.POLISH_ROUNDS):
-        best = fitted(many, best.x, left, 1e-8, 60)
+        best = fitted(many, best.x, left, 1e-8, 300)
         left = float(np.median(np.abs(best.fun[: 3 * len(many)])))
     return given.at(lower + best.x * width)
 
