@@ -27,6 +27,10 @@ _Result = TypeVar("_Result")
 _RECENT_S = 10.0  # for which the verdict speaks of an exception
 
 
+class FinishedError(UserError):
+    """A node cannot go on by its own judgement: raised in a callback, it ends the node."""
+
+
 class Failures:
     """Exceptions in the callbacks of a node.
 
@@ -95,10 +99,11 @@ class EnduringExecutor(SingleThreadedExecutor):
 
         Raises:
             ExternalShutdownException: rclpy was shut down.
+            FinishedError: of a callback.
         """
         try:
             super().spin_once(timeout_sec)
-        except ExternalShutdownException:
+        except (ExternalShutdownException, FinishedError):
             raise
         except Exception as error:
             if not self.context.ok():

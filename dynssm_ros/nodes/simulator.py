@@ -20,6 +20,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.nodes.executor import FinishedError
 from dynssm_ros.nodes.support import (
     actuators,
     choose,
@@ -38,7 +39,7 @@ from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
-from dynssm_ros.simulation.laps import Sample, drive
+from dynssm_ros.simulation.laps import Sample, SimulationError, drive
 from dynssm_ros.simulation.plant import PLANTS, PlantKind
 from dynssm_ros.simulation.sensing import Sensing, Sensors
 from dynssm_ros.track.driver import Style
@@ -157,7 +158,11 @@ class SimulatorNode(Node):
             self._held_up += late
             late = 0.0
         for _ in range(1 + int(late / self._period)):
-            self._publish(next(self._samples))
+            try:
+                sample = next(self._samples)
+            except SimulationError as error:
+                raise FinishedError(str(error)) from error
+            self._publish(sample)
 
     @property
     def _due(self) -> int:
