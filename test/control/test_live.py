@@ -123,7 +123,7 @@ def test_what_the_predictor_says_has_to_earn_its_place_in_the_plan(online, orca,
         car.answered(controller)
         controller.remote.adapted(answered + T_S, dict(zip(COEFFICIENTS, theta, strict=True)))
     assert controller.remote.output.source == RemoteModel.ADAPTED
-    np.testing.assert_array_equal(steps[-1][-1].theta, orca.nominal)
+    np.testing.assert_array_equal(steps[-1][-1].adapted.first.theta, orca.nominal)
     assert controller.values()["planned with calibrated"] == "1.00"
 
 
@@ -136,7 +136,7 @@ def test_what_the_predictor_says_reaches_the_plan_and_is_dropped_when_it_falls_s
         car.answered(controller)
         controller.remote.adapted(answered + T_S, dict(zip(COEFFICIENTS, theta, strict=True)))
         controller.remote.predicted(answered + T_S, car.plant.measured)
-    np.testing.assert_array_equal(steps[-1][-1].theta, theta)
+    np.testing.assert_array_equal(steps[-1][-1].adapted.first.theta, theta)
     assert controller.verdict() == (Level.OK, "drives, adapted coefficients")
     values = controller.values()
     assert float(values["D_f"]) == pytest.approx(theta[COEFFICIENTS.index("D_f")], rel=1e-5)
@@ -146,7 +146,7 @@ def test_what_the_predictor_says_reaches_the_plan_and_is_dropped_when_it_falls_s
 
     for _ in range(8):
         car.answered(controller)
-    np.testing.assert_array_equal(steps[-1][-1].theta, orca.nominal)
+    np.testing.assert_array_equal(steps[-1][-1].adapted.first.theta, orca.nominal)
     level, words = controller.verdict()
     assert level == Level.WARN
     assert "nominal car, nothing from the predictor for 0.1 s" in words
