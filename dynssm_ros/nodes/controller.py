@@ -23,7 +23,7 @@ from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.nodes.executor import failures
 from dynssm_ros.nodes.managed import ManagedNode
-from dynssm_ros.nodes.rivals import Output
+from dynssm_ros.nodes.rivals import WatchedOutput
 from dynssm_ros.nodes.support import (
     NEWEST_QOS,
     actuators,
@@ -72,7 +72,7 @@ class ControllerNode(ManagedNode):
         self._newest: int | None = None  # stamp of the odometry
         self._stuck = False  # whether the last odometry could not be planned from
 
-        self._command = Output(self, JointState, COMMAND_TOPIC)
+        self._command = WatchedOutput(self, JointState, COMMAND_TOPIC)
         self._publish_command = self._command.publish
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
         # when several messages wait, the executor serves subscriptions in this order

@@ -26,7 +26,7 @@ from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.nodes.display import Markers, frame_sender
 from dynssm_ros.nodes.executor import in_thread, let_wait
 from dynssm_ros.nodes.managed import ManagedNode
-from dynssm_ros.nodes.rivals import Output
+from dynssm_ros.nodes.rivals import WatchedOutput
 from dynssm_ros.nodes.support import (
     describe,
     diagnostics,
@@ -111,7 +111,7 @@ class PredictorNode(ManagedNode):
             raise ConfigurationError("parameter model: not set; expected a model folder, e.g. -p model:=out/model")
         self._predictor = Predictor(self._open(path), load_signal_map(self._signals), self._max_age, self._online)
         self._notice = self._load_state(pathlib.Path(self._state)) if self._state else ""
-        self._output = Output(self, Odometry, PREDICTION_TOPIC)
+        self._output = WatchedOutput(self, Odometry, PREDICTION_TOPIC)
         self._publish_parameters = output(self, JointState, PARAMETERS_TOPIC).publish
         self._publish_horizon = output(self, Path, HORIZON_TOPIC).publish
         self._markers = Markers(self) if self._draws else None
@@ -150,6 +150,7 @@ class PredictorNode(ManagedNode):
 
     async def _try_models(self, parameters: list[ParameterMessage]) -> None:
         """Opens and tries the models that are asked for, while the node goes on predicting."""
+        self._tried.clear()  # of a request that was refused before it came to the model
         for parameter in parameters:
             if parameter.name == "model" and self.prepared:
                 path = expanded(parameter.value.string_value)

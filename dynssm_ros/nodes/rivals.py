@@ -14,7 +14,7 @@ from dynssm_ros.signals.decoding import header_stamp_ns
 _REMEMBERED = 1000  # stamps of own messages
 
 
-class Output:
+class WatchedOutput:
     """A topic that a node publishes, and that it hears itself while there are other publishers of it.
 
     A publisher that is counted may be a stand-by, or dead for 20 s. So others are named that are heard.

@@ -102,7 +102,7 @@ class Predictor:
         How well it predicts is tried in a process of its own before: :func:`~dynssm_ros.runtime.trial.try_model`.
 
         Raises:
-            ArtifactError: it is for other commands or another car, or what it predicts is not finite or implausible.
+            ArtifactError: it is for other commands or another car, or what it predicts is not finite.
         """
         require_same_use(model, self.model.card)
         rows = np.zeros((model.H, len(WINDOW_COLUMNS)))
@@ -110,8 +110,7 @@ class Predictor:
         if np.all(np.isfinite(recent)):
             rows[-len(recent) :] = recent
             rows[: -len(recent)] = recent[0]
-        predicted = model.predict(rows[None])
-        for part in predicted[:4]:
+        for part in model.predict(rows[None])[:4]:
             if part is not None and not np.all(np.isfinite(part)):
                 raise ArtifactError(f"{model.artifact.path}: what it predicts is not finite; expected numbers")
 

@@ -105,10 +105,13 @@ def _wheelbase(vehicle: Vehicle) -> float:
     return vehicle.constants.l_f + vehicle.constants.l_r
 
 
-def judge(model: OnnxModel, present: ModelCard, rows: Vector) -> None:
+def judge(model: OnnxModel, present: ModelCard, rows: Vector) -> bool:
     """Compares what ``model`` predicts of ``rows`` ``(N, 7)`` with what was measured and with the calibrated car.
 
     Before a car has driven for long enough, only whether its predictions are plausible is looked at.
+
+    Returns:
+        whether it has driven for long enough.
 
     Raises:
         ArtifactError: errors many times as large as those of the physics, implausible predictions, or later than T_s.
@@ -146,6 +149,7 @@ def judge(model: OnnxModel, present: ModelCard, rows: Vector) -> None:
                 f"is {own[worst]:.3g}, that of the calibrated car {calibrated[worst]:.3g}; restart the node with this model "
                 "to use it all the same"
             )
+    return compared
 
 
 def _steady_windows(model: OnnxModel) -> Vector:
@@ -169,10 +173,10 @@ def _predicted(model: OnnxModel, learner: OnlineLearner | None, windows: Vector)
 
 def _seconds(model: OnnxModel) -> float:
     """How long a prediction takes (s), the shortest of three."""
-    taken = []
+    taken, window = [], _steady_windows(model)[:1]
     for _ in range(3):
         begin = time.perf_counter()
-        model.predict(_steady_windows(model)[:1])
+        model.predict(window)
         taken.append(time.perf_counter() - begin)
     return min(taken)
 

@@ -9,7 +9,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
-from dynssm_ros.nodes.rivals import Output
+from dynssm_ros.nodes.rivals import WatchedOutput
 from dynssm_ros.nodes.support import output, set_stamp
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(60)]
@@ -26,7 +26,7 @@ def test_another_publisher_is_named_while_it_is_heard(ros: None) -> None:
     executor = SingleThreadedExecutor()
     for node in nodes:
         executor.add_node(node)
-    commands, joystick = Output(own, JointState, "command"), output(other, JointState, "command")
+    commands, joystick = WatchedOutput(own, JointState, "command"), output(other, JointState, "command")
     count = 0
 
     def publishes_until(done: Callable[[], bool], *, both: bool) -> bool:

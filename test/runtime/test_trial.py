@@ -42,9 +42,9 @@ def refusal(use: Callable[[], None]) -> str:
 
 
 def test_a_model_is_good_enough_for_the_drive_that_it_was_trained_on(model: OnnxModel, rows: np.ndarray) -> None:
-    judge(model, model.card, rows)
-    judge(model, model.card, rows[:3])  # hardly driven yet
-    judge(model, model.card, rows[:0])
+    assert judge(model, model.card, rows)
+    assert not judge(model, model.card, rows[:3]), "hardly driven yet"
+    assert not judge(model, model.card, rows[:0])
 
 
 def spoilt(model: OnnxModel, monkeypatch: pytest.MonkeyPatch, change: Callable[..., WindowPrediction]) -> OnnxModel:

@@ -200,12 +200,13 @@ def _nearest_start(
     lower, width = given.vehicle.lower, given.vehicle.upper - given.vehicle.lower
 
     def fitted(
-        some: SimulationWindows, start: Vector, prior: float, tolerance: float, evaluations: int
+        some: SimulationWindows, start: Vector, prior: float, limits: tuple[float, int]
     ) -> optimize.OptimizeResult:
+        tolerance, evaluations = limits
         inside = np.clip(start, tuning.AT_BOUND, 1.0 - tuning.AT_BOUND)
 
-        def residuals_of(points: Vector) -> Vector:
-            cars = [given.at(lower + p * width) for p in points]
+        def residuals_at(places: Vector) -> Vector:
+            cars = [given.at(lower + p * width) for p in places]
             errors = some.errors_of(cars)[:, :, 0] / scale
             return np.concatenate(
                 [errors.reshape(len(cars), -1), prior * np.array([car.moved for car in cars])], axis=1
@@ -213,11 +214,11 @@ def _nearest_start(
 
         def derivatives(p: Vector) -> Vector:
             moved = p + np.diag(np.where(p + tuning.DIFFERENCE > 1.0, -tuning.DIFFERENCE, tuning.DIFFERENCE))
-            at = residuals_of(np.vstack([p, moved]))
+            at = residuals_at(np.vstack([p, moved]))
             return np.asarray((at[1:] - at[0]).T / (np.diag(moved) - p))
 
         def residuals(p: Vector) -> Vector:
-            return np.asarray(residuals_of(p[None])[0])
+            return np.asarray(residuals_at(p[None])[0])
 
         return optimize.least_squares(
             residuals, inside, derivatives, bounds=(0.0, 1.0), loss="soft_l1", x_scale="jac", ftol=tolerance,
@@ -226,12 +227,12 @@ def _nearest_start(
 
     found = []
     for theta in points:
-        found.append(fitted(few, (theta - lower) / width, tuning.SEARCH_PRIOR, 1e-5, 60))
+        found.append(fitted(few, (theta - lower) / width, tuning.SEARCH_PRIOR, tuning.SEARCH_LIMITS))
         tick()
     best = min(found, key=lambda fit: float(fit.cost))
     left = float(np.median(np.abs(best.fun[: 3 * len(few)])))
     for _ in range(tuning.POLISH_ROUNDS):
-        best = fitted(many, best.x, left, 1e-8, 300)
+        best = fitted(many, best.x, left, tuning.POLISH_LIMITS)
         left = float(np.median(np.abs(best.fun[: 3 * len(many)])))
     return given.at(lower + best.x * width)
 
