@@ -48,9 +48,6 @@ EXPLAINED_INFLATION = 2.0  # by correlated errors, up to which a model explains 
 SEARCH_ROWS, POLISH_ROWS = 1000, 4000  # with which starts are judged, and the best is polished [time]
 SEARCH_LIMITS = 1e-5, 60  # tolerance and evaluations of each start [time]
 POLISH_LIMITS = 1e-8, 300  # of the best: 60 lose a car from mid-range, 1e-12 comes no closer [test_paper_steps]
-    1e-8,
-    300,
-)  # of the best: 60 lose a car that is calibrated from mid-range, 1e-12 is no closer [test_paper_steps]
 SEARCH_PRIOR, POLISH_ROUNDS = 0.1, 3  # weight of what is known at first; rounds that find it [test_calibration]
 DIFFERENCE = 2.0**-26  # of the range, with which derivatives are taken: half of the digits [test_calibration]
 AT_BOUND = 1e-6  # of the range: what is closer is on the bound [test_calibration]
