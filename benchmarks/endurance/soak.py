@@ -44,12 +44,13 @@ from dynssm_ros.files import write_json
 from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.progress import Progress
 from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.trial import TIME_LIMIT_S
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.decoding import header_stamp_ns, live_decoders
 from dynssm_ros.signals.signal_map import load_signal_map
 
 _TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
-_START, _DRAIN = 60.0, 2.0  # s that the node may take until it answers, and to answer the last swaps
+_START = 60.0  # s that the node may take until it answers
 _SETTLED = 60.0  # s after which memory is to be flat
 _AFTER_SWAP = 1.0  # s in which answers are those of a swap
 _MB = 1e6
@@ -200,7 +201,8 @@ def soak(
                 if progress is not None:
                     progress(len(held), round(seconds))
         wait_for_the_last(run, collector.wait_for)
-        collector.wait_for(lambda: len(swapper.answers) == len(swapper.asked), _DRAIN)
+        waiting = len(swapper.asked) - len(swapper.answers)
+        collector.wait_for(lambda: len(swapper.answers) == len(swapper.asked), waiting * TIME_LIMIT_S)
     _judge(run, drive, done)
     if not spoilt:  # else a stamp does not say which message was answered
         _time(run, swapper.asked, done)
