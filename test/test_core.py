@@ -104,4 +104,5 @@ def test_an_environment_with_the_core_alone_predicts_live_on_dds(
     monkeypatch.chdir(tmp_path)  # away from the source tree
     run = live_run.run_live(small_model, laps_bag, 0.02, duration=4.0)
     assert len(run.predicted) > 150
-    assert run.missing() == []
+    assert run.lost == 0
+    assert run.passed_over < 0.3 * len(run.sent), "a machine that is busy"

@@ -36,7 +36,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]}
 FOLDERS = {path.name: path.parent for path in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]}
 USER_PAGES = {name: text for name, text in PAGES.items() if FOLDERS[name].name in ("start", "use", "understand")}
-WORDS, WORDS_OF_A_PAGE = 16_400, 1_600  # of docs/, and of a page of it
+WORDS, WORDS_OF_A_PAGE = 17_400, 1_600  # of docs/, and of a page of it
 RESULTS_FOLDER = ROOT / "benchmarks" / "results"  # in the words of the version that measured
 RESULTS = {path.name: path.read_text(encoding="utf-8") for path in RESULTS_FOLDER.glob("*.md")}
 README = PAGES["README.md"]
@@ -246,7 +246,7 @@ def _is_module(name: str) -> bool:
 
 
 def test_every_verdict_is_explained_and_every_explained_one_exists() -> None:
-    page = PAGES["troubleshooting.md"]
+    page, commands = PAGES["verdicts.md"], PAGES["troubleshooting.md"]
     source = " ".join(
         re.sub(r'"\s*\n?\s*f?"', "", path.read_text(encoding="utf-8")) for path in (ROOT / "dynssm_ros").rglob("*.py")
     )
@@ -254,7 +254,7 @@ def test_every_verdict_is_explained_and_every_explained_one_exists() -> None:
     assert {refusal.value for refusal in Refusal} <= verdicts
     for words in [*verdicts, *re.findall(r"^\| `([^`]+)` \| [^|]+ \| [^|]+ \| [^|]+ \|$", page, flags=re.M)]:
         assert words in source, words
-    for words in table("line contains", page):
+    for words in table("line contains", commands):
         assert words in source, words
 
 

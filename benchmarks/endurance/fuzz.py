@@ -27,7 +27,7 @@ from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.plausibility import ranges
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals import messages
-from dynssm_ros.signals.decoding import header_stamp_ns, live_decoders
+from dynssm_ros.signals.decoding import frames_of, header_stamp_ns, live_decoders
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.limits import vehicle_limits
@@ -146,7 +146,7 @@ class _Predicting:
             assert stamp is not None
             values = self.decoders[topic].decode(message)
             if topic == messages.ODOMETRY_TOPIC:
-                self._judge(stamp, values, self.predictor.predict(stamp, values))
+                self._judge(stamp, values, self.predictor.predict(stamp, values, frames_of(message)))
                 self.predictor.finish()
             else:
                 self.predictor.observe(stamp, values)

@@ -75,6 +75,16 @@ class LiveRun:
         first = min(self.predicted) - self.T_s
         return sorted(stamp for stamp in self.sent if stamp >= first and stamp + self.T_s not in self.predicted)
 
+    @property
+    def passed_over(self) -> int:
+        """Odometry that the predictor says it did not answer as newer one waited."""
+        return int(self.diagnostics[-1][2].get("refused: skipped", 0)) if self.diagnostics else 0
+
+    @property
+    def lost(self) -> int:
+        """Odometry messages after the first prediction that got none and were not passed over."""
+        return max(0, len(self.missing()) - self.passed_over)
+
 
 class Collector(Node):
     """Keeps everything that the predictor publishes."""
@@ -291,6 +301,8 @@ def run_live(
                 if progress is not None and len(run.sent) % 25 == 0:
                     progress(round((message.log_time - first) / 1e9), round(min(duration, 1e6)))
         wait_for_the_last(run, collector.wait_for)
+        told = len(run.diagnostics)
+        collector.wait_for(lambda: len(run.diagnostics) > told, 5.0)  # of what was passed over at the end
     return run
 
 

@@ -68,6 +68,7 @@ class Soaked:
         0  # odometry messages without a prediction, after the first one; of no meaning where messages are spoilt
     )
     latency_ms: dict[str, float] = field(default_factory=dict)  # percentiles, odometry published to prediction received
+    passed_over: int = 0  # odometry messages without a prediction, as newer ones waited
     late: int = 0  # predictions that took longer than T_s
     longest_gap_ms: float | None = None  # the longest time between two predictions
     # of the node's process: after the first minute (or at the start of a shorter run), the most since then, at the end
@@ -203,6 +204,8 @@ def soak(
         wait_for_the_last(run, collector.wait_for)
         waiting = len(swapper.asked) - len(swapper.answers)
         collector.wait_for(lambda: len(swapper.answers) == len(swapper.asked), waiting * TIME_LIMIT_S)
+        told = len(run.diagnostics)
+        collector.wait_for(lambda: len(run.diagnostics) > told, 5.0)  # of what was passed over at the end
     _judge(run, drive, done)
     if not spoilt:  # else a stamp does not say which message was answered
         _time(run, swapper.asked, done)
@@ -238,7 +241,7 @@ def _holds(pid: int) -> tuple[float, int]:
 
 def _judge(run: LiveRun, drive: _Drive, done: Soaked) -> None:
     done.predictions = sum(stamp - run.T_s in run.sent for stamp in run.predicted)
-    done.lost = len(run.missing())
+    done.passed_over, done.lost = run.passed_over, run.lost
     for stamp, state in run.predicted.items():
         if not all(map(math.isfinite, state)):
             done.violations.setdefault("an output is not finite", f"{state} at {stamp} ns")

@@ -20,6 +20,7 @@ from typing import get_args
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.control.brakes import AT_ONCE, Brakes
 from dynssm_ros.control.controller import LOST, Controller
 from dynssm_ros.control.evidence import SOURCES
 from dynssm_ros.control.horizon_model import STATES
@@ -29,6 +30,8 @@ from dynssm_ros.control.remote import RemoteModel
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.runtime.health import Level
+from dynssm_ros.runtime.plausibility import Plausibility
+from dynssm_ros.signals.decoding import Frames
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.simulation.sensing import MOST_LATE, steps_late
 from dynssm_ros.track.driver import Driver, Style
@@ -41,7 +44,7 @@ LAUNCH = 0.3, 0.7  # shares of the line's speed: below the first pursuit takes o
 _LAUNCH_STYLE = Style(aggressiveness=0.7, variation=0.0)
 _REMEMBERED = 1000  # control steps that the percentiles are of
 _TOLERATED = 0.01  # share of plans that may be missing before it is called a warning
-_LARGEST = 1e6  # m, rad, m/s, rad/s; what is larger is as good as infinite
+_STANDING = 0.2  # of the vehicle's minimum speed, below which a car stands
 _PUNCTUAL = 0.02  # of T_s by which odometry may be off for its difference to the one before to be that of a step
 _EARLY = 0.25  # of T_s that odometry may come before its time; what comes earlier is for a later step
 
@@ -97,8 +100,8 @@ class Laps:
 class LiveController:
     """Drives one car on one track from what comes over a bus.
 
-    Odometry that is not finite, comes twice or in disorder is refused. After a gap, or when its time jumps back, everything
-    begins anew. Far beside the road the car is braked.
+    Odometry that comes twice, in disorder or that the car cannot have produced is refused. After a gap, or when its time
+    jumps back, everything begins anew. What it brakes for is said by :mod:`dynssm_ros.control.brakes`.
 
     Args:
         vehicle: the car.
@@ -108,6 +111,8 @@ class LiveController:
         max_age: how old the odometry behind the predictor's coefficients may be (s).
         max_gap: longest time between two odometry messages that is no gap (s).
         delay: from the stamp of an odometry message until it arrives (s), in whole T_s.
+        max_late: by how much more odometry may come late (s).
+        frames: that the odometry must have; those that are empty are as they come first.
         clock: time now (s), of any origin, for the deadline.
 
     Raises:
@@ -124,6 +129,8 @@ class LiveController:
         max_age: float = 0.5,
         max_gap: float = 0.2,
         delay: float = 0.0,
+        max_late: float = math.inf,
+        frames: Frames = ("", ""),
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.vehicle = vehicle
@@ -140,8 +147,9 @@ class LiveController:
         self._pursuit = Driver(vehicle, reference.line, vehicle_limits(vehicle), _LAUNCH_STYLE)
         self._reference = reference
         self._brakes = vehicle.inputs.throttle[0]
-        self._max_age, self._max_gap = max_age, max_gap * 1e9
+        self._max_age, self._max_gap, self._max_late = max_age, max_gap * 1e9, max_late
         self._track = track
+        self._frames = frames
         self._reset()
         # what is loaded, compiled or allocated by the first step is so before the car waits for it
         x, y = (float(value) for value in reference.line.position(0.0))
@@ -160,6 +168,9 @@ class LiveController:
         self._heading = 0.0
         # commands from the one that acts at the stamp of the newest odometry to the last
         self._sent = deque([Applied(0.0, 0.0)] * self._age, maxlen=self._age)
+        self.brakes = Brakes(self.vehicle.sampling_time, _STANDING * self.vehicle.minimum_speed)
+        self._contract = Plausibility(self.vehicle, frames=self._frames)
+        self._jumps = 0
         self._weights = np.zeros(len(SOURCES))
         self._planned_with = self.remote.calibrated
         self._restart()
@@ -171,18 +182,40 @@ class LiveController:
         self._launching = False
         self._memory: Vector | None = None
 
-    def step(self, stamp: int, pose: Pose, seen: State) -> Applied | Refusal | None:
-        """Answers the odometry message of ``stamp`` (ns), with a heading that may be wrapped.
+    def step(
+        self, stamp: int, pose: Pose, seen: State, *, frames: Frames | None = None, late: float = 0.0
+    ) -> Applied | Refusal | None:
+        """Answers an odometry message.
+
+        Args:
+            stamp: of the message (ns).
+            pose: with a heading that may be wrapped.
+            seen: velocities.
+            frames: of the message; ``None`` if it has none.
+            late: how much later than the fastest the last messages came (s).
 
         Returns:
             The command from ``stamp + answered_after`` on, finite and within the limits; why the message is refused; or
                 nothing if it is too early for a new plan.
         """
-        if not all(abs(value) < _LARGEST for value in (*pose, *seen)):
-            return Refusal.NOT_FINITE
         since = math.inf if self._last is None else stamp - self._last
         if -self._max_gap <= since <= 0:
             return Refusal.REPEATED
+        if since < 0:
+            self._contract.forget()
+        refusal = self._contract.check(stamp, pose._asdict() | seen._asdict(), frames)
+        if refusal is None and not all(map(math.isfinite, (*pose, *seen))):
+            refusal = Refusal.NOT_FINITE
+        if refusal in AT_ONCE:
+            self.brakes.apply(refusal.value)
+            return self.brake()
+        if refusal is not None:
+            return refusal
+        if self._contract.jumps > self._jumps:
+            self._jumps = self._contract.jumps
+            self.brakes.apply("the pose jumped", until_standing=True)
+        elif late > self._max_late:
+            self.brakes.apply(f"odometry comes {late:.2f} s later than its fastest")
         together = 0 < since <= self._max_gap
         if together and stamp - self._planned < (1 - _EARLY) * self.period:
             self._last = stamp
@@ -196,17 +229,17 @@ class LiveController:
         if since < 0 or self._last is None:
             self.laps, self._first = Laps(self._track), stamp
         self._last = self._planned = stamp
-        return self._answer(stamp, pose, seen, together)
+        self.laps.passed((stamp - self._first) / 1e9, pose.x, pose.y, together)
+        if self.laps.outside > LOST * self.laps.width:
+            self.brakes.apply(f"{self.laps.outside:.3g} m outside the borders")
+        return self._answer(stamp, pose, seen) if self.brakes.released(seen.v_x) else self.brake()
 
     def learn(self) -> None:
         """Learns from the last step; to be called once its command is out, which does not wait for it."""
         self._pilot.learn()
 
-    def _answer(self, stamp: int, pose: Pose, seen: State, together: bool) -> Applied:
+    def _answer(self, stamp: int, pose: Pose, seen: State) -> Applied:
         t = (stamp - self._first) / 1e9
-        self.laps.passed(t, pose.x, pose.y, together)
-        if self.laps.outside > LOST * self.laps.width:
-            return self.brake()
         self._heading += math.remainder(pose.theta - self._heading, 2 * math.pi)
         context = t, *self._track.centre.place(self.laps.s % self._track.length).values()
         x = self.remote.start(Pose(pose.x, pose.y, self._heading), seen, self._sent[0], context, self._memory)
@@ -245,8 +278,8 @@ class LiveController:
 
     def verdict(self) -> tuple[Level, str]:
         """How it goes, in words."""
-        if self.laps.outside > LOST * self.laps.width:
-            return Level.ERROR, f"{self.laps.outside:.3g} m outside the borders: brakes"
+        if self.brakes.reason:
+            return Level.ERROR, f"{self.brakes.reason}: brakes"
         output, level, words = self.remote.output, Level.OK, ""
         if output.source == RemoteModel.NOMINAL:
             level, words = Level.WARN, f", nothing from the predictor for {self._max_age:g} s"
@@ -267,6 +300,7 @@ class LiveController:
             "step p50 (ms)": f"{1e3 * p50:.3f}",
             "step p99 (ms)": f"{1e3 * p99:.3f}",
             **{f"plans {status}": str(self.counts[status]) for status in get_args(Status)},
+            "braked": str(self.brakes.count),
             "laps": str(laps.count),
             "last lap (s)": f"{laps.last:.3f}",
             "place on the track (m)": f"{laps.s % self._track.length:.3f}",

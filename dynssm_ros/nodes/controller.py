@@ -35,8 +35,9 @@ from dynssm_ros.nodes.support import (
     repeat,
     run,
 )
-from dynssm_ros.runtime.health import Health, Level
-from dynssm_ros.signals.decoding import decoders, header_stamp_ns
+from dynssm_ros.runtime.health import Delivery, Health, Level
+from dynssm_ros.runtime.plausibility import Plausibility
+from dynssm_ros.signals.decoding import decoders, frames_of, header_stamp_ns
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.messages import COMMAND_TOPIC, ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -45,6 +46,7 @@ from dynssm_ros.vehicle import Applied, State, load_vehicle
 from dynssm_ros.vehicle.kinematics import Pose
 
 _STEPS = (2, 100)  # of a horizon
+_AGAIN_S = 0.005  # between answers to another node's commands, which may answer too
 
 
 class ControllerNode(ManagedNode):
@@ -69,10 +71,13 @@ class ControllerNode(ManagedNode):
         self._driver = self._make_driver()
         self._health = Health((ODOMETRY_TOPIC, PREDICTION_TOPIC, PARAMETERS_TOPIC), self._watchdog)
         self._decoder = decoders(load_signal_map("default"))[ODOMETRY_TOPIC]
+        self._delivery = Delivery(math.inf, self._max_late)
+        self._possible = Plausibility(self._driver.vehicle)
         self._newest: int | None = None  # stamp of the odometry
-        self._stuck = False  # whether the last odometry could not be planned from
+        self._refused = -math.inf, Refusal.MISSING  # of odometry, the last one and when it came (s)
+        self._answered = -math.inf  # when a rival was answered (s)
 
-        self._command = WatchedOutput(self, JointState, COMMAND_TOPIC)
+        self._command = WatchedOutput(self, JointState, COMMAND_TOPIC, self._on_rival)
         self._publish_command = self._command.publish
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
         # when several messages wait, the executor serves subscriptions in this order
@@ -111,6 +116,15 @@ class ControllerNode(ManagedNode):
         self._delay: float = describe(
             self, "delay", 0.0, "From the stamp of the odometry until it arrives (s).", (0.0, 10.0), read_only=True
         )
+        self._max_late: float = describe(
+            self, "max_late", 0.1, "By how much more odometry may come late (s).", (0.0, 10.0), read_only=True
+        )
+        self._frames: tuple[str, str] = (
+            describe(self, "frame_id", "", "Frame of the odometry's pose; empty: as it comes first.", read_only=True),
+            describe(
+                self, "child_frame_id", "", "Frame of the odometry's twist; empty: as it comes first.", read_only=True
+            ),
+        )
         self._max_age: float = describe(
             self, "max_age", 0.5, "Age to which the predictor's coefficients are held (s).", (0.01, 10.0), read_only=True
         )  # fmt: skip
@@ -125,8 +139,9 @@ class ControllerNode(ManagedNode):
         settings = Settings.of(car, self._objective, self._steps or None, self._offset_free, self._evidence)
         settings = replace(settings, deadline=car.sampling_time / self._rate)
         driver = LiveController(
-            car, reference, road, settings, max_age=self._max_age, max_gap=self._watchdog, delay=self._delay
-        )
+            car, reference, road, settings, max_age=self._max_age, max_gap=self._watchdog, delay=self._delay,
+            max_late=self._max_late, frames=self._frames,
+        )  # fmt: skip
         self.get_logger().info(
             f"{car.name} on {road.name} ({road.length:.4g} m), {self._objective} of the {reference.name} line "
             f"({reference.lap_time:.4g} s a lap at its own speed), {settings.N} steps of {car.sampling_time:g} s"
@@ -140,10 +155,11 @@ class ControllerNode(ManagedNode):
     def _on_prediction(self, message: Odometry) -> None:
         self._health.arrived(PREDICTION_TOPIC, self._now())
         twist = message.twist.twist
-        self._refuse(
-            PREDICTION_TOPIC,
-            self._driver.remote.predicted(_stamp(message), (twist.linear.x, twist.linear.y, twist.angular.z)),
-        )
+        state = State(twist.linear.x, twist.linear.y, twist.angular.z)
+        if self._possible.is_beyond(state._asdict()):
+            self._refuse(PREDICTION_TOPIC, self._possible.last)
+        else:
+            self._refuse(PREDICTION_TOPIC, self._driver.remote.predicted(_stamp(message), state))
 
     def _on_parameters(self, message: JointState) -> None:
         self._health.arrived(PARAMETERS_TOPIC, self._now())
@@ -158,50 +174,65 @@ class ControllerNode(ManagedNode):
         if not self.active:
             self._health.arrived(ODOMETRY_TOPIC, self._now())
             return
-        stamp, values = _stamp(message), self._decoder.decode(message)
+        stamp, values, now = _stamp(message), self._decoder.decode(message), self._now()
         pose, seen = Pose(*map(values.__getitem__, Pose._fields)), State(*map(values.__getitem__, State._fields))
+        self._delivery.arrived(now, stamp)
         outcome: Applied | Refusal | None
         try:
-            outcome = self._driver.step(stamp, pose, seen)
-            self._stuck = False
+            outcome = self._driver.step(stamp, pose, seen, frames=frames_of(message), late=self._delivery.behind)
         except Exception as error:  # whatever it is: the car must not go on with the command before
             failures(self).add(self, error)
-            outcome, self._stuck = self._driver.brake(), True
+            self._driver.brakes.apply("cannot plan")
+            outcome = self._driver.brake()
         if isinstance(outcome, Refusal):
             self._health.refused(outcome)
+            self._refused = now, outcome
             return
         self._health.arrived(ODOMETRY_TOPIC, self._now())  # now: a step that took long is no silence of the odometry
         self._newest = stamp
         if outcome is not None:
             self._publish_command(actuators(stamp + self._driver.answered_after, outcome))
-            if not self._stuck:
+            if not self._driver.brakes.reason:
                 self._driver.learn()
 
     def _watch(self) -> None:
-        """Brakes while odometry is silent."""
-        if not (self.active and self._silent()):
+        """Brakes while there is no good odometry, and looks for others who command."""
+        self._command.look()
+        if not self.active:
             return
+        now = self._now()
+        age = self._health.age(ODOMETRY_TOPIC, now)
+        if age <= self._watchdog:
+            return
+        refused, why = self._refused
+        if now - refused <= self._watchdog:
+            words = why.value
+        else:
+            words = f"{ODOMETRY_TOPIC}: " + ("nothing received" if math.isinf(age) else f"silent for {age:.1f} s")
+        self._driver.brakes.apply(words)
+        self._brake()
+
+    def _on_rival(self) -> None:
+        """Brakes, also after each command of another node: the actuators obey the last one."""
+        now = time.monotonic()
+        if self.active and now - self._answered > _AGAIN_S:
+            self._answered = now
+            self._driver.brakes.apply(f"another node publishes on {self._command.topic}")
+            self._brake()
+
+    def _brake(self) -> None:
         if self._newest is None:
             stamp = int(self.get_clock().now().nanoseconds)
         else:
-            silence = self._health.age(ODOMETRY_TOPIC, self._now())
+            silence = max(0.0, self._health.age(ODOMETRY_TOPIC, self._now()))
             stamp = self._newest + self._driver.answered_after + round(silence * 1e9)
         self._publish_command(actuators(stamp, self._driver.brake()))
-
-    def _silent(self) -> bool:
-        return self._health.age(ODOMETRY_TOPIC, self._now()) > self._watchdog
 
     def _diagnose(self) -> None:
         now, driver, health = self._now(), self._driver, self._health
         level, words = driver.verdict() if self.active else (Level.OK, "inactive, drives nothing")
-        if self.active and self._stuck:
-            level, words = Level.ERROR, "cannot plan: brakes"
-        if self._silent():
-            age = health.age(ODOMETRY_TOPIC, now)
-            silence = "nothing received" if math.isinf(age) else f"silent for {age:.1f} s"
-            level, words = Level.ERROR, f"{ODOMETRY_TOPIC}: {silence}: brakes"
         if (rival := self._command.rival()) and self.active:
-            level, words = Level.ERROR, f"{words}; {rival}"
+            level, words = Level.ERROR, f"{rival}: brakes"
         values = driver.values()
         for topic in health.topics:
             values[f"{topic} rate (Hz)"] = f"{health.rate(topic, now):.1f}"

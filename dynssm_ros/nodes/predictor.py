@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import pathlib
 import time
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -19,6 +20,7 @@ from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.arrays import Vector
@@ -38,6 +40,8 @@ from dynssm_ros.nodes.support import (
     run,
     set_pose,
     set_stamp,
+    waited,
+    waiting,
 )
 from dynssm_ros.runtime.artifact import parse_artifact, read_folder
 from dynssm_ros.runtime.health import Health, Level
@@ -45,13 +49,15 @@ from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.trial import try_model
 from dynssm_ros.runtime.wiring import Wiring
-from dynssm_ros.signals.decoding import TopicDecoder, header_stamp_ns, live_decoders
+from dynssm_ros.signals.decoding import TopicDecoder, frames_of, header_stamp_ns, live_decoders
+from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, planar_covariance
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import COEFFICIENTS
 from dynssm_ros.vehicle.kinematics import Pose
 
 _SAVE_PERIOD_S = 10.0
+_ROLLOUT = 0.8  # of T_s from the odometry's arrival, after which a rollout is cut off
 
 
 class PredictorNode(ManagedNode):
@@ -71,6 +77,12 @@ class PredictorNode(ManagedNode):
             "Oldest actuator sample that a prediction may rest on (s).",
             (0.01, 10.0),
             read_only=True,
+        )
+        self._frames = (
+            describe(self, "frame_id", "", "Frame of the odometry's pose; empty: as it comes first.", read_only=True),
+            describe(
+                self, "child_frame_id", "", "Frame of the odometry's twist; empty: as it comes first.", read_only=True
+            ),
         )
         self._horizon = describe(
             self, "horizon", 0.0, "Length of the rollout on /dynssm/horizon (s); 0 switches it off.", (0.0, 10.0)
@@ -109,7 +121,9 @@ class PredictorNode(ManagedNode):
         path = expanded(self.get_parameter("model").value)
         if not path:
             raise ConfigurationError("parameter model: not set; expected a model folder, e.g. -p model:=out/model")
-        self._predictor = Predictor(self._open(path), load_signal_map(self._signals), self._max_age, self._online)
+        self._predictor = Predictor(
+            self._open(path), load_signal_map(self._signals), self._max_age, self._online, frames=self._frames
+        )
         self._notice = self._load_state(pathlib.Path(self._state)) if self._state else ""
         self._output = WatchedOutput(self, Odometry, PREDICTION_TOPIC)
         self._publish_parameters = output(self, JointState, PARAMETERS_TOPIC).publish
@@ -170,38 +184,57 @@ class PredictorNode(ManagedNode):
         self._health = Health(
             tuple(self._names.values()), max(self._max_age, signal_map.max_gap), self._predictor.model.T_s
         )
+        self._subscribed: dict[TopicDecoder, Subscription] = {}
         # actuators come first: when several messages wait, the executor serves subscriptions in this order
         for topic, decoder in by_topic.items():
             receive = self._on_odometry if topic == signal_map.odometry_topic else self._on_actuator
-            listen(self, message_class(decoder.msgtype), decoder.subscribed, partial(receive, decoder))
+            subscription = listen(self, message_class(decoder.msgtype), decoder.subscribed, partial(receive, decoder))
+            self._subscribed[decoder] = subscription
 
-    def _on_actuator(self, decoder: TopicDecoder, message: Any) -> None:
-        now = time.monotonic()
-        stamp = self._stamp(message)
-        self._health.arrived(self._names[decoder.topic], now, stamp)
-        refusal = self._predictor.observe(stamp, decoder.decode(message))
+    def _arrived(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int]) -> tuple[int, float]:
+        """Notes a message; returns its stamp (ns) and when it arrived (s)."""
+        stamp, arrived = self._stamp(message), time.monotonic() - waited(times)
+        self._health.arrived(self._names[decoder.topic], arrived, stamp)
+        return stamp, arrived
+
+    def _on_actuator(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int]) -> None:
+        stamp, _ = self._arrived(decoder, message, times)
+        refusal = self._predictor.observe(stamp, decoder.decode(message), frames_of(message))
         if refusal is not None:
             self._health.refused(refusal)
 
-    def _on_odometry(self, decoder: TopicDecoder, message: Any) -> None:
-        now = time.monotonic()
-        stamp = self._stamp(message)
-        self._health.arrived(self._names[decoder.topic], now, stamp)
-        outcome = self._predictor.predict(stamp, decoder.decode(message))
+    def _on_odometry(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int]) -> None:
+        if waited(times) > self._predictor.model.T_s:  # the instant that it would predict has passed
+            message, times = self._newest(decoder, message, times)
+        stamp, arrived = self._arrived(decoder, message, times)
+        outcome = self._predictor.predict(stamp, decoder.decode(message), frames_of(message))
         if not isinstance(outcome, Prediction):
             self._health.refused(outcome)
             return
         if self.active:
-            self._publish(outcome, message)
-        queued = self._health.queued(self._names[decoder.topic])
-        self._health.predicted(time.monotonic() - now, outcome.residual_share, queued)
+            self._publish(outcome, message, arrived + _ROLLOUT * self._predictor.model.T_s)
+        late = self._health.delivery(self._names[decoder.topic]).newest
+        self._health.predicted(time.monotonic() - arrived, outcome.residual_share, late)
         self._predictor.finish()
         self._wiring.add(stamp, self._predictor.row)
+
+    def _newest(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int]) -> tuple[Any, Mapping[str, int]]:
+        """Takes all that waits into the history but the newest odometry, which it returns."""
+        older = [(message, times), *waiting(self._subscribed[decoder])]  # first: its actuators are there then
+        for other, subscription in self._subscribed.items():
+            if other is not decoder:
+                for each in waiting(subscription):
+                    self._on_actuator(other, *each)
+        newest = older.pop()
+        for each in older:
+            self._on_actuator(decoder, *each)
+            self._health.refused(Refusal.SKIPPED)
+        return newest
 
     def _set_wiring(self) -> None:
         self._wiring = Wiring(self._predictor.vehicle, self._predictor.model.T_s)
 
-    def _publish(self, prediction: Prediction, message: Any) -> None:
+    def _publish(self, prediction: Prediction, message: Any, deadline: float) -> None:
         odometry = self._prediction
         set_stamp(odometry.header, prediction.stamp)
         if isinstance(message, Odometry):
@@ -220,7 +253,8 @@ class PredictorNode(ManagedNode):
             self._publish_parameters(self._adapted)
         ahead: list[Pose] = []
         if self._horizon > 0:
-            ahead = self._predictor.horizon(prediction, max(1, round(self._horizon / self._predictor.model.T_s)))
+            steps = max(1, round(self._horizon / self._predictor.model.T_s))
+            ahead = self._predictor.horizon(prediction, steps, deadline)
             self._publish_horizon(self._path(prediction, ahead))
         if prediction.pose is not None and self._markers is not None:
             self._markers.draw(odometry.header, self._predictor.vehicle, prediction.pose, ahead)
@@ -303,6 +337,7 @@ class PredictorNode(ManagedNode):
     def _diagnose(self) -> None:
         now = time.monotonic()
         self._health.wiring = self._wiring.verdict()
+        self._health.hindsight = self._predictor.hindsight()
         self._health.publishers = {topic: self.count_publishers(topic) for topic in self._health.topics}
         level, words = self._health.verdict(now)
         if (rival := self._output.rival()) and self.active:

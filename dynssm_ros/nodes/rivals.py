@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
@@ -23,14 +24,21 @@ class WatchedOutput:
         node: that publishes.
         msgtype: class of the messages; they have a header.
         topic: in the node's namespace.
+        on_rival: called when another node's message is heard.
     """
 
-    def __init__(self, node: Node, msgtype: Any, topic: str) -> None:
+    def __init__(self, node: Node, msgtype: Any, topic: str, on_rival: Callable[[], None] = lambda: None) -> None:
         self._node, self._msgtype = node, msgtype
         self._publisher = output(node, msgtype, topic)
         self._subscription: Subscription | None = None
         self._sent: Counter[int] = Counter()
         self._foreign = 0
+        self._on_rival = on_rival
+
+    @property
+    def topic(self) -> str:
+        """Its full name."""
+        return self._publisher.topic_name
 
     def publish(self, message: Any) -> None:
         """Publishes a message."""
@@ -38,9 +46,9 @@ class WatchedOutput:
             self._sent[header_stamp_ns(message) or 0] += 1
         self._publisher.publish(message)
 
-    def rival(self) -> str:
-        """Who else was heard since the last look, in words; empty if nobody was."""
-        topic, foreign, self._foreign = self._publisher.topic_name, self._foreign, 0
+    def look(self) -> None:
+        """Listens while there are other publishers."""
+        topic = self.topic
         shared = self._node.count_publishers(topic) > 1
         if shared and self._subscription is None:
             self._sent.clear()
@@ -50,6 +58,11 @@ class WatchedOutput:
             self._subscription = None
         for stamp in sorted(self._sent)[:-_REMEMBERED]:
             del self._sent[stamp]
+
+    def rival(self) -> str:
+        """Looks; who else was heard since the last time, in words, empty if nobody was."""
+        self.look()
+        topic, foreign, self._foreign = self.topic, self._foreign, 0
         if not foreign:
             return ""
         infos = self._node.get_publishers_info_by_topic(topic)
@@ -64,3 +77,4 @@ class WatchedOutput:
             self._sent[stamp] -= 1
         else:
             self._foreign += 1
+            self._on_rival()

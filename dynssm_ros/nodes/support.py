@@ -8,7 +8,8 @@ import math
 import re
 import signal
 import sys
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from pathlib import Path
 from types import ModuleType
@@ -25,6 +26,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
 from dynssm_ros.configuration import config_root
@@ -58,14 +60,32 @@ def output(node: Node, msgtype: Any, topic: str) -> Publisher:
     )
 
 
-def listen(node: Node, msgtype: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile = SENSOR_QOS) -> None:
+def listen(
+    node: Node, msgtype: Any, topic: str, callback: Callable[..., None], qos: QoSProfile = SENSOR_QOS
+) -> Subscription:
     """Subscribes with ``qos`` unless ``qos_overrides`` say otherwise: best effort takes what any sensor publishes.
 
-    Reliable, it takes what reliable publishers send alone, and loses nothing of that while it is held up.
+    Reliable, it takes what reliable publishers send alone, and loses nothing of that while it is held up. A ``callback``
+    that takes two arguments is given the message's times as well.
     """
-    node.create_subscription(
+    return node.create_subscription(
         msgtype, topic, callback, copy(qos), qos_overriding_options=QoSOverridingOptions.with_default_policies()
     )
+
+
+def waiting(subscription: Subscription) -> Iterator[tuple[Any, Mapping[str, int]]]:
+    """Takes the messages that wait, oldest first, with their times."""
+    while True:
+        with subscription.handle:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if taken is None:
+            return
+        yield taken
+
+
+def waited(times: Mapping[str, int]) -> float:
+    """How long ago a message with these ``times`` arrived in this process (s)."""
+    return max(0.0, (time.time_ns() - times["received_timestamp"]) / 1e9)
 
 
 def repeat(node: Node, period: float, work: Callable[[], None]) -> None:

@@ -1,4 +1,4 @@
-"""What the live predictor says of itself: counts, rates, ages, latencies and a verdict in words."""
+"""What a live node says of what comes in and goes out: counts, rates, ages, latencies and a verdict in words."""
 
 from __future__ import annotations
 
@@ -12,10 +12,16 @@ import numpy as np
 from dynssm_ros.signals.history import Refusal
 
 _REMEMBERED = 1000
+_CLOCKS = 10  # messages by whose delays clocks are compared
 _JUDGED = 100  # outcomes that the verdict is of
 _NOW = 5  # of which the last, all refused, mean that there is no prediction now
 _MANY = 0.05  # share of them refused, from which on it is said
 _OTHER_CLOCK_S = 0.5
+_FORGETTING = 1e-3  # s per s by which the fastest delivery may grow: clocks drift less
+_REAL_TIME = (
+    0.05  # share by which stamps and clock may differ for lateness to be told: else a log is played more slowly
+)
+_SETTLED_S = 2.0  # after which that share is known
 
 
 class Level(IntEnum):
@@ -26,6 +32,56 @@ class Level(IntEnum):
     ERROR = 2
 
 
+class Delivery:
+    """How much later messages come than the fastest of them lately, whatever their clock is.
+
+    Nothing is late after a silence, a time that jumps back, or where stamps do not go at the pace of the clock.
+
+    Args:
+        max_silence: after which it begins anew (s).
+        max_late: lateness (s) beyond which it is not got used to.
+    """
+
+    def __init__(self, max_silence: float, max_late: float = np.inf) -> None:
+        self._max_silence, self._max_late = max_silence, max_late
+        self.forget()
+
+    def forget(self) -> None:
+        """The next message is the first."""
+        self._first: tuple[float, int] | None = None
+        self._last = (0.0, 0)
+        self._fastest = np.inf
+        self._behind: deque[float] = deque(maxlen=_NOW)
+
+    def arrived(self, now: float, stamp: int) -> None:
+        """A message with ``stamp`` (ns) came at ``now`` (s)."""
+        elapsed = now - self._last[0]
+        if self._first is None or elapsed > self._max_silence or stamp < self._last[1]:
+            self.forget()
+            self._first, elapsed = (now, stamp), 0.0
+        self._last = now, stamp
+        delay = now - stamp / 1e9
+        if delay - self._fastest < self._max_late:
+            self._fastest += _FORGETTING * elapsed
+        self._fastest = min(delay, self._fastest)
+        self._behind.append(delay - self._fastest)
+
+    @property
+    def newest(self) -> float:
+        """Of the newest message (s)."""
+        return self._behind[-1] if self._behind else 0.0
+
+    @property
+    def behind(self) -> float:
+        """The least of the last messages (s); 0 where it cannot be told."""
+        if self._first is None or len(self._behind) < _NOW:
+            return 0.0
+        elapsed, driven = self._last[0] - self._first[0], (self._last[1] - self._first[1]) / 1e9
+        if elapsed < _SETTLED_S or abs(driven - elapsed) > _REAL_TIME * elapsed:
+            return 0.0
+        return min(self._behind)
+
+
 @dataclass
 class Health:
     """Collects what happened; times are seconds of a clock that never jumps.
@@ -33,9 +89,10 @@ class Health:
     Attributes:
         topics: the inputs that are expected.
         max_silence: longest time without odometry that is still called healthy (s).
-        period: T_s (s), by which an answer may wait in a queue and is not late.
+        period: T_s (s), within which an answer is not late.
         publishers: of each input, as far as known.
         wiring: what is wired wrongly, in words; empty if nothing is known to be.
+        hindsight: that predictions were worse than none, in words; empty if they were not.
         late: answers that were late.
     """
 
@@ -44,6 +101,7 @@ class Health:
     period: float = np.inf
     publishers: dict[str, int] = field(default_factory=dict)
     wiring: str = ""
+    hindsight: str = ""
     late: int = 0
     refusals: Counter[Refusal] = field(default_factory=Counter)
     predictions: int = 0
@@ -52,31 +110,33 @@ class Health:
     _shares: deque[float] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     _outcomes: deque[Refusal | None] = field(default_factory=lambda: deque(maxlen=_JUDGED))
     _delays: dict[str, deque[float]] = field(default_factory=dict)
+    _deliveries: dict[str, Delivery] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._arrivals = {topic: deque(maxlen=100) for topic in self.topics}
-        self._delays = {topic: deque(maxlen=_REMEMBERED) for topic in self.topics}
+        self._delays = {topic: deque(maxlen=_CLOCKS) for topic in self.topics}
+        self._deliveries = {topic: Delivery(self.max_silence) for topic in self.topics}
 
     def arrived(self, topic: str, now: float, stamp: int | None = None) -> None:
         """A message of ``topic`` came in, with ``stamp`` (ns)."""
         self._arrivals[topic].append(now)
         if stamp is not None:
             self._delays[topic].append(now - stamp / 1e9)
+            self._deliveries[topic].arrived(now, stamp)
 
-    def queued(self, topic: str) -> float:
-        """How much longer the last message of ``topic`` took to come than the fastest one lately (s)."""
-        delays = self._delays[topic]
-        return delays[-1] - min(delays) if delays else 0.0
+    def delivery(self, topic: str) -> Delivery:
+        """How late the messages of ``topic`` come."""
+        return self._deliveries[topic]
 
     def refused(self, refusal: Refusal) -> None:
-        """A sample or a prediction was refused."""
+        """A sample or a prediction was refused, or odometry passed over."""
         self.refusals[refusal] += 1
         self._outcomes.append(refusal)
 
-    def predicted(self, latency: float, residual_share: float, queued: float = 0.0) -> None:
-        """A prediction went out ``latency`` seconds after its odometry came in, which had waited ``queued`` seconds."""
+    def predicted(self, latency: float, residual_share: float, late: float = 0.0) -> None:
+        """A prediction went out ``latency`` seconds after its odometry arrived in the process, itself ``late`` (s)."""
         self.predictions += 1
-        self.late += queued + latency > self.period
+        self.late += late + latency > self.period
         self._outcomes.append(None)
         self._latencies.append(latency)
         self._shares.append(residual_share)
@@ -114,11 +174,27 @@ class Health:
         newest = recent[-1] if recent else None
         if newest is not None and None not in recent:
             return (Level.WARN if newest is Refusal.FILLING else Level.ERROR), newest.value
+        if late := self._lateness():
+            return late
+        if self.hindsight:
+            return Level.ERROR, self.hindsight
         several = [f"{topic}: {count} publishers" for topic, count in self.publishers.items() if count > 1]
         if several:
             return Level.WARN, "; ".join(several)
         refused = self._mostly_refused()
         return (Level.WARN, refused[0]) if refused else (Level.OK, "predicting")
+
+    def _lateness(self) -> tuple[Level, str] | None:
+        """The verdict on inputs or answers of which the last were all late, the worst of them."""
+        found = {
+            f"{topic}: comes {{}} later than its fastest lately": d.behind for topic, d in self._deliveries.items()
+        }
+        if len(self._latencies) >= _NOW:
+            found["answers come {} after the odometry: it cannot keep up"] = min(list(self._latencies)[-_NOW:])
+        words, late = max(found.items(), key=lambda item: item[1])
+        if late <= self.period:
+            return None
+        return Level.ERROR if late > self.max_silence else Level.WARN, words.format(f"{late:.2f} s")
 
     def _mostly_refused(self) -> list[str]:
         """The share of messages that was refused lately, with the reason of most; nothing if it is small."""
@@ -131,7 +207,7 @@ class Health:
 
     def _clocks(self) -> list[str]:
         """Topics whose stamps are on another clock than those of most others."""
-        delays = {topic: min(list(values)[-10:]) for topic, values in self._delays.items() if values}
+        delays = {topic: min(values) for topic, values in self._delays.items() if values}
         if len(delays) < 2:
             return []
         usual = sorted(delays.values())[(len(delays) - 1) // 2]

@@ -1,6 +1,8 @@
-"""Samples that the car cannot have produced: beyond what it can do, or farther from the last one than it can move.
+"""What a measured sample must be, for predictor, controller and recordings alike.
 
-A jump is believed when a second sample confirms it, as after a collision or where a filter was set anew.
+Numbers within what the car can do, no farther from the last ones than it can move, an orientation that is one, the frames
+of before, and poses that move as the velocities say (:mod:`dynssm_ros.runtime.consistency`). A jump is believed when a
+second sample confirms it, as after a collision or where a filter was set anew.
 """
 
 from __future__ import annotations
@@ -13,10 +15,13 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
+from dynssm_ros.runtime.consistency import Consistency
+from dynssm_ros.signals.decoding import Frames
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.signals.signal_map import STATE_SIGNALS
-from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
+from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS
+from dynssm_ros.vehicle import COEFFICIENTS, State, Vehicle
+from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.limits import vehicle_limits
 
 _BEYOND = 1.5  # times a limit
@@ -25,7 +30,9 @@ _HARD = 4.0  # times the car's accelerations: kerbs, hits
 _NOISE = 0.5  # jump that is no sign of anything, in units of the car's own speed and yaw rate
 _COLUMNS = {"throttle_feedback": "r_fb", "steering_feedback": "delta_fb"}
 _COMMANDED = {"throttle_command", "steering_command"}  # not measured: a controller may ask for anything
+_NAME = 60  # characters of a frame's name that are told
 _SINGLE = 1e-6  # rounding of what a graph computes
+_FARTHEST = 1e8  # m; coordinates of the whole earth are below
 _ACTUATOR_RANGE_S = 0.01  # an actuator that crosses its range faster than this, does not
 
 
@@ -61,6 +68,7 @@ def ranges(vehicle: Vehicle) -> dict[str, Range]:
         "v_x": Range(-top, top, _HARD * grip, speed_noise),
         "v_y": Range(-top, top, _HARD * grip, speed_noise),
         "omega": Range(-yaw, yaw, turning, yaw_noise),
+        **dict.fromkeys(("x", "y"), Range(-_FARTHEST, _FARTHEST, 0.0, math.inf)),
     }
     throttle = min(inputs.throttle[0], -1.0), max(inputs.throttle[1], 1.0)  # a fraction, whatever this car uses of it
     for actuator, (low, high) in (("throttle", throttle), ("steering", inputs.steering)):
@@ -71,18 +79,47 @@ def ranges(vehicle: Vehicle) -> dict[str, Range]:
 
 
 def implausible_rows(recording: Recording, vehicle: Vehicle) -> Iterator[str]:
-    """The rows of a recording that hold what the car cannot have done, in words: a line for each signal, with its first."""
+    """What a recording holds that the car cannot have done, in words: a line for each kind, with its first row."""
     of = ranges(vehicle)
     for signal in of.keys() - _COMMANDED:
         limit, name = of[signal], _COLUMNS.get(signal, signal)
+        if name in POSE_SIGNALS and not recording.has_pose:
+            continue
         values = recording[name]
         beyond = np.flatnonzero(~((limit.low <= values) & (values <= limit.high)))
         if len(beyond):
             row = int(beyond[0])
             yield (
-                f"row {row} at {(recording.time[row] - recording.time[0]) / 1e9:.2f} s: {name} = {values[row]:.4g}; expected "
-                f"{limit.low:.4g} to {limit.high:.4g} of vehicle {vehicle.name} ({len(beyond)} such rows)"
+                f"{_place(recording, row)}: {name} = {values[row]:.4g}; expected {limit.low:.4g} to {limit.high:.4g} of "
+                f"vehicle {vehicle.name} ({len(beyond)} such rows)"
             )
+    if recording.has_pose:
+        yield from _inconsistent_rows(recording, vehicle)
+
+
+def _inconsistent_rows(recording: Recording, vehicle: Vehicle) -> Iterator[str]:
+    """Where pose and velocities contradict each other."""
+    checked, found = _consistency(vehicle), dict[Refusal, list[tuple[int, str]]]()
+    rows = np.stack([recording[name] for name in (*POSE_SIGNALS, *STATE_SIGNALS)], axis=1)
+    finite = np.all(np.isfinite(rows), axis=1).tolist()
+    for row, (stamp, values) in enumerate(zip(recording.time.tolist(), rows.tolist(), strict=True)):
+        if not finite[row]:
+            continue
+        refusal = checked.check(stamp, Pose(*values[:3]), State(*values[3:]))
+        if refusal is not None:
+            found.setdefault(refusal, []).append((row, checked.words))
+    for refusal, which in found.items():
+        row, words = which[0]
+        yield f"{_place(recording, row)}: {refusal.value}: {words} ({len(which)} such rows)"
+
+
+def _place(recording: Recording, row: int) -> str:
+    return f"row {row} at {(recording.time[row] - recording.time[0]) / 1e9:.2f} s"
+
+
+def _consistency(vehicle: Vehicle) -> Consistency:
+    constants = vehicle.constants
+    return Consistency(constants.l_f + constants.l_r, vehicle.minimum_speed)
 
 
 class Plausibility:
@@ -90,10 +127,14 @@ class Plausibility:
 
     Args:
         vehicle: whose limits hold.
+        frames: ``frame_id`` and ``child_frame_id`` that the odometry must have; those that are empty are as they come
+            first.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, *, frames: Frames = ("", "")) -> None:
         self._ranges = ranges(vehicle)
+        self._frames = frames
+        self._consistency = _consistency(vehicle)
         rounding = _SINGLE * np.maximum(np.abs(vehicle.lower), np.abs(vehicle.upper))
         self._lower, self._upper = vehicle.lower - rounding, vehicle.upper + rounding
         self.top = self._ranges["v_x"].high if self._ranges else 0.0
@@ -102,26 +143,32 @@ class Plausibility:
         """What was refused last, in words."""
         self.forget()
 
+    @property
+    def jumps(self) -> int:
+        """Jumps of the pose that a second message confirmed."""
+        return self._consistency.jumps
+
     def forget(self) -> None:
         """The next samples are the first."""
+        self._consistency.forget()
         self._accepted: dict[str, tuple[int, float]] = {}
         self._suspect: dict[str, tuple[int, float]] = {}
 
-    def check(self, stamp: int, values: Mapping[str, float]) -> Refusal | None:
+    def check(self, stamp: int, values: Mapping[str, float], frames: Frames | None = None) -> Refusal | None:
         """Judges the samples of a message.
 
         Args:
             stamp: of the message (ns).
             values: by signal name, SI units.
+            frames: of the message; ``None`` if it has none.
 
         Returns:
             ``None`` if the car can have produced them, else why not.
         """
-        for name, value in values.items():
-            limit = self._ranges.get(name)
-            if limit is not None and math.isfinite(value) and not limit.low <= value <= limit.high:
-                self.last = f"{name} = {value:.4g}; expected {limit.low:.4g} to {limit.high:.4g}"
-                return Refusal.IMPLAUSIBLE
+        if frames is not None and (other := self._check_frames(frames)) is not None:
+            return other
+        if self.is_beyond(values):
+            return Refusal.IMPLAUSIBLE
         refusal: Refusal | None = None
         for name, value in values.items():
             limit = self._ranges.get(name)
@@ -136,6 +183,38 @@ class Plausibility:
                     continue
             self._suspect.pop(name, None)
             self._accepted[name] = stamp, value
+        return refusal or self._check_motion(stamp, values)
+
+    def is_beyond(self, values: Mapping[str, float]) -> bool:
+        """Whether one of the values by signal name is beyond what the car can do; ``last`` says which."""
+        for name, value in values.items():
+            limit = self._ranges.get(name)
+            if limit is not None and math.isfinite(value) and not limit.low <= value <= limit.high:
+                self.last = f"{name} = {value:.4g}; expected {limit.low:.4g} to {limit.high:.4g}"
+                return True
+        return False
+
+    def _check_frames(self, frames: Frames) -> Refusal | None:
+        for expected, found, name in zip(self._frames, frames, ("frame_id", "child_frame_id"), strict=True):
+            if expected and found != expected:
+                self.last = f"{name} '{found[:_NAME]}'; expected '{expected[:_NAME]}'"
+                return Refusal.FRAMES
+        self._frames = frames
+        return None
+
+    def _check_motion(self, stamp: int, values: Mapping[str, float]) -> Refusal | None:
+        pose = [values[name] for name in POSE_SIGNALS if name in values]
+        if len(pose) < len(POSE_SIGNALS):
+            return None
+        if math.isnan(pose[2]) and math.isfinite(pose[0] + pose[1]):
+            self.last = "an orientation whose length is not 1"
+            return Refusal.NO_ORIENTATION
+        seen = [values[name] for name in STATE_SIGNALS if name in values]
+        if len(seen) < len(STATE_SIGNALS) or not all(map(math.isfinite, (*pose, *seen))):
+            return None
+        refusal = self._consistency.check(stamp, Pose(*pose), State(*seen))
+        if refusal is not None:
+            self.last = self._consistency.words
         return refusal
 
     def of_prediction(

@@ -7,6 +7,7 @@ predicts one sampling time ahead. Bad data never yields a prediction but a :clas
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -18,12 +19,14 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.contract import WindowPrediction
+from dynssm_ros.runtime.hindsight import Hindsight
 from dynssm_ros.runtime.learner import OnlineLearner
 from dynssm_ros.runtime.online import OnlineState, expert_weights
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.plausibility import Plausibility
 from dynssm_ros.runtime.rollout import states_ahead, step_of
 from dynssm_ros.runtime.trial import require_same_use
+from dynssm_ros.signals.decoding import Frames
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import SignalMap
@@ -65,14 +68,24 @@ class Predictor:
         signal_map: where its inputs come from.
         max_age: how old the newest sample of a signal may be when odometry arrives (s).
         online: whether the model's online layer learns and corrects, if it has one.
+        frames: that the odometry must have; those that are empty are as they come first.
 
     Raises:
         ArtifactError: the model was trained with commands that do not exist live.
         ConfigurationError: the model needs command topics and the signal map has none.
     """
 
-    def __init__(self, model: OnnxModel, signal_map: SignalMap, max_age: float = 0.2, online: bool = True) -> None:
+    def __init__(
+        self,
+        model: OnnxModel,
+        signal_map: SignalMap,
+        max_age: float = 0.2,
+        online: bool = True,
+        *,
+        frames: Frames = ("", ""),
+    ) -> None:
         self.signal_map = live_signal_map(model, signal_map)
+        self._frames = frames
         self._history = History(self.signal_map, model.T_s, model.H, max_age=max_age, held=model.card.held)
         self._learner: OnlineLearner | None = None
         self._learns = online
@@ -147,6 +160,10 @@ class Predictor:
             figures |= {f"online weight of the {name}": f"{weight:.3f}" for name, weight in experts.items()}
         return figures
 
+    def hindsight(self) -> str:
+        """That what was predicted in the last second was worse than no prediction, in words; empty if it was not."""
+        return self._hindsight.verdict()
+
     def finish(self) -> None:
         """Does what can wait until the prediction is out; the next one or a horizon does it else."""
         if self._learner is not None:
@@ -177,24 +194,26 @@ class Predictor:
             self._learner = OnlineLearner(model, layer)
         self._learned_at: int | None = None
         self.model = model
-        self._plausibility = Plausibility(model.card.vehicle)
+        self._plausibility = Plausibility(model.card.vehicle, frames=self._frames)
         self._scale = model.card.normalisation.increment_scale
+        self._hindsight = Hindsight(self._scale)
         self._period = round(model.T_s * 1e9)
 
-    def observe(self, stamp: int, values: dict[str, float]) -> Refusal | None:
+    def observe(self, stamp: int, values: dict[str, float], frames: Frames | None = None) -> Refusal | None:
         """Takes the samples of one message; see :meth:`History.add`. What the car cannot have produced is refused."""
-        refusal = self._plausibility.check(stamp, values) or self._history.add(stamp, values)
+        refusal = self._plausibility.check(stamp, values, frames) or self._history.add(stamp, values)
         if refusal is Refusal.JUMPED_BACK:
             self._plausibility.forget()
+            self._hindsight.forget()
             self._rows.clear()
             if self._learner is not None:
                 self._learner.reset()
                 self._learned_at = None
         return refusal
 
-    def predict(self, stamp: int, values: dict[str, float]) -> Prediction | Refusal:
+    def predict(self, stamp: int, values: dict[str, float], frames: Frames | None = None) -> Prediction | Refusal:
         """Takes the odometry sample ``values`` at ``stamp`` (ns) and predicts the instant ``stamp + T_s``."""
-        refusal = self.observe(stamp, values)
+        refusal = self.observe(stamp, values, frames)
         if refusal is not None:
             return refusal
         if not _finite(values.values()):  # the pose, which is no part of the window
@@ -210,12 +229,14 @@ class Predictor:
             predicted = self._learner.corrected(window, predicted)
         state, theta, physics, variance = predicted[:4]
         now, following = window[-1, :3].tolist(), state[0].tolist()  # a few floats are faster than a small array
+        self._hindsight.measured(stamp, now)
         if not (_finite(following) and _finite_row(theta) and _finite_row(variance)):
             return Refusal.BAD_PREDICTION
         stated, adapted = None if variance is None else variance[0], None if theta is None else theta[0]
         if words := self._plausibility.of_prediction(now, following, self.model.T_s, variance=stated, theta=adapted):
             self._plausibility.last = words
             return Refusal.IMPLAUSIBLE_PREDICTION
+        self._hindsight.predicted(stamp + self._period, following, now)
         return Prediction(
             stamp + self._period,
             state[0],
@@ -226,11 +247,12 @@ class Predictor:
             0.0 if physics is None else self._residual_share(now, following, physics[0].tolist()),
         )
 
-    def horizon(self, prediction: Prediction, steps: int) -> list[Pose]:
+    def horizon(self, prediction: Prediction, steps: int, deadline: float = math.inf) -> list[Pose]:
         """Poses of a rollout with the last command held: the predicted one and ``steps - 1`` more.
 
         Call it right after :meth:`predict`; it continues the window of that prediction. The actuators reach the held
-        command within one step, so that from then on feedback is the command and the increment is zero.
+        command within one step, so that from then on feedback is the command and the increment is zero. It ends early
+        at ``deadline``, a time of ``time.monotonic`` (s).
         """
         if prediction.pose is None:
             return []
@@ -242,7 +264,7 @@ class Predictor:
         for (values,) in states_ahead(step, rows, self.model.H):
             following = State(*values.tolist())
             pose = advance_pose(SCALAR, poses[-1], state, following, self.model.T_s)
-            if not _finite(pose):
+            if not _finite(pose) or time.monotonic() > deadline:
                 break
             poses.append(pose)
             state = following

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from dynssm_ros.errors import BagError
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.bags import Bag, copy_topics, open_bag, write_bag
-from dynssm_ros.signals.decoding import header_stamp_ns, live_decoders
+from dynssm_ros.signals.decoding import Frames, frames_of, header_stamp_ns, live_decoders
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.messages import (
     JOINT_STATE,
@@ -30,7 +30,7 @@ class Replayed(NamedTuple):
     log_time: int  # ns
     stamp: int  # ns, of the odometry
     outcome: Prediction | Refusal
-    frames: tuple[str, str]
+    frames: Frames
     """``frame_id`` and ``child_frame_id`` of the odometry, empty where it has none."""
 
 
@@ -53,9 +53,8 @@ def replay(bag: Bag, predictor: Predictor, progress: Callable[[int, int], None] 
         stamp = log_time if stamp is None else stamp
         values = by_topic[topic].decode(message)
         if topic == predictor.signal_map.odometry_topic:
-            header = getattr(message, "header", None)
-            frames = (getattr(header, "frame_id", ""), getattr(message, "child_frame_id", ""))
-            yield Replayed(log_time, stamp, predictor.predict(stamp, values), frames)
+            frames = frames_of(message)
+            yield Replayed(log_time, stamp, predictor.predict(stamp, values, frames), frames or ("", ""))
         else:
             predictor.observe(stamp, values)
         if progress is not None:

@@ -12,6 +12,9 @@ from dynssm_ros.errors import BagError
 from dynssm_ros.signals.signal_map import Accessor, SignalMap, Source, compile_field
 from dynssm_ros.signals.velocities import LiveVelocities
 
+Frames = tuple[str, str]
+"""``frame_id`` of the header and ``child_frame_id``."""
+
 
 class _Reading(NamedTuple):
     signal: str
@@ -107,6 +110,14 @@ def header_stamp_ns(message: Any) -> int | None:
     try:
         stamp = message.header.stamp
         return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    except AttributeError:
+        return None
+
+
+def frames_of(message: Any) -> Frames | None:
+    """The frames of odometry, or ``None`` where the message names none of its own."""
+    try:
+        return message.header.frame_id, message.child_frame_id
     except AttributeError:
         return None
 

@@ -30,6 +30,7 @@ ROUNDING = 1e-6
 """Periods by which an instant of a grid may miss a sample."""
 
 Accessor = Callable[[Any], float | None]
+_NOT_UNIT = 0.1  # squared length of a quaternion: some drivers publish some that are not quite unit
 _STEP = r"[A-Za-z_]\w*(?:\[[^\[\]().]+\])?"
 _PATH = rf"{_STEP}(?:\.{_STEP})*"
 _FIELD = re.compile(rf"^(?:yaw\((?P<yaw>{_PATH})\)|(?P<path>{_PATH}))\Z")
@@ -210,7 +211,9 @@ def _compile_path(field: str) -> Accessor:
 
 
 def _yaw(q: Any) -> float:
-    """Of a quaternion of any length: some drivers publish some that are not quite unit."""
+    """Of a quaternion; NaN if its length is not near 1, as where nobody filled it in."""
+    if abs(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z - 1.0) > _NOT_UNIT:
+        return math.nan
     return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ def test_no_damaged_message_raises_or_yields_a_prediction(small_model: Path, see
     assert done.messages >= 6000
     assert 0.1 < done.spoilt / done.messages < 0.2
     assert done.predictions > 0.7 * done.messages / 3
-    assert {"not_finite", "implausible", "repeated", "outlier"} <= set(done.refusals)
+    assert {"not_finite", "implausible", "jumped", "no_orientation", "repeated", "outlier"} <= set(done.refusals)
 
 
 def test_the_same_seed_sends_the_same(small_model: Path) -> None:
@@ -31,8 +32,8 @@ def test_what_must_not_happen_is_seen(small_model: Path, monkeypatch: pytest.Mon
     right = Predictor.predict
     last: list[Prediction] = []
 
-    def wrong(self: Predictor, stamp: int, values: dict[str, float]) -> Prediction | Refusal:
-        outcome = right(self, stamp, values)
+    def wrong(self: Predictor, *message: Any) -> Prediction | Refusal:
+        outcome = right(self, *message)
         if isinstance(outcome, Prediction):
             last[:] = [outcome]
             return replace(outcome, state=outcome.state * np.nan)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +19,9 @@ from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.runtime.health import Level
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
-from dynssm_ros.simulation.plant import Pose, make_plant
+from dynssm_ros.simulation.plant import Pose, make_plant, plant_type
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, State
+from dynssm_ros.vehicle.low_speed import LowSpeedRolling
 
 T_S = 20_000_000  # ns
 STAMP = 1_700_000_000_000_000_000
@@ -55,16 +58,17 @@ class SteppedCar:
 
     def __init__(self, vehicle, track, v_x=1.5, late=0):
         start = Pose(*(float(v) for v in track.centre.position(0.0)), float(track.centre.heading(0.0)))
-        self.plant = make_plant(vehicle, "euler", start, State(v_x, 0.0, 0.0), line=track.centre)
+        rolling = LowSpeedRolling(vehicle, plant_type("euler").step(vehicle))
+        self.plant = make_plant(vehicle, "euler", start, State(v_x, 0.0, 0.0), last=(rolling,), line=track.centre)
         self.stamp, self.sent = STAMP, Applied(0.0, 0.0)
         self.on_the_way, self.late = [], late
 
-    def answered(self, online: LiveController):
-        """One odometry message and its answer, and the car drives on."""
-        pose = self.plant.pose
+    def answered(self, online: LiveController, spoilt=lambda *odometry: odometry, **others):
+        """One odometry message, as it is or ``spoilt``, and its answer, and the car drives on."""
+        pose, seen = spoilt(self.plant.pose, self.plant.measured)
         wrapped = pose._replace(theta=math.remainder(pose.theta, 2 * math.pi))
-        self.on_the_way.append((self.stamp, wrapped, self.plant.measured))
-        outcome = online.step(*self.on_the_way.pop(0)) if len(self.on_the_way) > self.late else None
+        self.on_the_way.append((self.stamp, wrapped, seen))
+        outcome = online.step(*self.on_the_way.pop(0), **others) if len(self.on_the_way) > self.late else None
         self.plant.advance(self.sent)
         self.stamp += T_S
         if isinstance(outcome, Applied):
@@ -152,28 +156,100 @@ def test_what_the_predictor_says_reaches_the_plan_and_is_dropped_when_it_falls_s
     assert "nominal car, nothing from the predictor for 0.1 s" in words
 
 
-@pytest.mark.parametrize(("spoilt", "by"), [(0, math.nan), (3, math.inf), (5, 1e300)])
-def test_odometry_that_is_not_finite_is_refused_and_the_drive_goes_on(online, orca, club, spoilt, by):
+@pytest.mark.parametrize(
+    ("spoilt", "by", "refusal"),
+    [
+        (0, math.nan, Refusal.NOT_FINITE),
+        (2, math.nan, Refusal.NO_ORIENTATION),
+        (3, math.inf, Refusal.NOT_FINITE),
+        (5, 1e300, Refusal.IMPLAUSIBLE),
+        (0, 1e300, Refusal.IMPLAUSIBLE),
+        (1, 0.5, Refusal.JUMPED),
+        (3, -1.5, Refusal.JUMPED),
+    ],
+)
+def test_odometry_that_cannot_be_is_refused_and_the_drive_goes_on(online, orca, club, spoilt, by, refusal):
     controller, car = online(), SteppedCar(orca, club)
     for _ in range(5):
         car.answered(controller)
     row = [*car.plant.pose, *car.plant.measured]
     row[spoilt] = by
-    assert controller.step(car.stamp, Pose(*row[:3]), State(*row[3:])) is Refusal.NOT_FINITE
+    assert controller.step(car.stamp, Pose(*row[:3]), State(*row[3:])) is refusal
+    car.stamp += T_S
     assert isinstance(car.answered(controller), Applied)
 
 
-@pytest.mark.parametrize(
-    "state",
-    [State(9e5, 0.0, 0.0), State(2.0, -9e5, 0.0), State(2.0, 0.0, 9e5), State(-3.0, 1.0, 5.0), State(0.0, 0.0, 0.0)],
-)
-def test_odometry_that_cannot_be_yields_a_command_that_can(online, orca, club, state):
+@pytest.mark.parametrize("state", [State(-3.0, 1.0, 5.0), State(0.0, 0.0, 0.0)])
+def test_whatever_is_measured_the_command_may_be_sent(online, orca, club, state):
     controller, car = online(), SteppedCar(orca, club)
-    for _ in range(3):
-        car.answered(controller)
     command = controller.step(car.stamp, car.plant.pose, state)
     for value, (low, high) in zip(command, (orca.inputs.throttle, orca.inputs.steering), strict=True):
         assert low <= value <= high
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What odometry becomes, message by message, as of where it begins."""
+
+    words: str
+    within: int
+    """Messages until it is braked and said so."""
+    odometry: Callable[[Pose, State, Pose, State], tuple[Pose, State]] = lambda pose, seen, *_: (pose, seen)
+    others: Mapping[str, Any] = field(default_factory=dict)
+
+
+FAULTS = {
+    "frozen": Fault("the odometry stands still", 7, lambda pose, seen, *first: first),
+    "pose frozen": Fault("the odometry stands still", 7, lambda pose, seen, at, was: (at, seen)),
+    "pose 0.5 m beside": Fault("the pose jumped", 2, lambda pose, seen, *_: (pose._replace(x=pose.x + 0.5), seen)),
+    "heading turned": Fault("the pose jumped", 2, lambda pose, seen, *_: (pose._replace(theta=pose.theta + 1.5), seen)),
+    "twist in a turned frame": Fault(
+        "pose and twist contradict each other",
+        16,
+        lambda pose, seen, *_: (pose, State(seen.v_y, -seen.v_x, seen.omega)),
+    ),
+    "speed negated": Fault(
+        "the speed's sign is swapped", 40, lambda pose, seen, *_: (pose, State(-seen.v_x, -seen.v_y, seen.omega))
+    ),
+    "0.15 s late": Fault("odometry comes 0.15 s later than its fastest", 1, others={"late": 0.15}),
+    "other frames": Fault("the odometry is in other frames", 1, others={"frames": ("base_link", "map")}),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_what_it_cannot_drive_with_is_braked_for_and_it_drives_on_when_all_is_well(online, orca, club, name):
+    fault, controller, car = FAULTS[name], online(max_late=0.1), SteppedCar(orca, club)
+    well = {"frames": ("map", "base_link")}
+    for _ in range(20):
+        assert isinstance(car.answered(controller, **well), Applied)
+        assert controller.verdict()[0] != Level.ERROR
+    first = car.plant.pose, car.plant.measured
+    for _ in range(fault.within):
+        car.answered(controller, spoilt=lambda *now: fault.odometry(*now, *first), **(well | fault.others))
+        if controller.verdict() == (Level.ERROR, f"{fault.words}: brakes"):
+            break
+    assert controller.verdict() == (Level.ERROR, f"{fault.words}: brakes")
+    assert car.sent.r == orca.inputs.throttle[0]
+    for _ in range(100):
+        car.answered(controller, **well)
+        if not controller.brakes.reason:
+            break
+    assert controller.verdict()[0] != Level.ERROR, (controller.verdict(), car.plant.measured, car.plant.pose)
+    assert controller.brakes.count <= 2, "to have the right pose again is a jump too"
+
+
+def test_a_car_that_may_be_elsewhere_stands_before_it_drives_on(online, orca, club):
+    controller, car = online(), SteppedCar(orca, club)
+    for _ in range(20):
+        car.answered(controller)
+    speeds = []
+    for _ in range(100):
+        car.answered(controller, spoilt=lambda pose, seen: (pose._replace(y=pose.y + 0.2), seen))
+        speeds.append(car.plant.measured.v_x)
+        if controller.brakes.count and not controller.brakes.reason:
+            break
+    assert min(speeds) < 0.2
+    assert speeds == sorted(speeds, reverse=True), "without a break"
 
 
 def test_odometry_that_comes_twice_or_late_is_refused(online, orca, club):
@@ -246,12 +322,14 @@ def test_far_off_the_road_it_brakes_and_says_so(online, orca, club):
         car.answered(controller)
     steering = car.sent.delta
     beside = Pose(*(float(v) for v in club.centre.position(0.3, -3 * 0.4)), 0.0)
+    car.stamp += 10**9  # a gap, else the pose jumps
     assert controller.step(car.stamp, beside, State(1.0, 0.0, 0.0)) == (orca.inputs.throttle[0], steering)
     level, words = controller.verdict()
     assert level == Level.ERROR
     assert "m outside the borders: brakes" in words
-    car.stamp += T_S
-    car.answered(controller)
+    car.stamp += 10**9
+    for _ in range(6):
+        car.answered(controller)
     assert controller.verdict()[0] != Level.ERROR
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import math
 import os
 import subprocess
 import threading
@@ -21,7 +22,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from benchmarks.endurance.live_run import Collector, LiveRun, collecting, isolated_environment, predictor_process
-from dynssm_ros.nodes.support import SENSOR_QOS
+from dynssm_ros.nodes.support import SENSOR_QOS, set_pose
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC, PREDICTION_TOPIC
 
 PERIOD = 20_000_000  # ns
@@ -42,11 +43,17 @@ def call(collector: Collector, service: Any, name: str, **request: Any) -> Any:
 
 
 class Car:
-    """Drives straight at 1 m/s on simulated stamps; what it sends can be spoilt message by message."""
+    """Drives straight at 1 m/s on simulated stamps; what it sends can be spoilt message by message.
+
+    It goes where its velocities say, as far as a car can.
+    """
 
     def __init__(self, collector: Collector, run: LiveRun, process: subprocess.Popen[str]) -> None:
         self.collector, self.run, self.process = collector, run, process
-        self.stamp = 1_700_000_000_000_000_000
+        self.stamp = self._moved = 1_700_000_000_000_000_000
+        self.pose = [0.0, 0.0, 0.0]
+        self.spoil: Callable[[Odometry], object] | None = None
+        """Spoils odometry before it is sent."""
         self._odometry = collector.create_publisher(Odometry, ODOMETRY_TOPIC, SENSOR_QOS)
         self._feedback = collector.create_publisher(JointState, FEEDBACK_TOPIC, SENSOR_QOS)
         self._command = collector.create_publisher(JointState, COMMAND_TOPIC, SENSOR_QOS)
@@ -78,9 +85,23 @@ class Car:
         message.header.frame_id, message.child_frame_id = "map", "base_link"
         twist = message.twist.twist
         twist.linear.x, twist.linear.y, twist.angular.z = v_x, v_y, omega
-        message.pose.pose.orientation.w = 1.0
+        self._move(v_x, v_y, omega)
+        set_pose(message.pose.pose, *self.pose)
+        if self.spoil is not None:
+            self.spoil(message)
         self._odometry.publish(message)
         return self.stamp + PERIOD
+
+    def _move(self, v_x: float, v_y: float, omega: float) -> None:
+        elapsed, possible = (self.stamp - self._moved) / 1e9, abs(v_x) < 10 and abs(v_y) < 10 and abs(omega) < 30
+        if 0 < elapsed < 1 and possible:
+            x, y, theta = self.pose
+            heading = theta + omega * elapsed / 2
+            along, across = elapsed * v_x, elapsed * v_y
+            x += along * math.cos(heading) - across * math.sin(heading)
+            y += along * math.sin(heading) + across * math.cos(heading)
+            self.pose = [x, y, theta + omega * elapsed]
+        self._moved = self.stamp
 
     def actuators(self, commands: bool = True, throttle: float = 0.2, steering: float = 0.0) -> None:
         for publisher in (self._feedback, self._command) if commands else (self._feedback,):

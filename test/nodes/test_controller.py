@@ -20,7 +20,7 @@ from benchmarks.endurance.live_laps import drive_live
 from benchmarks.endurance.live_run import LiveRun, collecting, isolated_environment, node_process
 from dynssm_ros.nodes.support import SENSOR_QOS, set_pose, set_stamp
 from dynssm_ros.signals.decoding import header_stamp_ns
-from dynssm_ros.signals.messages import COMMAND_TOPIC, ODOMETRY_TOPIC, PARAMETERS_TOPIC
+from dynssm_ros.signals.messages import COMMAND_TOPIC, ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
 
@@ -28,6 +28,7 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 
 PERIOD = 20_000_000  # ns
 PATIENCE = 120.0  # s for a lap, and for processes to start
+CLUB = load_track("club")
 RATE = 0.5  # of real time: these laps are not about the machine's speed; `benchmarks.endurance.live_laps` is
 
 
@@ -45,14 +46,16 @@ class Stand:
         subscribe(JointState, COMMAND_TOPIC, lambda message: self._keep(self.commands, message), SENSOR_QOS)
         self._odometry = publish(Odometry, ODOMETRY_TOPIC, SENSOR_QOS)
         self._parameters = publish(JointState, PARAMETERS_TOPIC, SENSOR_QOS)
-        self.stamp = 1_700_000_000_000_000_000
+        self.spoil: Callable[[Odometry], object] | None = None
+        """Spoils odometry before it is sent."""
+        self.stamp = self._began = 1_700_000_000_000_000_000
 
     def start(self, node: str, **parameters: object) -> subprocess.Popen[str]:
         return self._stack.enter_context(node_process(node, parameters, os.environ.copy()))
 
     def control(self, **parameters: object) -> subprocess.Popen[str]:
-        """Starts the controller and waits until it tells of itself."""
-        process = self.start("controller", diagnostics_period=0.1, **parameters)
+        """Starts the controller, for odometry however late, and waits until it tells of itself."""
+        process = self.start("controller", **{"diagnostics_period": 0.1, "max_late": 10.0} | parameters)
         deadline = time.monotonic() + PATIENCE
         while not self.wait_for(lambda: bool(self.told), 0.5):
             assert process.poll() is None, "the controller stopped"
@@ -82,12 +85,16 @@ class Stand:
             lambda: any("laps" in values and words in said for _, said, values in self.run.diagnostics[seen:]), timeout
         )
 
-    def send_odometry(self, x: float = 0.3, v_x: float = 1.0) -> None:
-        """The next odometry message of a car on the first straight of the club track."""
+    def send_odometry(self, x: float = 0.0, v_x: float = 1.0) -> None:
+        """The next odometry message of a car on the centre line of the club track, or ``x`` (m) beside it."""
         message = Odometry()
         set_stamp(message.header, self.stamp)
-        set_pose(message.pose.pose, x, 0.0, 0.0)
+        at = (self.stamp - self._began) / 1e9
+        place, heading = CLUB.centre.position(at), float(CLUB.centre.heading(at))
+        set_pose(message.pose.pose, float(place[0]) + x, float(place[1]), heading)
         message.twist.twist.linear.x = v_x
+        if self.spoil is not None:
+            self.spoil(message)
         self._odometry.publish(message)
         self.stamp += PERIOD
 
@@ -122,9 +129,8 @@ def stand() -> Iterator[Stand]:
 
 
 def assert_on_the_road(odometry: list[Odometry]) -> None:
-    track = load_track("club")
     places = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in odometry])
-    assert np.min(track.clearance(places)) > 0
+    assert np.min(CLUB.clearance(places)) > 0
 
 
 def assert_possible(commands: list[JointState]) -> None:
@@ -222,6 +228,76 @@ def test_bad_messages_change_nothing_but_the_diagnostics(stand: Stand) -> None:
     assert stand.keep_sending(lambda: "nominal car" in stand.told[-1][1], D_f=5000.0), "another car's are refused"
     assert float(stand.told[-1][2]["D_f"]) == 0.192
     assert_possible(stand.commands)
+
+
+def test_odometry_that_stays_wrong_is_braked_for(stand: Stand) -> None:
+    stand.control()
+    assert stand.keep_sending(lambda: "drives" in stand.told[-1][1])
+    stand.spoil = lambda message: (
+        setattr(message.pose.pose.orientation, "w", 0.0) or setattr(message.pose.pose.orientation, "z", 0.0)
+    )
+    words = "the orientation is no quaternion of length 1: brakes"
+    assert stand.keep_sending(lambda: stand.told[-1][1] == words), stand.told[-1]
+    assert stand.told[-1][0] == 2
+    assert stand.newest[0] == load_vehicle("orca").inputs.throttle[0]
+    stand.spoil = None
+    assert stand.keep_sending(lambda: "drives" in stand.told[-1][1])
+
+
+def test_odometry_that_freezes_is_braked_for(stand: Stand) -> None:
+    stand.control()
+    assert stand.keep_sending(lambda: "drives" in stand.told[-1][1])
+    last = Odometry()
+
+    def freeze(message: Odometry) -> None:
+        if not last.twist.twist.linear.x:
+            last.pose, last.twist = message.pose, message.twist
+        message.pose, message.twist = last.pose, last.twist
+
+    stand.spoil = freeze
+    assert stand.keep_sending(lambda: stand.told[-1][1] == "the odometry stands still: brakes"), stand.told[-1]
+    assert stand.newest[0] == load_vehicle("orca").inputs.throttle[0]
+    assert stand.told[-1][2]["braked"] == "2", "and before the first odometry"
+
+
+def test_a_second_commander_is_braked_for(stand: Stand) -> None:
+    stand.control()
+    assert stand.keep_sending(lambda: "drives" in stand.told[-1][1])
+    joystick = stand.collector.create_publisher(JointState, COMMAND_TOPIC, SENSOR_QOS)
+    full = JointState(name=["throttle", "steering"], position=[1.0, 0.0])
+    words = f"another node publishes on {COMMAND_TOPIC}: /collector: brakes"
+
+    def is_braked() -> bool:
+        joystick.publish(full)
+        return stand.told[-1][1] == words
+
+    assert stand.keep_sending(is_braked), stand.told[-1]
+    lowest = load_vehicle("orca").inputs.throttle[0]
+    joystick.publish(full)
+    assert stand.wait_for(lambda: stand.newest[0] == 1.0 or stand.commands[-2].position[0] == 1.0)
+    assert stand.wait_for(lambda: stand.newest[0] == lowest), "the last word is its own, without odometry too"
+    stand.collector.destroy_publisher(joystick)
+    assert stand.keep_sending(lambda: "drives" in stand.told[-1][1]), "once it is alone"
+
+
+def test_predictions_that_no_car_can_follow_are_refused(stand: Stand) -> None:
+    stand.control(evidence=False)
+    predictions = stand.collector.create_publisher(Odometry, PREDICTION_TOPIC, SENSOR_QOS)
+    message = Odometry()
+
+    def predicted(v_x: float, *, until: Callable[[dict[str, str]], bool]) -> bool:
+        message.twist.twist.linear.x = v_x
+
+        def done() -> bool:
+            set_stamp(message.header, stand.stamp)
+            predictions.publish(message)
+            return until(stand.told[-1][2])
+
+        return stand.keep_sending(done)
+
+    assert predicted(1.2, until=lambda values: float(values["added to v_x"]) > 0.1)
+    assert predicted(1e30, until=lambda values: float(values["age of the coefficients (s)"]) > 0.3)
+    assert abs(float(stand.told[-1][2]["added to v_x"])) < 1.0
 
 
 def test_the_process_holds_no_torch_and_is_warm_before_it_listens(stand: Stand) -> None:

@@ -47,6 +47,15 @@ Wiring.verdict = lambda self: time.sleep(0.15) or ""
 """
 
 
+SLOW_TO_PREDICT = """
+import time
+from dynssm_ros.runtime.onnx_model import OnnxModel
+
+quick = OnnxModel.predict
+OnnxModel.predict = lambda self, windows: (time.sleep(0.06), quick(self, windows))[1]
+"""
+
+
 @pytest.fixture
 def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
     """Writes a module that processes find which are started from now on."""
@@ -87,7 +96,8 @@ def test_every_odometry_message_after_the_first_window_gets_a_prediction_as_repl
     recording_to_bag(recording, bag)
     run = run_live(small_model, bag, 0.02, rate=speed, duration=4.0 * speed)
     assert len(run.sent) >= 4.0 * speed * rate
-    assert run.missing() == []
+    assert run.lost == 0
+    assert run.passed_over < 0.3 * len(run.sent), "a machine that is busy"
     # the first window begins with the first odometry that its actuators have not been overtaken by
     late = min(run.predicted) - run.T_s - sorted(run.sent)[round((H - 1) * 0.02 * rate)]
     assert 0 <= late <= 0.2e9
@@ -263,10 +273,12 @@ def test_the_horizon_is_published_on_request(start_car) -> None:
     car = start_car(horizon=0.2)
     paths: list[PathMessage] = []
     car.collector.create_subscription(PathMessage, "/dynssm/horizon", paths.append, SENSOR_QOS)
-    car.drive_until_answered()
-    car.drive_until_answered()
-    assert car.collector.wait_for(lambda: bool(paths), 0.1) or car.answered(car.step())
-    assert len(paths[-1].poses) == 10
+
+    def is_whole() -> bool:
+        car.drive_until_answered()
+        return car.collector.wait_for(lambda: any(len(path.poses) == 10 for path in paths), 0.1)
+
+    assert any(is_whole() for _ in range(50))
     assert paths[-1].poses[0].header.stamp == paths[-1].header.stamp
 
 
@@ -290,7 +302,8 @@ def test_the_predicted_pose_is_sent_to_tf(start_car, stand_in: Callable[[str, st
     car = start_car(tf=True)
     sent = heard(car, TransformStamped, "/stand_in_of_tf", 10)
     assert (sent.header.frame_id, sent.child_frame_id) == ("map", "base_link_predicted")
-    assert sent.transform.translation.x == pytest.approx(0.02, abs=0.005), "a step of 20 ms at 1 m/s from the origin"
+    ahead = sent.transform.translation.x - car.pose[0]
+    assert ahead == pytest.approx(0.02, abs=0.005), "a step of 20 ms at 1 m/s"
     assert sent.transform.rotation.w == pytest.approx(1.0, abs=1e-3)
 
 
@@ -301,8 +314,56 @@ def test_diagnostics_that_take_longer_than_their_period_leave_time_for_what_wait
     car = start_car()
     car.drive_until_answered()
     stamps = [car.step() for _ in range(100)]
-    assert car.answered(stamps[-1], timeout=5.0)
-    assert car.run.predicted.keys() >= set(stamps)
+    assert car.answered(stamps[-1], timeout=5.0), "the newest"
+    assert car.diagnosed("")
+    assert len(car.run.missing()) <= car.run.passed_over
+
+
+def test_a_node_that_cannot_keep_up_answers_the_newest_and_says_so(
+    start_car, stand_in: Callable[[str, str], None]
+) -> None:
+    """Each message takes three periods."""
+    stand_in("sitecustomize", SLOW_TO_PREDICT)
+    car = start_car()
+    car.drive_until_answered()
+    pause, behind = threading.Event(), []
+    for _ in range(150):
+        expected = car.step()
+        pause.wait(0.02)  # nobody sets it: the rate of a car
+        behind.append((expected - max(car.run.predicted)) / 1e9)
+    assert max(behind[50:]) < 0.3, "it does not fall behind further and further"
+    assert car.diagnosed("newer odometry waited") or car.diagnosed("it cannot keep up")
+    assert car.run.diagnostics[-1][0] > 0
+    assert car.run.passed_over > 30
+    assert float(car.run.diagnostics[-1][2]["latency p99 (ms)"]) > 50
+
+
+def test_a_rollout_that_takes_too_long_is_cut_off(start_car) -> None:
+    from nav_msgs.msg import Path as PathMessage
+
+    car = start_car(horizon=10.0)
+    path = heard(car, PathMessage, "/dynssm/horizon", SENSOR_QOS)
+    assert 1 <= len(path.poses) < 500
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "verdict"),
+    [
+        (lambda message: setattr(message.pose.pose.orientation, "w", 0.0), "the orientation is no quaternion"),
+        (lambda message: setattr(message.pose.pose.position, "x", 1e300), "a sample is beyond what the car can do"),
+        (lambda message: setattr(message, "child_frame_id", "map"), "the odometry is in other frames"),
+        (lambda message: setattr(message.header, "frame_id", ""), "the odometry is in other frames"),
+    ],
+    ids=["no orientation", "far away", "other child frame", "empty frame"],
+)
+def test_from_a_pose_that_cannot_be_nothing_is_predicted_and_it_is_named(car, spoilt, verdict: str) -> None:
+    car.drive_until_answered()
+    car.spoil = spoilt
+    bad = [car.step() for _ in range(10)]
+    assert car.diagnosed(verdict)
+    car.spoil = None
+    car.drive_until_answered()
+    assert not any(stamp in car.run.predicted for stamp in bad)
 
 
 def test_parameters_are_listed_described_and_read(start_car, small_model: Path, call_service) -> None:

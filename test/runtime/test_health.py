@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
-from dynssm_ros.runtime.health import Health, Level
+from dynssm_ros.runtime.health import Delivery, Health, Level
 from dynssm_ros.signals.history import Refusal
 
 ODOMETRY, FEEDBACK = "/odometry", "/feedback"
@@ -98,6 +100,74 @@ def test_answers_to_messages_that_waited_longer_than_a_step_are_late() -> None:
     for k in range(50):
         delay = 0.03 if k % 10 == 9 else 0.001
         health.arrived(ODOMETRY, k / 50 + delay, k * 20_000_000)
-        health.predicted(0.001, 0.0, health.queued(ODOMETRY))
+        health.predicted(0.001, 0.0, health.delivery(ODOMETRY).newest)
     assert health.late == 5
     assert health.values(1.0)["late answers"] == "5"
+
+
+def delivered(delays: list[float], *, rate: float = 1.0, max_late: float = math.inf) -> Delivery:
+    """After messages every 20 ms, each with its delay (s); of a log that is played ``rate`` times as fast."""
+    delivery = Delivery(0.25, max_late)
+    for k, delay in enumerate(delays):
+        delivery.arrived(100.0 + 0.02 * k / rate + delay, 1_000_000_000 + 20_000_000 * k)
+    return delivery
+
+
+def test_how_late_messages_come_is_told_whatever_their_clock_is() -> None:
+    usual = [0.003, 0.001, 0.004, 0.002] * 50
+    assert delivered(usual).behind < 0.003
+    assert delivered([*usual, *[0.15] * 5]).behind == pytest.approx(0.149, abs=0.001)
+    assert delivered([*usual, *[0.15] * 4, 0.002]).behind < 0.003, "one that is in time"
+
+
+def test_lateness_is_not_got_used_to_where_it_must_not_be() -> None:
+    late = [*[0.0] * 200, *[0.15] * 10_000]
+    assert delivered(late).behind < 0.001
+    assert delivered(late, max_late=0.1).behind == pytest.approx(0.15, abs=0.005)
+
+
+@pytest.mark.parametrize("rate", [0.5, 4.0])
+def test_of_a_log_that_is_played_slowly_or_fast_nothing_is_late(rate: float) -> None:
+    assert delivered([0.0] * 500, rate=rate).behind == 0.0
+
+
+def test_time_that_jumps_back_is_no_lateness() -> None:
+    delivery = delivered([0.0] * 200)
+    for k in range(200):
+        delivery.arrived(104.02 + 0.02 * k, 500_000_000 + 20_000_000 * k)
+    assert delivery.behind == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("latency", "delay", "level", "words"),
+    [
+        (0.03, 0.0, Level.WARN, "answers come 0.03 s after the odometry: it cannot keep up"),
+        (0.3, 0.0, Level.ERROR, "answers come 0.30 s after the odometry: it cannot keep up"),
+        (0.001, 0.1, Level.WARN, "/odometry: comes 0.10 s later than its fastest lately"),
+        (0.001, 0.3, Level.ERROR, "/odometry: comes 0.30 s later than its fastest lately"),
+    ],
+)
+def test_what_is_late_for_longer_is_said(latency: float, delay: float, level: Level, words: str) -> None:
+    health = Health((ODOMETRY,), 0.25, period=0.02)
+    for k in range(400):
+        now = 0.02 * k + (delay * min(1.0, (k - 190) / 100) if k >= 200 else 0.0)
+        health.arrived(ODOMETRY, now, k * 20_000_000)
+        health.predicted(latency if k >= 200 else 0.001, 0.0)
+        if k == 199:
+            assert health.verdict(now) == (Level.OK, "predicting")
+    assert health.verdict(now) == (level, words)
+
+
+def test_passed_over_odometry_is_counted_and_said_if_it_is_much(health: Health) -> None:
+    for _ in range(6):
+        health.refused(Refusal.SKIPPED)
+        health.predicted(0.001, 0.0)
+    level, words = health.verdict(1.05)
+    assert level is Level.WARN
+    assert words == "6% of the last messages refused, mostly: newer odometry waited"
+    assert health.values(1.05)["refused: skipped"] == "6"
+
+
+def test_predictions_that_were_worse_than_none_are_an_error(health: Health) -> None:
+    health.hindsight = "predictions are 9 times as far off as the state before"
+    assert health.verdict(1.05) == (Level.ERROR, health.hindsight)

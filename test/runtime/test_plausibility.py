@@ -15,7 +15,7 @@ ORCA = load_vehicle("orca")
 
 
 def sample(v_x: float = 2.0, v_y: float = 0.05, omega: float = 1.0) -> dict[str, float]:
-    return {"v_x": v_x, "v_y": v_y, "omega": omega, "x": 0.0, "y": 0.0, "theta": 0.0}
+    return {"v_x": v_x, "v_y": v_y, "omega": omega}
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_of_two_publishers_that_disagree_the_first_one_is_believed(checks: Plaus
 
 def test_what_is_not_finite_or_not_known_is_left_to_others(checks: Plausibility) -> None:
     assert checks.check(T_S, sample(v_x=np.nan)) is None
-    assert checks.check(T_S, {"x": 1e9, "anything": 1e9}) is None
+    assert checks.check(T_S, {"x": 1e7, "anything": 1e9}) is None
 
 
 def test_rows_of_a_recording_that_the_car_cannot_have_driven_are_named() -> None:

@@ -26,7 +26,7 @@ DEFAULT = load_signal_map("default")
 
 
 class Drive:
-    """A straight drive fed to a predictor sample by sample."""
+    """A steady turn fed to a predictor sample by sample."""
 
     def __init__(self, model: Path) -> None:
         self.predictor = Predictor(OnnxModel(open_artifact(model)), DEFAULT)
@@ -37,7 +37,9 @@ class Drive:
             self.predictor.observe(self.stamp, {f"throttle_{kind}": 0.2, f"steering_{kind}": 0.05})
 
     def odometry(self, **changed: float) -> Prediction | Refusal:
-        values = {"v_x": 1.0, "v_y": 0.0, "omega": 0.1, "x": 0.0, "y": 0.0, "theta": 0.0} | changed
+        theta = 0.1 * (self.stamp - START) / 1e9
+        pose = {"x": 10.0 * math.sin(theta), "y": 10.0 * (1.0 - math.cos(theta)), "theta": theta}
+        values = {"v_x": 1.0, "v_y": 0.0, "omega": 0.1} | pose | changed
         return self.predictor.predict(self.stamp, values)
 
     def step(self, **changed: float) -> Prediction | Refusal:
@@ -126,7 +128,8 @@ def test_a_sample_that_is_not_finite_yields_nothing_and_the_next_good_one_does(
     drive: Drive, name: str, value: float
 ) -> None:
     drive.fill()
-    assert drive.step(**{name: value}) is Refusal.NOT_FINITE
+    outcome = drive.step(**{name: value})
+    assert outcome is (Refusal.NO_ORIENTATION if name == "theta" and math.isnan(value) else Refusal.NOT_FINITE)
     assert isinstance(drive.step(), Prediction)
 
 
@@ -291,8 +294,12 @@ def test_the_horizon_begins_with_the_prediction_and_goes_on_with_the_command_hel
 
 def test_at_constant_velocity_the_horizon_is_the_line_or_the_circle_that_is_driven(drive: Drive, still: Still) -> None:
     drive.predictor.swap(still)
-    drive.fill()
     for omega in (0.0, 0.8):
+        drive.stamp += 10 * 10**9  # a gap, after which the car is elsewhere
+        for _ in range(H - 1):
+            drive.actuators()
+            drive.predictor.predict(drive.stamp, {"v_x": 2.0, "v_y": 0.0, "omega": omega})
+            drive.stamp += PERIOD
         outcome = drive.step(v_x=2.0, v_y=0.0, omega=omega, x=1.0, y=-1.0, theta=0.3)
         assert isinstance(outcome, Prediction)
         poses = np.array(drive.predictor.horizon(outcome, 25))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -171,8 +172,8 @@ def test_elements_of_nested_messages_are_reached_by_index() -> None:
     assert compile_field("yaw(wheels[2])")(message) is None
 
 
-@pytest.mark.parametrize("length", [1.0, 0.5, 1.01])
-def test_yaw_is_the_heading_of_a_quaternion_of_any_length(length: float) -> None:
+@pytest.mark.parametrize("length", [1.0, 0.97, 1.01])
+def test_yaw_is_the_heading_of_a_quaternion_that_is_not_quite_unit(length: float) -> None:
     roll, pitch, yaw = 0.2, -0.3, 2.5
     (cr, sr), (cp, sp), (cy, sy) = ((np.cos(a / 2), np.sin(a / 2)) for a in (roll, pitch, yaw))
     q = SimpleNamespace(
@@ -182,6 +183,12 @@ def test_yaw_is_the_heading_of_a_quaternion_of_any_length(length: float) -> None
         z=length * (cr * cp * sy - sr * sp * cy),
     )
     assert compile_field("yaw(q)")(SimpleNamespace(q=q)) == pytest.approx(yaw, abs=1e-14)
+
+
+@pytest.mark.parametrize("length", [0.0, 0.5, 2.0, math.nan])
+def test_a_quaternion_that_nobody_filled_in_has_no_heading(length: float) -> None:
+    message = SimpleNamespace(q=SimpleNamespace(w=length, x=0.0, y=0.0, z=0.0))
+    assert math.isnan(compile_field("yaw(q)")(message))
 
 
 def test_a_path_that_is_none_cannot_be_compiled() -> None:

@@ -1,0 +1,61 @@
+"""When a controller brakes, why, and when it drives on: two states.
+
+It drives until something is wrong that it cannot drive with; then it brakes. It drives on when nothing was wrong for several
+odometry messages in a row, and, if it may be somewhere else than it was believed, once it stands.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynssm_ros.signals.history import Refusal
+
+AT_ONCE = frozenset(
+    {
+        Refusal.STANDS_STILL,
+        Refusal.MAP_FRAME,
+        Refusal.SPEED_SIGN,
+        Refusal.SPEED_UNIT,
+        Refusal.CONTRADICTION,
+        Refusal.FRAMES,
+    }
+)
+"""What is wrong with odometry for longer than a message: it is braked for at once. Others are braked for if they last."""
+_WELL_S = 0.1  # of good odometry before it drives on
+
+
+class Brakes:
+    """The state of the brakes.
+
+    Args:
+        T_s: time between odometry messages that are answered (s).
+        standing: speed (m/s) below which the car stands.
+    """
+
+    def __init__(self, T_s: float, standing: float) -> None:
+        self._enough = max(2, math.ceil(_WELL_S / T_s))
+        self._standing = standing
+        self.reason = ""
+        """Why it brakes, in words; empty while it drives."""
+        self.count = 0
+        """How often it began to brake."""
+        self._well = 0
+        self._until_standing = False
+
+    def apply(self, reason: str, *, until_standing: bool = False) -> None:
+        """Something is wrong.
+
+        Args:
+            reason: what, in words.
+            until_standing: whether the car has to stand before it drives on.
+        """
+        self.count += not self.reason
+        self.reason, self._well = reason, 0
+        self._until_standing = self._until_standing or until_standing
+
+    def released(self, speed: float) -> bool:
+        """Takes an odometry message with which nothing is wrong, at ``speed`` (m/s); whether it drives."""
+        self._well += 1
+        if self._well > self._enough and not (self._until_standing and abs(speed) > self._standing):
+            self.reason, self._until_standing = "", False
+        return not self.reason

@@ -1,0 +1,69 @@
+"""Whether what was predicted lately was nearer to what was then measured than no prediction: the state as it was."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+_SECONDS = 1.0  # that are judged
+_FEWEST = 10  # comparisons, before anything is said
+_NOTICEABLE = 1.0  # error in usual increments, below which a car that drives evenly is well predicted
+_KEPT = 1000
+
+
+class _Pending(NamedTuple):
+    due: int  # ns
+    predicted: tuple[float, ...]
+    before: tuple[float, ...]
+
+
+class Hindsight:
+    """Compares predictions with measurements as they come in.
+
+    Args:
+        scale: usual increments of ``v_x, v_y, omega``, from the model card.
+    """
+
+    def __init__(self, scale: Sequence[float]) -> None:
+        self._scale = scale
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing was predicted."""
+        self._pending: deque[_Pending] = deque(maxlen=_KEPT)
+        self._last: tuple[int, tuple[float, ...]] | None = None
+        self._squares: deque[tuple[int, float, float]] = deque(maxlen=_KEPT)
+
+    def predicted(self, due: int, predicted: Sequence[float], before: Sequence[float]) -> None:
+        """A state was predicted for the instant ``due`` (ns) from the one ``before``; ``v_x, v_y, omega`` each."""
+        self._pending.append(_Pending(due, tuple(predicted), tuple(before)))
+
+    def measured(self, stamp: int, state: Sequence[float]) -> None:
+        """The state at ``stamp`` (ns) was measured. Between two measurements it is on a line."""
+        now = tuple(state)
+        while self._pending and self._pending[0].due <= stamp:
+            due, predicted, before = self._pending.popleft()
+            if self._last is None or not self._last[0] < due:
+                continue
+            share = (due - self._last[0]) / (stamp - self._last[0])
+            then = [a + share * (b - a) for a, b in zip(self._last[1], now, strict=True)]
+            self._squares.append((stamp, self._distance(predicted, then), self._distance(before, then)))
+        self._last = stamp, now
+        while self._squares and stamp - self._squares[0][0] > _SECONDS * 1e9:
+            self._squares.popleft()
+
+    def verdict(self) -> str:
+        """That predictions of the last second were worse than none, in words; empty if they were not."""
+        if len(self._squares) < _FEWEST:
+            return ""
+        own = math.sqrt(math.fsum(square for _, square, _ in self._squares) / len(self._squares))
+        none = math.sqrt(math.fsum(square for _, _, square in self._squares) / len(self._squares))
+        if own <= max(none, _NOTICEABLE):
+            return ""
+        return f"predictions are {own / max(none, 1e-9):.3g} times as far off as the state before"
+
+    def _distance(self, one: Sequence[float], other: Sequence[float]) -> float:
+        """Mean square of the differences, in usual increments."""
+        return sum(((a - b) / s) ** 2 for a, b, s in zip(one, other, self._scale, strict=True)) / len(self._scale)
