@@ -9,15 +9,15 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.identification import tuning
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, Effect
 from dynssm_ros.vehicle.single_track import VehicleConstants
 
 Values = dict[str, float]
+_KEPT = 64  # vehicles whose coefficients are kept at hand
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class CarEstimate:
 
     def at(self, theta: Vector) -> CarEstimate:
         """The same car with coefficients ``theta`` ``(17,)``."""
-        return replace(self, moved=np.append(_moved(self.vehicle, theta), self.moved[-1]))
+        return replace(self, moved=np.append(_about(self.vehicle).moved(theta), self.moved[-1]))
 
     @property
     def as_known(self) -> CarEstimate:
@@ -66,19 +66,17 @@ class CarEstimate:
     @cached_property
     def limits(self) -> tuple[Vector, Vector]:
         """The least and the largest of :attr:`moved`."""
-        vehicle = self.vehicle
-        margin = tuning.INSIDE_BOUNDS * (vehicle.upper - vehicle.lower)
-        lower, upper = (_moved(vehicle, bound) for bound in (vehicle.lower + margin, vehicle.upper - margin))
+        lower, upper = _about(self.vehicle).limits
         mass = np.log([1 / tuning.MASS_RANGE, tuning.MASS_RANGE]) / self.mass_std if self.mass_std else (-1.0, 1.0)
         return np.append(lower, mass[0]), np.append(upper, mass[1])
 
     @cached_property
     def theta(self) -> Coefficients:
         """The coefficients, inside their bounds."""
-        step = np.clip(self.moved, *self.limits)[:-1] * prior_std(self.vehicle)
-        nominal, scales = self.vehicle.nominal, _scaling(self.vehicle)
-        grown = nominal * np.exp(np.where(scales, step / np.where(scales, nominal, 1.0), 0.0))
-        return Coefficients(*np.where(scales, grown, nominal + step).tolist())
+        about = _about(self.vehicle)
+        step = np.clip(self.moved, *self.limits)[:-1] * about.std
+        grown = about.nominal * np.exp(np.where(about.scales, step / about.base, 0.0))
+        return Coefficients(*np.where(about.scales, grown, about.nominal + step).tolist())
 
     @cached_property
     def constants(self) -> VehicleConstants:
@@ -114,11 +112,11 @@ class CarEstimate:
         Args:
             covariance: of :attr:`moved`, at least its first 17 rows and columns.
         """
-        n, nominal, scales = len(COEFFICIENTS), self.vehicle.nominal, _scaling(self.vehicle)
+        n, about = len(COEFFICIENTS), _about(self.vehicle)
         relative = np.sqrt(np.diag(covariance)[:n])
         correlation = covariance[:n, :n] / np.outer(relative, relative)
-        grown = np.where(scales, np.array(self.theta) / np.where(scales, nominal, 1.0), 1.0)
-        std = np.minimum(relative, 1.0) * prior_std(self.vehicle) * grown
+        grown = np.where(about.scales, np.array(self.theta) / about.base, 1.0)
+        std = np.minimum(relative, 1.0) * about.std * grown
         return self.vehicle.with_nominal(np.array(self.theta), std, correlation)
 
     def extended(self, covariance: Vector, recording: int | None = None) -> Vehicle:
@@ -173,17 +171,55 @@ def _together(values: Sequence[float]) -> Any:
     return float(column[0]) if (column == column[0]).all() else column[:, None]
 
 
-def _scaling(vehicle: Vehicle) -> npt.NDArray[np.bool_]:
-    """The coefficients that move as logarithms, so that an effect that multiplies can make up for them exactly."""
-    return np.asarray((vehicle.lower >= 0) & (vehicle.nominal > 0))
+@dataclass(frozen=True)
+class _Coefficients:
+    """How the coefficients of a vehicle move."""
+
+    vehicle: Vehicle
+
+    @cached_property
+    def nominal(self) -> Vector:
+        return self.vehicle.nominal
+
+    @cached_property
+    def std(self) -> Vector:
+        """Of what is known of them."""
+        return prior_std(self.vehicle)
+
+    @cached_property
+    def scales(self) -> Mask:
+        """Those that move as logarithms, so that an effect that multiplies can make up for them exactly."""
+        return np.asarray((self.vehicle.lower >= 0) & (self.nominal > 0))
+
+    @cached_property
+    def base(self) -> Vector:
+        """What those are divided by; 1 for the others."""
+        return np.where(self.scales, self.nominal, 1.0)
+
+    @cached_property
+    def limits(self) -> tuple[Vector, Vector]:
+        """The least and the largest of :meth:`moved`."""
+        lower, upper = self.vehicle.lower, self.vehicle.upper
+        margin = tuning.INSIDE_BOUNDS * (upper - lower)
+        return self.moved(lower + margin), self.moved(upper - margin)
+
+    def moved(self, values: Vector) -> Vector:
+        """How far values ``(17,)`` are off nominal, in standard deviations of what is known before."""
+        grown = self.base * np.log(np.where(self.scales, values, 1.0) / self.base)
+        return np.asarray(np.where(self.scales, grown, values - self.nominal) / self.std)
 
 
-def _moved(vehicle: Vehicle, values: Vector) -> Vector:
-    """How far coefficients ``(17,)`` are off nominal, in standard deviations of what is known before."""
-    scales, nominal = _scaling(vehicle), vehicle.nominal
-    base = np.where(scales, nominal, 1.0)
-    grown = base * np.log(np.where(scales, values, 1.0) / base)
-    return np.asarray(np.where(scales, grown, values - nominal) / prior_std(vehicle))
+_KNOWN: dict[int, _Coefficients] = {}
+
+
+def _about(vehicle: Vehicle) -> _Coefficients:
+    """How the coefficients move: worked out once for the cars of a fit, which share the vehicle."""
+    found = _KNOWN.get(id(vehicle))
+    if found is None or found.vehicle is not vehicle:
+        if len(_KNOWN) > _KEPT:
+            _KNOWN.clear()
+        found = _KNOWN[id(vehicle)] = _Coefficients(vehicle)
+    return found
 
 
 def prior_std(vehicle: Vehicle) -> Vector:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -73,6 +74,11 @@ class Fit:
     def position(self) -> Vector:
         """The fitted values: 18 of the nominal car and those of ``free``."""
         return position(self.car, self.free)
+
+    @cached_property
+    def white_jacobian(self) -> Vector:
+        """The derivatives whitened; of the same shape."""
+        return self.noise.whiten(self.jacobian)
 
 
 def closest(fits: Mapping[Option, Fit]) -> Option:
@@ -230,7 +236,7 @@ class IdentificationProblem:
                 jacobian = np.concatenate([nominal, self.columns(car, errors, free, n)], axis=2) if free else nominal
             else:
                 jacobian, stale = self.columns(car, errors, free), False
-            H, g = self._normal(errors, jacobian, p, noise)
+            H, g = self._normal(errors, noise.whiten(jacobian), p, noise)
             before, promised, kept = best, 0.0, 0.0
             for damping in tuning.DAMPING:
                 step = _step(H + damping * np.diag(np.diag(H)), g, lower - p, upper - p)
@@ -285,14 +291,14 @@ class IdentificationProblem:
         out = []
         for car, errors in zip(cars, self.errors_of(cars), strict=True):
             p = position(car, near.free)
-            H, g = self._normal(errors, near.jacobian, p, near.noise)
+            H, g = self._normal(errors, near.white_jacobian, p, near.noise)
             lower, upper = limits(car, near.free)
             out.append(with_values(car, near.free, p + _step(H, g, lower - p, upper - p)))
         return out
 
-    def _normal(self, errors: Vector, jacobian: Vector, p: Vector, noise: Noise) -> tuple[Vector, Vector]:
+    def _normal(self, errors: Vector, white_jacobian: Vector, p: Vector, noise: Noise) -> tuple[Vector, Vector]:
         """Second and first derivatives of half the objective, as Gauss and Newton approximate them."""
-        weighed, J, _ = noise.robust(errors, jacobian)
+        weighed, J, _ = noise.robust(errors, white_jacobian)
         known, weight = self.prior_precision(p), self.tempering**-0.5
         H, g = normal_equations(weight * J.reshape(-1, len(p)), weight * weighed.ravel(), known)
         return H, g + known @ p
@@ -346,7 +352,7 @@ class IdentificationProblem:
 
     def _scores(self, fit: Fit, cluster: Indices) -> tuple[Vector, Vector]:
         """The information on the fitted values, and what clusters of errors make of it, both ``(P, P)``."""
-        weighed, J, _ = fit.noise.robust(fit.errors, fit.jacobian)
+        weighed, J, _ = fit.noise.robust(fit.errors, fit.white_jacobian)
         scores = np.einsum("wnp,wn->wp", J, weighed)
         flat = J.reshape(-1, J.shape[2])
         information = flat.T @ flat

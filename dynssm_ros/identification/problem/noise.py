@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import lapack
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.identification import tuning
@@ -31,6 +32,11 @@ class NoiseResponse:
 
     group: Indices
     G: Vector
+
+    @cached_property
+    def members(self) -> list[Indices]:
+        """The windows of each group."""
+        return [np.flatnonzero(self.group == m) for m in range(len(self.G))]
 
     @classmethod
     def of(cls, transitions: Vector, speed: Vector) -> NoiseResponse:
@@ -76,18 +82,20 @@ class Noise:
 
     def whiten(self, errors: Vector) -> Vector:
         """Errors or their derivatives ``(W, 3 K, ...)`` as independent ones of unit variance."""
-        flat = errors.reshape(*errors.shape[:2], -1)
+        flat = errors.reshape(len(errors), errors.shape[1], -1)
         out = np.empty_like(flat)
-        for m, inverse in enumerate(self._inverse_roots):
-            member = np.flatnonzero(self.spread.group == m)
-            out[member] = np.matmul(inverse, flat[member])
+        for inverse, member in zip(self._inverse_roots, self.spread.members, strict=True):
+            if flat.shape[2] == 1:  # a product for all windows is quicker than one for each
+                out[member, :, 0] = flat[member, :, 0] @ inverse.T
+            else:
+                out[member] = inverse @ flat[member]
         return out.reshape(errors.shape)
 
-    def robust(self, errors: Vector, jacobian: Vector) -> tuple[Vector, Vector, Vector]:
-        """Errors and derivatives, whitened and with outliers weighed down, and the roots of the weights, ``(W, 1)``."""
+    def robust(self, errors: Vector, white_jacobian: Vector) -> tuple[Vector, Vector, Vector]:
+        """Whitened errors and derivatives with outliers weighed down, and the roots of the weights, ``(W, 1)``."""
         white = self.whiten(errors)
         root = np.sqrt(weights(white))[:, None]
-        return white * root, self.whiten(jacobian) * root[..., None], root
+        return white * root, white_jacobian * root[..., None], root
 
 
 def weights(white: Vector) -> Vector:
@@ -121,9 +129,9 @@ def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Ve
     With ``C = W diag(v_k of each column) W'``, ``W = (I, G)``, the traces of Fisher's information are sums of squares of
     ``W' C^-1 W``, so that no covariance of a single variance is formed.
     """
-    G, groups = spread.G, range(len(spread.G))
-    count = np.bincount(spread.group, minlength=len(G)).astype(float)
-    moment = np.stack([errors[spread.group == m].T @ errors[spread.group == m] for m in groups])
+    G = spread.G
+    count = np.array([len(member) for member in spread.members], dtype=float)
+    moment = np.stack([errors[member].T @ errors[member] for member in spread.members])
     # which variance each column of W has, as an indicator (columns, 9)
     steps = G.shape[1] // 3
     of_column = np.eye(9)[[*(0, 1, 2) * steps, 6, 7, 8, *(3, 4, 5) * steps]]
@@ -134,21 +142,21 @@ def _most_likely(spread: NoiseResponse, errors: Vector, start: Vector, floor: Ve
         """Twice the negative logarithm of the likelihood, and the covariances' inverses."""
         C = _covariance(G, np.exp(log_v))
         root = np.linalg.cholesky(C)
-        inverse = np.linalg.inv(C)
+        inverse = np.stack([lapack.dpotri(each.T)[0] for each in root])  # its upper half
+        inverse += np.swapaxes(np.triu(inverse, 1), 1, 2)
         log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        return float(count @ log_det + np.einsum("mij,mij->", inverse, moment)), np.asarray(inverse, dtype=np.float64)
+        return float(count @ log_det + np.einsum("mij,mij->", inverse, moment)), inverse
 
     log_v = np.clip(np.log(start), low, high)
     value, inverse = likelihood(log_v)
     for _ in range(tuning.MAX_ROUNDS):
-        slope, curvature = np.zeros(9), np.zeros((9, 9))
-        for m in groups:
-            across = inverse[m] @ G[m]
-            weighed = np.concatenate([inverse[m], across], axis=1)  # C^-1 W
-            inner = np.concatenate([weighed, np.concatenate([across.T, G[m].T @ across], axis=1)])  # W' C^-1 W
-            explained = np.einsum("ic,ic->c", weighed, moment[m] @ weighed)
-            slope += of_column.T @ (count[m] * np.diagonal(inner) - explained)
-            curvature += count[m] * of_column.T @ (inner**2) @ of_column
+        across = inverse @ G
+        weighed = np.concatenate([inverse, across], axis=2)  # C^-1 W
+        lower_part = np.concatenate([np.swapaxes(across, 1, 2), np.swapaxes(G, 1, 2) @ across], axis=2)
+        inner = np.concatenate([weighed, lower_part], axis=1)  # W' C^-1 W
+        explained = np.einsum("mic,mic->c", weighed, moment @ weighed)
+        slope = of_column.T @ (count @ np.diagonal(inner, axis1=1, axis2=2) - explained)
+        curvature = of_column.T @ np.einsum("m,mij,mij->ij", count, inner, inner) @ of_column
         v = np.exp(log_v)
         slope, curvature = v * slope, np.outer(v, v) * curvature
         free = ~((log_v <= low) & (slope > 0) | (log_v >= high) & (slope < 0))

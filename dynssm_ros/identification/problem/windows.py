@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,11 @@ class RecordedRows:
         return "s" in self.context and bool(np.ptp(self.context["lap_length"]) == 0.0)
 
     @cached_property
+    def applied(self) -> Vector:
+        """Applied throttle and steering, shape ``(2, N)``."""
+        return np.array(applied_inputs(self.rows), dtype=np.float64)
+
+    @cached_property
     def lines(self) -> Vector:
         """Applied throttle and steering if they move in lines from one sample to the next, shape ``(2, N)``.
 
@@ -56,7 +62,7 @@ class RecordedRows:
         apart, and after the last change.
         """
         cut = (np.diff(self.time) > 1.5 * self.T_s) | (np.diff(self.number) != 0)
-        rows, lines = np.arange(len(self.time)), np.array(applied_inputs(self.rows), dtype=np.float64)
+        rows, lines = np.arange(len(self.time)), self.applied.copy()
         for held, apart in zip(lines, self.rows_per_sample, strict=True):
             ends = np.flatnonzero((np.diff(held) != 0) | cut) + 1
             if len(ends):
@@ -172,7 +178,7 @@ class SimulationWindows:
         shift = -self.warm if car.effect_states or self.filtered else 0
         taken = 1.0 - np.exp(-self.data.T_s / tuning.OBSERVER_S) if self.filtered else 1.0
         first = self.data.rows[:, self.starts + shift]
-        here = self.context(shift) | (context or {})
+        here = self._read(car, shift, context)
         state = State(*first[:3])
         effect_states = car.settled(state, Applied(*first[3:5]), fleet.theta, context=here)
         with np.errstate(all="ignore"):
@@ -221,10 +227,17 @@ class SimulationWindows:
     ) -> tuple[State, dict[str, Vector]]:
         """One step from the rows ``k`` after the starts."""
         now = self.starts + k
-        applied = applied_inputs(self.data.rows[:, now])
         if self.hold == "first":
             applied = Applied(*(self.data.lines[:, now] + self.data.lines[:, now + 1]) / 2)
-        return car.step(state, applied, theta, effect_states, context=self.context(k) | dict(context or {}))
+        else:
+            applied = Applied(*self.data.applied[:, now])
+        return car.step(state, applied, theta, effect_states, context=self._read(car, k, context))
+
+    def _read(self, car: CarModel, k: int, context: Mapping[str, float] | None) -> dict[str, Any]:
+        """The other signals that effects of the car read, ``k`` rows after the starts; ``context`` replaces them."""
+        given, signals = context or {}, self.data.context
+        at = {name: self.starts + k for effect in car.effects for name in effect.needs if name in signals}
+        return {name: given[name] if name in given else signals[name][rows] for name, rows in at.items()}
 
     def _bound(self, fleet: CarBatch) -> CarModel:
         return CarModel(fleet.constants, self.data.T_s, fleet.effects, self.integrator, self.substeps)

@@ -206,7 +206,7 @@ class ScoreTest:
         self._fit, self._responses = fit, responses
         self._columns: dict[int, _Whitened] = {}
         self._products: dict[tuple[int, int], Vector] = {}
-        weighed, J, self._root = fit.noise.robust(fit.errors, fit.jacobian)
+        weighed, J, self._root = fit.noise.robust(fit.errors, fit.white_jacobian)
         # what is known of the values as further rows, so that projecting is plain least squares
         known = np.sqrt(problem.tempering) * np.linalg.cholesky(problem.prior_precision(fit.position)).T
         tall = np.concatenate([J.reshape(-1, J.shape[2]), known])
