@@ -10,7 +10,7 @@ import pytest
 
 import dynssm_ros
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.identification.result.calibration import calibrate
+from dynssm_ros.identification.result.calibration import Calibration, calibrate
 from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
@@ -52,6 +52,12 @@ def noisy(drive: Drive, orca: Vehicle) -> Recording:
 
 
 @pytest.fixture(scope="module")
+def found(noisy: Recording, orca: Vehicle) -> Calibration:
+    """What the noisy recording says of a car that is known roughly."""
+    return calibrate(noisy, around(orca, 0.5), integrator="euler", starts=1)
+
+
+@pytest.fixture(scope="module")
 def club(laps_bag: Path) -> Recording:
     return extract([laps_bag], load_signal_map("default"), 50.0)
 
@@ -63,7 +69,7 @@ def test_the_published_orca_car_is_recovered_exactly_and_holds_on_another_track(
     orca_bag: Path, club: Recording, orca: Vehicle
 ) -> None:
     recording = extract([orca_bag], load_signal_map("default"), 50.0)
-    found = calibrate(recording, mid_range(orca), starts=1)
+    found = calibrate(recording, mid_range(orca), integrator="euler", starts=1)
     assert found.rmse_after.max() < 1e-8
     assert (found.rmse_before > 1e-3).all()
     rows = club.window_ends(1)
@@ -87,15 +93,14 @@ def test_effects_of_the_vehicle_are_part_of_the_model(drive: Drive, orca: Vehicl
     car = orca.with_effect("steering_offset", {"offset": 0.03}).with_effect("rear_grip", {"factor": 0.8})
     recording = drive(car, 1500, steering=0.09)
     assert calibrate(recording, mid_range(car), integrator="euler", starts=1).rmse_after.max() < 1e-6
-    assert (
-        calibrate(recording, orca, integrator="euler", starts=1).rmse_before.max() > 1e-2
-    )  # of the file, whatever is fitted
+    other = calibrate(recording.select(slice(0, 700)), orca, integrator="euler", starts=1)
+    assert other.rmse_before.max() > 1e-2, "of the file, whatever is fitted"
 
 
 @pytest.mark.parametrize(("plant", "chosen"), [("euler", "euler"), ("rk4", "rk4")])
 def test_the_data_choose_how_the_model_steps(orca: Vehicle, plant: PlantKind, chosen: str) -> None:
     """Euler steps fitted to a continuous car make a yaw inertia of their own."""
-    laps = dynssm_ros.recorded(dynssm_ros.simulate(orca, "club", duration=30.0, plant=plant, noise=SENSORS, seed=3))
+    laps = dynssm_ros.recorded(dynssm_ros.simulate(orca, "club", duration=20.0, plant=plant, noise=SENSORS, seed=3))
     found = calibrate(laps, mid_range(orca), starts=1)
     assert (found.vehicle.integrator, found.vehicle.model_integrator) == (chosen, chosen)
     assert found.vehicle.coefficients["I_z"].nominal == pytest.approx(orca.coefficients["I_z"].nominal, rel=0.05)
@@ -121,16 +126,15 @@ def test_estimates_lie_within_their_errors(drive: Drive, orca: Vehicle) -> None:
     assert 0.3 < np.sqrt(np.square(pulls).mean()) < 1.7
 
 
-def test_what_was_known_before_counts(noisy: Recording, orca: Vehicle) -> None:
+def test_what_was_known_before_counts(noisy: Recording, orca: Vehicle, found: Calibration) -> None:
     """A coefficient whose value the file states well stays there, and the others are known better for it."""
-    free = calibrate(noisy, around(orca, 0.5), integrator="euler", starts=1)
     known = {name: {"std": 1e-4 * abs(orca.coefficients[name].nominal)} for name in ("B_f", "C_f", "E_f")}
     told = calibrate(noisy, unknown(orca, **known), integrator="euler", starts=1)
     for name in known:
         k = COEFFICIENTS.index(name)
         assert told.theta[k] == pytest.approx(orca.nominal[k], rel=1e-3)
         assert told.std[k] <= 1.001 * known[name]["std"]
-    assert told.std[COEFFICIENTS.index("D_f")] < 0.5 * free.std[COEFFICIENTS.index("D_f")]
+    assert told.std[COEFFICIENTS.index("D_f")] < 0.5 * found.std[COEFFICIENTS.index("D_f")]
 
 
 def test_errors_grow_with_the_noise(drive: Drive, orca: Vehicle) -> None:
@@ -149,25 +153,25 @@ def test_errors_grow_with_the_noise(drive: Drive, orca: Vehicle) -> None:
     assert np.median(more[known] / less[known]) == pytest.approx(2.0, rel=0.2)
 
 
-def test_the_calibrated_vehicle_carries_values_and_errors(noisy: Recording, orca: Vehicle) -> None:
-    found = calibrate(noisy, around(orca, 0.5), integrator="euler", starts=1)
+def test_the_calibrated_vehicle_carries_values_and_errors(orca: Vehicle, found: Calibration) -> None:
     np.testing.assert_allclose(found.vehicle.nominal, found.theta)
     assert [found.vehicle.coefficients[name].std for name in COEFFICIENTS] == pytest.approx(found.std)
     assert found.vehicle.constants == orca.constants
 
 
-def test_outliers_hardly_move_it(noisy: Recording, orca: Vehicle) -> None:
+def test_outliers_hardly_move_it(noisy: Recording, orca: Vehicle, found: Calibration) -> None:
     spoilt = {name: values.copy() for name, values in noisy.columns.items()}
     spoilt["omega"][200::397] += 5.0
     recording = Recording(noisy.info, noisy.time, noisy.segment, spoilt)
     car = around(orca, 0.5)
-    clean, with_outliers = (calibrate(each, car, integrator="euler", starts=1) for each in (noisy, recording))
-    off = np.abs(with_outliers.theta - clean.theta) / (car.upper - car.lower)
+    with_outliers = calibrate(recording, car, integrator="euler", starts=1)
+    off = np.abs(with_outliers.theta - found.theta) / (car.upper - car.lower)
     assert np.median(off) < 0.02
 
 
 def test_the_seed_alone_decides(noisy: Recording, orca: Vehicle) -> None:
-    first, second = (calibrate(noisy, around(orca, 0.5), integrator="euler", starts=3, seed=7) for _ in range(2))
+    part, car = noisy.select(slice(0, 800)), around(orca, 0.5)
+    first, second = (calibrate(part, car, integrator="euler", starts=3, seed=7) for _ in range(2))
     np.testing.assert_array_equal(first.theta, second.theta)
     np.testing.assert_array_equal(first.std, second.std)
 
@@ -224,7 +228,7 @@ def test_another_sampling_time_is_refused(drive: Drive, orca: Vehicle) -> None:
 
 def test_progress_counts_the_starting_points_of_each_integrator_and_the_last_fit(drive: Drive, orca: Vehicle) -> None:
     calls: list[tuple[int, int]] = []
-    calibrate(drive(orca, 1500), orca, starts=2, on_progress=lambda *counts: calls.append(counts))
+    calibrate(drive(orca, 500), orca, starts=2, on_progress=lambda *counts: calls.append(counts))
     assert calls == [(1, 5), (2, 5), (3, 5), (4, 5), (5, 5)]
 
 

@@ -30,11 +30,12 @@ from dynssm_ros.signals.standard import recording_to_bag
 pytestmark = [pytest.mark.live, pytest.mark.timeout(240)]
 
 SECONDS, GAP_NS = 35.0, 5_000_000_000
+FIRST = 12.0  # s of the stint on the known track
 
 
-def drive(track, seed, **effects):
+def drive(track, seed, seconds=SECONDS, **effects):
     run = dynssm_ros.simulate(
-        "orca", track, duration=SECONDS, seed=seed, plant="double_track", noise=(0.01, 0.01, 0.03), effects=effects
+        "orca", track, duration=seconds, seed=seed, plant="double_track", noise=(0.01, 0.01, 0.03), effects=effects
     )
     return dynssm_ros.recorded(run)
 
@@ -42,28 +43,24 @@ def drive(track, seed, **effects):
 @pytest.fixture(scope="module")
 def stints():
     """Another driver on the track of the training, then another track with less grip, 5 s later."""
-    first, second = drive("club", 2), drive("club_b", 3, front_grip={"factor": 0.85})
+    first, second = drive("club", 2, FIRST), drive("club_b", 3, front_grip={"factor": 0.85})
     shift = first.time[-1] + GAP_NS - second.time[0]
     return first, dataclasses.replace(second, time=second.time + shift)
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("rls") / "model"
-    return dynssm_ros.train(drive("club", 1), "rls", "orca", folder).artifact.path
+def model(kept):
+    return kept("rls", lambda folder: dynssm_ros.train(drive("club", 1), "rls", "orca", folder / "rls")) / "rls"
 
 
-def replayed(model, bag, online=True, state=None, keep=None):
+def replayed(model, bag, online=True, state=None):
     predictor = Predictor(OnnxModel(open_artifact(model)), load_signal_map("default"), online=online)
     if state is not None:
         predictor.load_online(state)
     with open_bag(bag) as opened:
-        found = {
+        return {
             o.outcome.stamp: o.outcome.state for o in replay(opened, predictor) if isinstance(o.outcome, Prediction)
         }
-    if keep is not None:
-        predictor.save_online(keep)
-    return found
 
 
 def rmse(found, recording, start, end):
@@ -79,7 +76,7 @@ def rmse(found, recording, start, end):
 def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(model, stints, tmp_path: Path):
     bag = tmp_path / "both"
     recording_to_bag(concatenate(stints), bag)
-    run = run_live(model, bag, 0.02, rate=1.5)
+    run = run_live(model, bag, 0.02, rate=2.0)
     assert len(run.missing()) < 40, run.diagnostics[-1]  # the window fills anew after the gap
     expected = replayed(model, bag)
     stamps = sorted(set(run.predicted) & set(expected))
@@ -97,27 +94,26 @@ def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(
 def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(model, stints, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
     recording_to_bag(stints[0], bag)
-    run_live(model, bag, 0.02, rate=2.5, duration=10.0, parameters={"online_state": str(state)})
+    run_live(model, bag, 0.02, rate=2.5, duration=8.0, parameters={"online_state": str(state)})
     assert state.is_file()
-    offline = tmp_path / "offline.safetensors"
-    replayed(model, bag, keep=offline)
     second = tmp_path / "second"
-    recording_to_bag(stints[1], second)
+    recording_to_bag(stints[1].select(slice(0, 400)), second)
     fresh, goes_on = replayed(model, second), replayed(model, second, state=state)
     assert set(fresh) == set(goes_on)
     first = sorted(fresh)[0]
     assert np.abs(fresh[first] - goes_on[first]).max() > 0.0
 
 
-@pytest.mark.parametrize("rounds", [1, pytest.param(3, marks=pytest.mark.slow)])
-def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(model, stints, rounds, tmp_path: Path):
+@pytest.mark.parametrize("stops", [2, pytest.param(15, marks=pytest.mark.slow)])
+def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(model, stints, stops, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
     recording_to_bag(stints[0], bag)
     os.environ.update(isolated_environment())
     here = os.environ.copy()
     with ExitStack() as stack:
         stack.enter_context(node_process("player", {"bag": bag, "rate": 3.0, "loop": True}, here))
-        for stop in (*(signal.SIGINT,) * 4, signal.SIGTERM) * rounds:
+        for k in range(stops):
+            stop = signal.SIGTERM if k % 5 == 1 else signal.SIGINT
             run = LiveRun(20_000_000)
             state.unlink(missing_ok=True)
             with predictor_process(model, {"online_state": state}, here) as process, collecting(run) as collector:
