@@ -194,7 +194,7 @@ def test_what_no_car_has_gives_way_to_what_cannot_be_told_from_it() -> None:
     """Without downforce, tyres that gain less force than load are like a centre of gravity that is lower than measured."""
     av21 = load_vehicle("av21")
     car = av21.with_effect("load_sensitivity", {"exponent": 0.5})
-    run = simulate(car, load_track("road_course"), duration=60.0, plant="rk4", noise=(0.005, 0.005, 0.001))
+    run = simulate(car, load_track("road_course"), duration=40.0, plant="rk4", noise=(0.005, 0.005, 0.001))
     recording = as_recording(run)
     data = recorded_rows(recording, lap_context(recording, None))
     given = fit_windows(recording, data, 0.5, 0.0).with_integrator("rk4", av21)
@@ -278,7 +278,7 @@ def test_another_yaw_inertia_is_not_taken_for_euler_steps() -> None:
     known = CarEstimate.of(av21.with_nominal(av21.nominal, 0.01 * np.abs(av21.nominal) + 1e-6))
     car = av21.with_effect("yaw_inertia", {"factor": 0.65})
     recording = as_recording(
-        simulate(car, load_track("road_course"), duration=60.0, plant="rk4", noise=(0.01, 0.01, 0.002))
+        simulate(car, load_track("road_course"), duration=40.0, plant="rk4", noise=(0.01, 0.01, 0.002))
     )
     given = fit_windows(recording, recorded_rows(recording, lap_context(recording, None)), 0.5, 0.0)
     found = search_causes(given, known, quarters(given), exclude=OTHERS)
@@ -290,7 +290,7 @@ def test_another_yaw_inertia_is_not_taken_for_euler_steps() -> None:
 def test_inputs_that_changed_between_the_rows_go_on_a_line() -> None:
     fast = ORCA.model_copy(update={"sampling_time": ORCA.sampling_time / 4})
     recording = as_recording(
-        simulate(fast, load_track("club"), duration=25.0, plant="rk4", noise=(0.002, 0.002, 0.005))
+        simulate(fast, load_track("club"), duration=18.0, plant="rk4", noise=(0.002, 0.002, 0.005))
     )
     slow = recording.info.model_copy(update={"sampling_time": ORCA.sampling_time})
     every = Recording(
