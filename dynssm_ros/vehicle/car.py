@@ -221,7 +221,7 @@ class CarModel:
 
         def rates(y: Sequence[Array]) -> tuple[Array, ...]:
             q = self.motion(State(*y[:3]), applied, theta, dict(zip(names, y[3:], strict=True)), context=context, h=h)
-            return (q.a_x, q.a_y, q.omega_dot, *(q.effect_state_rates[name] for name in names))
+            return (q.a_x, q.a_y, q.omega_dot, *map(q.effect_state_rates.__getitem__, names))
 
         moved = integrate(rates, (*true, *now.values()), self.T_s, self.integrator, self.substeps)
         change, changed = State(*moved[:3]), dict(zip(names, moved[3:], strict=True))

@@ -78,6 +78,21 @@ def small_run(plan, tmp_path_factory):
     return root, steps, available, read_results(plan, root, steps)
 
 
+@pytest.fixture(scope="module")
+def quick_run(plan, tmp_path_factory):
+    """The split that is there, with models that take no epochs: its folder, and results."""
+    study = plan.studies["track"].model_copy(
+        update={"models": ("persistence", "single_track", "ridge_orca"), "seeds": 1}
+    )
+    small = plan.model_copy(update={"studies": {"track": study}})
+    root = tmp_path_factory.mktemp("quick_run")
+    steps = steps_of(small, None, {})
+    needed = [step for step in split_available(steps)[0] if not step.key.startswith("costs")]
+    for step in sorted(needed, key=lambda step: len(step.uses)):
+        assert perform(step, root, [other.key for other in needed if output(other, root).exists()]) is None
+    return root, read_results(small, root, steps)
+
+
 def by_key(steps):
     return {step.key: step for step in steps}
 
@@ -188,15 +203,17 @@ def test_the_small_run_measures_all_that_it_can(small_run):
     )
 
 
-def test_calibration_starts_mid_range_and_finds_the_simulated_car(small_run):
-    vehicle, truth = load_vehicle(small_run[0] / "vehicles/club.topics.yaml"), load_vehicle("orca")
+def test_calibration_starts_mid_range_and_finds_the_simulated_car(quick_run):
+    root, results = quick_run
+    vehicle, truth = load_vehicle(root / "vehicles/club.topics.yaml"), load_vehicle("orca")
     assert vehicle.coefficients["B_f"].nominal == pytest.approx(truth.coefficients["B_f"].nominal, rel=1e-3)
-    assert small_run[3].comparisons[0].rmse("single_track")[0].mean < 1e-6
+    assert results.comparisons[0].rmse("single_track")[0].mean < 1e-6
 
 
-def test_a_test_part_is_scored_and_nothing_else(small_run):
-    track = small_run[3].comparisons[0]
-    recording = Recording.load(small_run[0] / "recordings/club.parquet")
+def test_a_test_part_is_scored_and_nothing_else(quick_run):
+    root, results = quick_run
+    track = results.comparisons[0]
+    recording = Recording.load(root / "recordings/club.parquet")
     late = int(((recording.time - recording.time[0]) / 1e9 >= 6.0).sum())
     assert track.test("late")["rows"] == late - 15  # windows of 15 rows and the row to predict
 

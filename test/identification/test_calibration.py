@@ -102,7 +102,9 @@ def test_the_data_choose_how_the_model_steps(orca: Vehicle, plant: PlantKind, ch
     """Euler steps fitted to a continuous car make a yaw inertia of their own."""
     laps = dynssm_ros.recorded(dynssm_ros.simulate(orca, "club", duration=20.0, plant=plant, noise=SENSORS, seed=3))
     width = orca.upper - orca.lower
-    car = unknown(orca.with_nominal(orca.nominal + 0.1 * np.where(orca.nominal < orca.lower + width / 2, width, -width)))
+    car = unknown(
+        orca.with_nominal(orca.nominal + 0.1 * np.where(orca.nominal < orca.lower + width / 2, width, -width))
+    )
     found = calibrate(laps, car, starts=1)
     assert (found.vehicle.integrator, found.vehicle.model_integrator) == (chosen, chosen)
     assert found.vehicle.coefficients["I_z"].nominal == pytest.approx(orca.coefficients["I_z"].nominal, rel=0.05)

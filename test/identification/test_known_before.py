@@ -17,7 +17,7 @@ from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle, save_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 
 ORCA = load_vehicle("orca")
-OTHERS = set(EFFECTS) - {"steering_offset", "steering_lag", "drag", "front_grip"}  # untried
+OTHERS = set(EFFECTS) - {"steering_offset", "drag"}  # untried
 NOISE = (0.01, 0.01, 0.03)
 
 

@@ -22,7 +22,7 @@ from dynssm_ros.vehicle import Vehicle, load_vehicle
 from dynssm_ros.vehicle.single_track import Motion, StageEffect
 
 Spoil = Callable[[dict[str, Vector], Vector], None]
-CASE = Case({}, 9800, "rk4", 100.0)
+CASE, QUICK = Case({}, 9800, "rk4", 100.0), Case({}, 9800, "euler", 100.0)
 
 
 def drifting_scale(columns: dict[str, Vector], t: Vector) -> None:
@@ -37,27 +37,26 @@ def loose_sensor(columns: dict[str, Vector], t: Vector) -> None:
 
 
 @pytest.fixture(scope="module")
-def spoiled() -> Callable[[Spoil], Diagnosis]:
-    recording, vehicle = record(CASE)
-
-    def diagnosed(spoil: Spoil) -> Diagnosis:
+def spoiled() -> Callable[..., Diagnosis]:
+    def diagnosed(spoil: Spoil, case: Case = CASE) -> Diagnosis:
+        recording, vehicle = record(case)
         columns = {name: values.copy() for name, values in recording.columns.items()}
         spoil(columns, (recording.time - recording.time[0]) / 1e9)
-        return diagnose(replace(recording, columns=columns), vehicle, integrator="rk4", line=CASE.road.centre)
+        return diagnose(replace(recording, columns=columns), vehicle, integrator=case.plant, line=case.road.centre)
 
     return diagnosed
 
 
 @pytest.mark.slow
-def test_grip_that_grows_does_not_stand_for_a_scale_that_drifts(spoiled: Callable[[Spoil], Diagnosis]) -> None:
+def test_grip_that_grows_does_not_stand_for_a_scale_that_drifts(spoiled: Callable[..., Diagnosis]) -> None:
     found = spoiled(drifting_scale)
     assert (found.verdict, found.causes) == ("unexplained", ())
     assert found.vehicle.effects == ()
     assert any("grip_drift would be on the side of neutral on which no car has it" in note for note in found.notes)
 
 
-def test_a_sensor_that_was_loose_for_seconds_is_placed_in_time(spoiled: Callable[[Spoil], Diagnosis]) -> None:
-    found = spoiled(loose_sensor)
+def test_a_sensor_that_was_loose_for_seconds_is_placed_in_time(spoiled: Callable[..., Diagnosis]) -> None:
+    found = spoiled(loose_sensor, QUICK)
     assert (found.verdict, found.causes) == ("unexplained", ())
     low, high = found.clustered.when
     assert 40.0 < low < high < 46.0
@@ -98,7 +97,7 @@ def test_a_term_that_no_effect_has_is_proposed_as_a_formula() -> None:
 
 @pytest.mark.slow
 def test_where_the_library_for_formulas_is_missing_a_note_says_how_to_have_it(
-    spoiled: Callable[[Spoil], Diagnosis], monkeypatch: pytest.MonkeyPatch
+    spoiled: Callable[..., Diagnosis], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
         "dynssm_ros.identification.result.diagnose.missing_libraries", lambda *extras: {"sklearn": "formula"}

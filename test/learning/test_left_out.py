@@ -51,16 +51,21 @@ def test_the_layer_is_fitted_to_what_models_say_of_parts_that_they_did_not_know(
         assert torch.equal(value, trained.model.state_dict()[name])
 
 
-@pytest.mark.parametrize("epoch", [3, 5, 6])
+@pytest.fixture(scope="module")
+def whole(drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicle, tmp_path_factory: Any) -> Any:
+    """A training that nobody interrupted."""
+    return train(drive(orca, 800), make_config(**WITH_PARTS), orca, tmp_path_factory.mktemp("whole") / "whole.pt")
+
+
+@pytest.mark.parametrize("epoch", [3, pytest.param(5, marks=pytest.mark.slow), 6])
 def test_an_interrupted_stage_is_gone_on_with(
-    drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicle, tmp_path: Path, epoch: int
+    drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicle, whole: Any, tmp_path: Path, epoch: int
 ) -> None:
     def interrupt(done: int, total: int, words: str) -> None:
         if done == epoch:
             raise KeyboardInterrupt
 
     recording, config = drive(orca, 800), make_config(**WITH_PARTS)
-    whole = train(recording, config, orca, tmp_path / "whole.pt")
     with pytest.raises(KeyboardInterrupt):
         train(recording, config, orca, tmp_path / "cut.pt", progress=interrupt)
     told: list[int] = []

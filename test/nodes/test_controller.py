@@ -167,6 +167,7 @@ def test_three_processes_drive_laps_and_the_predictor_may_die(stand: Stand, smal
     assert_possible(stand.commands)
 
 
+@pytest.mark.slow
 def test_a_lap_with_noise_delay_and_a_patch_of_little_grip_stays_on_the_road(small_model: Path) -> None:
     driven = drive_live("orca", 2, small_model, rate=RATE, lockstep=True)
     assert driven.least_room > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,19 +23,21 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(180)]
 
 
 @pytest.fixture(scope="module")
-def model(putnam: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model(putnam: Path, kept: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """DynSSM after two epochs on the log, without commands as the car did not record them."""
-    folder = tmp_path_factory.mktemp("putnam")
-    config = load_model_config("dynssm")
-    config = config.model_copy(update={"training": config.training.model_copy(update={"epochs": 2})})
-    recording = extract([putnam], load_signal_map("av21"), 25.0)
-    return save_artifact(train(recording, config, load_vehicle("av21"), folder / "c.pt"), folder / "model").path
+
+    def make(folder: Path) -> None:
+        config = load_model_config("dynssm").with_training(epochs=2)
+        recording = extract([putnam], load_signal_map("av21"), 25.0)
+        save_artifact(train(recording, config, load_vehicle("av21"), folder / "c.pt"), folder / "model")
+
+    return kept("putnam", make) / "model"
 
 
 @pytest.mark.parametrize(
     ("rate", "speed", "seconds"),
     [
-        (25.0, 1.0, 8.0),
+        pytest.param(25.0, 1.0, 8.0, marks=pytest.mark.slow),
         (25.0, 4.0, 32.0),
         (100.0, 1.0, 8.0),
         pytest.param(100.0, 4.0, 24.0, marks=pytest.mark.slow),  # 400 messages a second take a core of their own
