@@ -181,6 +181,20 @@ def small_model(laps_bag: Path, kept: Kept) -> Path:
     return kept("small_model", make) / "small"
 
 
+@pytest.fixture(scope="session")
+def rls_model(kept: Kept) -> Path:
+    """The folder of the online layer alone, trained on 40 s of a four-wheeled small car with noisy sensors."""
+
+    def make(folder: Path) -> None:
+        import dynssm_ros
+
+        noise = (0.01, 0.01, 0.03)
+        run = dynssm_ros.simulate("orca", "club", duration=40.0, seed=1, plant="double_track", noise=noise)
+        dynssm_ros.train(dynssm_ros.recorded(run), "rls", "orca", folder / "rls")
+
+    return kept("rls_model", make) / "rls"
+
+
 SMALL: dict[str, Any] = {
     "name": "small",
     "history": 0.1,

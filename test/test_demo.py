@@ -16,6 +16,7 @@ name: small
 history: 0.4
 inputs: {history: 0.36}
 innovation: {history: 0.32}
+physics: {nominal: vehicle}
 gru: {hidden: 4}
 fusion: {hidden: 8, latent: 8}
 residual: {hidden: [8]}
@@ -28,7 +29,7 @@ def test_the_demo_goes_the_whole_way_and_ends_with_a_report(
 ) -> None:
     model = tmp_path / "small.yaml"
     model.write_text(SMALL)
-    short = {"TRAINING_TIME": 45.0, "TEST_TIME": 12.0, "LIVE_TIME": 3.0, "EPOCHS": 1, "MODEL": model}
+    short = {"TRAINING_TIME": 35.0, "TEST_TIME": 12.0, "LIVE_TIME": 3.0, "EPOCHS": 1, "MODEL": model}
     for name, value in short.items():
         monkeypatch.setattr(demo, name, value)
     demo.demo(tmp_path / "demo")

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dynssm_ros import simulate
 from dynssm_ros.signals.messages import PARAMETERS_TOPIC, PREDICTION_TOPIC
+from dynssm_ros.simulation.laps import write_run
 from dynssm_ros.vehicle import load_vehicle
 from examples import a_hidden_cause_found, a_log_to_a_prediction
 
@@ -19,7 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def test_a_log_becomes_a_prediction_that_beats_persistence(tmp_path: Path) -> None:
-    ade = a_log_to_a_prediction.main(None, "default", "orca", tmp_path)
+    write_run(simulate("orca", "club", duration=30.0, plant="euler", noise=(0.01, 0.01, 0.03)), tmp_path / "laps")
+    ade = a_log_to_a_prediction.main(tmp_path / "laps", "default", "orca", tmp_path)
     assert ade["rls"] < ade["single_track"] < 0.5 * ade["persistence"]
 
 

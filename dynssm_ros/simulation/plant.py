@@ -46,19 +46,17 @@ class _Odometer(StageEffect):
 
     POSE = ("pose.x", "pose.y", "pose.theta")
 
+    def inputs(self, xp: Any, q: Motion) -> None:
+        """Shows the pose to the effects that follow."""
+        x, y, theta = self.POSE
+        now = q.effect_states
+        q.context = {**q.context, "x": now[x], "y": now[y], "theta": now[theta]}
+
     def accelerations(self, xp: Any, q: Motion) -> None:
         """Sets the rates of the pose."""
         x, y, theta = self.POSE
         q.effect_state_rates[x], q.effect_state_rates[y] = world_velocity(xp, q.effect_states[theta], q.v_x, q.v_y)
         q.effect_state_rates[theta] = q.omega
-
-
-class _ShownOdometer(_Odometer):
-    """Shows the pose to the effects that follow, where one of them reads it."""
-
-    def inputs(self, xp: Any, q: Motion) -> None:
-        """Puts the pose beside the other signals."""
-        q.context = {**q.context, **{name: q.effect_states[f"pose.{name}"] for name in Pose._fields}}
 
 
 class SingleTrackPlant:
@@ -97,9 +95,7 @@ class SingleTrackPlant:
         effects = vehicle.active_effects
         sensors = [effect for effect in effects if effect.SENSOR and not effect.reading_delay]
         physics = [effect for effect in effects if not effect.SENSOR]
-        acting: tuple[StageEffect, ...] = (*first, *physics, *last, *sensors)
-        read = any(name in Pose._fields for effect in acting for name in effect.needs)
-        acting = (_ShownOdometer() if read else _Odometer(), *acting)
+        acting: tuple[StageEffect, ...] = (_Odometer(), *first, *physics, *last, *sensors)
         delay = sum(effect.reading_delay for effect in effects)
         substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
         self._pieces = substeps if delay > 0 else 1  # a late reading falls between two steps

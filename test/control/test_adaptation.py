@@ -24,6 +24,7 @@ def raced(model, effects=None, **options):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_on_a_car_that_has_lost_grip_the_second_lap_is_almost_that_of_the_true_model(model):
     true, fixed, learned = raced(model, {"front_grip": {"factor": 0.85}})
     assert max(race.outside for race in (true, fixed, learned)) == 0.0

@@ -192,13 +192,29 @@ def test_a_model_that_knows_of_the_place_learns_without_it(learner, orca, club):
     assert len(knowing.laps) == 2
 
 
-def test_a_car_with_less_grip_than_its_file_learns_it_and_comes_round_faster(orca, club):
+def learned_laps(orca, club, laps):
     """The front tyres grip 15 % less than the controller's model has it."""
     driven = orca.with_effect("front_grip", {"factor": 0.85})
     settings, line = replace(Settings.of(orca, "progress"), deadline=np.inf), load_reference("racing", orca, club, SAFE)
     sensing = Sensing((0.01, 0.01, 0.03), (0.002, 0.002, 0.002), 0.02)
-    course = Course(driven, club, "rk4", line, settings, 5, sensing=sensing, learning=orca)
-    outcome = race(course, Fixed("file", CarModel.at_any_speed(orca, "rk4", 2), orca.nominal))
+    course = Course(driven, club, "rk4", line, settings, laps, sensing=sensing, learning=orca)
+    return race(course, Fixed("file", CarModel.at_any_speed(orca, "rk4", 2), orca.nominal))
+
+
+def test_a_second_lap_is_driven_with_what_the_first_one_told(orca, club):
+    outcome = learned_laps(orca, club, 2)
+    assert outcome.completed
+    assert outcome.outside == 0
+    first, second = outcome.learned
+    known = [one.vehicle.coefficients["D_f"] for one in (first, second)]
+    assert known[1].std < known[0].std
+    assert known[1].nominal < 0.95 * orca.coefficients["D_f"].nominal
+    assert len(outcome.to_json()["learned"]) == 2
+
+
+@pytest.mark.slow
+def test_a_car_with_less_grip_than_its_file_learns_it_and_comes_round_faster(orca, club):
+    outcome = learned_laps(orca, club, 5)
     assert outcome.completed
     assert outcome.outside == 0
     assert outcome.lap_times[-1] < 0.975 * outcome.lap_times[0]

@@ -48,11 +48,6 @@ def stints():
     return first, dataclasses.replace(second, time=second.time + shift)
 
 
-@pytest.fixture(scope="module")
-def model(kept):
-    return kept("rls", lambda folder: dynssm_ros.train(drive("club", 1), "rls", "orca", folder / "rls")) / "rls"
-
-
 def replayed(model, bag, online=True, state=None):
     predictor = Predictor(OnnxModel(open_artifact(model)), load_signal_map("default"), online=online)
     if state is not None:
@@ -73,39 +68,39 @@ def rmse(found, recording, start, end):
     return np.sqrt(np.mean(errors**2, axis=0))
 
 
-def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(model, stints, tmp_path: Path):
+def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(rls_model, stints, tmp_path: Path):
     bag = tmp_path / "both"
     recording_to_bag(concatenate(stints), bag)
-    run = run_live(model, bag, 0.02, rate=2.0)
+    run = run_live(rls_model, bag, 0.02, rate=2.0)
     assert len(run.missing()) < 40, run.diagnostics[-1]  # the window fills anew after the gap
-    expected = replayed(model, bag)
+    expected = replayed(rls_model, bag)
     stamps = sorted(set(run.predicted) & set(expected))
     live = np.array([run.predicted[stamp] for stamp in stamps])
     same = np.abs(live - np.array([expected[stamp] for stamp in stamps])).max(axis=1) < 1e-3
     assert same.mean() > 0.98  # odometry that overtakes its actuators is predicted from held samples
     found = {stamp: np.array(state) for stamp, state in run.predicted.items()}
-    without = replayed(model, bag, online=False)
+    without = replayed(rls_model, bag, online=False)
     before, after = (rmse(found, stints[1], *part) / rmse(without, stints[1], *part) for part in ((1, 6), (20, 35)))
     print("error with the layer over that without: first seconds", before.round(3), "after 20 s", after.round(3))
     assert np.all(after < 1.0)
     assert np.prod(after) < np.prod(before)
 
 
-def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(model, stints, tmp_path: Path):
+def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(rls_model, stints, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
     recording_to_bag(stints[0], bag)
-    run_live(model, bag, 0.02, rate=2.5, duration=8.0, parameters={"online_state": str(state)})
+    run_live(rls_model, bag, 0.02, rate=2.5, duration=8.0, parameters={"online_state": str(state)})
     assert state.is_file()
     second = tmp_path / "second"
     recording_to_bag(stints[1].select(slice(0, 400)), second)
-    fresh, goes_on = replayed(model, second), replayed(model, second, state=state)
+    fresh, goes_on = replayed(rls_model, second), replayed(rls_model, second, state=state)
     assert set(fresh) == set(goes_on)
     first = sorted(fresh)[0]
     assert np.abs(fresh[first] - goes_on[first]).max() > 0.0
 
 
 @pytest.mark.parametrize("stops", [2, pytest.param(15, marks=pytest.mark.slow)])
-def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(model, stints, stops, tmp_path: Path):
+def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(rls_model, stints, stops, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
     recording_to_bag(stints[0], bag)
     os.environ.update(isolated_environment())
@@ -116,18 +111,18 @@ def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(mode
             stop = signal.SIGTERM if k % 5 == 1 else signal.SIGINT
             run = LiveRun(20_000_000)
             state.unlink(missing_ok=True)
-            with predictor_process(model, {"online_state": state}, here) as process, collecting(run) as collector:
+            with predictor_process(rls_model, {"online_state": state}, here) as process, collecting(run) as collector:
                 assert collector.wait_for(lambda run=run: len(run.predicted) > 20, 30.0)
                 process.send_signal(stop)
                 assert process.wait(10) == 0, process.communicate()[1]
             assert state.is_file()
 
 
-def test_a_state_that_cannot_be_read_is_set_aside_and_the_node_begins_from_the_prior(model, stints, tmp_path: Path):
+def test_a_state_that_cannot_be_read_is_set_aside_and_the_node_begins_from_the_prior(rls_model, stints, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
     recording_to_bag(stints[0], bag)
     state.write_bytes(b"")
-    run = run_live(model, bag, 0.02, rate=2.5, duration=5.0, parameters={"online_state": str(state)})
+    run = run_live(rls_model, bag, 0.02, rate=2.5, duration=5.0, parameters={"online_state": str(state)})
     assert len(run.predicted) > 100
     level, words, _ = run.diagnostics[-1]
     assert level >= 1

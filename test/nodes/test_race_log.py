@@ -28,7 +28,7 @@ def model(putnam: Path, kept: Callable[[str, Callable[[Path], None]], Path]) -> 
 
     def make(folder: Path) -> None:
         config = load_model_config("dynssm").with_training(epochs=2)
-        recording = extract([putnam], load_signal_map("av21"), 25.0)
+        recording = extract([putnam], load_signal_map("av21"), 25.0).select(slice(0, 2500))
         save_artifact(train(recording, config, load_vehicle("av21"), folder / "c.pt"), folder / "model")
 
     return kept("putnam", make) / "model"

@@ -39,7 +39,7 @@ def test_a_changed_car_is_learned_to_a_fraction_of_the_physics_errors(
 def test_where_the_physics_is_exact_nothing_is_added(
     make_fitted: MakeConfig, laps: Recording, orca: Vehicle, tmp_path: Path
 ) -> None:
-    trained = train(laps, make_fitted(**GP), orca, tmp_path / "c.pt")
+    trained = train(laps.select(slice(0, len(laps) // 2)), make_fitted(**GP), orca, tmp_path / "c.pt")
     assert np.all(np.array(trained.validation_rmse) < 1e-4)
 
 

@@ -69,6 +69,7 @@ def test_the_deployed_graph_is_the_trained_model(
     assert artifact.card.parameters == gru // 4 + 4 * 9 + dense + 6 + 6 + 17  # frozen or not
 
 
+@pytest.mark.slow
 def test_a_rival_is_trained_by_the_plugin_evaluated_replayed_and_raced(
     dynssm: Callable[..., tuple[int, str, str]], laps: Recording, laps_bag: Path, tmp_path: Path
 ) -> None:
