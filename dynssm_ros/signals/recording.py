@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import os
 from collections.abc import Iterator, Sequence
@@ -25,6 +26,9 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, Commands
 
 METADATA_KEY = b"dynssm"
+_ARROW_SCHEMA = b"ARROW:schema"
+"""Under which pyarrow keeps names and metadata a second time."""
+_UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError)  # names that are no text, or those of several columns
 _ROWS_AT_ONCE = 65536  # that are written
 _FINGERPRINT_NS, _FINGERPRINT_ROWS = 10_000_000_000, 5
 _MOST_ROWS = 50_000_000  # five days at 100 Hz
@@ -181,7 +185,7 @@ class Recording:
             )
 
     def save(self, path: str | Path) -> None:
-        """Writes Parquet with the metadata inside, atomically."""
+        """Writes Parquet with the metadata and checksums of its pages inside, atomically."""
         arrays = {"time": pa.array(self.time), "segment": pa.array(self.segment)}
         arrays |= {name: pa.array(values) for name, values in self.columns.items()}
         fields = [
@@ -195,7 +199,10 @@ class Recording:
         with replacing(path) as aside:
             table = pa.table(list(arrays.values()), schema=schema)
             # measured numbers hardly repeat: a dictionary of them costs memory and is larger
-            pq.write_table(table, aside, row_group_size=_ROWS_AT_ONCE, compression="zstd", use_dictionary=["segment"])
+            pq.write_table(
+                table, aside, row_group_size=_ROWS_AT_ONCE, compression="zstd", use_dictionary=["segment"],
+                write_page_checksum=True,
+            )  # fmt: skip
 
     @classmethod
     def load(cls, path: str | Path) -> Recording:
@@ -219,6 +226,7 @@ class Recording:
         missing = [name for name in ("time", "segment", *WINDOW_COLUMNS) if name not in file.schema_arrow.names]
         if missing:
             raise RecordingError(f"{path}: column {missing[0]} is missing")
+        _require_undamaged(path, file)
         if file.metadata.num_rows == 0:
             raise RecordingError(f"{path}: the recording is empty")
         if file.metadata.num_rows > _MOST_ROWS:
@@ -232,6 +240,25 @@ class Recording:
                 raise RecordingError(f"{path}: column {name}, row {bad[0]}: {values[bad[0]]}; expected a finite number")
         _require_grid(path, time, segment, info.sampling_time)
         return cls(info, time, segment, columns)
+
+
+def _require_undamaged(path: Path, file: pq.ParquetFile) -> None:
+    """Checks what a file says twice; its pages have checksums, but its footer has none.
+
+    Raises:
+        RecordingError: it contradicts itself.
+    """
+    footer, metadata = file.metadata, file.metadata.metadata
+    if sum(footer.row_group(k).num_rows for k in range(footer.num_row_groups)) != footer.num_rows:
+        raise RecordingError(f"{path}: its footer contradicts itself about the number of rows; damaged")
+    if _ARROW_SCHEMA in metadata:  # by other writers than pyarrow it may be missing
+        second = pa.ipc.read_schema(pa.py_buffer(base64.b64decode(metadata[_ARROW_SCHEMA])))
+        for what, first, again in (
+            ("names of columns", file.schema.names, second.names),
+            ("metadata", metadata.get(METADATA_KEY), (second.metadata or {}).get(METADATA_KEY)),
+        ):
+            if again != first:
+                raise RecordingError(f"{path}: its footer contradicts itself about the {what}; damaged")
 
 
 def _require_grid(path: Path, time: npt.NDArray[Any], segment: npt.NDArray[Any], T_s: float) -> None:
@@ -260,7 +287,7 @@ def _is_recording(path: str | Path) -> bool:
     """Whether a file is Parquet with our metadata."""
     try:
         return METADATA_KEY in (pq.read_schema(path).metadata or {})
-    except (pa.ArrowException, OSError):
+    except _UNREADABLE:
         return False
 
 
@@ -270,15 +297,17 @@ def _opened(path: str | Path) -> Iterator[pq.ParquetFile]:
     if not os.path.isfile(path):
         raise RecordingError(f"{path}: no such recording; `dynssm extract` makes one from a bag")
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
             yield file
-    except (pa.ArrowException, OSError) as error:
+    except _UNREADABLE as error:
         raise RecordingError(f"{path}: not a readable Parquet file ({' '.join(str(error).split())})") from error
 
 
 def _column(file: pq.ParquetFile, name: str, kind: str, path: Path) -> npt.NDArray[Any]:
     """A column, read alone: a long recording is not held twice."""
     column = file.read(columns=[name], use_threads=False)[name]
+    if len(column) != file.metadata.num_rows:
+        raise RecordingError(f"{path}: column {name}: {len(column)} rows; expected {file.metadata.num_rows}")
     if str(column.type) != kind or column.null_count:
         have = f"{column.null_count} empty rows" if column.null_count else str(column.type)
         raise RecordingError(f"{path}: column {name}: {have}; expected {kind} in every row")

@@ -142,6 +142,32 @@ def test_what_is_not_parquet_is_told_in_one_line(tmp_path: Path, content: bytes)
     assert "\n" not in str(caught.value)
 
 
+def test_a_flipped_bit_changes_nothing_or_is_told(tmp_path: Path) -> None:
+    file, damaged = tmp_path / "r.parquet", tmp_path / "damaged.parquet"
+    original = recording([0, 0, 0])
+    original.save(file)
+    content, refusals = file.read_bytes(), []
+    for position in range(0, len(content), 11):
+        bits = content[position] ^ 1 << position % 8
+        damaged.write_bytes(content[:position] + bytes([bits]) + content[position + 1 :])
+        try:
+            again = Recording.load(damaged)
+        except RecordingError as error:
+            refusals.append(str(error))
+            continue
+        assert again.info == original.info
+        assert again.columns.keys() == original.columns.keys()
+        np.testing.assert_array_equal(again.matrix, original.matrix)
+        np.testing.assert_array_equal(again.time, original.time)
+    assert len(refusals) > len(content) / 11 / 2
+    assert all(words.startswith(f"{damaged}: ") for words in refusals)
+
+
+def test_a_recording_without_checksums_opens(tmp_path: Path) -> None:
+    file = rewritten(tmp_path, lambda table: table)
+    assert Recording.load(file)["v_x"].tolist() == [0, 1, 2]
+
+
 def test_a_cut_off_file_is_told(tmp_path: Path) -> None:
     file = tmp_path / "r.parquet"
     recording([0] * 50).save(file)
