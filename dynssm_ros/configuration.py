@@ -45,7 +45,7 @@ def config_directories() -> Iterator[Path]:
 def config_root() -> Path:
     """The folder of the shipped configuration; a :class:`ConfigurationError` if the installation lacks it."""
     for directory in config_directories():
-        if (directory / "vehicles").is_dir():
+        if os.path.isdir(directory / "vehicles"):
             return directory
     raise ConfigurationError("shipped configuration not found: expected share/dynssm_ros/config beside the package")
 

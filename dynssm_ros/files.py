@@ -1,6 +1,7 @@
 """Outputs are written aside and renamed: a kill leaves the old file or the new one, never half of one.
 
-An output never replaces an input of the same command, nor a log, nor what is neither file nor folder.
+An output never replaces an input of the same command, nor lies inside one, nor replaces a log or what is neither file
+nor folder.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ _FORCED: ContextVar[bool] = ContextVar("forced", default=False)
 
 @contextmanager
 def protecting(inputs: Collection[Path], force: bool = False) -> Iterator[None]:
-    """While this lasts, no output replaces one of ``inputs``; with ``force`` it replaces what others wrote."""
-    tokens = _INPUTS.set(tuple(path.resolve() for path in inputs)), _FORCED.set(force)
+    """While this lasts, no output replaces or enters one of ``inputs``; with ``force`` it replaces what others wrote."""
+    tokens = _INPUTS.set(tuple(map(real_path, inputs))), _FORCED.set(force)
     try:
         yield
     finally:
@@ -50,19 +51,30 @@ def require_replaceable(path: str | Path, ours: bool, what: str) -> None:
 
 
 def require_no_input(path: str | Path) -> None:
-    """Raises a :class:`UserError` if writing ``path`` destroys what the command reads, or what is no file or folder."""
-    target = Path(path)
-    if not os.path.lexists(target):
-        return
-    here = target.resolve()
-    if here.exists() and not stat.S_ISREG(here.stat().st_mode) and not here.is_dir():
-        raise UserError(f"{target}: is neither a file nor a folder; not replaced")
+    """Raises a :class:`UserError` if ``path`` is what the command reads, or lies in a folder that it reads."""
+    here = real_path(path)
     for one in _INPUTS.get():
         linked = os.path.exists(here) and os.path.exists(one) and os.path.samefile(here, one)  # by a hard link
-        if here == one or here in one.parents or linked:
+        if here == one or one in here.parents or linked:
+            raise UserError(f"{path}: the command reads {one.name} there; an output never replaces an input")
+
+
+def _require_writable(target: Path) -> None:
+    """Checks that writing ``target`` neither destroys nor enters what the command reads, nor destroys a log."""
+    require_no_input(target)
+    here = real_path(target)
+    if os.path.exists(here) and not os.path.isfile(here) and not os.path.isdir(here):
+        raise UserError(f"{target}: is neither a file nor a folder; not replaced")
+    for one in _INPUTS.get():
+        if here in one.parents:
             raise UserError(f"{target}: the command reads {one.name} there; an output never replaces an input")
-    if here.is_file() and here.suffix in LOG_SUFFIXES and not _FORCED.get():
+    if os.path.isfile(here) and here.suffix in LOG_SUFFIXES and not _FORCED.get():
         raise UserError(f"{target}: exists and looks like a log; not replaced (another name, or --force)")
+
+
+def real_path(path: str | Path) -> Path:
+    """The path without links; unlike ``Path.resolve`` also where links go round in a circle."""
+    return Path(os.path.realpath(path))
 
 
 @contextmanager
@@ -79,7 +91,7 @@ def replacing(path: str | Path, may_hold: Collection[str] = ()) -> Iterator[Path
         UserError: ``path`` cannot be written, or would destroy what is there.
     """
     target = Path(path)
-    require_no_input(target)
+    _require_writable(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         begin = f".{target.name}.{socket.gethostname()}."
@@ -92,25 +104,39 @@ def replacing(path: str | Path, may_hold: Collection[str] = ()) -> Iterator[Path
         _require_nothing_else(target, scratch / target.name, may_hold)
         _settle(scratch / target.name, scratch)
         _put(scratch / target.name, target, scratch / "replaced")
-    except OSError as error:
-        if error.errno not in _NO_ROOM:
+    except Exception as error:
+        if isinstance(error, UserError) or not (number := _no_room(error, scratch)):
             raise
-        raise UserError(f"{target}: cannot be written ({os.strerror(error.errno)})") from error
+        raise UserError(f"{target}: cannot be written ({os.strerror(number)})") from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _no_room(error: Exception, folder: Path) -> int:
+    """The number of the system's error if writing failed because there is no room in ``folder``, else 0.
+
+    Libraries raise errors of their own then, so a file is tried.
+    """
+    if not isinstance(error, OSError):
+        try:
+            (folder / "room").write_bytes(bytes(_CHUNK))
+        except OSError as tried:
+            error = tried
+    number = getattr(error, "errno", None)
+    return number if number in _NO_ROOM else 0
 
 
 def _clear_away(target: Path, begin: str) -> None:
     """Removes scratch folders for an output, which ``begin`` so, of processes of this machine that were killed."""
     for path in target.parent.iterdir():
         owner = path.name.removeprefix(begin).partition(".")[0]
-        if path.name.startswith(begin) and owner.isdigit() and not Path(f"/proc/{owner}").exists():
+        if path.name.startswith(begin) and owner.isdigit() and not os.path.exists(f"/proc/{owner}"):
             shutil.rmtree(path, ignore_errors=True)
 
 
 def _require_nothing_else(target: Path, aside: Path, may_hold: Collection[str]) -> None:
     """Checks that a folder which is replaced holds nothing of somebody else's."""
-    if not (aside.is_dir() and target.is_dir()) or _FORCED.get():
+    if not (os.path.isdir(aside) and os.path.isdir(target)) or _FORCED.get():
         return
     foreign = sorted(set(os.listdir(target)) - set(os.listdir(aside)) - set(may_hold))
     if foreign:
@@ -124,7 +150,7 @@ def _settle(aside: Path, scratch: Path) -> None:
     usual = scratch / "usual"
     usual.touch()
     mode = stat.S_IMODE(usual.stat().st_mode)
-    for file in [path for path in aside.rglob("*") if path.is_file()] if aside.is_dir() else [aside]:
+    for file in [path for path in aside.rglob("*") if os.path.isfile(path)] if os.path.isdir(aside) else [aside]:
         file.chmod(mode)
         with file.open("rb") as content:
             os.fsync(content.fileno())
@@ -145,13 +171,13 @@ def _put(aside: Path, target: Path, replaced: Path) -> None:
     A folder cannot be renamed onto a filled one: both change names at once, or the older one goes to ``replaced`` first.
     """
     try:
-        if aside.is_dir() and target.is_dir():
+        if os.path.isdir(aside) and os.path.isdir(target):
             if _exchange(aside, target):
                 return
             target.rename(replaced)
         os.replace(aside, target)
     except OSError as error:
-        if replaced.exists():
+        if os.path.exists(replaced):
             replaced.rename(target)
         raise UserError(f"{target}: cannot be written ({error.strerror})") from error
 
@@ -186,4 +212,4 @@ def content_key(content: Any) -> str:
 
 def files_in(path: Path) -> list[Path]:
     """A file, or all files in a folder, however deep; none if nothing is there."""
-    return [file for file in (sorted(path.rglob("*")) if path.is_dir() else [path]) if file.is_file()]
+    return [file for file in (sorted(path.rglob("*")) if os.path.isdir(path) else [path]) if os.path.isfile(file)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -230,6 +231,26 @@ def test_a_full_disk_is_named_and_leaves_what_was_there(
         write()
     assert text_of(target) == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_full_disk_is_named_whatever_a_library_raises(tmp_path: Path) -> None:
+    def write(error: type[Exception]) -> None:
+        with replacing(tmp_path / "out") as aside:
+            aside.write_bytes(b"half")
+            raise error
+
+    with pytest.raises(RuntimeError):
+        write(RuntimeError)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # which stands for a full disk
+    try:
+        with pytest.raises(UserError, match=r"out: cannot be written \(File too large\)"):
+            write(RuntimeError)
+        with pytest.raises(UserError, match=r"^$"):
+            write(UserError)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("out", ["bag", "laps.parquet"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,7 +61,7 @@ def replay(
 
     s, signal_map = settings, signal_map_of(signals)
     predictor = Predictor(OnnxModel(open_artifact(model)), signal_map, max_age=s.max_age, online=s.online)
-    if s.online_state is not None and s.online_state.exists():
+    if s.online_state is not None and os.path.exists(s.online_state):
         predictor.load_online(s.online_state)
     outcome = replay_to_bag(Path(bag), predictor, Path(out), with_inputs=s.with_inputs, progress=on_progress)
     if s.online_state is not None:

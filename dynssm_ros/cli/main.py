@@ -29,7 +29,7 @@ from dynssm_ros.cli.sweep import sweep
 from dynssm_ros.cli.train import train
 from dynssm_ros.errors import DataWarning, UserError
 from dynssm_ros.extras import load_plugins
-from dynssm_ros.files import protecting
+from dynssm_ros.files import protecting, require_no_input
 
 app = typer.Typer(
     name="dynssm",
@@ -46,6 +46,8 @@ for command in (inspect, simulate, extract, calibrate, train, sweep, evaluate, r
 
 
 _OUTPUTS = ("--out", "--bag", "--json", "--online-state")
+_NAMES = ("--vehicle", "--signals", "--track", "--line", "--car")
+"""Options that take a file or a name; a folder that is called like a name is not read."""
 _M_MMAP_THRESHOLD, _LARGE = -3, 1_000_000  # an option of mallopt(3), and from how many bytes on an array is large
 
 
@@ -71,10 +73,15 @@ def main() -> None:
     _give_memory_back()
     try:
         load_plugins()
-        with _warning_in_lines(), protecting(inputs(arguments), force=len(arguments) < len(sys.argv) - 1):
+        inputs, outputs = paths(arguments)
+        with _warning_in_lines(), protecting(inputs, force=len(arguments) < len(sys.argv) - 1):
+            for output in outputs:
+                require_no_input(output)
             status = app(arguments, standalone_mode=False)
     except UserError as error:
         _fail(str(error))
+    except OSError as error:  # of a path that is forbidden or too long, or a disk that fails
+        _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except _UsageProblem as error:
         words = cast("Any", error).format_message()
         if words:  # without a subcommand the help is shown, and that is no error
@@ -92,18 +99,27 @@ def _give_memory_back() -> None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE)
 
 
-def inputs(arguments: Sequence[str]) -> list[Path]:
-    """What a command reads: all arguments that are paths of something there, but for those of outputs."""
-    found, option = [], ""
+def paths(arguments: Sequence[str]) -> tuple[list[Path], list[Path]]:
+    """What a command reads, which is all arguments that are paths of something there but for those of outputs; and these.
+
+    Raises:
+        UserError: an argument is not UTF-8.
+    """
+    inputs, outputs, option = list[Path](), list[Path](), ""
+    names = (*_NAMES, "--model") if arguments[:1] in (["train"], ["sweep"]) else _NAMES
     for word in arguments:
+        if any("\ud800" <= letter <= "\udfff" for letter in word):
+            raise UserError(f"argument {word!a}: expected UTF-8")  # as which reports and recordings note it
         name, is_option, value = word.partition("=") if word.startswith("--") else ("", "", word)
         if name and not is_option:
             option = name
             continue
-        if (name or option) not in _OUTPUTS and value and os.path.lexists(value):
-            found.append(Path(value))
+        if (name or option) in _OUTPUTS:
+            outputs.append(Path(value))
+        elif value and os.path.lexists(value) and not ((name or option) in names and os.path.isdir(value)):
+            inputs.append(Path(value))
         option = ""
-    return found
+    return inputs, outputs
 
 
 @contextmanager

@@ -6,6 +6,7 @@ diagnosed. What comes out is compared over time: :func:`alarms` says which sessi
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
@@ -170,7 +171,7 @@ def review_again(
 ) -> Review:
     """What is found in a session, or was found in it before and written to ``out``; see :func:`review`."""
     session, file = task
-    trained = [digest(Path(name)) for name in models if Path(name).exists()]
+    trained = [digest(Path(name)) for name in models if os.path.exists(name)]
     key = content_key([__version__, car.model_dump(mode="json"), models, trained, stretch, checksum(file)])
     kept = out / "sessions" / f"{'-'.join(session.place)}.json"
     try:

@@ -6,6 +6,7 @@ import copy
 import io
 import json
 import logging
+import os
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -16,7 +17,7 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -39,6 +40,7 @@ from dynssm_ros.runtime.artifact import (
     write_card,
 )
 from dynssm_ros.runtime.online import save_layer
+from dynssm_ros.runtime.tensors import write_tensors
 
 LOSSES = "losses.png"
 TOLERANCE = 1e-5  # largest difference between ONNX and torch, in units of each state's scale
@@ -88,7 +90,7 @@ def save_artifact(
     sample = _sample_windows(trained)
     with replacing(out, may_hold=(ONLINE, LOSSES)) as folder:
         folder.mkdir()
-        save_file({name: value.contiguous() for name, value in model.state_dict().items()}, folder / WEIGHTS)
+        write_tensors(folder / WEIGHTS, {name: value.numpy(force=True) for name, value in model.state_dict().items()})
         export_onnx(model, sample, folder / ONNX, trained.features)
         if trained.online is not None:
             save_layer(trained.online, folder / ONLINE)
@@ -145,7 +147,7 @@ def check_replaceable(out: Path) -> None:
     Raises:
         ArtifactError: something else is there.
     """
-    if out.exists() and not (out / CARD).is_file():
+    if os.path.exists(out) and not os.path.isfile(out / CARD):
         raise ArtifactError(f"{out}: exists and is not a model folder; not replaced")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -209,7 +210,7 @@ class Optimisation:
 
     def _resume(self) -> int:
         """Continues from the checkpoint if it is of this very training; returns its epoch, 0 for a fresh start."""
-        if not self.checkpoint.is_file():
+        if not os.path.isfile(self.checkpoint):
             return 0
         try:
             with zipfile.ZipFile(self.checkpoint) as archive:

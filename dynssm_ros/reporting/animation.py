@@ -19,7 +19,7 @@ from dynssm_ros.control.race import Race
 from dynssm_ros.control.race_models import TRUE
 from dynssm_ros.evaluation.coefficients import coefficient_label
 from dynssm_ros.files import replacing
-from dynssm_ros.reporting.evaluation_figures import MEASURED, STYLE
+from dynssm_ros.reporting.evaluation_figures import MEASURED, STYLE, names_as_they_are
 from dynssm_ros.reporting.race_figures import draw_borders, driven_coefficients, race_lines
 from dynssm_ros.track.racing_line import CAR_WIDTH
 from dynssm_ros.vehicle import COEFFICIENTS
@@ -52,7 +52,7 @@ def animate(races: Sequence[Race], path: str | Path) -> None:
         parts = _cars(races, road, _changed_stretch(longest, name, truth))
         parts += _curves(races, strips, name, longest.time, truth)
         figure.legend(*road.get_legend_handles_labels(), loc="outside upper left", ncols=5)
-        figure.draw_without_rendering()
+        names_as_they_are(figure).draw_without_rendering()
     figure.set_layout_engine("none")  # it is laid out once, not for each frame
     writer = PillowWriter(fps=max(2, round(min(RATE, count / duration))))
     with replacing(path) as aside, writer.saving(figure, str(aside), dpi=90):

@@ -8,6 +8,7 @@ a display.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
@@ -16,6 +17,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import PercentFormatter, ScalarFormatter
 
 from dynssm_ros.arrays import Vector
@@ -52,19 +54,27 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.3,
 }
+_FORMULA = re.compile(r"([^$]|\$(\\omega|[A-Za-z]+_(\w|\{\w+\}))\$)*")  # texts whose only formulas are symbols of ours
 Drawn = TypeVar("Drawn")
 _P = ParamSpec("_P")
 
 
 def styled(draw: Callable[_P, Figure]) -> Callable[_P, Figure]:
-    """Decorator: draws in the package's style."""
+    """Decorator: draws in the package's style, and names of users, with ``$`` in them, as they are."""
 
     @wraps(draw)
     def in_style(*args: _P.args, **kwargs: _P.kwargs) -> Figure:
         with mpl.rc_context(STYLE):
-            return draw(*args, **kwargs)
+            return names_as_they_are(draw(*args, **kwargs))
 
     return in_style
+
+
+def names_as_they_are(figure: Figure) -> Figure:
+    """Has texts drawn as formulas only where these are symbols with an index or omega; what else has ``$`` is a name."""
+    for each in figure.findobj(Text):
+        each.set_parse_math(_FORMULA.fullmatch(each.get_text()) is not None)
+    return figure
 
 
 def sheet(height: float, rows: int = 1, columns: int = 1, **grid: Any) -> tuple[Figure, Any]:

@@ -24,7 +24,7 @@ def inspection_report(found: Inspection) -> Report:
     told = "".join(f" {name}: {one.note}." for name, one in found.signals.items() if one.note)
     text = f"As written to signals.yaml. Names suggest it, so check each line.{missing}{told}"
     sections = [Section("Signal map", text, table=signal_table(found) if found.signals else None)]
-    if found.signals:
+    if any(name in found.signals for names in _PANELS.values() for name in names):
         text = "Signs are seen best here: in a bend to the left omega and the steering are positive."
         sections.append(Section("Signals", text, signals_over_time(found)))
     if "x" in found.signals and "y" in found.signals:

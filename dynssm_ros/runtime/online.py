@@ -15,6 +15,7 @@ The features are stateless and computed by the model's graph. What is learned is
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,14 +23,13 @@ from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
-from safetensors.numpy import save_file
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import replacing
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
-from dynssm_ros.runtime.tensors import read_tensors
+from dynssm_ros.runtime.tensors import read_tensors, write_tensors
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.integrators import Integrator
@@ -293,10 +293,10 @@ class OnlineState:
 
     def save(self, path: Path, owner: str) -> None:
         """Writes what was learned to ``path``, atomically; ``owner`` names the prior that it belongs to."""
-        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _SAVED}
+        arrays = {name: getattr(self, name) for name in _SAVED}
         arrays |= {f"coefficients.{name}": value for name, value in self.coefficients.kept().items()}
         with replacing(path) as aside:
-            save_file(arrays, aside, {"prior": owner, "steps": str(self.steps)})
+            write_tensors(aside, arrays, {"prior": owner, "steps": str(self.steps)})
 
     def load(self, path: Path, owner: str) -> None:
         """Goes on from what :meth:`save` wrote.
@@ -327,7 +327,7 @@ _ROUNDING = 1e-9  # of eigenvalues
 def _state_in(path: Path) -> bytes:
     """The content of a file of what was learned; without waiting where it is none."""
     try:
-        if not path.is_file() or path.stat().st_size > _LARGEST_STATE:
+        if not os.path.isfile(path) or path.stat().st_size > _LARGEST_STATE:
             raise ArtifactError(
                 f"{path}: not a readable online state (expected a file of at most {_LARGEST_STATE} bytes)"
             )
@@ -338,7 +338,7 @@ def _state_in(path: Path) -> bytes:
 
 def save_layer(layer: OnlineLayer, path: Path) -> None:
     """Writes the numbers of a layer; names and time constants are in the card."""
-    save_file({name: np.ascontiguousarray(getattr(layer, name)) for name in _PRIOR}, path)
+    write_tensors(path, {name: getattr(layer, name) for name in _PRIOR})
 
 
 def load_layer(

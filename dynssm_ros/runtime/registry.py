@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ def load_model(name_or_dir: str | Path, vehicle: Vehicle | None = None) -> Windo
         ArtifactError: the folder is not a usable model.
         ConfigurationError: no such model, or the vehicle is missing.
     """
-    if Path(name_or_dir).is_dir():
+    if os.path.isdir(name_or_dir):
         return OnnxModel(open_artifact(name_or_dir))
     if name_or_dir == Persistence.name:
         return Persistence()

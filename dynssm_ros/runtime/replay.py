@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dynssm_ros.errors import BagError
+from dynssm_ros.files import real_path
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.bags import Bag, copy_topics, open_bag, write_bag
 from dynssm_ros.signals.decoding import Frames, frames_of, header_stamp_ns, live_decoders
@@ -83,7 +84,7 @@ def replay_to_bag(
     Raises:
         BagError: as :func:`replay`, or ``out`` is the bag itself.
     """
-    if out.resolve() in (bag.resolve(), bag.resolve().parent):
+    if real_path(out) in (real_path(bag), real_path(bag).parent):
         raise BagError(f"{out}: is the bag that is replayed; expected another folder to write")
     refusals: Counter[Refusal] = Counter()
     count = 0

@@ -1,11 +1,14 @@
-"""Arrays in the bytes of a safetensors file."""
+"""Arrays in safetensors files."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from pathlib import Path
 
+import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load
+from safetensors.numpy import load, save
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
@@ -27,3 +30,12 @@ def read_tensors(data: bytes, refusal: str) -> tuple[dict[str, Vector], dict[str
     except (SafetensorError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise ArtifactError(f"{refusal} ({error})") from error
     return arrays, about
+
+
+def write_tensors(path: Path, arrays: Mapping[str, Vector], about: dict[str, str] | None = None) -> None:
+    """Writes arrays by name, and what they are ``about``, to a safetensors file.
+
+    Raises:
+        OSError: cannot be written; the library's own writer raises another error where the disk is full.
+    """
+    path.write_bytes(save({name: np.asarray(array, order="C") for name, array in arrays.items()}, about))

@@ -25,7 +25,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from dynssm_ros import __version__
 from dynssm_ros.errors import BagError
-from dynssm_ros.files import replacing, require_replaceable
+from dynssm_ros.files import real_path, replacing, require_replaceable
 from dynssm_ros.signals.recover import (
     bad_chunks,
     is_short,
@@ -173,7 +173,7 @@ def _open(paths: list[Path]) -> AnyReader:
     Raises:
         BagError: there is more to do; says why.
     """
-    if any(path.is_dir() and not (path / "metadata.yaml").is_file() for path in paths):
+    if any(os.path.isdir(path) and not os.path.isfile(path / "metadata.yaml") for path in paths):
         raise BagError("there is no metadata.yaml")
     try:
         files = [file for path in paths for file in _storage_files(path)]
@@ -192,7 +192,7 @@ def _open(paths: list[Path]) -> AnyReader:
 
 def _storage_files(path: Path) -> list[Path]:
     """The storage files of a folder, or the file itself; what is there packed and unpacked counts once."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    files = sorted(path.iterdir()) if os.path.isdir(path) else [path]
     return [
         file
         for file in files
@@ -210,7 +210,7 @@ def _open_files(path: Path, scratch: Path, damage: str, notes: list[str]) -> Any
     try:
         files = _storage_files(path)
         taken_for_ros1 = path.suffix == ".bag"  # rosbags goes by the name, also of a folder; nothing is wrong with it
-        if path.is_dir() and damage not in (_NO_INDEX, _LOG_LEFT) and not taken_for_ros1:
+        if os.path.isdir(path) and damage not in (_NO_INDEX, _LOG_LEFT) and not taken_for_ros1:
             notes.append(f"{path.name}: read file by file ({damage})")
         found = [_usable_file(file, scratch / str(number), notes) for number, file in enumerate(files)]
     except (OSError, sqlite3.Error) as error:
@@ -238,7 +238,7 @@ def _usable_file(file: Path, scratch: Path, notes: list[str]) -> Path | None:
         notes.append(f"{file.name}: its recorder was killed; merged with the log that it left")
     else:
         source = scratch / f"link{file.suffix}"  # SQLite does not find a path with '#', '?' or '%' as rosbags asks
-        source.symlink_to(file.resolve())
+        source.symlink_to(real_path(file))
     damage = _damage(source)
     if damage is None:
         return source

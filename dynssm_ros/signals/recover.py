@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import mmap
+import os
 import shutil
 import sqlite3
 import struct
@@ -93,7 +94,7 @@ def is_short(file: Path) -> bool:
 def log_left(file: Path) -> bool:
     """Whether a killed recorder left a SQLite log beside ``file`` that holds what is not yet in it."""
     logs = (Path(f"{file}{suffix}") for suffix in SQLITE_LOGS)
-    return file.suffix == ".db3" and any(log.is_file() and log.stat().st_size > 0 for log in logs)
+    return file.suffix == ".db3" and any(os.path.isfile(log) and log.stat().st_size > 0 for log in logs)
 
 
 def merge_log(file: Path, merged: Path) -> None:
@@ -103,7 +104,7 @@ def merge_log(file: Path, merged: Path) -> None:
         OSError: cannot be copied.
     """
     for suffix in ("", *SQLITE_LOGS):
-        if Path(f"{file}{suffix}").is_file():
+        if os.path.isfile(f"{file}{suffix}"):
             shutil.copyfile(f"{file}{suffix}", f"{merged}{suffix}")
     with closing(sqlite3.connect(merged)) as database, suppress(sqlite3.DatabaseError):
         database.execute("PRAGMA journal_mode = DELETE")

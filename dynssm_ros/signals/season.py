@@ -10,6 +10,7 @@ Logs that are as they were are not read again; one that cannot be read is listed
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from pydantic import Field, ValidationError
 
 from dynssm_ros.configuration import StrictModel, describe
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.files import write_json
+from dynssm_ros.files import real_path, write_json
 from dynssm_ros.signals.recording import Recording
 
 MANIFEST, FILE = "_season.json", "recording.parquet"
@@ -104,9 +105,9 @@ class Season:
         Raises:
             RecordingError: there is none.
         """
-        within = Path(folder or self.path).resolve()
+        within = real_path(folder or self.path)
         there = [each for each in self.sessions.values() if not each.failure]
-        found = [each for each in there if self.file(each.place).resolve().is_relative_to(within)]
+        found = [each for each in there if real_path(self.file(each.place)).is_relative_to(within)]
         if not found:
             raise RecordingError(f"{folder or self.path}: none of {len(there)} sessions; `dynssm inspect` lists them")
         return sorted(found, key=lambda each: (each.start, each.place))
@@ -122,12 +123,12 @@ class Season:
 
 def address(bag: Path) -> str:
     """By which the manifest names a log."""
-    return str(bag.resolve())
+    return str(real_path(bag))
 
 
 def is_season(path: str | Path) -> bool:
     """Whether a folder holds a season."""
-    return (Path(path) / MANIFEST).is_file()
+    return os.path.isfile(Path(path) / MANIFEST)
 
 
 def season_part(folder: str | Path) -> tuple[Season, list[Session]]:
@@ -137,7 +138,7 @@ def season_part(folder: str | Path) -> tuple[Season, list[Session]]:
         RecordingError: there is no session with a recording.
     """
     path = Path(folder)
-    root = next((each for each in (path, *path.resolve().parents) if is_season(each)), path)
+    root = next((each for each in (path, *real_path(path).parents) if is_season(each)), path)
     season = Season.load(root)
     return season, season.chosen(path)
 
@@ -150,7 +151,7 @@ def recording_files(paths: Sequence[str | Path]) -> list[Path]:
     """
     found = []
     for path in map(Path, paths):
-        if path.is_dir():
+        if os.path.isdir(path):
             season, sessions = season_part(path)
             found += [season.file(session.place) for session in sessions]
         else:

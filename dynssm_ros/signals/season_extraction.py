@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from dynssm_ros import __version__
 from dynssm_ros.errors import ConfigurationError, SettingError, UserError
-from dynssm_ros.files import content_key, digest, files_in, require_replaceable
+from dynssm_ros.files import content_key, digest, files_in, real_path, require_replaceable
 from dynssm_ros.parallel import HERE, Workers, each
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.extraction import extract
@@ -51,9 +52,9 @@ def logs_of(
     Raises:
         ConfigurationError: a name that is no folder's, or two bags that cannot be told apart.
     """
-    names = [bag.name if bag.is_dir() else bag.stem for bag in bags]
+    names = [bag.name if os.path.isdir(bag) else bag.stem for bag in bags]
     names = [
-        f"{bag.resolve().parent.name}-{name}" if names.count(name) > 1 else name
+        f"{real_path(bag).parent.name}-{name}" if names.count(name) > 1 else name
         for bag, name in zip(bags, names, strict=True)
     ]
     for what, name in (("car", car), ("track", track), *(("session", name) for name in names)):
@@ -84,7 +85,7 @@ def extract_season(
         UserError: ``out`` is something else; the names of a log are those of others.
     """
     out = Path(out)
-    require_replaceable(out, is_season(out) or (out.is_dir() and not any(out.iterdir())), "a season")
+    require_replaceable(out, is_season(out) or (os.path.isdir(out) and not os.listdir(out)), "a season")
     season = Season.load(out) if is_season(out) else Season(out)
     logs = [_placed(season, log) for log in logs]
     out.mkdir(parents=True, exist_ok=True)
@@ -115,7 +116,7 @@ def _placed(season: Season, log: Log) -> Log:
     if known is not None:
         return replace(log, session=known)
     taken = {each.session: each.checksum for each in here}
-    for name in (log.session, f"{log.bag.resolve().parent.name}-{log.session}"):
+    for name in (log.session, f"{real_path(log.bag).parent.name}-{log.session}"):
         if name not in taken or taken[name] == digest(log.bag):  # the same log, elsewhere
             return replace(log, session=name)
     raise UserError(f"{log.bag}: {season.path} has a session '{log.session}' of another log; expected another name")
@@ -124,7 +125,11 @@ def _placed(season: Season, log: Log) -> Log:
 def _is_as_it_was(season: Season, log: Log) -> bool:
     """Whether a log need not be read: same settings, and files of the same size and time, or else of the same content."""
     before = season.sessions.get(log.place)
-    if before is None or before.settings != log.settings or not (before.failure or season.file(log.place).is_file()):
+    if (
+        before is None
+        or before.settings != log.settings
+        or not (before.failure or os.path.isfile(season.file(log.place)))
+    ):
         return False
     files = _states(log.bag)
     if files != before.files and digest(log.bag) != before.checksum:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -109,7 +110,7 @@ def load_track(name_or_path: str | Path) -> Track:
         TrackError: neither a file nor a built-in name, or the file is no track.
     """
     path = Path(name_or_path)
-    if path.is_file():
+    if os.path.isfile(path):
         return read_track(path)
     if str(name_or_path) in LAYOUTS:
         layout = LAYOUTS[str(name_or_path)]()

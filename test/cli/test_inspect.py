@@ -6,6 +6,8 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+from dynssm_ros.signals import messages
+from dynssm_ros.signals.bags import write_bag
 from dynssm_ros.signals.signal_map import load_signal_map
 
 Run = Callable[..., tuple[int, str, str]]
@@ -27,6 +29,18 @@ def test_a_log_is_shown_and_its_map_can_be_extracted_with(dynssm: Run, laps_bag:
     laps = tmp_path / "laps.parquet"
     status, _, err = dynssm("extract", laps_bag, "--signals", out / "signals.yaml", "--rate", 50, "--out", laps)
     assert (status, err) == (0, "")
+
+
+def test_a_log_of_poses_alone_is_shown(dynssm: Run, tmp_path: Path) -> None:
+    """As of motion capture: the twist is not filled in, so nothing but the path can be drawn."""
+    with write_bag(tmp_path / "bag") as bag:
+        bag.add_topic(messages.ODOMETRY_TOPIC, messages.ODOMETRY)
+        for k in range(300):
+            stamp = 1_700_000_000_000_000_000 + 10_000_000 * k
+            bag.write(messages.ODOMETRY_TOPIC, stamp, messages.odometry(stamp, (0.1 * k, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    status, _, err = dynssm("inspect", tmp_path / "bag", "--out", tmp_path / "inspection")
+    assert (status, err) == (0, "")
+    assert (tmp_path / "inspection" / "report.html").read_text().count("data:image/svg+xml") == 1
 
 
 def test_what_is_no_bag_ends_in_one_line(refused: Refused, tmp_path: Path) -> None:

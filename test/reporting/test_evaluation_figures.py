@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from dynssm_ros.reporting import evaluation_figures as figures
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
@@ -28,6 +29,20 @@ def test_predicted_and_measured_shows_three_channels_with_units(drawn, run):
     axes = drawn(figures.predicted_and_measured(time, states, predicted))
     assert [a.get_ylabel() for a in axes[::2]] == ["$v_x$ (m/s)", "$v_y$ (m/s)", r"$\omega$ (rad/s)"]
     assert all(len(a.get_lines()) == 4 for a in axes)
+
+
+@pytest.mark.parametrize("name", [r"a$\frac{$b", "$x$", "$v_x$", "$", r"\$", "a^_{b", r"$\mathdefault{$"])
+def test_a_name_is_drawn_as_it_is(drawn, run, name):
+    time, states, predicted = run
+    figure = figures.predicted_and_measured(time, states, {name: predicted["dynssm"]})
+    assert drawn(figure)
+    rmse = {name: np.ones(3)}
+    std = {name: np.zeros(3)}
+    assert drawn(figures.relative_errors(rmse, std, np.ones(3)))
+    formulas = {each.get_text() for each in figure.findobj(Text) if "$" in each.get_text() and each.get_parse_math()}
+    ours = {("$v_x$", "m/s"), ("$v_y$", "m/s"), (r"$\omega$", "rad/s")}
+    labels = {f"{symbol}{what} ({unit})" for symbol, unit in ours for what in ("", " error")}
+    assert formulas == labels | ({name} & {"$v_x$"})
 
 
 def test_increments_leave_out_persistence_and_say_how_much_is_explained(drawn, run):

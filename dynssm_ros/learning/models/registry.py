@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from functools import reduce
 from operator import getitem
@@ -117,7 +118,7 @@ def fields_of(path: Path, depth: int = 0) -> dict[str, Any]:
 def referred(path: Path, name: str) -> Path:
     """The model file that ``path`` calls ``name``: one beside it, else as on the command line."""
     sibling = path.parent / f"{name}.yaml"
-    return sibling if sibling.is_file() else configuration.find_config("models", name)
+    return sibling if os.path.isfile(sibling) else configuration.find_config("models", name)
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
