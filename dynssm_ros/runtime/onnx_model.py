@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,9 @@ from dynssm_ros.signals.signal_map import Commands
 _AT_ONCE = 32
 """Windows that a graph sees at once. Memory that it has used stays with it: two megabytes for each of them with the paper's
 encoders. More at once are no faster."""
+_REPEATING = re.compile(rb"(?:\"|\xa2\x80*\x00)(?:[\x04\x0b]|[\x84\x8b]\x80*\x00)(Loop|Scan|SequenceMap)")
+"""Operators that run for as long as their input says, as the format has them: field 4 of a node, length, name. Those that the
+export writes take the same time whatever comes in, so that a trial tells how long a prediction takes."""
 _WEIGHTS_ELSEWHERE = "session.model_external_initializers_file_folder_path"
 
 
@@ -59,6 +63,10 @@ class OnnxModel:
 
     def _open(self) -> None:
         """Opens the graph."""
+        if repeating := _REPEATING.search(self.artifact.graph):
+            raise ArtifactError(
+                f"{self.artifact.onnx}: has the operator {repeating[1].decode()}, which may never end; expected none"
+            )
         options = ort.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")

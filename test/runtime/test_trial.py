@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import checksum
 from dynssm_ros.runtime.artifact import CARD, METRICS, ONNX, WEIGHTS, ModelCard, open_artifact, read_folder
 from dynssm_ros.runtime.contract import WindowPrediction
-from dynssm_ros.runtime.onnx_model import OnnxModel
+from dynssm_ros.runtime.onnx_model import _REPEATING, OnnxModel
 from dynssm_ros.runtime.trial import judge, require_same_use, try_model
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -134,15 +135,40 @@ def constants(graph: onnx.GraphProto, **values: np.ndarray) -> None:
 
 
 def endless(graph: onnx.GraphProto) -> None:
-    """A loop of 2^40 rounds."""
+    """A loop of as many rounds as the window says, in a branch."""
     ports = [("i", TensorProto.INT64), ("go", TensorProto.BOOL), ("v", TensorProto.FLOAT)]
     inputs = [helper.make_tensor_value_info(name, kind, []) for name, kind in ports]
     outputs = [helper.make_tensor_value_info(f"{name}_out", kind, []) for name, kind in ports[1:]]
     nodes = [helper.make_node(kind, [name], [f"{name}_out"]) for kind, name in (("Identity", "go"), ("Sin", "v"))]
-    constants(graph, rounds=np.array(2**40), begin=np.array(True), zero=np.array(0, np.float32))
+    constants(graph, one=np.array(1, np.float32), begin=np.array(True), zero=np.array(0, np.float32))
     body = helper.make_graph(nodes, "body", inputs, outputs)
-    graph.node.append(helper.make_node("Loop", ["rounds", "begin", "zero"], ["turned"], body=body))
-    graph.node.append(helper.make_node("Add", ["raw", "turned"], ["increment"]))
+    loop = helper.make_node("Loop", ["rounds", "begin", "zero"], ["turned"], body=body)
+    turned = [helper.make_tensor_value_info("turned", TensorProto.FLOAT, [])]
+    other = helper.make_node("Identity", ["zero"], ["turned"])
+    graph.node.extend(
+        [
+            helper.make_node("ReduceMax", ["window"], ["fastest"], keepdims=0),
+            helper.make_node("Greater", ["fastest", "one"], ["fast"]),
+            helper.make_node("Cast", ["fastest"], ["rounds"], to=TensorProto.INT64),
+            helper.make_node(
+                "If",
+                ["fast"],
+                ["result"],
+                then_branch=helper.make_graph([loop], "then", [], turned),
+                else_branch=helper.make_graph([other], "else", [], turned),
+            ),
+            helper.make_node("Add", ["raw", "result"], ["increment"]),
+        ]
+    )
+
+
+def slow(graph: onnx.GraphProto) -> None:
+    """Products of large matrices, a thousand times."""
+    constants(graph, shape=np.array([2000, 2000]))
+    graph.node.append(helper.make_node("ConstantOfShape", ["shape"], ["m0"]))
+    graph.node.extend(helper.make_node("MatMul", ["m0", f"m{k}"], [f"m{k + 1}"]) for k in range(1000))
+    graph.node.append(helper.make_node("ReduceSum", ["m1000"], ["sum"], keepdims=0))
+    graph.node.append(helper.make_node("Add", ["raw", "sum"], ["increment"]))
 
 
 def vast(graph: onnx.GraphProto) -> None:
@@ -162,10 +188,27 @@ def test_a_good_model_passes_in_its_own_process(small_model: Path, model: OnnxMo
 
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize(
-    ("edit", "expected"), [(endless, "takes too long or too much memory"), (vast, "cannot be used (RuntimeError")]
+    ("edit", "expected"), [(slow, "takes too long or too much memory"), (vast, "cannot be used (RuntimeError")]
 )
 def test_a_model_that_would_take_all_time_or_memory_ends_its_trial_alone(
     small_model: Path, tmp_path: Path, model: OnnxModel, rows: np.ndarray, edit: Callable[..., None], expected: str
 ) -> None:
     folder = edited(small_model, tmp_path / "evil", edit)
     assert expected in refusal(lambda: try_model(folder, read_folder(folder), model.card, rows))
+
+
+def test_a_model_whose_inputs_say_how_long_it_runs_is_refused_unopened(
+    small_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = edited(small_model, tmp_path / "evil", endless)
+    words = refusal(lambda: OnnxModel(open_artifact(folder)))
+    assert words == f"{folder / ONNX}: has the operator Loop, which may never end; expected none"
+    monkeypatch.setattr("dynssm_ros.runtime.onnx_model._REPEATING", re.compile(b"no such operator"))
+    OnnxModel(open_artifact(folder))  # nothing else is wrong with it
+
+
+@pytest.mark.parametrize("start", [b'"', b"\xa2\x00", b"\xa2\x80\x80\x00"])
+@pytest.mark.parametrize("name", [b"\x04Scan", b"\x84\x00Scan", b"\x0bSequenceMap", b"\x8b\x80\x00SequenceMap"])
+def test_such_operators_are_known_however_the_format_writes_their_length(start: bytes, name: bytes) -> None:
+    assert _REPEATING.search(b"\n\x01x" + start + name)
+    assert not _REPEATING.search(b"\n\x01x\x1a" + name)  # what is called so
