@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -340,6 +341,18 @@ def _topic_rows() -> list[list[str]]:
             return rows
         rows.append([cell.strip() for cell in line.strip("|").split("|")][1:])
     return rows
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd")
+def test_the_unit_is_one_that_systemd_knows(tmp_path: Path) -> None:
+    unit = next(block for block in re.findall(r"(?:^    .*\n)+", PAGES["security.md"], re.M) if "[Service]" in block)
+    (line,) = re.findall(r"^    (Environment=FASTDDS.*)$", PAGES["security.md"], re.M)
+    file = tmp_path / "dynssm.service"
+    text = re.sub("^    ", "", unit, flags=re.M) + line + "\n"
+    file.write_text(text.replace("/opt/dynssm/bin/predictor", sys.executable).replace("User=racing", "User=nobody"))
+    done = subprocess.run(["systemd-analyze", "verify", str(file)], capture_output=True, text=True, check=False)
+    assert [words for words in done.stderr.splitlines() if file.name in words] == []
+    assert "PrivateIPC" not in unit  # nodes must see the same /dev/shm
 
 
 def test_the_effects_of_the_document_are_those_of_the_code() -> None:
