@@ -185,6 +185,8 @@ def _open(paths: list[Path]) -> AnyReader:
             raise BagError("a file is shorter than its header says")
         reader = AnyReader(paths, default_typestore=_TYPESTORE)
         reader.open()
+        if any((type(c.topic), type(c.msgtype), type(c.msgcount)) != (str, str, int) for c in reader.connections):
+            raise BagError("its metadata.yaml is damaged")  # which rosbags hands on as it is
     except Exception as error:  # rosbags lets through what its decoders raise: struct, codec, YAML, index, type errors
         raise BagError(_one_line(error)) from error
     return reader
