@@ -5,7 +5,8 @@ import pytest
 from benchmarks.endurance.live_seeds import Seeded, drive_seeded, words
 
 
-@pytest.mark.parametrize("seed", [22, pytest.param(23, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [22, 23])
 def test_drives_that_were_lost_stay_on_the_road(seed):
     """They spun on the patch: no small change of their plans led out of a turn that had become too tight."""
     drive = drive_seeded("orca", seed, 2)

@@ -173,6 +173,7 @@ def test_the_least_time_of_a_step_that_is_taken_again_leaves_the_machine_out(mon
     assert "times cannot be compared" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_cell_is_driven_with_each_model(small_model, tmp_path):
     (cell,) = [each for each in cells() if each.name == "orca-club_11-none"]

@@ -43,6 +43,7 @@ def test_the_command_writes_what_it_measured(small_model: Path, tmp_path: Path) 
     assert content["slowest_at_swap_ms"] is None
 
 
+@pytest.mark.slow
 def test_nothing_is_predicted_from_what_is_spoilt(small_model: Path) -> None:
     done = soak([small_model], 3.0, 200.0, spoilt=0.15)
     assert done.violations == {}

@@ -122,7 +122,10 @@ def test_what_does_not_fit_is_one_line_and_leaves_nothing(
     assert [path.name for path in tmp_path.iterdir()] == ["laps.parquet"]
 
 
-@pytest.mark.parametrize("command", ["calibrate", "train", "evaluate", "diagnose"])
+@pytest.mark.parametrize(
+    "command",
+    ["calibrate", "train", *(pytest.param(each, marks=pytest.mark.slow) for each in ("evaluate", "diagnose"))],
+)
 def test_rows_that_the_car_cannot_have_driven_are_named_in_a_line(
     dynssm: Run, laps: Path, tmp_path: Path, command
 ) -> None:

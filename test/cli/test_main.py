@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
 
@@ -35,11 +36,6 @@ def test_every_command_has_help(command: str) -> None:
         (["drive"], "No such command 'drive'"),
         (["extract"], "Missing argument"),
         (["extract", "bag", "--signals", "av21", "--rate", "0", "--out", "r.parquet"], "'--rate'"),
-        (
-            ["train", "r.parquet", "--model", "nothing", "--vehicle", "orca", "--out", "m"],
-            "'nothing' is neither a file",
-        ),
-        (["train", "r.parquet", "--model", "ridge", "--vehicle", "orca", "--out", "m", "--device", "tpu"], "tpu"),
     ],
 )
 def test_a_usage_error_is_one_line_and_exit_status_1(arguments: list[str], expected: str) -> None:
@@ -48,6 +44,19 @@ def test_a_usage_error_is_one_line_and_exit_status_1(arguments: list[str], expec
     (line,) = result.stderr.strip().splitlines()
     assert line.startswith("error: ")
     assert expected in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--model", "nothing", "--vehicle", "orca", "--out", "m"], "'nothing' is neither a file"),
+        (["--model", "ridge", "--vehicle", "orca", "--out", "m", "--device", "tpu"], "tpu"),
+    ],
+)
+def test_an_error_of_an_option_is_one_line_too(
+    refused: Callable[..., str], arguments: list[str], expected: str
+) -> None:
+    assert expected in refused("train", "r.parquet", *arguments)
 
 
 _MEMORY = """

@@ -133,6 +133,7 @@ def test_the_present_folder_can_hold_the_model(
     assert open_artifact(tmp_path / "model").card.training["seed"] == 5
 
 
+@pytest.mark.slow
 def test_without_a_terminal_there_is_no_progress_bar(arguments: list[str]) -> None:
     command = [sys.executable, "-m", "dynssm_ros.cli.main", *arguments, "--epochs", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -78,7 +78,7 @@ def test_the_published_orca_car_is_recovered_exactly_and_holds_on_another_track(
     assert (error < 1e-6).all()
 
 
-@pytest.mark.parametrize("horizon", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("horizon", [0.02, pytest.param(0.1, marks=pytest.mark.slow), 0.5])
 def test_simulated_laps_give_the_coefficients_back_over_any_horizon(
     club: Recording, orca: Vehicle, horizon: float
 ) -> None:

@@ -21,7 +21,7 @@ from dynssm_ros.identification.result.diagnose import _moved_together, diagnose
 from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis
 from dynssm_ros.identification.search.candidates import Responses, ScoreTest, candidates
 from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC
-from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report, headline
+from dynssm_ros.reporting.diagnosis_report import as_text, headline
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle
@@ -32,7 +32,7 @@ LINE = load_track("road_course").centre
 SEED = 1
 
 
-AT_ONCE = ("drag", "steering_lag", "yaw_rate_bias")  # diagnosed in every run of the tests
+AT_ONCE = ("steering_lag", "yaw_rate_bias")  # diagnosed in every run of the tests
 FEW = (
     "drag",
     "front_grip",
@@ -179,7 +179,7 @@ def test_what_takes_little_off_every_channel_is_small_unless_what_was_known_tell
     assert (content["causes"], [one["effect"] for one in content["small_effects"]]) == ([], ["steering_lag"])
 
 
-def test_words_and_report_name_cause_size_gain_and_advice(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
+def test_words_name_cause_size_gain_and_advice(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
     found = lagging[2]
     words = as_text(found)
     for part in (
@@ -190,9 +190,6 @@ def test_words_and_report_name_cause_size_gain_and_advice(lagging: tuple[Recordi
         "Error on held-out laps",
     ):
         assert part in words
-    page = diagnosis_report(found).html()
-    assert page.count("data:image/svg+xml") >= 8
-    assert EFFECTS["steering_lag"].SUMMARY in page
 
 
 @pytest.mark.parametrize(

@@ -253,7 +253,7 @@ def test_the_integrator_is_that_of_the_data(plant: str) -> None:
     assert np.isfinite(found.selection.fit.objective)
 
 
-@pytest.mark.parametrize("stated", [None, "rk4", "euler"])
+@pytest.mark.parametrize("stated", [None, pytest.param("rk4", marks=pytest.mark.slow), "euler"])
 def test_the_integrator_is_that_of_the_file_where_the_data_do_not_say(stated: str | None) -> None:
     given = stepped("rk4", (0.2, 0.2, 1.0))
     car = CarEstimate.of(ORCA.model_copy(update={"integrator": stated}))

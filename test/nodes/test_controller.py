@@ -175,6 +175,7 @@ def test_a_lap_with_noise_delay_and_a_patch_of_little_grip_stays_on_the_road(sma
     assert driven.controller.startswith("drives, adapted coefficients")
 
 
+@pytest.mark.slow
 def test_the_car_stops_without_its_controller_and_the_controller_brakes_without_its_car(stand: Stand) -> None:
     """Each of the two is killed in turn; the controller comes back in between.
 

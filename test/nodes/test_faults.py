@@ -165,9 +165,19 @@ FAULTS = (
     Fault("no actuators", not_used(without_actuators), 40, "/vehicle/actuator_feedback: silent for"),
     Fault("a second without messages", gap, 1, "", H),
 )
+ALIKE = (  # faults with the verdict, or the way to it, of another one
+    "yaw rate in degrees per second", "steering in degrees", "the lateral velocity's sign", "the yaw rate's sign",
+    "infinite steering", "every other stamp 10 s ahead",
+)  # fmt: skip
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name.replace(" ", "_"))
+@pytest.mark.parametrize(
+    "fault",
+    [
+        pytest.param(fault, id=fault.name.replace(" ", "_"), marks=pytest.mark.slow if fault.name in ALIKE else ())
+        for fault in FAULTS
+    ],
+)
 def test_a_fault_is_named_nothing_is_predicted_from_it_and_predictions_come_back(
     car: Any, laps: list[Row], fault: Fault
 ) -> None:

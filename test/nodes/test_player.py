@@ -34,6 +34,7 @@ def _player(*parameters: str) -> list[str]:
     return [sys.executable, "-m", "dynssm_ros.nodes.player", "--ros-args", *arguments]
 
 
+@pytest.mark.slow
 def test_player_and_predictor_work_as_separate_processes(small_model: Path, laps_bag: Path) -> None:
     os.environ.update(isolated_environment())
     run = LiveRun(20_000_000)

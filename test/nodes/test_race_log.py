@@ -39,7 +39,7 @@ def model(putnam: Path, kept: Callable[[str, Callable[[Path], None]], Path]) -> 
     [
         pytest.param(25.0, 1.0, 8.0, marks=pytest.mark.slow),
         (25.0, 4.0, 32.0),
-        (100.0, 1.0, 8.0),
+        pytest.param(100.0, 1.0, 8.0, marks=pytest.mark.slow),
         pytest.param(100.0, 4.0, 24.0, marks=pytest.mark.slow),  # 400 messages a second take a core of their own
     ],
 )

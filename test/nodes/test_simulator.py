@@ -132,6 +132,7 @@ def test_effects_are_added_to_the_car_and_to_what_is_measured_of_it(start_pit: S
     )
 
 
+@pytest.mark.slow
 def test_predictor_answers_each_odometry_message_of_the_simulated_car(start_pit: StartPit, small_model: Path) -> None:
     with ExitStack() as stack:
         stack.enter_context(predictor_process(small_model, {"diagnostics_period": 0.1}, os.environ.copy()))

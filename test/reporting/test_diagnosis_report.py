@@ -163,6 +163,7 @@ def test_the_report_shows_one_step_and_the_horizon_over_time_place_and_signals(l
                   "Errors against steering", "Errors against throttle", "Errors against position on the lap",
                   "Errors against lateral acceleration", "What these laps would show", "Nominal values"):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
+    assert EFFECTS["steering_lag"].SUMMARY in page
 
 
 def test_figures_have_a_row_for_one_step_and_one_for_the_horizon(improvement: Improvement) -> None:
