@@ -36,6 +36,7 @@ def test_a_changed_car_is_learned_to_a_fraction_of_the_physics_errors(
     assert scores["gp"].rollout.ade < 0.3 * scores["physics"].rollout.ade
 
 
+@pytest.mark.slow
 def test_where_the_physics_is_exact_nothing_is_added(
     make_fitted: MakeConfig, laps: Recording, orca: Vehicle, tmp_path: Path
 ) -> None:
