@@ -73,29 +73,33 @@ class OnnxModel:
         # the export has optimised the graph; doing it again would hold up a swap
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
         options.enable_mem_reuse = False  # small tensors: planning their reuse costs more than their effect states
-        options.log_severity_level = 3
+        options.log_severity_level = 4  # its errors are raised too
+        # a single window, as in the node, always has its place in memory
+        self._window = np.zeros((1, self.H, len(WINDOW_COLUMNS)), dtype=np.float32)
         try:
             # of the bytes that were checked; a graph whose weights are in other files finds none here
             options.add_session_config_entry(_WEIGHTS_ELSEWHERE, str(self.artifact.onnx / "none"))
-            self._session = ort.InferenceSession(self.artifact.graph, options, providers=["CPUExecutionProvider"])
+            self._session = ort.InferenceSession(
+                self.artifact.graph, options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )  # which would print, and try the same again
+            self._outputs = [output.name for output in self._session.get_outputs()]
+            inputs = [(each.name, each.shape[1:]) for each in self._session.get_inputs()]
+            if inputs != [("window", [self.H, len(WINDOW_COLUMNS)])] or "increment" not in self._outputs:
+                raise ArtifactError(
+                    f"{self.artifact.onnx}: maps {inputs} to {self._outputs}; expected a window of {self.H} rows and "
+                    f"{len(WINDOW_COLUMNS)} columns to increment, and theta, physics, variance if it has them"
+                )
+            self._binding = self._session.io_binding()
+            self._binding.bind_cpu_input("window", self._window)
+            for name in self._outputs:
+                self._binding.bind_output(name)
+            self._session.run_with_iobinding(self._binding)
+        except ArtifactError:
+            raise
         except Exception as error:  # onnxruntime raises its own unrelated classes
             raise ArtifactError(
                 f"{self.artifact.onnx}: ONNX Runtime refuses it ({' '.join(str(error).split())})"
             ) from error
-        self._outputs = [output.name for output in self._session.get_outputs()]
-        inputs = [(each.name, each.shape[1:]) for each in self._session.get_inputs()]
-        if inputs != [("window", [self.H, len(WINDOW_COLUMNS)])] or "increment" not in self._outputs:
-            raise ArtifactError(
-                f"{self.artifact.onnx}: maps {inputs} to {self._outputs}; expected a window of {self.H} rows and "
-                f"{len(WINDOW_COLUMNS)} columns to increment, and theta, physics, variance if it has them"
-            )
-
-        # a single window, as in the node, always has its place in memory
-        self._window = np.empty((1, self.H, len(WINDOW_COLUMNS)), dtype=np.float32)
-        self._binding = self._session.io_binding()
-        self._binding.bind_cpu_input("window", self._window)
-        for name in self._outputs:
-            self._binding.bind_output(name)
 
     @property
     def origin(self) -> str:

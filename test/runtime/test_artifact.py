@@ -238,13 +238,22 @@ def test_weights_that_are_no_safetensors_are_refused(folder: Path) -> None:
     assert "not a readable safetensors file" in refusal(folder)
 
 
-@pytest.mark.parametrize("spoil", [lambda content: b"garbage", lambda content: content[:200], lambda content: b""])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda content: b"garbage",
+        lambda content: content[:200],
+        lambda content: b"",
+        lambda content: content.replace(b"increment", b"increm\xf7nt"),
+    ],
+)
 def test_a_graph_that_onnx_runtime_refuses_is_an_error_on_opening(
-    folder: Path, spoil: Callable[[bytes], bytes]
+    folder: Path, spoil: Callable[[bytes], bytes], capfd: pytest.CaptureFixture[str]
 ) -> None:
     (folder / ONNX).write_bytes(spoil((folder / ONNX).read_bytes()))
     certify(folder)
     assert "ONNX Runtime refuses it" in refusal(folder, deploy)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_the_graph_of_another_model_is_an_error_on_opening(folder: Path) -> None:
