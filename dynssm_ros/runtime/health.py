@@ -92,7 +92,7 @@ class Health:
         period: T_s (s), within which an answer is not late.
         publishers: of each input, as far as known.
         wiring: what is wired wrongly, in words; empty if nothing is known to be.
-        hindsight: that predictions were worse than none, in words; empty if they were not.
+        hindsight: what became of the predictions; see :meth:`~dynssm_ros.runtime.hindsight.Hindsight.verdict`.
         late: answers that were late.
     """
 
@@ -101,7 +101,7 @@ class Health:
     period: float = np.inf
     publishers: dict[str, int] = field(default_factory=dict)
     wiring: str = ""
-    hindsight: str = ""
+    hindsight: tuple[Level, str] = (Level.OK, "")
     late: int = 0
     refusals: Counter[Refusal] = field(default_factory=Counter)
     predictions: int = 0
@@ -176,8 +176,8 @@ class Health:
             return (Level.WARN if newest is Refusal.FILLING else Level.ERROR), newest.value
         if late := self._lateness():
             return late
-        if self.hindsight:
-            return Level.ERROR, self.hindsight
+        if self.hindsight[0]:
+            return self.hindsight
         several = [f"{topic}: {count} publishers" for topic, count in self.publishers.items() if count > 1]
         if several:
             return Level.WARN, "; ".join(several)

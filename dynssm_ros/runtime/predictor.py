@@ -19,6 +19,7 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.contract import WindowPrediction
+from dynssm_ros.runtime.health import Level
 from dynssm_ros.runtime.hindsight import Hindsight
 from dynssm_ros.runtime.learner import OnlineLearner
 from dynssm_ros.runtime.online import OnlineState, expert_weights
@@ -160,8 +161,8 @@ class Predictor:
             figures |= {f"online weight of the {name}": f"{weight:.3f}" for name, weight in experts.items()}
         return figures
 
-    def hindsight(self) -> str:
-        """That what was predicted in the last second was worse than no prediction, in words; empty if it was not."""
+    def hindsight(self) -> tuple[Level, str]:
+        """What became of the predictions of the last second; see :class:`Hindsight`."""
         return self._hindsight.verdict()
 
     def finish(self) -> None:
@@ -196,7 +197,7 @@ class Predictor:
         self.model = model
         self._plausibility = Plausibility(model.card.vehicle, frames=self._frames)
         self._scale = model.card.normalisation.increment_scale
-        self._hindsight = Hindsight(self._scale)
+        self._hindsight = Hindsight(self._scale, model.vehicle.minimum_speed)
         self._period = round(model.T_s * 1e9)
 
     def observe(self, stamp: int, values: dict[str, float], frames: Frames | None = None) -> Refusal | None:

@@ -169,5 +169,5 @@ def test_passed_over_odometry_is_counted_and_said_if_it_is_much(health: Health) 
 
 
 def test_predictions_that_were_worse_than_none_are_an_error(health: Health) -> None:
-    health.hindsight = "predictions are 9 times as far off as the state before"
-    assert health.verdict(1.05) == (Level.ERROR, health.hindsight)
+    health.hindsight = (Level.ERROR, "predictions were off by 9 usual steps lately, the state before them by 1")
+    assert health.verdict(1.05) == health.hindsight
