@@ -1,4 +1,4 @@
-"""The whole way, shortened: the same code as `make demo` with less driving and a small model."""
+"""The whole way, shortened: the same code as `make demo` with less driving and training."""
 
 from __future__ import annotations
 
@@ -8,29 +8,13 @@ import pytest
 
 from examples import demo
 
-pytestmark = [pytest.mark.live, pytest.mark.timeout(240)]
-
-SMALL = """
-base: dynssm
-name: small
-history: 0.4
-inputs: {history: 0.36}
-innovation: {history: 0.32}
-physics: {nominal: vehicle}
-gru: {hidden: 4}
-fusion: {hidden: 8, latent: 8}
-residual: {hidden: [8]}
-online: {folds: 1}
-"""
+pytestmark = [pytest.mark.live, pytest.mark.slow, pytest.mark.timeout(240)]
 
 
 def test_the_demo_goes_the_whole_way_and_ends_with_a_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model = tmp_path / "small.yaml"
-    model.write_text(SMALL)
-    short = {"TRAINING_TIME": 35.0, "TEST_TIME": 12.0, "LIVE_TIME": 3.0, "EPOCHS": 1, "MODEL": model}
-    for name, value in short.items():
+    for name, value in {"TRAINING_TIME": 90.0, "TEST_TIME": 20.0, "LIVE_TIME": 4.0, "EPOCHS": 1}.items():
         monkeypatch.setattr(demo, name, value)
     demo.demo(tmp_path / "demo")
     assert "0 missing" in " ".join(capsys.readouterr().out.split())

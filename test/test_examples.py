@@ -20,6 +20,7 @@ from examples import a_hidden_cause_found, a_log_to_a_prediction
 ROOT = Path(__file__).resolve().parent.parent
 
 
+@pytest.mark.slow
 def test_a_log_becomes_a_prediction_that_beats_persistence(tmp_path: Path) -> None:
     write_run(simulate("orca", "club", duration=30.0, plant="euler", noise=(0.01, 0.01, 0.03)), tmp_path / "laps")
     ade = a_log_to_a_prediction.main(tmp_path / "laps", "default", "orca", tmp_path)

@@ -27,6 +27,7 @@ def test_each_message_is_answered_while_models_are_swapped(small_model: Path, tm
     assert done.open_files[0] > 5
 
 
+@pytest.mark.slow
 def test_a_swap_that_is_refused_is_seen(small_model: Path, tmp_path: Path) -> None:
     done = soak([small_model, tmp_path / "none"], 1.5, 100.0, swap_every=0.8)
     assert "no such model folder" in done.violations["a swap was refused"]

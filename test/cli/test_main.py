@@ -24,10 +24,10 @@ def test_help_lists_every_command() -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help(command: str) -> None:
-    result = dynssm(command, "--help")
-    assert result.returncode == 0
-    assert "Usage" in result.stdout
+def test_every_command_has_help(command: str, told: Callable[..., tuple[int, str]]) -> None:
+    status, words = told(command, "--help")
+    assert status == 0
+    assert "Usage" in words
 
 
 @pytest.mark.parametrize(

@@ -272,6 +272,7 @@ def test_what_hides_the_steps_never_makes_a_fit_worse(monkeypatch: pytest.Monkey
     assert _with_what_hides(problem, fit) is fit
 
 
+@pytest.mark.slow
 def test_another_yaw_inertia_is_not_taken_for_euler_steps() -> None:
     """Steps of 40 ms that act half a step late are to a car of this yaw inertia what it is to one of less."""
     av21 = load_vehicle("av21")
@@ -287,6 +288,7 @@ def test_another_yaw_inertia_is_not_taken_for_euler_steps() -> None:
     assert found.selection.fit.car.effects["yaw_inertia"]["factor"] == pytest.approx(0.65, abs=0.05)
 
 
+@pytest.mark.slow
 def test_inputs_that_changed_between_the_rows_go_on_a_line() -> None:
     fast = ORCA.model_copy(update={"sampling_time": ORCA.sampling_time / 4})
     recording = as_recording(

@@ -68,6 +68,7 @@ def rmse(found, recording, start, end):
     return np.sqrt(np.mean(errors**2, axis=0))
 
 
+@pytest.mark.slow
 def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(rls_model, stints, tmp_path: Path):
     bag = tmp_path / "both"
     recording_to_bag(concatenate(stints), bag)
