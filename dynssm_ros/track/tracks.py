@@ -17,6 +17,7 @@ from dynssm_ros.track.layouts import LAYOUTS, closed_loop
 from dynssm_ros.track.lines import ClosedLine, Floats
 
 CSV_COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
+LARGEST = 1e9  # m, of a coordinate or width
 MIN_POINTS = 10
 MAX_FOLDED = 0.25  # share of the lap; 0.04 on the published ETHZ track
 
@@ -155,8 +156,8 @@ def _numbers(cells: list[str], where: str) -> list[float]:
         values = [float(cell) for cell in cells]
     except ValueError as error:
         raise TrackError(f"{where}: '{','.join(cells)}'; expected four numbers") from error
-    if not np.all(np.isfinite(values)):
-        raise TrackError(f"{where}: '{','.join(cells)}'; expected finite numbers")
+    if not np.all(np.abs(values) <= LARGEST):
+        raise TrackError(f"{where}: '{','.join(cells)}'; expected finite numbers of at most {LARGEST:g} m")
     return values
 
 

@@ -138,6 +138,10 @@ def test_repeated_first_point_is_left_out(tmp_path):
         ([*ring()[:5], [1.0, 2.0, 1.0], *ring()[6:]], "line 7: 3 values; expected 4"),
         ([*ring()[:5], [1.0, "far", 1.0, 1.0], *ring()[6:]], "line 7: '1.0,far,1.0,1.0'; expected four numbers"),
         ([*ring()[:5], [1.0, "nan", 1.0, 1.0], *ring()[6:]], "line 7: .* expected finite numbers"),
+        (
+            [*ring()[:5], [1.0, -1e308, 1.0, 1.0], *ring()[6:]],
+            "line 7: .* expected finite numbers of at most 1e\\+09 m",
+        ),
         ([*ring()[:5], ring()[4], *ring()[5:]], "points 4 and 5 are the same"),
         (eight(), "borders cross near"),
         (ring(left=21.0), "borders cross: the left border runs backwards along 100% of the lap"),
