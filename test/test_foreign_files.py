@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import resource
 import shutil
@@ -75,7 +76,7 @@ def damaged(content: bytes, damage: list[tuple[int, str, int]]) -> bytes:
 def edited(tree: Any, edits: list[tuple[int, str, Any]]) -> Any:
     """What YAML or JSON holds, with values exchanged, left out, added, or under another name."""
     tree = json.loads(json.dumps(tree))
-    for place, how, odd in edits:
+    for place, how, odd in copy.deepcopy(edits):
         places: list[tuple[Any, Any]] = []
         left = [tree]
         while left:
