@@ -131,7 +131,7 @@ def test_bad_samples_yield_no_prediction_and_the_node_recovers_by_itself(car) ->
     assert all(np.isfinite(state).all() for state in car.run.predicted.values())
 
 
-@pytest.mark.parametrize("asked", ["reliable", "best_effort"])
+@pytest.mark.parametrize("asked", [pytest.param("reliable", marks=pytest.mark.slow), "best_effort"])
 def test_outputs_are_reliable_unless_asked_otherwise(start_car, asked: str) -> None:
     given = {} if asked == "reliable" else {"qos_overrides./dynssm/prediction.publisher.reliability": asked}
     car = start_car(**given)
@@ -217,7 +217,7 @@ def test_time_that_jumps_back_restarts_the_window(car) -> None:
     assert first not in car.run.predicted
 
 
-@pytest.mark.parametrize("how", [{"actuators": False}, {"commands": False}])
+@pytest.mark.parametrize("how", [{"actuators": False}, pytest.param({"commands": False}, marks=pytest.mark.slow)])
 def test_stale_actuators_stop_predictions_and_diagnostics_say_so_until_they_are_back(car, how) -> None:
     car.drive_until_answered()
     stale = [car.step(**how) for _ in range(30)]
