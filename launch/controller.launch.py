@@ -60,6 +60,8 @@ def _parameters(executable: str, given: dict[str, str]) -> dict[str, str | float
         if executable in nodes and given[name]
     }
     values |= {name: values[name] == "true" for name in SWITCHES if name in values}
+    if executable == "controller" and given["lockstep"] == "true":
+        values["max_late"] = 10.0  # the stamps of a car whose time waits fall behind
     return values | ({"driver": "external"} if executable == "simulator" else {})
 
 

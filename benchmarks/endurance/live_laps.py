@@ -153,7 +153,7 @@ def _parameters(
         },
         "controller": road | {
             "vehicle": folder / "known.yaml", "speed_scale": SPEED_SCALE, "delay": sensed.delay,
-            "diagnostics_period": 0.5,
+            "diagnostics_period": 0.5, "max_late": 10.0,  # the simulated car's time may stand still
         },
     }  # fmt: skip
 

@@ -184,15 +184,17 @@ def node_process(
     parameters: Mapping[str, object] | None = None,
     environment: Mapping[str, str] | None = None,
     namespace: str = "",
+    remapped: Mapping[str, str] | None = None,
 ) -> Iterator[subprocess.Popen[str]]:
-    """Starts a node of this package (``predictor``, ``simulator``, ``controller``) with ROS parameters as a process
-    of its own; interrupts it in the end.
+    """Starts a node of this package (``predictor``, ``simulator``, ``controller``) with ROS parameters and ``remapped``
+    topics as a process of its own; interrupts it in the end.
 
     Raises:
         UserError: it crashed, or it did not end when it was interrupted.
     """
     arguments = [part for name, value in (parameters or {}).items() for part in ("-p", f"{name}:={value}")]
     arguments += ["-r", f"__ns:=/{namespace}"] if namespace else []
+    arguments += [part for name, other in (remapped or {}).items() for part in ("-r", f"{name}:={other}")]
     command = [sys.executable, "-m", f"dynssm_ros.nodes.{node}", *(["--ros-args", *arguments] if arguments else [])]
     process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)  # noqa: S603 - own module
     try:
