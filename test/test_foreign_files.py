@@ -76,7 +76,8 @@ def damaged(content: bytes, damage: list[tuple[int, str, int]]) -> bytes:
 def edited(tree: Any, edits: list[tuple[int, str, Any]]) -> Any:
     """What YAML or JSON holds, with values exchanged, left out, added, or under another name."""
     tree = json.loads(json.dumps(tree))
-    for place, how, odd in copy.deepcopy(edits):
+    for place, how, each in edits:
+        odd = copy.deepcopy(each)
         places: list[tuple[Any, Any]] = []
         left = [tree]
         while left:
