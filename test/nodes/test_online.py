@@ -72,7 +72,7 @@ def rmse(found, recording, start, end):
 def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(rls_model, stints, tmp_path: Path):
     bag = tmp_path / "both"
     recording_to_bag(concatenate(stints), bag)
-    run = run_live(rls_model, bag, 0.02, rate=1.5)
+    run = run_live(rls_model, bag, 0.02)
     assert len(run.missing()) < 40, run.diagnostics[-1]  # the window fills anew after the gap
     expected = replayed(rls_model, bag)
     stamps = sorted(set(run.predicted) & set(expected))
