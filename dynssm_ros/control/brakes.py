@@ -34,13 +34,15 @@ class Brakes:
 
     def __init__(self, T_s: float, standing: float) -> None:
         self._enough = max(2, math.ceil(_WELL_S / T_s))
-        self._standing = standing
+        self.standing = standing
+        """Below that speed the car stands (m/s)."""
         self.reason = ""
         """Why it brakes, in words; empty while it drives."""
         self.count = 0
         """How often it began to brake."""
         self._well = 0
-        self._until_standing = False
+        self.until_standing = False
+        """Whether the car has to stand before it drives on, as it may be elsewhere."""
 
     def apply(self, reason: str, *, until_standing: bool = False) -> None:
         """Something is wrong.
@@ -51,11 +53,11 @@ class Brakes:
         """
         self.count += not self.reason
         self.reason, self._well = reason, 0
-        self._until_standing = self._until_standing or until_standing
+        self.until_standing = self.until_standing or until_standing
 
     def released(self, speed: float) -> bool:
         """Takes an odometry message with which nothing is wrong, at ``speed`` (m/s); whether it drives."""
         self._well += 1
-        if self._well > self._enough and not (self._until_standing and abs(speed) > self._standing):
-            self.reason, self._until_standing = "", False
+        if self._well > self._enough and not (self.until_standing and abs(speed) > self.standing):
+            self.reason, self.until_standing = "", False
         return not self.reason

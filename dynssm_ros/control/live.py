@@ -15,7 +15,7 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from dynssm_ros.control.evidence import SOURCES
 from dynssm_ros.control.horizon_model import STATES
 from dynssm_ros.control.nmpc import Status
 from dynssm_ros.control.reference import Reference
-from dynssm_ros.control.remote import RemoteModel
+from dynssm_ros.control.remote import Context, RemoteModel
 from dynssm_ros.control.settings import Settings
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.runtime.health import Level
@@ -42,11 +42,22 @@ from dynssm_ros.vehicle.limits import vehicle_limits
 
 LAUNCH = 0.3, 0.7  # shares of the line's speed: below the first pursuit takes over, above the second it ends
 _LAUNCH_STYLE = Style(aggressiveness=0.7, variation=0.0)
+_DOUBTED_S = 0.25  # of odometry before it is seen that it is wrong
+_RECKONED_S = 3.0  # over which the car is reckoned on
+_KEPT = 200  # messages, for that
 _REMEMBERED = 1000  # control steps that the percentiles are of
 _TOLERATED = 0.01  # share of plans that may be missing before it is called a warning
 _STANDING = 0.2  # of the vehicle's minimum speed, below which a car stands
 _PUNCTUAL = 0.02  # of T_s by which odometry may be off for its difference to the one before to be that of a step
 _EARLY = 0.25  # of T_s that odometry may come before its time; what comes earlier is for a later step
+
+
+class _Believed(NamedTuple):
+    """Where the car was."""
+
+    stamp: int  # ns
+    x: Vector  # the controller's state, ``(size,)``
+    context: Context
 
 
 class Laps:
@@ -168,6 +179,9 @@ class LiveController:
         self._heading = 0.0
         # commands from the one that acts at the stamp of the newest odometry to the last
         self._sent = deque([Applied(0.0, 0.0)] * self._age, maxlen=self._age)
+        self._acting: deque[tuple[int, Applied]] = deque(maxlen=_KEPT)  # commands by when they begin to act (ns)
+        self._believed: deque[_Believed] = deque(maxlen=_KEPT)
+        self._reckoned: _Believed | None = None  # while it brakes
         self.brakes = Brakes(self.vehicle.sampling_time, _STANDING * self.vehicle.minimum_speed)
         self._contract = Plausibility(self.vehicle, frames=self._frames)
         self._jumps = 0
@@ -208,7 +222,7 @@ class LiveController:
             refusal = Refusal.NOT_FINITE
         if refusal in AT_ONCE:
             self.brakes.apply(refusal.value)
-            return self.brake()
+            return self.brake(stamp + self.answered_after, _DOUBTED_S)
         if refusal is not None:
             return refusal
         if self._contract.jumps > self._jumps:
@@ -222,6 +236,8 @@ class LiveController:
             return None
         if not together:
             self._restart()
+            self._believed.clear()
+            self._reckoned = None
         elif abs(stamp - self._planned - self.period) > _PUNCTUAL * self.period:
             self._pilot.interrupt()
         if since < 0:
@@ -232,24 +248,44 @@ class LiveController:
         self.laps.passed((stamp - self._first) / 1e9, pose.x, pose.y, together)
         if self.laps.outside > LOST * self.laps.width:
             self.brakes.apply(f"{self.laps.outside:.3g} m outside the borders")
-        return self._answer(stamp, pose, seen) if self.brakes.released(seen.v_x) else self.brake()
+        if self.brakes.released(seen.v_x):
+            return self._answer(stamp, pose, seen)
+        if not self.brakes.until_standing:
+            self._believe(stamp, pose, seen)
+        return self.brake(stamp + self.answered_after + round(1e9 * late))
 
     def learn(self) -> None:
         """Learns from the last step; to be called once its command is out, which does not wait for it."""
         self._pilot.learn()
 
-    def _answer(self, stamp: int, pose: Pose, seen: State) -> Applied:
-        t = (stamp - self._first) / 1e9
+    def _believe(self, stamp: int, pose: Pose, seen: State) -> tuple[Vector, Context]:
+        """The controller's state ``(size,)`` and its context at an odometry message."""
         self._heading += math.remainder(pose.theta - self._heading, 2 * math.pi)
+        t = (stamp - self._first) / 1e9
         context = t, *self._track.centre.place(self.laps.s % self._track.length).values()
         x = self.remote.start(Pose(pose.x, pose.y, self._heading), seen, self._sent[0], context, self._memory)
+        self._believed.append(_Believed(stamp, x, context))
+        self._reckoned = None
+        return x, context
+
+    def _answer(self, stamp: int, pose: Pose, seen: State) -> Applied:
+        x, context = self._believe(stamp, pose, seen)
         self.remote.measured(stamp, x, context)
         self.remote.update(stamp)
         for increments in np.diff(np.array([self._sent[0], *self._sent]), axis=0):
             x = self.remote.ahead(x, context, self.remote.calibrated, increments)
         pursued = self._pursued(Pose(*x[:3].tolist()), State(*x[3:6].tolist()))
-        self._sent.append(pursued or self._planned_command(t, Pose(pose.x, pose.y, self._heading), seen))
-        return self._sent[-1]
+        return self._send(
+            stamp + self.answered_after,
+            pursued or self._planned_command(context[0], Pose(pose.x, pose.y, self._heading), seen),
+        )
+
+    def _send(self, acts: int | None, command: Applied) -> Applied:
+        """Notes a command and when it begins to act (ns), if that is known."""
+        self._sent.append(command)
+        if acts is not None:
+            self._acting.append((acts, command))
+        return command
 
     def _pursued(self, pose: Pose, state: State) -> Applied | None:
         """The command of a launch; ``None`` while there is none."""
@@ -270,11 +306,43 @@ class LiveController:
         self._recent.append((decision.seconds, decision.plan.status == "solved"))
         return decision.command
 
-    def brake(self) -> Applied:
-        """The command for when there is nothing to plan from: full brakes, the steering held."""
+    def brake(self, acts: int | None = None, doubted: float = 0.0) -> Applied:
+        """The command for when there is nothing to plan from: full brakes, along the line as far as that can be reckoned.
+
+        The calibrated car is stepped on from the last odometry that is believed, under the commands since. It steers as it
+        does when it gets up to speed.
+
+        Args:
+            acts: when the command acts (ns); ``None``: the steering is held.
+            doubted: of the last odometry (s), that is not believed.
+        """
         self._restart()
-        self._sent.append(Applied(self._brakes, self._sent[-1].delta))
-        return self._sent[-1]
+        command = Applied(self._brakes, self._sent[-1].delta)
+        x = None if acts is None else self._reckon(acts, doubted)
+        if x is not None and x[3] > self.brakes.standing:
+            pose = Pose(*x[:3].tolist())
+            on_line = float(self._reference.line.project(pose[:2])[0])
+            steered = self._pursuit.command(0.0, pose, State(*x[3:6].tolist()), on_line, Applied(*x[6:8].tolist()))
+            command = Applied(self._brakes, steered.delta)
+        return self._send(acts, command)
+
+    def _reckon(self, acts: int, doubted: float) -> Vector | None:
+        """The controller's state ``(size,)`` at ``acts`` (ns), as the calibrated car comes there; ``None`` from too far."""
+        if self._reckoned is None and self._believed:
+            trusted = self._believed[-1].stamp - 1e9 * doubted
+            while len(self._believed) > 1 and self._believed[-1].stamp > trusted:
+                self._believed.pop()
+            self._reckoned = self._reckoned_from = self._believed[-1]
+        if self._reckoned is None or not 0 < acts - self._reckoned_from.stamp < _RECKONED_S * 1e9:
+            return None
+        stamp, x, context = self._reckoned
+        while stamp + self.period // 2 < acts:
+            sent = (command for since, command in reversed(self._acting) if since <= stamp + self.period // 2)
+            increments = np.array(next(sent, x[6:8])) - x[6:8]
+            x = self.remote.ahead(x, context, self.remote.calibrated, increments)
+            stamp += self.period
+        self._reckoned = _Believed(stamp, x, context)
+        return x if np.all(np.isfinite(x)) else None
 
     def verdict(self) -> tuple[Level, str]:
         """How it goes, in words."""

@@ -222,11 +222,11 @@ class ControllerNode(ManagedNode):
 
     def _brake(self) -> None:
         if self._newest is None:
-            stamp = int(self.get_clock().now().nanoseconds)
+            self._publish_command(actuators(int(self.get_clock().now().nanoseconds), self._driver.brake()))
         else:
             silence = max(0.0, self._health.age(ODOMETRY_TOPIC, self._now()))
-            stamp = self._newest + self._driver.answered_after + round(silence * 1e9)
-        self._publish_command(actuators(stamp, self._driver.brake()))
+            acts = self._newest + self._driver.answered_after + round(silence * 1e9)
+            self._publish_command(actuators(acts, self._driver.brake(acts)))
 
     def _diagnose(self) -> None:
         now, driver, health = self._now(), self._driver, self._health

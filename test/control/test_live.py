@@ -56,10 +56,10 @@ def steps(monkeypatch):
 class SteppedCar:
     """The simulated car, rolling at first, that obeys each command one step late, and whose odometry may be late too."""
 
-    def __init__(self, vehicle, track, v_x=1.5, late=0):
+    def __init__(self, vehicle, track, v_x=1.5, late=0, plant="euler"):
         start = Pose(*(float(v) for v in track.centre.position(0.0)), float(track.centre.heading(0.0)))
-        rolling = LowSpeedRolling(vehicle, plant_type("euler").step(vehicle))
-        self.plant = make_plant(vehicle, "euler", start, State(v_x, 0.0, 0.0), last=(rolling,), line=track.centre)
+        rolling = LowSpeedRolling(vehicle, plant_type(plant).step(vehicle))
+        self.plant = make_plant(vehicle, plant, start, State(v_x, 0.0, 0.0), last=(rolling,), line=track.centre)
         self.stamp, self.sent = STAMP, Applied(0.0, 0.0)
         self.on_the_way, self.late = [], late
 
@@ -320,10 +320,9 @@ def test_far_off_the_road_it_brakes_and_says_so(online, orca, club):
     controller, car = online(), SteppedCar(orca, club)
     for _ in range(5):
         car.answered(controller)
-    steering = car.sent.delta
     beside = Pose(*(float(v) for v in club.centre.position(0.3, -3 * 0.4)), 0.0)
     car.stamp += 10**9  # a gap, else the pose jumps
-    assert controller.step(car.stamp, beside, State(1.0, 0.0, 0.0)) == (orca.inputs.throttle[0], steering)
+    assert controller.step(car.stamp, beside, State(1.0, 0.0, 0.0)).r == orca.inputs.throttle[0]
     level, words = controller.verdict()
     assert level == Level.ERROR
     assert "m outside the borders: brakes" in words
@@ -340,11 +339,36 @@ def test_a_delay_beyond_what_can_be_carried_over_is_refused(online):
         online(delay=-1.0)
 
 
-def test_brakes_hold_the_steering(online, orca, club):
+def test_without_a_place_the_brakes_hold_the_steering(online, orca, club):
     controller, car = online(), SteppedCar(orca, club)
     for _ in range(20):
         car.answered(controller)
     assert controller.brake() == (orca.inputs.throttle[0], car.sent.delta)
+    assert controller.brake(car.stamp + 10**10) == (orca.inputs.throttle[0], car.sent.delta), "too far to be reckoned"
+
+
+@pytest.mark.parametrize("driven", [120, 165, 210, 255, 300])
+@pytest.mark.parametrize("fault", ["frozen", "silent"])
+def test_it_brakes_along_the_line_without_seeing_it(online, orca, club, driven, fault):
+    """From full speed, by a car that slides otherwise than the controller's; with the steering held it would leave the
+    road by up to a metre."""
+    controller, car = online("racing", 0.9, N=15), SteppedCar(orca, club, plant="double_track")
+    for _ in range(driven):
+        car.answered(controller)
+    assert controller.verdict()[0] != Level.ERROR
+    first, room = (car.plant.pose, car.plant.measured), []
+    for k in range(150):
+        if fault == "frozen":
+            car.answered(controller, spoilt=lambda *_: first)
+        else:
+            if k > 10:
+                controller.brakes.apply("silent")
+                car.sent = controller.brake(car.stamp + controller.answered_after)
+            car.plant.advance(car.sent)
+            car.stamp += T_S
+        room.append(float(club.clearance(np.array(car.plant.pose[:2])[None])[0]))
+    assert car.plant.measured.v_x < 0.1
+    assert min(room) > -0.02
 
 
 def test_late_plans_are_counted_and_told(orca, club):
