@@ -241,7 +241,8 @@ def _holds(pid: int) -> tuple[float, int]:
 
 def _judge(run: LiveRun, drive: _Drive, done: Soaked) -> None:
     done.predictions = sum(stamp - run.T_s in run.sent for stamp in run.predicted)
-    done.passed_over, done.lost = run.passed_over, run.lost
+    done.lost = run.lost
+    done.passed_over = len(run.missing()) - done.lost
     for stamp, state in run.predicted.items():
         if not all(map(math.isfinite, state)):
             done.violations.setdefault("an output is not finite", f"{state} at {stamp} ns")

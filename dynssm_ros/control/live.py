@@ -43,7 +43,7 @@ from dynssm_ros.vehicle.limits import vehicle_limits
 LAUNCH = 0.3, 0.7  # shares of the line's speed: below the first pursuit takes over, above the second it ends
 _LAUNCH_STYLE = Style(aggressiveness=0.7, variation=0.0)
 _DOUBTED_S = 0.25  # of odometry before it is seen that it is wrong
-_RECKONED_S = 3.0  # over which the car is reckoned on
+_RECKONED_S = 10.0  # over which the car is reckoned on: until it stands, from any speed
 _KEPT = 200  # messages, for that
 _REMEMBERED = 1000  # control steps that the percentiles are of
 _TOLERATED = 0.01  # share of plans that may be missing before it is called a warning

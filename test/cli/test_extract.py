@@ -199,7 +199,7 @@ def test_an_unknown_signal_map_lists_the_shipped_ones(tmp_path: Path, run: Run) 
 
 def test_commands_that_the_map_does_not_have_are_refused(tmp_path: Path, run: Run) -> None:
     out = tmp_path / "out" / "r.parquet"
-    ended = run(tmp_path, "--signals", "av21", "--rate", 25, "--out", out, "--commands", "topics")
+    ended = run(tmp_path / "bag", "--signals", "av21", "--rate", 25, "--out", out, "--commands", "topics")
     assert_refused(ended, out.parent, "missing throttle_command, steering_command")
 
 

@@ -140,7 +140,7 @@ def test_a_controller_that_cannot_plan_brakes_says_so_and_drives_on_when_it_can(
     message.header.stamp.sec = 1
     message.pose.pose.orientation.w = 1.0
 
-    def refuse(*_: Any) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
         raise MemoryError("of the solver")
 
     with monkeypatch.context() as ill:
@@ -151,11 +151,13 @@ def test_a_controller_that_cannot_plan_brakes_says_so_and_drives_on_when_it_can(
     assert told[-1].level == b"\x02"
     assert told[-1].message.startswith("cannot plan: brakes; goes on after an exception: MemoryError: of the solver")
     message.header.stamp.sec = 2
-    node._on_odometry(message)
+    for k in range(8):
+        message.header.stamp.nanosec = k * 20_000_000
+        node._on_odometry(message)
     node._diagnose()
     assert "cannot plan" not in told[-1].message
     node._command.rival = lambda: "another node publishes on /vehicle/actuator_command: /joystick"
     node._diagnose()
     assert told[-1].level == b"\x02"
-    assert "; another node publishes on /vehicle/actuator_command: /joystick" in told[-1].message
+    assert told[-1].message.startswith("another node publishes on /vehicle/actuator_command: /joystick: brakes")
     node.destroy_node()

@@ -13,7 +13,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 
 from benchmarks.endurance.live_run import LiveRun, collecting, isolated_environment, predictor_process
-from dynssm_ros.nodes.support import SENSOR_QOS
+from dynssm_ros.nodes.support import SENSOR_QOS, set_pose
 
 pytestmark = pytest.mark.live
 PERIOD = 20_000_000  # ns
@@ -26,6 +26,7 @@ class NamespacedCar:
     def __init__(self, node, namespace: str, start: int) -> None:
         self.predicted: dict[int, float] = {}
         self.stamp = start
+        self.x = 0.0
         self._odometry = node.create_publisher(Odometry, f"/{namespace}/vehicle/odometry", SENSOR_QOS)
         self._actuators = [
             node.create_publisher(JointState, f"/{namespace}/vehicle/actuator_{kind}", SENSOR_QOS)
@@ -42,6 +43,8 @@ class NamespacedCar:
         actuators = JointState(name=["throttle", "steering"], position=[0.2, 0.0])
         odometry = Odometry()
         odometry.twist.twist.linear.x = v_x
+        self.x += v_x * PERIOD / 1e9
+        set_pose(odometry.pose.pose, self.x, 0.0, 0.0)
         for message in (actuators, odometry):
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.stamp, 10**9)
         for publisher in self._actuators:
