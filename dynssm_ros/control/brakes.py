@@ -1,7 +1,8 @@
 """When a controller brakes, why, and when it drives on: two states.
 
 It drives until something is wrong that it cannot drive with; then it brakes. It drives on when nothing was wrong for several
-odometry messages in a row, and, if it may be somewhere else than it was believed, once it stands.
+odometry messages in a row, and, if it may be somewhere else than it was believed, once it stands. Where its odometry was
+wrong again and again, it stays where it is.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ AT_ONCE = frozenset(
 )
 """What is wrong with odometry for longer than a message: it is braked for at once. Others are braked for if they last."""
 _WELL_S = 0.1  # of good odometry before it drives on
+_AGAIN_S = 30.0  # of driving, within which odometry that is wrong again is not by chance
+_TIMES = 3  # that it is believed again
 
 
 class Brakes:
@@ -41,23 +44,36 @@ class Brakes:
         self.count = 0
         """How often it began to brake."""
         self._well = 0
+        self._soon = math.ceil(_AGAIN_S / T_s)
+        self._driven = self._soon  # messages since it drives
+        self._times = 0  # that odometry was wrong, each soon after the one before
         self.until_standing = False
         """Whether the car has to stand before it drives on, as it may be elsewhere."""
 
-    def apply(self, reason: str, *, until_standing: bool = False) -> None:
+    @property
+    def stays(self) -> bool:
+        """Whether it drives no more."""
+        return self._times > _TIMES
+
+    def apply(self, reason: str, *, until_standing: bool = False, doubted: bool = False) -> None:
         """Something is wrong.
 
         Args:
             reason: what, in words.
             until_standing: whether the car has to stand before it drives on.
+            doubted: whether it is the odometry.
         """
-        self.count += not self.reason
-        self.reason, self._well = reason, 0
+        if not self.reason:
+            self.count += 1
+            if doubted:
+                self._times = self._times + 1 if self._driven < self._soon else 1
+        self.reason, self._well, self._driven = reason, 0, 0
         self.until_standing = self.until_standing or until_standing
 
     def released(self, speed: float) -> bool:
         """Takes an odometry message with which nothing is wrong, at ``speed`` (m/s); whether it drives."""
         self._well += 1
-        if self._well > self._enough and not (self.until_standing and abs(speed) > self.standing):
+        self._driven += not self.reason
+        if self._well > self._enough and not self.stays and not (self.until_standing and abs(speed) > self.standing):
             self.reason, self.until_standing = "", False
         return not self.reason

@@ -221,13 +221,13 @@ class LiveController:
         if refusal is None and not all(map(math.isfinite, (*pose, *seen))):
             refusal = Refusal.NOT_FINITE
         if refusal in AT_ONCE:
-            self.brakes.apply(refusal.value)
+            self.brakes.apply(refusal.value, doubted=True)
             return self.brake(stamp + self.answered_after, _DOUBTED_S)
         if refusal is not None:
             return refusal
         if self._contract.jumps > self._jumps:
             self._jumps = self._contract.jumps
-            self.brakes.apply("the pose jumped", until_standing=True)
+            self.brakes.apply("the pose jumped", until_standing=True, doubted=True)
         elif late > self._max_late:
             self.brakes.apply(f"odometry comes {late:.2f} s later than its fastest")
         together = 0 < since <= self._max_gap
@@ -347,7 +347,7 @@ class LiveController:
     def verdict(self) -> tuple[Level, str]:
         """How it goes, in words."""
         if self.brakes.reason:
-            return Level.ERROR, f"{self.brakes.reason}: brakes"
+            return Level.ERROR, f"{self.brakes.reason}: brakes{' until it is configured anew' * self.brakes.stays}"
         output, level, words = self.remote.output, Level.OK, ""
         if output.source == RemoteModel.NOMINAL:
             level, words = Level.WARN, f", nothing from the predictor for {self._max_age:g} s"

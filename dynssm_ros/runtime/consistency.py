@@ -27,6 +27,7 @@ _FEWEST = 3  # messages, likewise
 _DIFFERENT = 0.6  # of the way, from which on poses and velocities contradict each other; 0.3 in real logs
 _EXPLAINED = 0.25  # of the difference that may be left
 _REMEMBERED = 0.98  # of differences, from message to message
+_SLOW = 0.5  # of the minimum speed, below which nothing is said of the motion: headings of real logs settle at 0.4
 _KEPT = 1000  # messages
 
 _EXPLANATIONS = (Refusal.STANDS_STILL, Refusal.MAP_FRAME, Refusal.SPEED_SIGN, Refusal.SPEED_SIGN, Refusal.SPEED_UNIT)
@@ -46,11 +47,11 @@ class Consistency:
 
     Args:
         wheelbase: of the car (m).
-        minimum_speed: below it nothing is said of the motion (m/s).
+        minimum_speed: of the car's model (m/s).
     """
 
     def __init__(self, wheelbase: float, minimum_speed: float) -> None:
-        self._wheelbase, self._minimum_speed = wheelbase, minimum_speed
+        self._wheelbase, self._minimum_speed = wheelbase, _SLOW * minimum_speed
         self.jumps = 0
         """Jumps that a second message confirmed."""
         self.words = ""

@@ -238,6 +238,17 @@ def test_what_it_cannot_drive_with_is_braked_for_and_it_drives_on_when_all_is_we
     assert controller.brakes.count <= 2, "to have the right pose again is a jump too"
 
 
+def test_odometry_that_is_wrong_again_and_again_is_believed_no_more(online, orca, club):
+    controller, car = online(), SteppedCar(orca, club)
+    for _ in range(4):
+        assert not controller.brakes.stays
+        for _ in range(60):
+            car.answered(controller, frames=("map", "base_link"))
+        car.answered(controller, frames=("odom", "base_link"))
+    assert controller.brakes.count == 4
+    assert controller.verdict() == (Level.ERROR, "the odometry is in other frames: brakes until it is configured anew")
+
+
 def test_a_car_that_may_be_elsewhere_stands_before_it_drives_on(online, orca, club):
     controller, car = online(), SteppedCar(orca, club)
     for _ in range(20):
