@@ -41,6 +41,7 @@ from dynssm_ros.signals.messages import ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDIC
 _EVERYTHING = QoSProfile(depth=1000)
 _END_TIMEOUT = 10.0  # s
 _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
+_TOLD = 5.0  # s until the next diagnostics, at most
 _DRAIN = 2.0  # s without an answer after the last message before the run counts as over
 _PARTICIPANTS = 20  # of a test's domain, at most
 _SHARED_MEMORY = Path("/dev/shm")  # noqa: S108, which is Fast DDS's choice
@@ -303,8 +304,6 @@ def run_live(
                 if progress is not None and len(run.sent) % 25 == 0:
                     progress(round((message.log_time - first) / 1e9), round(min(duration, 1e6)))
         wait_for_the_last(run, collector.wait_for)
-        told = len(run.diagnostics)
-        collector.wait_for(lambda: len(run.diagnostics) > told, 5.0)  # of what was passed over at the end
     return run
 
 
@@ -317,12 +316,15 @@ def _finds(diagnostics: list[tuple[int, str, dict[str, str]]], topics: tuple[str
 
 def wait_for_the_last(run: LiveRun, wait_for: Callable[[Callable[[], bool], float], bool]) -> None:
     """Waits until the last message is answered, or nothing is for a while: a predictor that was held up has a queue.
-    ``wait_for``: as :meth:`Collector.wait_for`.
+
+    Then it waits for the next diagnostics, which tell what was passed over. ``wait_for``: as :meth:`Collector.wait_for`.
     """
     last, answered = max(run.sent, default=0) + run.T_s, -1
     while last not in run.predicted and len(run.predicted) > answered:
         answered = len(run.predicted)
         wait_for(lambda: last in run.predicted, _DRAIN)
+    told = len(run.diagnostics)
+    wait_for(lambda: len(run.diagnostics) > told, _TOLD)
 
 
 def _stamp_of(raw: bytes) -> int:

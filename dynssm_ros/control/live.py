@@ -160,7 +160,7 @@ class LiveController:
         self._brakes = vehicle.inputs.throttle[0]
         self._max_age, self._max_gap, self._max_late = max_age, max_gap * 1e9, max_late
         self._track = track
-        self._frames = frames
+        self._contract = Plausibility(vehicle, frames=frames)
         self._reset()
         # what is loaded, compiled or allocated by the first step is so before the car waits for it
         x, y = (float(value) for value in reference.line.position(0.0))
@@ -183,8 +183,8 @@ class LiveController:
         self._believed: deque[_Believed] = deque(maxlen=_KEPT)
         self._reckoned: _Believed | None = None  # while it brakes
         self.brakes = Brakes(self.vehicle.sampling_time, _STANDING * self.vehicle.minimum_speed)
-        self._contract = Plausibility(self.vehicle, frames=self._frames)
-        self._jumps = 0
+        self._contract.forget()
+        self._jumps = self._contract.jumps
         self._weights = np.zeros(len(SOURCES))
         self._planned_with = self.remote.calibrated
         self._restart()
@@ -253,6 +253,12 @@ class LiveController:
         if not self.brakes.until_standing:
             self._believe(stamp, pose, seen)
         return self.brake(stamp + self.answered_after + round(1e9 * late))
+
+    def predicted(self, stamp: int, state: State) -> str:
+        """Takes what the predictor says of the instant ``stamp`` (ns). Returns what is wrong with it, else nothing."""
+        if self._contract.is_beyond(state._asdict()):
+            return self._contract.last
+        return self.remote.predicted(stamp, state)
 
     def learn(self) -> None:
         """Learns from the last step; to be called once its command is out, which does not wait for it."""
@@ -332,8 +338,8 @@ class LiveController:
             trusted = self._believed[-1].stamp - 1e9 * doubted
             while len(self._believed) > 1 and self._believed[-1].stamp > trusted:
                 self._believed.pop()
-            self._reckoned = self._reckoned_from = self._believed[-1]
-        if self._reckoned is None or not 0 < acts - self._reckoned_from.stamp < _RECKONED_S * 1e9:
+            self._reckoned = self._believed[-1]
+        if self._reckoned is None or not 0 < acts - self._believed[-1].stamp < _RECKONED_S * 1e9:
             return None
         stamp, x, context = self._reckoned
         while stamp + self.period // 2 < acts:

@@ -36,7 +36,6 @@ from dynssm_ros.nodes.support import (
     run,
 )
 from dynssm_ros.runtime.health import Delivery, Health, Level
-from dynssm_ros.runtime.plausibility import Plausibility
 from dynssm_ros.signals.decoding import decoders, frames_of, header_stamp_ns
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.messages import COMMAND_TOPIC, ODOMETRY_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC
@@ -72,7 +71,6 @@ class ControllerNode(ManagedNode):
         self._health = Health((ODOMETRY_TOPIC, PREDICTION_TOPIC, PARAMETERS_TOPIC), self._watchdog)
         self._decoder = decoders(load_signal_map("default"))[ODOMETRY_TOPIC]
         self._delivery = Delivery(math.inf, self._max_late)
-        self._possible = Plausibility(self._driver.vehicle)
         self._newest: int | None = None  # stamp of the odometry
         self._refused = -math.inf, Refusal.MISSING  # of odometry, the last one and when it came (s)
         self._answered = -math.inf  # when a rival was answered (s)
@@ -156,10 +154,7 @@ class ControllerNode(ManagedNode):
         self._health.arrived(PREDICTION_TOPIC, self._now())
         twist = message.twist.twist
         state = State(twist.linear.x, twist.linear.y, twist.angular.z)
-        if self._possible.is_beyond(state._asdict()):
-            self._refuse(PREDICTION_TOPIC, self._possible.last)
-        else:
-            self._refuse(PREDICTION_TOPIC, self._driver.remote.predicted(_stamp(message), state))
+        self._refuse(PREDICTION_TOPIC, self._driver.predicted(_stamp(message), state))
 
     def _on_parameters(self, message: JointState) -> None:
         self._health.arrived(PARAMETERS_TOPIC, self._now())
@@ -224,7 +219,7 @@ class ControllerNode(ManagedNode):
         if self._newest is None:
             self._publish_command(actuators(int(self.get_clock().now().nanoseconds), self._driver.brake()))
         else:
-            silence = max(0.0, self._health.age(ODOMETRY_TOPIC, self._now()))
+            silence = self._health.age(ODOMETRY_TOPIC, self._now())
             acts = self._newest + self._driver.answered_after + round(silence * 1e9)
             self._publish_command(actuators(acts, self._driver.brake(acts)))
 

@@ -49,7 +49,7 @@ from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.trial import try_model
 from dynssm_ros.runtime.wiring import Wiring
-from dynssm_ros.signals.decoding import TopicDecoder, frames_of, header_stamp_ns, live_decoders
+from dynssm_ros.signals.decoding import Frames, TopicDecoder, frames_of, header_stamp_ns, live_decoders
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, planar_covariance
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -198,8 +198,12 @@ class PredictorNode(ManagedNode):
         return stamp, arrived
 
     def _on_actuator(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int]) -> None:
+        self._observe(decoder, message, times, None)
+
+    def _observe(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int], frames: Frames | None) -> None:
+        """Takes a message into the history."""
         stamp, _ = self._arrived(decoder, message, times)
-        refusal = self._predictor.observe(stamp, decoder.decode(message), frames_of(message))
+        refusal = self._predictor.observe(stamp, decoder.decode(message), frames)
         if refusal is not None:
             self._health.refused(refusal)
 
@@ -226,8 +230,8 @@ class PredictorNode(ManagedNode):
                 for each in waiting(subscription):
                     self._on_actuator(other, *each)
         newest = older.pop()
-        for each in older:
-            self._on_actuator(decoder, *each)
+        for each, when in older:
+            self._observe(decoder, each, when, frames_of(each))
             self._health.refused(Refusal.SKIPPED)
         return newest
 
@@ -254,7 +258,7 @@ class PredictorNode(ManagedNode):
         ahead: list[Pose] = []
         if self._horizon > 0:
             steps = max(1, round(self._horizon / self._predictor.model.T_s))
-            ahead = self._predictor.horizon(prediction, steps, deadline)
+            ahead = self._predictor.horizon(prediction, steps, deadline=deadline)
             self._publish_horizon(self._path(prediction, ahead))
         if prediction.pose is not None and self._markers is not None:
             self._markers.draw(odometry.header, self._predictor.vehicle, prediction.pose, ahead)

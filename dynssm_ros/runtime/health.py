@@ -18,9 +18,7 @@ _NOW = 5  # of which the last, all refused, mean that there is no prediction now
 _MANY = 0.05  # share of them refused, from which on it is said
 _OTHER_CLOCK_S = 0.5
 _FORGETTING = 1e-3  # s per s by which the fastest delivery may grow: clocks drift less
-_REAL_TIME = (
-    0.05  # share by which stamps and clock may differ for lateness to be told: else a log is played more slowly
-)
+_REAL_TIME = 0.05  # share by which stamps and clock may differ for lateness to be told: logs are played at other rates
 _SETTLED_S = 2.0  # after which that share is known
 
 

@@ -248,7 +248,7 @@ class Predictor:
             0.0 if physics is None else self._residual_share(now, following, physics[0].tolist()),
         )
 
-    def horizon(self, prediction: Prediction, steps: int, deadline: float = math.inf) -> list[Pose]:
+    def horizon(self, prediction: Prediction, steps: int, *, deadline: float = math.inf) -> list[Pose]:
         """Poses of a rollout with the last command held: the predicted one and ``steps - 1`` more.
 
         Call it right after :meth:`predict`; it continues the window of that prediction. The actuators reach the held

@@ -19,6 +19,7 @@ from dynssm_ros.vehicle.effects import EFFECTS
 
 Run = Callable[..., tuple[int, str, str]]
 Refused = Callable[..., str]
+ONE_EULER_START = ("--starts", 1, "--integrator", "euler")  # is soon done
 
 
 @pytest.fixture
@@ -43,18 +44,7 @@ def wrong_car(folder: Path, **bounds: tuple[float, float]) -> Path:
 
 def test_a_wrong_car_becomes_the_right_one(dynssm: Run, laps: Path, tmp_path: Path) -> None:
     car, out_json = tmp_path / "car.yaml", tmp_path / "car.json"
-    arguments = [
-        "--vehicle",
-        wrong_car(tmp_path),
-        "--starts",
-        1,
-        "--integrator",
-        "euler",
-        "--out",
-        car,
-        "--json",
-        out_json,
-    ]
+    arguments = ["--vehicle", wrong_car(tmp_path), *ONE_EULER_START, "--out", car, "--json", out_json]
     status, out, err = dynssm("calibrate", laps, *arguments)
     assert status == 0, err
     assert not [line for line in err.splitlines() if not line.startswith("calibrating:")]  # slow machines say how far

@@ -13,6 +13,8 @@ from dynssm_ros.signals.bags import open_bag
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import load_vehicle
 
+ONE_EULER_START = ("--starts", 1, "--integrator", "euler")  # is soon done
+
 
 def test_the_commands_lead_from_a_bag_to_predictions(dynssm, laps_bag: Path, tiny_model: Path, tmp_path: Path) -> None:
     laps, car, model = tmp_path / "laps.parquet", tmp_path / "car.yaml", tmp_path / "model"
@@ -22,18 +24,7 @@ def test_the_commands_lead_from_a_bag_to_predictions(dynssm, laps_bag: Path, tin
         assert set(bag.types) == {"/vehicle/odometry", "/vehicle/actuator_feedback", "/vehicle/actuator_command"}
 
     status, out, _ = dynssm(
-        "calibrate",
-        laps,
-        "--vehicle",
-        "orca",
-        "--starts",
-        1,
-        "--integrator",
-        "euler",
-        "--out",
-        car,
-        "--json",
-        tmp_path / "car.json",
+        "calibrate", laps, "--vehicle", "orca", *ONE_EULER_START, "--out", car, "--json", tmp_path / "car.json"
     )
     assert status == 0
     assert "one-step RMSE v_x" in out

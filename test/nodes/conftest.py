@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import importlib
-import math
 import os
 import subprocess
 import threading
@@ -24,6 +23,8 @@ from sensor_msgs.msg import JointState
 from benchmarks.endurance.live_run import Collector, LiveRun, collecting, isolated_environment, predictor_process
 from dynssm_ros.nodes.support import SENSOR_QOS, set_pose
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC, PREDICTION_TOPIC
+from dynssm_ros.vehicle import State
+from dynssm_ros.vehicle.kinematics import SCALAR, Pose, advance_pose
 
 PERIOD = 20_000_000  # ns
 LONG_AGO = 1000 * 10**9  # ns: farther than any test moves stamps
@@ -51,7 +52,7 @@ class Car:
     def __init__(self, collector: Collector, run: LiveRun, process: subprocess.Popen[str]) -> None:
         self.collector, self.run, self.process = collector, run, process
         self.stamp = self._moved = 1_700_000_000_000_000_000
-        self.pose = [0.0, 0.0, 0.0]
+        self.pose = Pose(0.0, 0.0, 0.0)
         self.spoil: Callable[[Odometry], object] | None = None
         """Spoils odometry before it is sent."""
         self._odometry = collector.create_publisher(Odometry, ODOMETRY_TOPIC, SENSOR_QOS)
@@ -95,12 +96,8 @@ class Car:
     def _move(self, v_x: float, v_y: float, omega: float) -> None:
         elapsed, possible = (self.stamp - self._moved) / 1e9, abs(v_x) < 10 and abs(v_y) < 10 and abs(omega) < 30
         if 0 < elapsed < 1 and possible:
-            x, y, theta = self.pose
-            heading = theta + omega * elapsed / 2
-            along, across = elapsed * v_x, elapsed * v_y
-            x += along * math.cos(heading) - across * math.sin(heading)
-            y += along * math.sin(heading) + across * math.cos(heading)
-            self.pose = [x, y, theta + omega * elapsed]
+            state = State(v_x, v_y, omega)
+            self.pose = advance_pose(SCALAR, self.pose, state, state, elapsed)
         self._moved = self.stamp
 
     def actuators(self, commands: bool = True, throttle: float = 0.2, steering: float = 0.0) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Quaternion
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 
@@ -234,9 +235,7 @@ def test_bad_messages_change_nothing_but_the_diagnostics(stand: Stand) -> None:
 def test_odometry_that_stays_wrong_is_braked_for(stand: Stand) -> None:
     stand.control()
     assert stand.keep_sending(lambda: "drives" in stand.told[-1][1])
-    stand.spoil = lambda message: (
-        setattr(message.pose.pose.orientation, "w", 0.0) or setattr(message.pose.pose.orientation, "z", 0.0)
-    )
+    stand.spoil = lambda message: setattr(message.pose.pose, "orientation", Quaternion(w=0.0))
     words = "the orientation is no quaternion of length 1: brakes"
     assert stand.keep_sending(lambda: stand.told[-1][1] == words), stand.told[-1]
     assert stand.told[-1][0] == 2

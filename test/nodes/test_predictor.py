@@ -304,7 +304,7 @@ def test_the_predicted_pose_is_sent_to_tf(start_car, stand_in: Callable[[str, st
     car = start_car(tf=True)
     sent = heard(car, TransformStamped, "/stand_in_of_tf", 10)
     assert (sent.header.frame_id, sent.child_frame_id) == ("map", "base_link_predicted")
-    ahead = sent.transform.translation.x - car.pose[0]
+    ahead = sent.transform.translation.x - car.pose.x
     assert ahead == pytest.approx(0.02, abs=0.005), "a step of 20 ms at 1 m/s"
     assert sent.transform.rotation.w == pytest.approx(1.0, abs=1e-3)
 

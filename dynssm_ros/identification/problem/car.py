@@ -215,7 +215,7 @@ _KNOWN: dict[int, _Coefficients] = {}
 def _about(vehicle: Vehicle) -> _Coefficients:
     """How the coefficients move: worked out once for the cars of a fit, which share the vehicle."""
     found = _KNOWN.get(id(vehicle))
-    if found is None or found.vehicle is not vehicle:
+    if found is None:  # the number is no other vehicle's while this one is kept
         if len(_KNOWN) > _KEPT:
             _KNOWN.clear()
         found = _KNOWN[id(vehicle)] = _Coefficients(vehicle)
