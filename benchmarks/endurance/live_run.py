@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -262,6 +263,7 @@ def run_live(
     parameters: Mapping[str, object] | None = None,
     progress: Callable[[int, int], None] | None = None,
     held_up: tuple[float, float] | None = None,
+    in_step: bool = False,
 ) -> LiveRun:
     """Starts the predictor, plays ``bag`` to it in real time and collects its answers.
 
@@ -275,6 +277,7 @@ def run_live(
         parameters: further ROS parameters of the predictor.
         progress: told of seconds played and to be played.
         held_up: from when to when in the recording the predictor is stopped, as if it got no computing time (s).
+        in_step: whether what follows odometry waits for its answer, from the first prediction on.
 
     Raises:
         UserError: the predictor does not start; carries its own words.
@@ -303,6 +306,8 @@ def run_live(
                     process.send_signal(signals.popleft()[1])
                 if progress is not None and len(run.sent) % 25 == 0:
                     progress(round((message.log_time - first) / 1e9), round(min(duration, 1e6)))
+                if in_step and run.predicted:
+                    collector.wait_for(partial(run.predicted.__contains__, stamp + run.T_s), _DRAIN)
         wait_for_the_last(run, collector.wait_for)
     return run
 

@@ -72,7 +72,7 @@ def rmse(found, recording, start, end):
 def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(rls_model, stints, tmp_path: Path):
     bag = tmp_path / "both"
     recording_to_bag(concatenate(stints), bag)
-    run = run_live(rls_model, bag, 0.02)
+    run = run_live(rls_model, bag, 0.02, rate=3.0, in_step=True)
     assert len(run.missing()) < 40, run.diagnostics[-1]  # the window fills anew after the gap
     expected = replayed(rls_model, bag)
     stamps = sorted(set(run.predicted) & set(expected))
@@ -90,7 +90,7 @@ def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(
 def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(rls_model, stints, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
     recording_to_bag(stints[0], bag)
-    run_live(rls_model, bag, 0.02, rate=2.5, duration=8.0, parameters={"online_state": str(state)})
+    run_live(rls_model, bag, 0.02, rate=2.5, duration=8.0, in_step=True, parameters={"online_state": str(state)})
     assert state.is_file()
     second = tmp_path / "second"
     recording_to_bag(stints[1].select(slice(0, 400)), second)
@@ -123,7 +123,7 @@ def test_a_state_that_cannot_be_read_is_set_aside_and_the_node_begins_from_the_p
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
     recording_to_bag(stints[0], bag)
     state.write_bytes(b"")
-    run = run_live(rls_model, bag, 0.02, rate=2.5, duration=5.0, parameters={"online_state": str(state)})
+    run = run_live(rls_model, bag, 0.02, rate=2.5, duration=5.0, in_step=True, parameters={"online_state": str(state)})
     assert len(run.predicted) > 100
     level, words, _ = run.diagnostics[-1]
     assert level >= 1
