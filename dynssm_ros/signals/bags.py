@@ -1,7 +1,7 @@
-"""rosbag2 folders and single files (MCAP and SQLite3), any message type that the bag describes.
+"""rosbag2 folders, single files (MCAP and SQLite3) and ROS 1 bags; any message type that the bag describes.
 
 Reading is rosbags' work. Added here: one clear error per kind of damage, and the way around it where there is one
-(:mod:`dynssm_ros.signals.recover`).
+(:mod:`dynssm_ros.signals.recover`). Messages of ROS 1 become those of ROS 2 as they are read: CDR, headers without ``seq``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import yaml
 from rosbags.highlevel import AnyReader
@@ -38,6 +38,8 @@ from dynssm_ros.signals.recover import (
 )
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
+_MAGIC = {b"#ROSBAG V": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
+_HEADER = "std_msgs/msg/Header"
 _NO_INDEX = "it has no index"
 _LOG_LEFT = "its recorder was killed"
 _TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
@@ -59,6 +61,7 @@ class Bag:
     reader: AnyReader
     mend: Callable[[str], AnyReader]  # a reader of what can be read of a bag in which that damage was met
     notes: list[str] = field(default_factory=list)
+    ros1_types: Any = None  # the types of a ROS 1 bag, with the header of ROS 2
 
     @cached_property
     def types(self) -> dict[str, str]:
@@ -94,7 +97,8 @@ class Bag:
 
     def typestore(self, msgtype: str) -> Any:
         """The descriptions that hold for ``msgtype``: the bag's own or, where it has none, those of ROS 2 Jazzy."""
-        return self.reader.typestore if msgtype in self.reader.typestore.types else _TYPESTORE
+        own = self.ros1_types or self.reader.typestore
+        return own if msgtype in own.types else _TYPESTORE
 
     def messages(self, topics: Sequence[str]) -> Iterator[BagMessage]:
         """Yields the messages of ``topics`` in the order in which they were recorded, behind damage too if a reader can
@@ -123,9 +127,18 @@ class Bag:
             return
         try:
             for connection, log_time, raw in self.reader.messages(wanted):
-                yield BagMessage(connection.topic, log_time, unpacked_message(bytes(raw)))
+                yield BagMessage(connection.topic, log_time, self._cdr(connection.msgtype, bytes(raw)))
         except Exception as error:  # rosbags lets through what its decoders raise: struct, codec, SQLite, index errors
             raise BagError(f"{self.path}: damaged, reading stopped ({_one_line(error)})") from error
+
+    def _cdr(self, msgtype: str, raw: bytes) -> bytes:
+        """A message as its publisher would serialise it in ROS 2; empty, which no message is, where it is damaged."""
+        if self.ros1_types is None:
+            return unpacked_message(raw)
+        try:
+            return bytes(self.ros1_types.ros1_to_cdr(raw, msgtype))
+        except Exception:  # rosbags raises struct, index, key and unicode errors here
+            return b""
 
     def decode(self, topic: str, raw: bytes) -> Any:
         """Deserialises a message of ``topic``.
@@ -142,7 +155,8 @@ class Bag:
 
 @contextmanager
 def open_bag(path: str | Path) -> Iterator[Bag]:
-    """Opens a rosbag2 folder or storage file; cut-off files are recovered up to the cut and ``notes`` says so.
+    """Opens a rosbag2 folder or storage file, or a ROS 1 bag; cut-off files of ROS 2 are recovered up to the cut and
+    ``notes`` says so.
 
     Raises:
         BagError: nothing there, not a bag, or nothing to recover.
@@ -150,12 +164,24 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
     path = Path(path)
     if not os.path.exists(path):  # unlike Path.exists, False where looking is forbidden
         raise BagError(f"{path}: no such bag")
+    suffix = bag_suffix(path)
     with ExitStack() as stack:
         notes: list[str] = []
+        given = path
+        if suffix is not None and suffix != path.suffix:  # rosbags goes by the name
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="dynssm-"))
+            path = Path(folder) / f"{given.name}{suffix}"
+            path.symlink_to(real_path(given))
+        if suffix == ".bag":
+            yield _ros1_bag(given, path, stack)
+            return
 
         def mend(damage: str) -> AnyReader:
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dynssm-")))
-            mended = _open_files(path, scratch, damage, notes)
+            try:
+                mended = _open_files(path, scratch, damage, notes)
+            except BagError as error:
+                raise BagError(str(error).replace(str(path), str(given))) from error
             stack.callback(mended.close)
             return mended
 
@@ -164,7 +190,50 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
             stack.callback(reader.close)
         except BagError as damage:
             reader = mend(str(damage))
-        yield Bag(path, reader, mend, notes)
+        yield Bag(given, reader, mend, notes)
+
+
+def bag_suffix(path: Path) -> str | None:
+    """How the name of a bag's storage file should end by its content: ``.bag`` (ROS 1), ``.mcap``, ``.db3``; ``None`` for
+    folders and files of another kind.
+
+    Raises:
+        BagError: the file cannot be read.
+    """
+    if not os.path.isfile(path):
+        return None
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read ({_one_line(error)})") from error
+    return next((suffix for magic, suffix in _MAGIC.items() if head.startswith(magic)), None)
+
+
+def _ros1_bag(path: Path, named: Path, stack: ExitStack) -> Bag:
+    """Opens a ROS 1 bag, whose name ends as rosbags expects in ``named``.
+
+    Raises:
+        BagError: damaged, without an index, or encrypted.
+    """
+
+    def refuse(damage: str) -> NoReturn:
+        raise BagError(
+            f"{path}: a ROS 1 bag that cannot be read ({damage}); `rosbag reindex` of ROS 1 mends what was cut off"
+        )
+
+    try:
+        reader = AnyReader([named])
+        reader.open()
+        stack.callback(reader.close)
+        types = dict(reader.typestore.fielddefs)
+        if _HEADER in types:
+            types[_HEADER] = _TYPESTORE.fielddefs[_HEADER]
+        store = get_typestore(Stores.EMPTY)
+        store.register(types)
+    except Exception as error:  # rosbags lets through what its decoders raise: struct, index, unicode, type errors
+        refuse(_one_line(error))
+    return Bag(path, reader, refuse, ros1_types=store)
 
 
 def _open(paths: list[Path]) -> AnyReader:

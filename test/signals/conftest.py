@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -87,6 +88,29 @@ def make_bag(tmp_path: Path, typestore: Any) -> MakeBag:
                 raw = message if isinstance(message, bytes) else bytes(typestore.serialize_cdr(message, msgtype))
                 writer.write(connections[topic], log_time, raw)
         return tmp_path / name
+
+    return make
+
+
+@pytest.fixture
+def make_ros1_bag(tmp_path: Path, typestore: Any) -> MakeBag:
+    """Writes records as a ROS 1 bag, whose headers have a ``seq``; a message of bytes is written as it is."""
+
+    def make(records: Iterable[Record], name: str = "run.bag", compression: Any = None) -> Path:
+        noetic = get_typestore(Stores.ROS1_NOETIC)
+        noetic.register({name: typestore.fielddefs[name] for name in CUSTOM_TYPES})
+        connections: dict[str, Any] = {}
+        writer = Ros1Writer(tmp_path / "as_written.bag")
+        if compression is not None:
+            writer.set_compression(compression)
+        with writer:
+            for topic, msgtype, log_time, message in records:
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, msgtype, typestore=noetic)
+                raw = message if isinstance(message, bytes) else typestore.serialize_cdr(message, msgtype)
+                raw = raw if isinstance(message, bytes) else typestore.cdr_to_ros1(raw, msgtype)
+                writer.write(connections[topic], log_time, bytes(raw))
+        return (tmp_path / "as_written.bag").rename(tmp_path / name)
 
     return make
 
