@@ -181,6 +181,27 @@ def small_model(laps_bag: Path, kept: Kept) -> Path:
     return kept("small_model", make) / "small"
 
 
+@pytest.fixture
+def vast_model(small_model: Path, tmp_path: Path) -> Path:
+    """The folder of a model that is well but for a tensor of 1.5 GB in its graph; the checksums fit."""
+    import onnx
+    import yaml
+    from onnx import helper, numpy_helper
+
+    from dynssm_ros.files import checksum
+    from dynssm_ros.runtime.artifact import CARD, ONNX
+
+    folder = shutil.copytree(small_model, tmp_path / "vast")
+    model = onnx.load(folder / ONNX)
+    model.graph.initializer.append(numpy_helper.from_array(np.array([375, 1000, 1000]), "shape"))
+    model.graph.node.insert(0, helper.make_node("ConstantOfShape", ["shape"], ["zeros"]))
+    onnx.save(model, folder / ONNX)
+    card = yaml.safe_load((folder / CARD).read_text())
+    card["checksums"][ONNX] = checksum(folder / ONNX)
+    (folder / CARD).write_text(yaml.safe_dump(card))
+    return folder
+
+
 @pytest.fixture(scope="session")
 def rls_model(kept: Kept) -> Path:
     """The folder of the online layer alone, trained on 40 s of a four-wheeled small car with noisy sensors."""

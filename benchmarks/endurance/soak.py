@@ -44,7 +44,7 @@ from dynssm_ros.files import write_json
 from dynssm_ros.nodes.support import SENSOR_QOS
 from dynssm_ros.progress import Progress
 from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.trial import TIME_LIMIT_S
+from dynssm_ros.runtime.bounded import TIME_LIMIT_S
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.decoding import header_stamp_ns, live_decoders
 from dynssm_ros.signals.signal_map import load_signal_map

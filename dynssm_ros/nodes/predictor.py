@@ -44,6 +44,7 @@ from dynssm_ros.nodes.support import (
     waiting,
 )
 from dynssm_ros.runtime.artifact import parse_artifact, read_folder
+from dynssm_ros.runtime.graph import try_graph
 from dynssm_ros.runtime.health import Health, Level
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
@@ -51,6 +52,7 @@ from dynssm_ros.runtime.trial import try_model
 from dynssm_ros.runtime.wiring import Wiring
 from dynssm_ros.signals.decoding import Frames, TopicDecoder, frames_of, header_stamp_ns, live_decoders
 from dynssm_ros.signals.history import Refusal
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, planar_covariance
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import COEFFICIENTS
@@ -147,7 +149,8 @@ class PredictorNode(ManagedNode):
 
         Args:
             path: of the folder.
-            rows: that it is tried on in a process of its own before, to take the place of the present model.
+            rows: that it is tried on before, to take the place of the present model; without them it is only opened before.
+                Both in a process of its own.
 
         Raises:
             ConfigurationError: the folder is not below ``model_root``.
@@ -160,7 +163,10 @@ class PredictorNode(ManagedNode):
         files = read_folder(path, self._root)
         if rows is not None:
             try_model(pathlib.Path(path), files, self._predictor.model.card, rows)
-        return OnnxModel(parse_artifact(pathlib.Path(path), files))
+        artifact = parse_artifact(pathlib.Path(path), files)
+        if rows is None:
+            try_graph(artifact.onnx, artifact.graph, artifact.card.window, len(WINDOW_COLUMNS))
+        return OnnxModel(artifact)
 
     async def _try_models(self, parameters: list[ParameterMessage]) -> None:
         """Opens and tries the models that are asked for, while the node goes on predicting."""

@@ -6,13 +6,6 @@ process has limits of memory and time: a model that takes all of either ends it,
 
 from __future__ import annotations
 
-import json
-import os
-import pickle
-import resource
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +17,7 @@ from dynssm_ros.errors import ArtifactError, UserError
 from dynssm_ros.extras import load_plugins
 from dynssm_ros.runtime.artifact import ModelCard, parse_artifact
 from dynssm_ros.runtime.baselines import SingleTrack
+from dynssm_ros.runtime.bounded import answer, ask
 from dynssm_ros.runtime.contract import WindowPrediction
 from dynssm_ros.runtime.learner import OnlineLearner
 from dynssm_ros.runtime.onnx_model import OnnxModel
@@ -32,12 +26,6 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 
-TIME_LIMIT_S = 15.0
-"""From the start of the process to its answer."""
-_TRIAL_S = 5  # without the start of Python
-_PROCESSOR_S = 3  # likewise, of a core
-_MEMORY = 1 << 30  # bytes, likewise
-_TOO_SLOW = "takes too long or too much memory"
 _MASS, _WHEELBASE = 0.25, 0.1  # relative differences of one car from day to day
 _PREDICTING_S = 0.5  # for the windows that are compared
 _FEWEST, _MOST = 25, 250  # windows that are compared
@@ -59,20 +47,7 @@ def try_model(path: Path, files: Mapping[str, bytes], present: ModelCard, rows: 
     Raises:
         ArtifactError: it is not usable, or predicts worse by far than the calibrated car.
     """
-    command = [sys.executable, "-m", __name__]
-    task = pickle.dumps((path, dict(files), present, rows))
-    try:
-        done = subprocess.run(  # noqa: S603 - this module
-            command, input=task, capture_output=True, timeout=TIME_LIMIT_S, start_new_session=True, check=False
-        )
-    except (subprocess.TimeoutExpired, OSError) as error:
-        raise ArtifactError(f"{path}: {_TOO_SLOW} ({error})") from error
-    if done.returncode in (-signal.SIGXCPU, -signal.SIGALRM, -signal.SIGKILL):
-        raise ArtifactError(f"{path}: {_TOO_SLOW}; expected {_PROCESSOR_S} s and {_MEMORY >> 20} MB to be enough")
-    if done.returncode:
-        raise ArtifactError(f"{path}: the process that tried it ended with status {done.returncode}")
-    if refusal := json.loads(done.stdout):
-        raise ArtifactError(refusal)
+    ask("dynssm_ros.runtime.trial", path, dict(files), present, rows)
 
 
 def require_same_use(model: OnnxModel, present: ModelCard) -> None:
@@ -208,28 +183,5 @@ def _refusal(path: Path, files: Mapping[str, bytes], present: ModelCard, rows: V
     return ""
 
 
-def _limit() -> None:
-    """Bounds what this process may take from here on; where memory is short, it goes first."""
-    with open("/proc/self/statm", encoding="ascii") as status:
-        pages = int(status.read().split()[0])
-    with open("/proc/self/oom_score_adj", "w", encoding="ascii") as score:
-        score.write("1000")
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + _MEMORY,) * 2)
-    resource.setrlimit(resource.RLIMIT_CPU, (int(used.ru_utime + used.ru_stime) + _PROCESSOR_S,) * 2)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    signal.alarm(_TRIAL_S)
-
-
-def main() -> None:
-    """Tries what standard input brings; the refusal, empty if there is none, goes to standard output."""
-    answer = os.dup(1)
-    os.dup2(2, 1)  # what libraries print is no answer
-    load_plugins()
-    task = pickle.load(sys.stdin.buffer)  # noqa: S301 - from the process that started this one
-    _limit()
-    os.write(answer, json.dumps(_refusal(*task)).encode())
-
-
 if __name__ == "__main__":
-    main()
+    answer(_refusal, load_plugins)

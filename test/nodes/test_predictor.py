@@ -435,3 +435,9 @@ def test_a_wrong_start_is_one_clear_line(
     refused_start: Callable[..., str], small_model: Path, parameters: list[str], expected: str
 ) -> None:
     assert expected in refused_start("predictor", *(text.format(model=small_model) for text in parameters))
+
+
+def test_a_start_with_a_graph_that_takes_all_memory_is_refused(
+    refused_start: Callable[..., str], vast_model: Path
+) -> None:
+    assert "model.onnx: ONNX Runtime refuses it" in refused_start("predictor", f"model:={vast_model}")

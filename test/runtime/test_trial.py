@@ -16,8 +16,10 @@ from onnx import TensorProto, helper, numpy_helper
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import checksum
 from dynssm_ros.runtime.artifact import CARD, METRICS, ONNX, WEIGHTS, ModelCard, open_artifact, read_folder
+from dynssm_ros.runtime.bounded import ask
 from dynssm_ros.runtime.contract import WindowPrediction
-from dynssm_ros.runtime.onnx_model import _REPEATING, OnnxModel
+from dynssm_ros.runtime.graph import _REPEATING, try_graph
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.trial import judge, require_same_use, try_model
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -197,13 +199,30 @@ def test_a_model_that_would_take_all_time_or_memory_ends_its_trial_alone(
     assert expected in refusal(lambda: try_model(folder, read_folder(folder), model.card, rows))
 
 
+@pytest.mark.timeout(60)
+def test_the_graph_of_a_first_model_is_opened_in_its_own_process(small_model: Path, vast_model: Path) -> None:
+    def use(folder: Path, rows: int = 5) -> None:
+        artifact = open_artifact(folder)
+        try_graph(artifact.onnx, artifact.graph, rows, 7)
+
+    use(small_model)
+    assert "maps [('window', [5, 7])]" in refusal(lambda: use(small_model, rows=6))
+    assert refusal(lambda: use(vast_model)).startswith(f"{vast_model / ONNX}: ONNX Runtime refuses it (")
+
+
+def test_a_trial_whose_process_ends_is_a_refusal(tmp_path: Path) -> None:
+    assert (
+        refusal(lambda: ask("no_such_module", tmp_path)) == f"{tmp_path}: the process that tried it ended with status 1"
+    )
+
+
 def test_a_model_whose_inputs_say_how_long_it_runs_is_refused_unopened(
     small_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = edited(small_model, tmp_path / "evil", endless)
     words = refusal(lambda: OnnxModel(open_artifact(folder)))
     assert words == f"{folder / ONNX}: has the operator Loop, which may never end; expected none"
-    monkeypatch.setattr("dynssm_ros.runtime.onnx_model._REPEATING", re.compile(b"no such operator"))
+    monkeypatch.setattr("dynssm_ros.runtime.graph._REPEATING", re.compile(b"no such operator"))
     OnnxModel(open_artifact(folder))  # nothing else is wrong with it
 
 
