@@ -294,14 +294,9 @@ def as_ros_writes(declared: dict[str, Any]) -> dict[str, str]:
     return {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in declared.items()}
 
 
-def test_the_parameters_of_the_node_are_those_of_the_table_and_of_the_shipped_file(
-    declared_parameters: Declared,
-) -> None:
-    declared = declared_parameters("predictor")
+def test_the_parameters_of_the_predictor_are_those_of_its_page(declared_parameters: Declared) -> None:
     described = {name: cells[0].strip("`") for name, cells in table("parameter", PAGES["predictor.md"]).items()}
-    assert described == as_ros_writes(declared)
-    shipped = yaml.safe_load((ROOT / "config" / "predictor.yaml").read_text())["/**/dynssm"]["ros__parameters"]
-    assert shipped == declared
+    assert described == as_ros_writes(declared_parameters("predictor"))
 
 
 def test_the_parameters_of_the_controller_are_those_of_its_page(declared_parameters: Declared) -> None:

@@ -212,6 +212,8 @@ def test_shipped_models_are_valid(name: str) -> None:
     assert load_model_config(name).name == name
 
 
+MUST_BE_SET = {"predictor": "model", "player": "bag"}
+"""Parameters without a usable default. A shipped file leaves them out: it would reset what was said before it."""
 NAMES = {"predictor": "dynssm", "controller": "controller", "simulator": "simulator", "player": "player"}
 
 
@@ -228,6 +230,11 @@ def test_each_node_has_a_parameters_file_with_its_defaults(
 ) -> None:
     content = parameters_file(node)
     declared = declared_parameters(node)
+    if (needed := MUST_BE_SET.get(node)) is not None:
+        assert declared.pop(needed) == ""
+        assert f"    # {needed}: " in (ROOT / "config" / f"{node}.yaml").read_text(encoding="utf-8"), (
+            "explained all the same"
+        )
     assert content == declared
     assert {name: type(value) for name, value in content.items()} == {n: type(v) for n, v in declared.items()}
 
@@ -271,6 +278,24 @@ def test_of_all_parameters_files_a_node_takes_its_own_alone(
     read = {name: list(v) if name.endswith("noise") else v for name, v in read.items() if name not in of_every_node}
     assert read == expected
     assert {name: type(value) for name, value in read.items()} == {name: type(v) for name, v in expected.items()}
+
+
+@pytest.mark.parametrize("node", MUST_BE_SET)
+@pytest.mark.parametrize("first", [True, False])
+def test_a_shipped_file_resets_nothing_that_must_be_set(
+    monkeypatch: pytest.MonkeyPatch, node: str, first: bool
+) -> None:
+    rclpy = pytest.importorskip("rclpy")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+    said, file = ["-p", f"{MUST_BE_SET[node]}:=mine"], ["--params-file", str(ROOT / "config" / f"{node}.yaml")]
+    context = rclpy.Context()
+    rclpy.init(args=["--ros-args", *(said + file if first else file + said)], context=context)
+    try:
+        made = rclpy.create_node(NAMES[node], context=context, automatically_declare_parameters_from_overrides=True)
+        assert made.get_parameter(MUST_BE_SET[node]).value == "mine"
+        made.destroy_node()
+    finally:
+        context.try_shutdown()
 
 
 class Recorder:
