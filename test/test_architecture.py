@@ -48,6 +48,9 @@ OWNERS = {
 }  # fmt: skip
 OWNERS |= {module: {"nodes"} for module in ROS}
 MOST_BY_POSITION, LONGEST_FILE = 5, 450
+LOOKED_UP = {
+    f"is_{kind}" for kind in ("file", "dir", "symlink", "fifo", "socket", "mount", "block_device", "char_device")
+}
 
 
 def imports(source: str, module: str, is_package: bool = False) -> Iterator[tuple[str, int]]:
@@ -192,6 +195,26 @@ def test_no_file_is_in_a_circle_of_imports() -> None:
         meant = {name if name in paths else name.rpartition(".")[0] for name in named}
         graph[module] = (meant & paths.keys()) - {module, PACKAGE}
     assert {*graphlib.TopologicalSorter(graph).static_order()} == paths.keys() | {PACKAGE}
+
+
+def looked_up(source: str) -> list[str]:
+    """Where a path is asked with its own methods what it is; in contrast to os.path's they raise where they may not look."""
+    return [
+        f"{node.func.attr}() in line {node.lineno}"
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
+        if (node.func.attr == "exists" and ast.unparse(node.func.value) != "os.path") or node.func.attr in LOOKED_UP
+    ]  # fmt: skip
+
+
+def test_what_a_path_is_never_raises() -> None:
+    """Names of more than 255 letters, links in a circle and folders that may not be entered are nothing."""
+    found = [f"{path}: {each}" for _, path in modules() for each in looked_up(path.read_text("utf-8"))]
+    assert not found, "\n".join(found)
+    assert looked_up("Path(x).is_dir()\npath.parent.exists()\nos.path.exists(x)\nos.path.isfile(x)") == [
+        "is_dir() in line 1",
+        "exists() in line 2",
+    ]
 
 
 def by_position(function: ast.FunctionDef | ast.AsyncFunctionDef, in_class: bool) -> int:

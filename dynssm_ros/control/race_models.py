@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from dynssm_ros.control.prediction_model import Adaptive, Fixed, PredictionModel
@@ -53,7 +54,7 @@ def load_prediction_model(
     if Path(name_or_path).suffix == ".yaml":
         model: WindowModel = SingleTrack(load_vehicle(name_or_path))
         model.name = Path(name_or_path).stem
-    elif Path(name_or_path).is_dir() or name_or_path in UNTRAINED:
+    elif os.path.isdir(name_or_path) or name_or_path in UNTRAINED:
         model = load_model(name_or_path, known)
     else:
         raise ConfigurationError(

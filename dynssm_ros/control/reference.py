@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -150,7 +151,7 @@ def load_reference(name_or_path: str, vehicle: Vehicle, track: Track, speed_scal
         TrackError: neither of the names nor a file; a file that is no line; a road that is too narrow for the car.
     """
     path, limits = Path(name_or_path), vehicle_limits(vehicle)
-    if path.is_file():
+    if os.path.isfile(path):
         return _read(path, speed_scale, limits)
     if name_or_path not in ("centre", "racing"):
         raise TrackError(f"line '{name_or_path}' is neither centre, racing nor a file {','.join(COLUMNS)}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+import stat
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -326,10 +327,12 @@ class PredictorNode(ManagedNode):
             self._predictor.load_online(path)
         except UserError as error:
             words = f"{error}; learns from the prior"
-            if self._predictor.online is not None and (path.is_file() or path.is_fifo()):
+            if self._predictor.online is not None:
                 try:
-                    path.rename(f"{path}.bad")
-                    words += f"; set aside as {path.name}.bad"
+                    kind = os.stat(path).st_mode
+                    if stat.S_ISREG(kind) or stat.S_ISFIFO(kind):
+                        path.rename(f"{path}.bad")
+                        words += f"; set aside as {path.name}.bad"
                 except OSError as refusal:
                     words += f"; cannot be set aside ({refusal.strerror})"
             self.get_logger().warning(words)
