@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,9 +16,9 @@ import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
 
-from benchmarks.endurance.live_run import run_live
+from benchmarks.endurance.live_run import isolated_environment, run_live
 from dynssm_ros.nodes.support import SENSOR_QOS
-from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.artifact import ONNX, open_artifact
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.replay import replay
@@ -437,7 +439,11 @@ def test_a_wrong_start_is_one_clear_line(
     assert expected in refused_start("predictor", *(text.format(model=small_model) for text in parameters))
 
 
-def test_a_start_with_a_graph_that_takes_all_memory_is_refused(
-    refused_start: Callable[..., str], vast_model: Path
-) -> None:
-    assert "model.onnx: ONNX Runtime refuses it" in refused_start("predictor", f"model:={vast_model}")
+def test_a_start_with_a_graph_that_takes_all_memory_is_refused(vast_model: Path) -> None:
+    command = [sys.executable, "-m", "dynssm_ros.nodes.predictor", "--ros-args", "-p", f"model:={vast_model}"]
+    done = subprocess.run(
+        command, env=os.environ | isolated_environment(), capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"error: {vast_model / ONNX}: ONNX Runtime refuses it (")
+    assert done.stderr.count("\n") == 1
