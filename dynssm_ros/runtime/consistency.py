@@ -3,7 +3,8 @@
 A message that lies farther from the one before than the car can have moved is refused until a second one confirms it.
 Over stretches of two wheelbases the way of the poses is compared with that of the velocities. If they differ by more than
 half, what goes wrong in odometry is tried instead: poses that stand still, a twist in the map's frame, a swapped sign,
-km/h. The one that explains the way is named, if no other does.
+km/h. The one that explains the way is named, if no other does. It stands until poses and velocities agree again over such
+a stretch: a car that stands shows nothing of that.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ _DIFFERENT = 0.6  # of the way, from which on poses and velocities contradict ea
 _EXPLAINED = 0.25  # of the difference that may be left
 _REMEMBERED = 0.98  # of differences, from message to message
 _SLOW = 0.5  # of the minimum speed, below which nothing is said of the motion: headings of real logs settle at 0.4
+_SLOW_IN_DOUBT = 0.2  # likewise after a jump or a contradiction; below that a car stands
 _KEPT = 1000  # messages
 
 _EXPLANATIONS = (Refusal.STANDS_STILL, Refusal.MAP_FRAME, Refusal.SPEED_SIGN, Refusal.SPEED_SIGN, Refusal.SPEED_UNIT)
@@ -51,7 +53,7 @@ class Consistency:
     """
 
     def __init__(self, wheelbase: float, minimum_speed: float) -> None:
-        self._wheelbase, self._minimum_speed = wheelbase, _SLOW * minimum_speed
+        self._wheelbase, self._minimum_speed = wheelbase, minimum_speed
         self.jumps = 0
         """Jumps that a second message confirmed."""
         self.words = ""
@@ -63,7 +65,9 @@ class Consistency:
         self._suspect: tuple[int, Pose, State] | None = None
         self._restart()
 
-    def _restart(self) -> None:
+    def _restart(self, in_doubt: bool = False) -> None:
+        self._in_doubt = in_doubt  # whether poses and velocities have yet to agree
+        self._contradicted: Refusal | None = None  # what they did before they agree again
         self._last: tuple[int, Pose, State] | None = None
         self._passed: deque[_Passed] = deque(maxlen=_KEPT)
         self._different = 0  # messages that contradict each other, one after the other
@@ -97,7 +101,7 @@ class Consistency:
                 )
                 return Refusal.JUMPED
             self.jumps += 1
-            self._restart()
+            self._restart(in_doubt=True)
         self._suspect = None
         self._pass(stamp, pose, seen)
         return self._contradiction(stamp)
@@ -112,8 +116,8 @@ class Consistency:
         if math.hypot(pose.x - was.x, pose.y - was.y) > _JUMP * self._wheelbase + _FASTER * speed * elapsed:
             return False
         turned = abs(math.remainder(pose.theta - was.theta, 2 * math.pi))
-        possible = _TURN + 2.0 * max(abs(seen.omega), abs(had.omega)) * elapsed
-        return speed < self._minimum_speed or turned <= possible
+        possible: float = _TURN + 2.0 * max(abs(seen.omega), abs(had.omega)) * elapsed
+        return turned <= possible
 
     def _pass(self, stamp: int, pose: Pose, seen: State) -> None:
         ways, way = (0j,) * (1 + len(_EXPLANATIONS)), 0.0
@@ -142,21 +146,22 @@ class Consistency:
     def _contradiction(self, stamp: int) -> Refusal | None:
         start, newest = self._passed[0], self._passed[-1]
         since, way = self._still_since
+        slow = self._minimum_speed * (_SLOW_IN_DOUBT if self._in_doubt else _SLOW)  # m/s
         if (
             self._still >= _FEWEST - 1
             and stamp - since >= _SPAN_S * 1e9
-            and newest.way - way >= max(self._wheelbase / 2, self._minimum_speed * (stamp - since) / 1e9)
+            and newest.way - way >= max(self._wheelbase / 2, slow * (stamp - since) / 1e9)
         ):
             self.words = f"the same pose for {(stamp - since) / 1e9:.2f} s and {newest.way - way:.3g} m"
-            return Refusal.STANDS_STILL
+            return self._doubted(Refusal.STANDS_STILL)
         way = newest.way - start.way
-        if not self._is_far(start) or way < self._minimum_speed * (newest.stamp - start.stamp) / 1e9:
+        if not self._is_far(start) or way < slow * (newest.stamp - start.stamp) / 1e9:
             self._different = 0
-            return None
+            return self._contradicted
         moved = newest.position - start.position
         shares = tuple(abs(moved - (b - a)) / way for a, b in zip(start.ways, newest.ways, strict=True))
         if shares[0] < _DIFFERENT:
-            self._different = 0
+            self._different, self._in_doubt, self._contradicted = 0, False, None
             return None
         if not self._different:
             self._since, self._squares = stamp, (0.0,) * len(shares)
@@ -164,9 +169,13 @@ class Consistency:
         sums = zip(self._squares, shares, strict=True)
         self._squares = tuple(_REMEMBERED * before + share**2 for before, share in sums)
         if self._different < _FEWEST or stamp - self._since < _SPAN_S * 1e9:
-            return None
+            return self._contradicted
         self.words = f"{abs(moved):.3g} m where the velocities say {way:.3g} m"
-        return self._named()
+        return self._doubted(self._named())
+
+    def _doubted(self, what: Refusal) -> Refusal:
+        self._in_doubt, self._contradicted = True, what
+        return what
 
     def _named(self) -> Refusal:
         """The only explanation, if there is one."""

@@ -109,6 +109,49 @@ def test_a_heading_that_jumps_and_stays_contradicts_the_velocities_from_then_on(
     assert set(found[120:]) == {Refusal.CONTRADICTION}
 
 
+def coasting(start: tuple[Pose, State], decay: float = 0.95) -> list[tuple[Pose, State]]:
+    """The car from ``start`` on, straight ahead until it stands, and 20 s longer."""
+    at, speed, rows = start[0], start[1].v_x, []
+    for _ in range(1000):
+        speed *= decay
+        step = speed * PERIOD / 1e9
+        at = at._replace(x=at.x + step * math.cos(at.theta), y=at.y + step * math.sin(at.theta))
+        rows.append((at, State(speed, 0.0, 0.0)))
+    return rows
+
+
+def test_what_contradicted_is_not_believed_because_the_car_stands_but_once_the_pose_jumps_back(laps) -> None:
+    car = Consistency(wheelbase=0.062, minimum_speed=0.5)
+    rows = [*laps[:100], *coasting(laps[99])]
+    rows = [(at._replace(theta=at.theta + 1.5 * (k >= 100)), v) for k, (at, v) in enumerate(rows)]
+    found = checked(car, rows)
+    assert found[100:102] == [Refusal.JUMPED, None]
+    assert set(found[115:]) == {Refusal.CONTRADICTION}
+    jumped_back = [rows[-1][0]._replace(theta=rows[-1][0].theta - 1.5)] * 3
+    after = [car.check((len(rows) + k) * PERIOD, at, rows[-1][1]) for k, at in enumerate(jumped_back)]
+    assert after == [Refusal.JUMPED, None, None]
+
+
+def test_what_contradicted_is_believed_again_once_it_agrees(laps) -> None:
+    backwards = [(at, State(-v.v_x, -v.v_y, v.omega)) for at, v in laps[50:110]]
+    found = checked(orca(), [*backwards, *laps[110:]])
+    assert Refusal.SPEED_SIGN in found[:60]
+    assert set(found[80:]) == {None}
+
+
+@pytest.mark.parametrize(("turn", "refused"), [(1.55, True), (0.2, False)])
+def test_a_heading_that_jumps_while_the_car_stands_is_told_and_judged_when_it_creeps(
+    turn: float, refused: bool
+) -> None:
+    car, creep = Consistency(wheelbase=3.0, minimum_speed=5.0), 2.0
+    stands = [(Pose(0.0, 0.0, turn * (k >= 20)), State(0.0, 0.0, 0.0)) for k in range(60)]
+    found = checked(car, stands)
+    assert [k for k, refusal in enumerate(found) if refusal is not None] == ([20] if refused else [])
+    creeps = [(Pose(creep * PERIOD / 1e9 * k, 0.0, turn), State(creep, 0.0, 0.0)) for k in range(400)]
+    found = [car.check((60 + k) * PERIOD, *row) for k, row in enumerate(creeps)]
+    assert set(found) == ({None, Refusal.MAP_FRAME} if refused else {None})
+
+
 def test_poses_that_jump_to_and_fro_are_never_believed_away_from_the_first(laps) -> None:
     car = orca()
     found = checked(car, [(at._replace(x=at.x + 5000.0 * (k % 2)), v) for k, (at, v) in enumerate(laps)])
