@@ -25,6 +25,8 @@ EXTRAS = {
     "race": ["casadi>=3.8", "scipy>=1.12"],
     # figures and pages
     "report": ["matplotlib>=3.9", "jinja2>=3.1", "scipy>=1.12"],
+    # logs in MATLAB files; all of the above read them too
+    "matlab": ["scipy>=1.12"],
     # what a diagnosis leaves, as a formula
     "formula": ["scikit-learn>=1.4"],
     # seasons of logs on several processes

@@ -13,6 +13,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "train": ("torch", "onnx", "onnxscript", "scipy"),
     "race": ("casadi", "scipy"),
     "report": ("matplotlib", "jinja2", "scipy"),
+    "matlab": ("scipy",),
     "formula": ("sklearn",),
     "scale": ("joblib",),
     "sweep": ("optuna",),

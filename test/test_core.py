@@ -73,6 +73,13 @@ def test_a_missing_extra_is_one_line_that_names_it(arguments: list[str], extra: 
     assert f"pip install 'dynssm_ros[{extra}]'" in line
 
 
+def test_a_matlab_file_is_one_line_that_names_its_extra(tmp_path: Path) -> None:
+    (tmp_path / "log.mat").write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(128))
+    done = run(DYNSSM, "inspect", tmp_path / "log.mat")
+    (line,) = done.stderr.strip().splitlines()
+    assert (done.returncode, "pip install 'dynssm_ros[matlab]'" in line) == (1, True)
+
+
 def test_what_is_there_is_not_asked_for() -> None:
     require("the tests", "train", "race", "report")
     with pytest.raises(KeyError):

@@ -30,8 +30,8 @@ def extract(
     """Turns race logs into a recording: named SI signals on a uniform time grid.
 
     Args:
-        bags: rosbag2 folders or ``.mcap``/``.db3`` files, in the order of driving.
-        signals: signal map: which topic and field is which signal.
+        bags: logs, in the order of driving: rosbag2 folders or files, ROS 1 bags, tables (CSV, Parquet, MATLAB, NumPy).
+        signals: signal map: which field of which topic, or which column, is which signal.
         settings: all keywords as one object.
         on_progress: called with messages read.
 

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 def inspect(
     bag: PathLike, vehicle: Vehicle | PathLike | None = None, *, on_progress: Progress | None = None
 ) -> Inspection:
-    """Says what is in a race log: topics, rates, gaps, clocks, and a first signal map.
+    """Says what is in a race log: topics or columns, rates, gaps, clocks, and a first signal map.
 
     Args:
-        bag: rosbag2 folder or ``.mcap``/``.db3`` file.
+        bag: rosbag2 folder or file, ROS 1 bag, or table (CSV, Parquet, MATLAB, NumPy).
         vehicle: with whose wheelbase the scale of the steering follows from the curvature that is driven.
         on_progress: called with messages read.
 

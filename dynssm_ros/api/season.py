@@ -41,9 +41,9 @@ def extract_season(
     """Turns race logs into a season, one recording for each; those that are as they were are not read again.
 
     Args:
-        bags: rosbag2 folders or ``.mcap``/``.db3`` files. One that cannot be read is listed with its reason.
+        bags: logs as of :func:`dynssm_ros.extract`. One that cannot be read is listed with its reason.
         out: folder of the season; sessions of other logs stay.
-        signals: signal map: which topic and field is which signal.
+        signals: signal map: which field of which topic, or which column, is which signal.
         settings: all keywords as one object; workers of a cluster find logs and folder by the same paths.
         on_progress: called with the logs that are done.
 

@@ -20,7 +20,10 @@ from dynssm_ros.signals.standard import recording_to_bag
 def extract(
     bags: Annotated[
         list[Path],
-        typer.Argument(help="rosbag2 folders or .mcap/.db3 files, in the order of driving.", metavar="BAG..."),
+        typer.Argument(
+            help="Bags of ROS 2 or ROS 1, or tables (CSV, Parquet, .mat, .npz), in the order of driving.",
+            metavar="LOG...",
+        ),
     ],
     signals: SignalsOption,
     out: Annotated[

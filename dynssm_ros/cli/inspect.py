@@ -20,7 +20,8 @@ def inspect(
     bag: Annotated[
         Path,
         typer.Argument(
-            help="rosbag2 folder or .mcap/.db3 file; or a season, whose sessions are listed.", metavar="BAG"
+            help="Bag of ROS 2 or ROS 1, or table (CSV, Parquet, .mat, .npz); or a season, whose sessions are listed.",
+            metavar="LOG",
         ),
     ],
     vehicle: Annotated[
@@ -32,7 +33,7 @@ def inspect(
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Show what is in a log: topics, rates, gaps, clocks; suggest a signal map."""
+    """Show what is in a log: topics or columns, rates, gaps, clocks; suggest a signal map."""
     from dynssm_ros.reporting.inspection_tables import inspection_json, season_table, topic_table
 
     if is_season(bag):

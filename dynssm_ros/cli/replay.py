@@ -15,7 +15,7 @@ from dynssm_ros.cli.options import SignalsOption, with_settings
 
 @with_settings(ReplaySettings)
 def replay(
-    bag: Annotated[Path, typer.Argument(help="rosbag2 folder or file.")],
+    bag: Annotated[Path, typer.Argument(help="rosbag2 folder or file, or ROS 1 bag.")],
     model: Annotated[Path, typer.Option(help="Model folder.")],
     out: Annotated[Path, typer.Option(help="rosbag2 folder to write.")],
     settings: ReplaySettings,

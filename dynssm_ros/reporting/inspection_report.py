@@ -30,7 +30,7 @@ def inspection_report(found: Inspection) -> Report:
     if "x" in found.signals and "y" in found.signals:
         sections.append(Section("Path", "Where the car was by its odometry; the dot is the start.", path(found)))
     notes = "".join(f" {note[0].upper()}{note[1:].rstrip('.?')}." for note in found.notes)
-    summary = f"{found.duration:.1f} s with {len(found.topics)} topics.{notes}"
+    summary = f"{found.duration:.1f} s with {len(found.topics)} {'topics' if found.time is None else 'columns'}.{notes}"
     return Report(f"Inspection of {found.name}", summary, sections, table=topic_table(found))
 
 

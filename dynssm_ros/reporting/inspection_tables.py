@@ -14,7 +14,9 @@ from dynssm_ros.signals.season import Season
 
 
 def topic_table(found: Inspection) -> Table:
-    """All topics, with how regularly they come."""
+    """All topics with how regularly they come, or all columns with what is in them."""
+    if found.time is not None:
+        return _column_table(found)
     return Table.of(
         found.topics.values(),
         (Column("topic", brief=True), lambda topic: topic.name),
@@ -26,6 +28,22 @@ def topic_table(found: Inspection) -> Table:
     )
 
 
+def _column_table(found: Inspection) -> Table:
+    limits = {name: one.limits or (np.nan,) * 3 for name, one in found.topics.items()}
+    return Table.of(
+        found.topics.values(),
+        (Column("column", brief=True), lambda column: column.name),
+        (Column("cells", brief=True), lambda column: column.msgtype),
+        (Column("unit", brief=True), lambda column: column.unit),
+        (Column("values", brief=True), lambda column: column.count),
+        (Column("rate", "Hz", brief=True), lambda column: column.rate),
+        (Column("longest gap", "s"), lambda column: column.longest_gap),
+        (Column("least", brief=True), lambda column: limits[column.name][0]),
+        (Column("largest", brief=True), lambda column: limits[column.name][1]),
+        (Column("zeros", "%", brief=True), lambda column: 100.0 * limits[column.name][2]),
+    )
+
+
 def signal_table(found: Inspection) -> Table:
     """The suggested sources, with what they were in the log."""
     return Table.of(
@@ -33,6 +51,7 @@ def signal_table(found: Inspection) -> Table:
         (Column("signal"), lambda item: item[0]),
         (Column("topic"), lambda item: item[1].topic.name),
         (Column("field"), lambda item: item[1].field),
+        (Column("unit"), lambda item: item[1].unit),
         (Column("scale"), lambda item: item[1].scale),
         (Column("least"), lambda item: float(np.nanmin(item[1].values))),
         (Column("largest"), lambda item: float(np.nanmax(item[1].values))),
@@ -65,11 +84,13 @@ def inspection_json(found: Inspection) -> dict[str, Any]:
                 "rate_hz": finite(topic.rate),
                 "longest_gap_s": topic.longest_gap,
                 "lateness_s": finite(topic.lateness),
+                "unit": topic.unit,
+                "reason": topic.reason,
             }
             for topic in found.topics.values()
         },
         "signals": {
-            name: {"topic": one.topic.name, "field": one.field, "scale": one.scale, "note": one.note}
+            name: {"topic": one.topic.name, "field": one.field, "unit": one.unit, "scale": one.scale, "note": one.note}
             for name, one in found.signals.items()
         },
         "missing": list(found.missing),

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dynssm_ros.errors import BagError
+from dynssm_ros.errors import BagError, ConfigurationError
 from dynssm_ros.signals.signal_map import Accessor, SignalMap, Source, compile_field
 from dynssm_ros.signals.velocities import LiveVelocities
 
@@ -20,16 +19,16 @@ class _Reading(NamedTuple):
     signal: str
     source: Source
     read: Accessor
-    to_si: Callable[[float], float]
+    to_si: Callable[[Any], Any]
 
 
-def _to_si(source: Source) -> Callable[[float], float]:
-    """Turns what is in a message into SI units."""
-    scale, offset = source.scale, source.offset
+def to_si(source: Source) -> Callable[[Any], Any]:
+    """Turns what is in a message, or in the cells of a column, into SI units."""
+    factor, offset = source.factor, source.offset
     if source.curve is None:
-        return lambda raw: scale * raw + offset
+        return lambda raw: factor * raw + offset
     at, values = np.array(source.curve).T
-    return lambda raw: scale * float(np.interp(raw, at, values) if math.isfinite(raw) else raw) + offset
+    return lambda raw: factor * np.where(np.isfinite(raw), np.interp(raw, at, values), raw) + offset
 
 
 class TopicDecoder:
@@ -42,7 +41,7 @@ class TopicDecoder:
         self.subscribed = next(sources, topic)
         """The name as the map has it: relative ones are in the namespace of a node."""
         self._readings = [
-            _Reading(name, source, compile_field(source.field), _to_si(source))
+            _Reading(name, source, compile_field(source.field), to_si(source))
             for name, source in signal_map.active_signals().items()
             if source.recorded == topic
         ]
@@ -59,7 +58,7 @@ class TopicDecoder:
             BagError: the message type has no such field, or the field is not a number.
         """
         values: dict[str, float] = {}
-        for signal, source, read, to_si in self._readings:
+        for signal, source, read, convert in self._readings:
             try:
                 raw = read(message)
             except AttributeError as error:
@@ -72,7 +71,7 @@ class TopicDecoder:
                     f"topic {self.topic}: field '{source.field}' for signal {signal} is not a number ({error})"
                 ) from error
             if raw is not None:
-                values[signal] = to_si(raw)
+                values[signal] = convert(raw)
         return values
 
 
@@ -99,7 +98,15 @@ def live_decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
 
 
 def decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
-    """A decoder for each topic of the map, actuators first so that a node serves them before the odometry."""
+    """A decoder for each topic of the map, actuators first so that a node serves them before the odometry.
+
+    Raises:
+        ConfigurationError: the map is of a table.
+    """
+    if signal_map.is_of_table:
+        raise ConfigurationError(
+            f"signal map {signal_map.name}: names columns of a table; expected the topics of a car or a bag"
+        )
     types = {source.recorded: source.type for source in signal_map.active_signals().values()}
     order = sorted(types, key=lambda topic: topic == signal_map.odometry_topic)
     return {topic: TopicDecoder(topic, types[topic], signal_map) for topic in order}

@@ -10,11 +10,14 @@ import numpy as np
 
 from dynssm_ros.errors import BagError, RecordingError
 from dynssm_ros.progress import Progress
-from dynssm_ros.signals.bags import Bag, open_bag
-from dynssm_ros.signals.decoding import decoders, header_stamp_ns
+from dynssm_ros.signals.bags import Bag
+from dynssm_ros.signals.decoding import decoders, header_stamp_ns, to_si
+from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import Stream, resample
-from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, SignalMap
+from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, POSE_SIGNALS, STATE_SIGNALS, SignalMap
+from dynssm_ros.signals.table_clock import clock_of
+from dynssm_ros.signals.tables import Table
 from dynssm_ros.signals.velocities import velocities_along
 
 _SLOW = 1.5  # periods of the grid between samples, from which on a signal is slower than it
@@ -27,23 +30,25 @@ def extract(
     drop_bad: bool = False,
     progress: Progress | None = None,
 ) -> Recording:
-    """Reads bags and brings their signals onto a uniform grid.
+    """Reads logs and brings their signals onto a uniform grid.
 
     Args:
-        bags: rosbag2 folders or storage files of one car, in the order in which they shall be joined.
+        bags: bags or tables of one car, in the order in which they shall be joined.
         signal_map: where the signals are.
         rate: of the grid (Hz).
         drop_bad: leave out samples that are not finite or whose stamps repeat or run backwards, instead of raising.
         progress: told of each message.
 
     Raises:
-        BagError: unreadable, topics missing or of another type, bad samples.
+        BagError: unreadable, topics or columns missing or of another type, bad samples.
         RecordingError: the signals never overlap in time.
     """
     recordings = []
     for path in bags:
-        with open_bag(path) as bag:
-            streams, notes = read_streams(bag, signal_map, drop_bad, progress)
+        with open_log(path) as log:
+            signal_map, lack = _with_commands_of(log, signal_map)
+            streams, notes = read_streams(log, signal_map, drop_bad, progress)
+        notes += lack
         if signal_map.velocities is not None:
             streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
             notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")
@@ -59,6 +64,21 @@ def extract(
         )
         recordings.append(resample(streams, rate, signal_map.max_gap, signal_map.commands, info))
     return concatenate(recordings)
+
+
+def _with_commands_of(log: Bag | Table, signal_map: SignalMap) -> tuple[SignalMap, list[str]]:
+    """The map, without commands where the log has none of their topics or columns, and a note on it."""
+    if signal_map.commands != "topics":
+        return signal_map, []
+    sources = [signal_map.signals[name] for name in COMMAND_SIGNALS]
+    if isinstance(log, Table):
+        missing = [f"column '{one.column}'" for one in sources if one.column and one.column not in log.headings]
+    else:
+        missing = [f"topic {one.recorded}" for one in sources if not one.column and not log.counts.get(one.recorded)]
+    if len(missing) < len(sources):
+        return signal_map, []
+    told = " and ".join(dict.fromkeys(missing))
+    return signal_map.with_commands("none"), [f"no commands in the log ({told}); commands: none"]
 
 
 def pose_velocities(streams: Mapping[str, Stream], window: float, where: str) -> dict[str, Stream]:
@@ -93,18 +113,42 @@ def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: f
 
 
 def read_streams(
-    bag: Bag, signal_map: SignalMap, drop_bad: bool = False, progress: Progress | None = None
+    log: Bag | Table, signal_map: SignalMap, drop_bad: bool = False, progress: Progress | None = None
 ) -> tuple[dict[str, Stream], list[str]]:
-    """Reads the samples of every mapped signal; memory holds these and one message at a time.
+    """Reads the samples of every mapped signal; memory holds these and one message, or the columns, at a time.
 
-    Stamps are header stamps, and log times only where a message has no header.
+    Stamps are header stamps, and log times only where a message has no header; of tables those of their time column.
 
     Returns:
         The streams by signal name, and notes on what was recovered or dropped.
 
     Raises:
-        BagError: a topic or field is missing, or samples are bad and ``drop_bad`` is off.
+        BagError: a topic, field or column is missing, or samples are bad and ``drop_bad`` is off.
     """
+    if isinstance(log, Table):
+        found, notes = _table_streams(log, signal_map, drop_bad), list(log.notes)
+    else:
+        found, notes = _bag_streams(log, signal_map, progress), list(log.notes)
+    streams: dict[str, Stream] = {}
+    for name, source in signal_map.active_signals().items():
+        place = f"column '{source.column}'" if source.column else f"topic {source.recorded}"
+        stream, dropped = clean(found[name], f"{log.path}: {place}: {name}", drop_bad)
+        if dropped:
+            notes.append(f"{name}: dropped {dropped}")
+        if len(stream.stamps):
+            streams[name] = stream
+            continue
+        counted = 1 if isinstance(log, Table) else log.counts[source.recorded]
+        lack = f"has no good sample of '{source.field}'" if dropped else f"never carries '{source.field}'"
+        lack = "has no good value" if source.column else lack
+        if name not in POSE_SIGNALS or not counted:
+            raise BagError(f"{log.path}: {place} {lack if counted else 'has no messages'}, needed for {name}")
+        notes.append(f"{name}: {place} {lack}; left out")
+    return streams, notes
+
+
+def _bag_streams(bag: Bag, signal_map: SignalMap, progress: Progress | None) -> dict[str, Stream]:
+    """The samples of every mapped signal, as they came."""
     by_topic = decoders(signal_map)
     for topic, decoder in by_topic.items():
         bag.require(topic, decoder.msgtype)
@@ -120,23 +164,31 @@ def read_streams(
         samples.add(topic, log_time if stamp is None else stamp, present)
         if progress is not None:
             progress(done, total)
-    notes = list(bag.notes)
-    streams: dict[str, Stream] = {}
-    for name, source in signal_map.active_signals().items():
-        stream = samples.stream(name, round(source.delay * 1e9))
-        where = f"{bag.path}: topic {source.recorded}"
-        stream, dropped = clean(stream, f"{where}: {name}", drop_bad)
-        if dropped:
-            notes.append(f"{name}: dropped {dropped}")
-        if len(stream.stamps):
-            streams[name] = stream
-            continue
-        counted = bag.counts[source.recorded]
-        lack = f"has no good sample of '{source.field}'" if dropped else f"never carries '{source.field}'"
-        if name not in POSE_SIGNALS or not counted:
-            raise BagError(f"{where} {lack if counted else 'has no messages'}, needed for {name}")
-        notes.append(f"{name}: topic {source.recorded} {lack}; left out")
-    return streams, notes
+    active = signal_map.active_signals().items()
+    return {name: samples.stream(name, round(source.delay * 1e9)) for name, source in active}
+
+
+def _table_streams(table: Table, signal_map: SignalMap, drop_bad: bool) -> dict[str, Stream]:
+    """The cells of every mapped column that have a value, as they came."""
+    if not signal_map.is_of_table:
+        raise BagError(
+            f"{table.path}: a table, and signal map {signal_map.name} names topics; expected one with columns (`dynssm "
+            f"inspect` suggests it)"
+        )
+    active = signal_map.active_signals()
+    columns = table.read([source.column for source in active.values()])
+    clock = clock_of(table, signal_map.time)
+    streams = {}
+    for name, source in active.items():
+        column = columns[source.column]
+        wrong = column.reason or ("" if drop_bad else column.bad)
+        if wrong:
+            hint = "" if column.reason else " (--drop-bad leaves such cells out)"
+            raise BagError(f"{table.path}: column '{source.column}' for {name}: {wrong}; expected numbers{hint}")
+        there = column.present & clock.known
+        stamps = clock.stamps[there] - round(source.delay * 1e9)
+        streams[name] = Stream(stamps, to_si(source)(column.values[there]))
+    return streams
 
 
 class _Samples:

@@ -117,7 +117,7 @@ def unpack(compressed: Path, unpacked: Path) -> None:
         OSError: ``compressed`` cannot be read or ``unpacked`` not be written, or it would be far larger than a log can be,
             or than the disk.
     """
-    room = min(_largest(compressed.stat().st_size), shutil.disk_usage(unpacked.parent).free)
+    room = min(largest_unpacked(compressed.stat().st_size), shutil.disk_usage(unpacked.parent).free)
     with compressed.open("rb") as source, unpacked.open("wb") as sink:
         for piece in _bounded(_pieces(source, "zstd"), room):
             sink.write(piece)
@@ -131,10 +131,10 @@ def unpacked_message(raw: bytes) -> bytes:
     """
     if not raw.startswith(_ZSTD_MAGIC):
         return raw
-    return b"".join(_bounded(_pieces(io.BytesIO(raw), "zstd"), _largest(len(raw))))
+    return b"".join(_bounded(_pieces(io.BytesIO(raw), "zstd"), largest_unpacked(len(raw))))
 
 
-def _largest(packed: int) -> int:
+def largest_unpacked(packed: int) -> int:
     """Bytes that so many ``packed`` ones may unpack to."""
     return max(_UNPACKED, _RATIO * packed)
 

@@ -1,4 +1,7 @@
-"""The signal map: which field of which topic is which signal, shared by extractor, node, player and replay."""
+"""The signal map: which field of which topic, or which column of a table, is which signal.
+
+Extractor, node, player and replay share it; columns are for the extractor alone.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +32,14 @@ Hold = Literal["zero", "first"]
 ROUNDING = 1e-6
 """Periods by which an instant of a grid may miss a sample."""
 
+UNITS = {
+    "m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kt": 1852 / 3600, "ft/s": 0.3048, "rad": 1.0, "deg": math.pi / 180,
+    "rad/s": 1.0, "deg/s": math.pi / 180, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "%": 0.01, "1": 1.0,
+}  # fmt: skip
+"""Units of fields and columns, and what one is in SI units."""
+TIME_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1, "days": 86_400_000_000_000}
+"""Units of time columns, and what one is in ns."""
+
 Accessor = Callable[[Any], float | None]
 _NOT_UNIT = 0.1  # squared length of a quaternion: some drivers publish some that are not quite unit
 _STEP = r"[A-Za-z_]\w*(?:\[[^\[\]().]+\])?"
@@ -38,23 +49,36 @@ _OUTSIDE_BRACKETS = r"(?![^\[]*\])"
 _PLUS, _TIMES = re.compile(rf"\s*\+\s*{_OUTSIDE_BRACKETS}"), re.compile(rf"\s*\*\s*{_OUTSIDE_BRACKETS}")
 
 
-class Source(StrictModel):
-    """Where one signal comes from; its value is ``scale * curve(field) + offset`` in SI units."""
+class TimeColumn(StrictModel):
+    """The time column of a table."""
 
+    column: str = Field(min_length=1, description="its heading")
+    unit: Literal["s", "ms", "us", "ns", "days"] | None = Field(
+        default=None, description="of its numbers; null for dates and times of day, and where its steps tell"
+    )
+
+
+class Source(StrictModel):
+    """Where one signal comes from, a field of a topic or a column; its value is ``scale * unit * curve(field) + offset``."""
+
+    column: str = Field(default="", description="heading of a table's column, instead of topic, type and field")
     topic: str = Field(
-        pattern=r"^/?(?:\w+/)*\w+$",
+        default="",
+        pattern=r"^(?:/?(?:\w+/)*\w+)?$",
         description="topic name; relative names, without a slash in front, are in the namespace of the node",
     )
-    type: str = Field(pattern=r"^\w+/msg/\w+$", description="message type, package/msg/Name")
+    type: str = Field(default="", pattern=r"^(?:\w+/msg/\w+)?$", description="message type, package/msg/Name")
     field: str = Field(
+        default="",
         description="dotted path; position[steering] picks by name or index; yaw(path) of a quaternion. Sums of products of "
-        "these: torque[fl] + torque[fr], pressure * area"
+        "these: torque[fl] + torque[fr], pressure * area",
     )
     curve: tuple[tuple[float, float], ...] | None = Field(
         default=None,
         min_length=2,
         description="points (field, value) of a measured curve or a dead band: lines between them, the ends held",
     )
+    unit: str = Field(default="1", description=f"of the field, or of what its curve gives: {' '.join(UNITS)}")
     scale: float = 1.0
     offset: float = 0.0
     delay: float = Field(default=0.0, ge=0, lt=1.0, description="by which stamps are late (s)")
@@ -64,6 +88,28 @@ class Source(StrictModel):
         "zero for actuators and commands that come more slowly than the rows of a recording, else first",
     )
 
+    @model_validator(mode="after")
+    def _one_place(self) -> Source:
+        named = [name for name in ("topic", "type", "field") if getattr(self, name)]
+        if self.column and named:
+            raise ValueError(f"column '{self.column}' and {named[0]} '{getattr(self, named[0])}'; expected either")
+        missing = [name for name in ("topic", "type", "field") if name not in named]
+        if missing and not self.column:
+            raise ValueError(f"{missing[0]} is missing; expected topic, type and field, or the column of a table")
+        return self
+
+    @field_validator("unit")
+    @classmethod
+    def _is_known(cls, value: str) -> str:
+        if value not in UNITS:
+            raise ValueError(f"expected one of {' '.join(UNITS)}")
+        return value
+
+    @property
+    def factor(self) -> float:
+        """Of a field, or of what its curve gives, to SI units."""
+        return self.scale * UNITS[self.unit]
+
     @property
     def recorded(self) -> str:
         """The topic's absolute name in a bag of one car."""
@@ -72,7 +118,7 @@ class Source(StrictModel):
     @field_validator("field")
     @classmethod
     def _parses(cls, value: str) -> str:
-        if not all(_FIELD.match(path) for term in _terms(value) for path in term):
+        if value and not all(_FIELD.match(path) for term in _terms(value) for path in term):
             raise ValueError(
                 "expected a dotted path such as twist.twist.linear.x, position[steering] or yaw(pose), or a sum (+) of "
                 "products (*) of them"
@@ -100,6 +146,7 @@ class SignalMap(StrictModel):
     name: str
     commands: Commands = "topics"
     max_gap: float = Field(default=0.25, gt=0, description="longest time between samples that is bridged (s)")
+    time: TimeColumn | None = Field(default=None, description="time column of a table; null: found by name and steps")
     velocities: Velocities | None = Field(
         default=None, description="for cars whose pose alone is measured; null: v_x, v_y and omega are signals"
     )
@@ -110,6 +157,8 @@ class SignalMap(StrictModel):
         unknown = [name for name in self.signals if name not in SIGNALS]
         if unknown:
             raise ValueError(f"signals: unknown '{unknown[0]}'; expected {' '.join(SIGNALS)}")
+        if len({bool(source.column) for source in self.signals.values()}) > 1:
+            raise ValueError("signals: some are columns of a table, others fields of topics; expected either")
         needed = REQUIRED_SIGNALS + (COMMAND_SIGNALS if self.commands == "topics" else ())
         if self.velocities is not None:
             double = [name for name in STATE_SIGNALS if name in self.signals]
@@ -129,6 +178,11 @@ class SignalMap(StrictModel):
             if types.setdefault(source.recorded, source.type) != source.type:
                 raise ValueError(f"signals: topic {source.topic} is given two types")
         return self
+
+    @property
+    def is_of_table(self) -> bool:
+        """Whether signals are columns of a table rather than fields of topics."""
+        return any(source.column for source in self.signals.values())
 
     @property
     def odometry_topic(self) -> str:

@@ -141,10 +141,13 @@ def bad_bags(folder: Path) -> dict[str, tuple[Path, str]]:
         pass
     return {
         "missing": (folder / "nowhere", "no such bag"),
-        "empty folder": (folder / "empty folder", "not a bag; expected a rosbag2 folder, or a .mcap or .db3 file"),
+        "empty folder": (
+            folder / "empty folder",
+            "not a bag; expected a rosbag2 folder, a .mcap or .db3 file, or a ROS 1 bag",
+        ),
         "noise in mcap": (folder / "noise.mcap", "not a bag, or cut off before its first message"),
         "noise in db3": (folder / "noise.db3", "not a bag, or cut off before its first message"),
-        "text": (folder / "text.txt", "not a bag; expected a rosbag2 folder"),
+        "text": (folder / "text.txt", "neither a table nor a bag; expected columns of numbers"),
         "empty": (folder / "empty", "is missing; the bag has no topics"),
         "cut early": (cut, "not a bag, or cut off before its first message"),
         "nan": (write(folder / "nan", spoil=lambda k: {"v_x": np.nan} if k == 7 else {}), "is not finite (1 such)"),

@@ -43,6 +43,24 @@ def test_a_log_of_poses_alone_is_shown(dynssm: Run, tmp_path: Path) -> None:
     assert (tmp_path / "inspection" / "report.html").read_text().count("data:image/svg+xml") == 1
 
 
+def test_a_table_is_shown_and_extracted_by_the_same_commands(dynssm: Run, refused: Refused, tmp_path: Path) -> None:
+    log, out, laps = tmp_path / "log.csv", tmp_path / "inspection", tmp_path / "laps.parquet"
+    cells = (f"{20 * k},{18 + k % 9},0.0{k % 7},1{k % 5},{k % 3},4{k % 9}\n" for k in range(300))
+    log.write_text("t (ms),speed (km/h),v_y,yaw rate (deg/s),steering (deg),throttle (%)\n" + "".join(cells))
+    status, shown, err = dynssm("inspect", log, "--out", out, "--json", tmp_path / "found.json")
+    assert (status, err) == (0, "")
+    assert "note: text, columns apart by comma, 1 line above the first row; time in ms from column 't (ms)'" in shown
+    assert "v_x: {column: speed (km/h), unit: km/h}" in shown
+    assert "column" in (out / "report.html").read_text()
+    assert json.loads((tmp_path / "found.json").read_text())["topics"]["throttle (%)"]["unit"] == "%"
+    status, shown, err = dynssm("extract", log, "--signals", out / "signals.yaml", "--rate", 50, "--out", laps)
+    assert (status, err) == (0, "")
+    assert "commands: none" in shown
+    assert "names topics; expected one with columns" in refused(
+        "extract", log, "--signals", "default", "--rate", 50, "--out", laps
+    )
+
+
 def test_what_is_no_bag_ends_in_one_line(refused: Refused, tmp_path: Path) -> None:
     line = refused("inspect", tmp_path / "nothing")
     assert "no such bag" in line

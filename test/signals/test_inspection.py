@@ -118,6 +118,13 @@ def test_where_velocities_are_missing_they_follow_from_poses(make_bag: Any) -> N
     np.testing.assert_allclose(extract([bag], mapped, 50.0)["v_x"], 10.0, atol=1e-6)
 
 
+def test_a_topic_that_cannot_be_read_is_listed_with_its_reason(make_bag: Any) -> None:
+    found = inspect(make_bag([*bends(), ("/imu", "sensor_msgs/msg/Imu", START, b"\0\1\0\0abc")]))
+    assert found.missing == ()
+    assert found.topics["/imu"].reason.startswith("a message is not a sensor_msgs/msg/Imu (")
+    assert found.notes == (f"/imu: {found.topics['/imu'].reason}",)
+
+
 def test_an_empty_log_is_refused(make_bag: Any) -> None:
     with pytest.raises(BagError, match="holds no messages"):
         inspect(make_bag([]))

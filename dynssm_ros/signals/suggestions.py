@@ -1,0 +1,260 @@
+"""Which fields of topics, or columns, the signals of a signal map may be: names suggest it, values correct it.
+
+A steering signal is compared with the curvature that is driven, so that degrees, steering-wheel angles and swapped signs
+are seen.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.signals.columns import heading
+from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, pose_fields
+from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, STATE_SIGNALS, UNITS
+
+_MOTION = {
+    "v_y": (r"(^|_)(v|vel|velocity|linear)_?(y|lat\w*)$|^v?_?lat\w*_(vel\w*|speed)$|^vlat|quergeschw",),
+    "v_x": (r"(^|_)(v|vel|velocity|linear)_?(x|long\w*)$|^v?_?long\w*(_vel\w*|_speed)?$", r"speed|velocity|geschw|^v$"),
+    "omega": (r"yaw_?(rate|vel\w*|speed)|gierrate|psi_?dot|angular(_vel\w*)?_z$|gyro_?z$|omega(_?z)?$|^(r|wz|w_z)$",),
+    "x": (r"^(pos\w*_|pose_)?x(_pos\w*)?$|position_x$|^(east|easting|pos_?x)$",),
+    "y": (r"^(pos\w*_|pose_)?y(_pos\w*)?$|position_y$|^(north|northing|pos_?y)$",),
+    "theta": (r"^(pose_)?(yaw|theta|heading|psi|gierwinkel)(_angle)?$|orientation_yaw$",),
+}
+"""Words for signals in headings, in the order in which they are tried."""
+_NOT_MOTION = re.compile(
+    r"wheel|(^|_)(rad|wind|soll)_|cmd|command|target|desired|setpoint|engine|motor|std|cov|sigma|acc|rpm|_ref|steer|lenk|error",
+    re.IGNORECASE,
+)
+_QUANTITIES = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "x": "m", "y": "m", "theta": "rad"}
+_FITTING = {
+    "m/s": ("m/s", "km/h", "mph", "kt", "ft/s"), "rad/s": ("rad/s", "deg/s"), "m": ("m", "cm", "mm", "km", "ft"),
+    "rad": ("rad", "deg"), "1": ("1", "%"),
+}  # fmt: skip
+_WORDS = {
+    "steering": re.compile(r"steer|delta|servo|lenk", re.IGNORECASE),
+    "throttle": re.compile(r"throttle|accel\w*pedal|pedal_(?:output|position)|gas|duty|drossel", re.IGNORECASE),
+    "brake": re.compile(r"brake|brems", re.IGNORECASE),
+}
+_COMMAND = re.compile(r"cmd|command|target|desired|setpoint|request", re.IGNORECASE)
+_MEASURED = re.compile(r"report|feedback|measured|actual|angle|position|output|pressure", re.IGNORECASE)
+_OTHER = re.compile(
+    r"rate|veloc|speed|torque|current|status|state|enable|fault|counter|temp|rolling|valid|overrid|timeout|limit|effort"
+    r"|covariance|stamp|warn|error|source|mode",
+    re.IGNORECASE,
+)
+_RADIANS, _SHARE = 1.6, 1.5  # larger values are no road-wheel angle in rad, and no throttle between -1 and 1
+_AGREES = 0.5  # correlation with the curvature, from which on a scale is told
+_UNIT = (0.6, 1.7)  # wheelbase times curvature per unit, for a signal that is the road-wheel angle in rad already
+_CLOCK = 1.0  # s by which the stamps of topics may be apart
+_FASTEST = 110.0  # m/s
+_MOST = {"omega": 15.0, "theta": 60.0}  # range in rad/s, and in rad, from which on degrees are likelier
+_DRIVING = 0.3  # of the largest speed, from which on curvature is compared
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Where a signal may come from."""
+
+    topic: TopicContent
+    field: str
+    scale: float = 1.0
+    note: str = ""
+    unit: str = "1"
+
+    @property
+    def values(self) -> Vector:
+        """The signal at the topic's samples, shape ``(N,)``."""
+        return self.scale * UNITS[self.unit] * self.topic.values[self.field]
+
+
+def suggest(
+    topics: dict[str, TopicContent], wheelbase: float | None, notes: list[str], *, is_table: bool
+) -> dict[str, Suggestion]:
+    """A source for each signal for which one is found; what to look at is added to ``notes``."""
+    motion = _motion(topics, notes) if is_table else _odometry(topics, notes)
+    used = {one.field for one in motion.values()} if is_table else set()
+    signals = motion | _actuators({name: one for name, one in topics.items() if name not in used})
+    if not set(COMMAND_SIGNALS) <= set(signals):  # of no use alone
+        signals = {name: source for name, source in signals.items() if not name.endswith("_command")}
+    for name in ("steering_feedback", "steering_command"):
+        if name in signals:
+            signals[name] = _scaled_steering(signals[name], signals, wheelbase)
+    notes += _clocks(topics, signals)
+    return signals
+
+
+def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Suggestion]:
+    """Velocities and poses among the columns of a table, by their headings."""
+    found: dict[str, Suggestion] = {}
+    names = {name: _plain(heading(name).bare) for name, one in columns.items() if one.values}
+    names = {name: plain for name, plain in names.items() if not _NOT_MOTION.search(plain)}
+    for signal, patterns in _MOTION.items():
+        fitting = [
+            name
+            for pattern in patterns
+            for name, plain in names.items()
+            if re.search(pattern, plain)
+            and name not in [one.field for one in found.values()]
+            and _may_be(columns[name], signal)
+        ]
+        if fitting:
+            best = max(fitting, key=lambda name: (_spread(columns[name].values[name]) > 0, -fitting.index(name)))
+            found[signal] = _with_unit(Suggestion(columns[best], best), _QUANTITIES[signal])
+            others = [name for name in fitting if name != best and not re.search(patterns[0], names[best])]
+            if others:
+                found[signal] = replace(found[signal], note=f"or {', '.join(dict.fromkeys(others))}")
+    if not {"x", "y", "theta"} <= set(found):
+        found = {name: one for name, one in found.items() if name in STATE_SIGNALS}
+    has_path = "x" in found and _spread(found["x"].values) + _spread(found["y"].values) > 0
+    if not set(STATE_SIGNALS) <= set(found) and has_path:
+        lack = ", ".join(name for name in STATE_SIGNALS if name not in found)
+        notes.append(f"no column is {lack}; velocities follow from the poses")
+        found = {name: one for name, one in found.items() if name not in STATE_SIGNALS}
+    elif not found:
+        notes.append("no column tells where the car is or how fast; find v_x, v_y and omega, or x, y and theta")
+    if "v_x" in found and float(np.nanmax(np.abs(found["v_x"].values), initial=0.0)) > _FASTEST:
+        found["v_x"] = replace(found["v_x"], note="too fast for m/s: find its unit")
+    for name in ("omega", "theta"):
+        if name in found and found[name].unit == "1" and _spread(found[name].values) > _MOST[name]:
+            found[name] = replace(found[name], note="large for rad: deg?")
+    return found
+
+
+def _plain(name: str) -> str:
+    """A heading in lower case, its words apart by underscores."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
+    return re.sub(r"[^0-9a-zäöüß]+", "_", words.lower()).strip("_")
+
+
+def _may_be(column: TopicContent, signal: str) -> bool:
+    """Whether the unit of a column, if it has one, is one of that signal."""
+    return column.unit not in UNITS or column.unit in _FITTING[_QUANTITIES[signal]]
+
+
+def _with_unit(suggestion: Suggestion, quantity: str) -> Suggestion:
+    """The source with the unit of its column, if that is one of the ``quantity``, a unit of the SI."""
+    unit = suggestion.topic.unit
+    return replace(suggestion, unit=unit) if unit in _FITTING[quantity] and unit != quantity else suggestion
+
+
+def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Suggestion]:
+    """The odometry that moves most often, if there is one."""
+    odometries = [topic for topic in topics.values() if topic.msgtype == ODOMETRY and topic.values]
+    moving = [topic for topic in odometries if _spread(topic.values[TWIST["v_x"]]) > 0]
+    if not moving:
+        poses = [topic for topic in topics.values() if topic.msgtype in POSES and _moves(topic)]
+        if not poses:
+            notes.append(
+                "nothing tells where the car is or how fast; find a topic with v_x, v_y and omega, or with poses"
+            )
+            return {}
+        best = max(poses, key=lambda topic: topic.count)
+        notes.append(f"no topic has velocities; they follow from the poses of {best.name}")
+        return {signal: Suggestion(best, path) for signal, path in pose_fields(best.msgtype).items()}
+    best = max(moving, key=lambda topic: topic.count)
+    if len(moving) > 1:
+        notes.append(f"several odometries move: {', '.join(topic.name for topic in moving)}; taken is {best.name}")
+    if _spread(best.values[TWIST["v_y"]]) == 0:
+        notes.append(f"{best.name}: v_y is constant, so that nothing is known of how the car slides")
+    fields = TWIST | pose_fields(ODOMETRY) if _moves(best) else TWIST
+    return {signal: Suggestion(best, path) for signal, path in fields.items()}
+
+
+def _moves(topic: TopicContent) -> bool:
+    fields = pose_fields(topic.msgtype)
+    return any(_spread(topic.values[fields[name]]) > 0 for name in ("x", "y") if fields[name] in topic.values)
+
+
+def _actuators(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:
+    """Throttle, steering and brake by their names, as measured and as commanded."""
+    found: dict[str, Suggestion] = {}
+    for actuator, words in _WORDS.items():
+        ranked: dict[str, list[tuple[tuple[int, ...], Suggestion]]] = {"feedback": [], "command": []}
+        for topic in topics.values():
+            for path, values in topic.values.items():
+                name = f"{topic.name} {path}"
+                leaf = path.rsplit(".", 1)[-1]
+                own = bool(words.search(path)) + bool(words.search(leaf))
+                others = any(word.search(path) for key, word in _WORDS.items() if key != actuator)
+                if not (own or words.search(topic.name)) or others or _OTHER.search(path):
+                    continue
+                kind = "command" if _COMMAND.search(name) else "feedback"
+                varied = len(np.unique(values[np.isfinite(values)])) > 2
+                rank = (varied, own, bool(_MEASURED.search(leaf)), bool(_MEASURED.search(topic.name)), topic.count)
+                quantity = "rad" if actuator == "steering" else "1"
+                ranked[kind].append((rank, _with_unit(Suggestion(topic, path), quantity)))
+        for kind, candidates in ranked.items():
+            if candidates:
+                found[f"{actuator}_{kind}"] = _scaled(actuator, max(candidates, key=lambda pair: pair[0])[1])
+        if f"{actuator}_feedback" not in found and f"{actuator}_command" in found and actuator != "brake":
+            command = found[f"{actuator}_command"]
+            note = "no feedback found: the command is taken for it"
+            found[f"{actuator}_feedback"] = replace(command, note=note)
+    return found
+
+
+def _scaled(actuator: str, suggestion: Suggestion) -> Suggestion:
+    """Pedals between 0 and 1; the steering is scaled by the curvature."""
+    values = suggestion.values
+    largest = float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else 0.0
+    if actuator == "steering" or largest <= _SHARE:
+        return suggestion
+    if actuator == "throttle" and largest <= 100.0 * _SHARE:
+        return replace(suggestion, scale=0.01, note="taken for percent")
+    note = f"up to {largest:.4g} in the log, which is taken for full {actuator}"
+    return replace(suggestion, scale=1.0 / largest, note=note)
+
+
+def _scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], wheelbase: float | None) -> Suggestion:
+    """The steering in rad at the road wheel, as far as the curvature that it drives tells."""
+    suggestion = replace(suggestion, scale=1.0)
+    slope, values = _curvature_per_unit(suggestion, signals), suggestion.values
+    if slope is None:
+        large = float(np.nanmax(np.abs(values), initial=0.0)) > _RADIANS
+        note = "too large for rad at the road wheel: find its scale" if large else suggestion.note
+        return replace(suggestion, scale=1.0, note=note)
+    told = f"the curvature follows it with {slope:.4g} 1/m per unit"
+    if wheelbase is None:
+        return replace(suggestion, scale=1.0, note=f"{told}: the scale is about that times the wheelbase")
+    scale = slope * wheelbase
+    if _UNIT[0] < scale < _UNIT[1]:
+        return replace(suggestion, scale=1.0)
+    return replace(suggestion, scale=scale, note=f"{told}; measure the scale at the wheel")
+
+
+def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) -> float | None:
+    """Change of ``omega / v_x`` (1/m) per unit of the signal; ``None`` where they do not go together."""
+    if "v_x" not in signals or "omega" not in signals:
+        return None
+    at = suggestion.topic.time
+    values = suggestion.values
+    v_x, omega = (np.interp(at, signals[name].topic.time, signals[name].values) for name in ("v_x", "omega"))
+    fast = (v_x > _DRIVING * v_x.max(initial=0.0)) & np.isfinite(values) & (v_x > 0)
+    if fast.sum() < 3 or _spread(values[fast]) == 0 or _spread(omega[fast]) == 0:
+        return None
+    curvature = omega[fast] / v_x[fast]
+    if abs(np.corrcoef(values[fast], curvature)[0, 1]) < _AGREES:
+        return None
+    return float(np.polyfit(values[fast], curvature, 1)[0])
+
+
+def _clocks(topics: dict[str, TopicContent], signals: dict[str, Suggestion]) -> list[str]:
+    """Topics of signals whose stamps are of another clock than the odometry's."""
+    if "v_x" not in signals:
+        return []
+    reference = signals["v_x"].topic
+    used = {suggestion.topic.name: suggestion.topic for suggestion in signals.values()}
+    return [
+        f"{topic.name} is stamped {topic.lateness - reference.lateness:+.3g} s against {reference.name}: another clock?"
+        for topic in used.values()
+        if abs(topic.lateness - reference.lateness) > _CLOCK
+    ]
+
+
+def _spread(values: Vector) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.ptp(known)) if len(known) else 0.0

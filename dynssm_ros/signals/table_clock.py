@@ -1,0 +1,139 @@
+"""The time column of a table: which it is, in which unit, and the stamps of the rows."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.errors import BagError
+from dynssm_ros.signals.columns import Column, known_unit
+from dynssm_ros.signals.signal_map import TIME_UNITS, TimeColumn
+from dynssm_ros.signals.tables import Table
+
+_CERTAIN = re.compile(
+    r"^[%# ]*(time|t|timestamp|time_?stamp|stamp|zeit|utc|datetime|date_?time|.*[/.]stamp)$", re.IGNORECASE
+)
+_POSSIBLE = re.compile(r"time|stamp|zeit|clock|utc|date|datum", re.IGNORECASE)
+_OTHER = re.compile(
+    r"lap|delta|diff|duration|left|best|rate|index|frame|sample|count|\bnr\b|\bid\b|dist|odom|row", re.IGNORECASE
+)
+_RISES = 0.5  # share of rows that are later than the one before, in a time column at all
+_STEPS = {"days": 0.0, "s": 5e-5, "ms": 0.3, "us": 300.0, "ns": 3e5}  # least step of a log, 0.3 ms, in each unit
+_EPOCH_S, _SLOWEST_S = (9e8, 4.1e9), 10.0  # seconds since 1970 of the years 1998 to 2099; between rows
+_DAY = 86_400_000_000_000
+_DATENUM, _EXCEL = 719_529, 25_569  # 1970-01-01 in days of MATLAB and of Excel
+_LARGEST = 2**62
+
+
+@dataclass(frozen=True)
+class Clock:
+    """When the rows of a table were measured."""
+
+    column: str
+    unit: str | None  # of its numbers; None for dates and times of day
+    stamps: npt.NDArray[np.int64]  # ns since 1970, midnight, or what the column counts from, (N,)
+    known: npt.NDArray[np.bool_]  # rows that have a time, (N,)
+    told: str  # what it is, in words
+
+
+def clock_of(table: Table, given: TimeColumn | None) -> Clock:
+    """The time of the rows, by the column that is ``given`` or else by name and steps.
+
+    Raises:
+        BagError: there is no time column, or it does not rise.
+    """
+    if given is not None:
+        clock = _clock(table, given.column, table.read([given.column])[given.column], given.unit)
+        if _rising(clock) <= _RISES:
+            raise BagError(
+                f"{table.path}: time column '{clock.column}' rises in {_rising(clock):.0%} of the rows; expected one that "
+                f"rises"
+            )
+        return clock
+    named = [
+        name for name, heading in table.headings.items() if _POSSIBLE.search(heading.bare) or _certain(table, name)
+    ]
+    named = [name for name in named if not _OTHER.search(table.headings[name].bare)]
+    columns = table.read(named)
+    found = [_clock(table, name, column, None) for name, column in columns.items() if not column.reason]
+    found.sort(key=lambda clock: (_rising(clock) < 0.99, not _certain(table, clock.column), -_rising(clock)))
+    if found and _rising(found[0]) > _RISES:
+        return found[0]
+    for name in named:
+        if not found and _certain(table, name):
+            raise BagError(f"{table.path}: time column '{name}': {columns[name].reason}; expected numbers or times")
+    for group in [] if found else table.groups():
+        for name, column in group.items():
+            if not column.reason and not _OTHER.search(table.headings[name].bare) and column.present.all():
+                clock = _clock(table, name, column, None)
+                if _rising(clock) == 1.0:
+                    return clock
+    if found:
+        raise BagError(
+            f"{table.path}: no time column: '{found[0].column}' rises in {_rising(found[0]):.0%} of the rows; expected one "
+            f"that rises (`time: {{column: NAME}}` in the signal map names it)"
+        )
+    raise BagError(
+        f"{table.path}: no time column among {', '.join(table.headings)}; expected one that rises, such as 'time'"
+    )
+
+
+def _certain(table: Table, name: str) -> bool:
+    return bool(_CERTAIN.match(table.headings[name].bare.strip()))
+
+
+def _rising(clock: Clock) -> float:
+    """Share of rows that are later than the one before."""
+    steps = np.diff(clock.stamps[clock.known])
+    return float((steps > 0).mean()) if len(steps) else 0.0
+
+
+def _clock(table: Table, name: str, column: Column, unit: str | None) -> Clock:
+    """The clock that a column is.
+
+    Raises:
+        BagError: nothing in it is a time.
+    """
+    if column.reason:
+        raise BagError(f"{table.path}: time column '{name}': {column.reason}; expected numbers, dates or times of day")
+    known = np.isfinite(column.values)
+    if column.is_time:
+        stamps = np.zeros(len(known), np.int64) if column.exact is None else column.exact.copy()
+        if "time of day" in column.type:
+            back = np.diff(stamps[known], prepend=stamps[known][:1]) < -_DAY // 2
+            stamps[known] += np.cumsum(back) * _DAY  # past midnight
+        return Clock(name, None, stamps, known, f"time from column '{name}' ({column.type})")
+    headed = known_unit(table.headings[name].unit)
+    by_heading = headed if headed in TIME_UNITS else None
+    chosen = unit or by_heading or _unit_by_steps(column.values[known])
+    values = np.where(known, column.values, 0.0)
+    exact = column.exact
+    if chosen == "days":
+        first = float(values[known][0]) if known.any() else 0.0
+        zero = _DATENUM if first > _DATENUM else _EXCEL if first > _EXCEL else 0
+        values, exact = values - zero, None
+    factor = TIME_UNITS[chosen]
+    known &= np.abs(values) < _LARGEST / factor
+    if exact is not None:
+        stamps = np.where(known, exact, 0) * factor
+    else:
+        whole = np.floor(np.where(known, values, 0.0))
+        stamps = whole.astype(np.int64) * factor + np.rint((np.where(known, values, 0.0) - whole) * factor).astype(
+            np.int64
+        )
+    guessed = "" if unit or by_heading else ", by its steps"
+    return Clock(name, chosen, stamps, known, f"time in {chosen} from column '{name}'{guessed}")
+
+
+def _unit_by_steps(values: npt.NDArray[np.float64]) -> str:
+    """The unit in which times since 1970 are of our days, and else that in which rows are 0.3 ms or more apart."""
+    steps = np.diff(values)
+    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    for unit in ("s", "ms", "us", "ns"):
+        seconds = TIME_UNITS[unit] / 1e9
+        if _EPOCH_S[0] < float(values[0]) * seconds < _EPOCH_S[1] and step * seconds < _SLOWEST_S:
+            return unit
+    return max((unit for unit, least in _STEPS.items() if step >= least), key=lambda unit: _STEPS[unit])

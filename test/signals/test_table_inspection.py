@@ -1,0 +1,161 @@
+"""What an inspection says of tables as people have them: exports of Excel, MATLAB, loggers; and the map it suggests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.inspection import Inspection, inspect
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.signal_map import SignalMap
+
+WHEELBASE = 0.3
+T = np.arange(0.0, 20.0, 0.02)
+DELTA, V_X = 0.2 * np.sin(T), 3.0 + np.sin(0.3 * T)
+OMEGA, V_Y = V_X * np.tan(DELTA) / WHEELBASE, 0.01 * np.sin(T)
+
+
+def suggested(found: Inspection) -> SignalMap:
+    """The signal map, read back."""
+    return SignalMap.model_validate(yaml.safe_load(found.signal_map()))
+
+
+def rows(path: Path, head: str, form: str, *columns: Any, encoding: str = "utf-8", comma: bool = False) -> Path:
+    """Writes a text table whose rows have the ``columns`` in the form ``form``, with a decimal comma if wanted."""
+    lines = [form.format(*cells) for cells in zip(*columns, strict=True)]
+    text = head + "\n".join(line.replace(".", ",") if comma else line for line in lines) + "\n"
+    path.write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    return path
+
+
+def german(path: Path) -> Path:
+    clock = [f"13:{int(t) // 60:02d}:{int(t) % 60:02d}.{round(t * 1000) % 1000:03d}" for t in T]
+    head = (
+        "Messung 7;;;;;\nFahrer: Müller;;;;;\n\nZeit;Geschwindigkeit [km/h];Gierrate [°/s];Quergeschwindigkeit [m/s];"
+        "Lenkwinkel [°];Gaspedal [%]\n"
+    )
+    columns = (clock, V_X * 3.6, np.degrees(OMEGA), V_Y, np.degrees(DELTA) * 14, 40 + 10 * np.sin(T))
+    return rows(path, head, "{};{:.6f};{:.6f};{:.6f};{:.6f};{:.1f}", *columns, encoding="cp1252", comma=True)
+
+
+def matlab(path: Path) -> Path:
+    head = "time,vx,vy,yawRate,steer_angle,throttle_pos,steer_cmd,throttle_cmd\ns,m/s,m/s,deg/s,deg,%,deg,%\n"
+    steer = np.degrees(DELTA)
+    return rows(
+        path,
+        head,
+        "{},{},{},{},{},{},{},{}",
+        T,
+        V_X,
+        V_Y,
+        np.degrees(OMEGA),
+        steer,
+        40 + 10 * np.sin(T),
+        steer,
+        41 + 0 * T,
+    )
+
+
+def night(path: Path) -> Path:
+    seconds = (86_390 + T) % 86_400
+    clock = [f"{int(s // 3600):02d}:{int(s // 60 % 60):02d}:{s % 60:06.3f}" for s in seconds]
+    head = "Time of Day\tSpeed (mph)\tLateral Velocity (m/s)\tYaw Rate (rad/s)\tSteering Angle\tThrottle\tGear\tState\n"
+    state = ["OK" if k % 7 else "WARN" for k in range(len(T))]
+    columns = (clock, V_X / 0.44704, V_Y, OMEGA, DELTA, 0.4 + 0.1 * np.sin(T), 3 + 0 * T, state)
+    return rows(path, head, "{}\t{}\t{}\t{}\t{}\t{}\t{}\t{}", *columns, encoding="utf-16")
+
+
+def logger(path: Path) -> Path:
+    x, y, theta = (
+        np.cumsum(0.02 * one)
+        for one in (V_X * np.cos(np.cumsum(0.02 * OMEGA)), V_X * np.sin(np.cumsum(0.02 * OMEGA)), OMEGA)
+    )
+    duty = [f"{0.4 + 0.001 * (k % 9):.3f}" if k != 500 else "ERR" for k in range(len(T))]
+    battery = ["" if k % 10 else "12.1" for k in range(len(T))]
+    head = "# logger v2, 3 sensors\n# boot_ms,x_m,y_m,yaw_deg,servo,duty,battery\n"
+    columns = (123_456 + np.round(T * 1e3).astype(int), x, y, np.degrees(theta) % 360, DELTA, duty, battery)
+    return rows(path, head, "{},{},{},{},{},{},{}", *columns)
+
+
+def plotted(path: Path) -> Path:
+    """As PlotJuggler exports topics, in an order of its own and stamped since 1970."""
+    head = (
+        "__time,/odom/twist/twist/angular/z,/odom/twist/twist/linear/x,/odom/twist/twist/linear/y,/joints/steering/position,"
+        "/joints/throttle/position\n"
+    )
+    return rows(path, head, "{:.6f},{},{},{},{},{}", 1_700_000_000 + T, OMEGA, V_X, V_Y, DELTA, 0.4 + 0.1 * np.sin(T))
+
+
+TABLES = {
+    "german.csv": (german, 4, {"throttle_feedback": ("Gaspedal [%]", "%"), "v_x": ("Geschwindigkeit [km/h]", "km/h")}),
+    "matlab.csv": (matlab, 2, {"omega": ("yawRate", "deg/s"), "throttle_command": ("throttle_cmd", "%")}),
+    "night.txt": (night, 1, {"v_x": ("Speed (mph)", "mph"), "omega": ("Yaw Rate (rad/s)", "1")}),
+    "logger.csv": (logger, 2, {"theta": ("yaw_deg", "deg"), "throttle_feedback": ("duty", "1")}),
+    "plotted.csv": (plotted, 1, {"v_x": ("/odom/twist/twist/linear/x", "1")}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_as_people_have_them_give_the_signals_that_are_in_them(tmp_path: Path, name: str) -> None:
+    write, above, sources = TABLES[name]
+    found = inspect(write(tmp_path / name), WHEELBASE)
+    assert f"{above} line{'s' * (above > 1)} above the first row" in found.notes[0]
+    assert found.missing == ()
+    mapped = suggested(found)
+    assert {one: (mapped.signals[one].column, mapped.signals[one].unit) for one in sources} == sources
+    recording = extract([tmp_path / name], mapped, 50.0, drop_bad=name == "logger.csv")
+    assert_driven(recording, 0.05 if name == "logger.csv" else 1e-4)
+
+
+def assert_driven(recording: Recording, tolerance: float) -> None:
+    """That the recording has the drive of this page."""
+    t = (recording.time - recording.time[0]) / 1e9 + (
+        T[-1] - recording.duration + 0.02 if len(recording) < len(T) else 0.0
+    )
+    rows = slice(20, 900)
+    np.testing.assert_allclose(recording["v_x"][rows], np.interp(t, T, V_X)[rows], rtol=tolerance + 0.01)
+    np.testing.assert_allclose(recording["omega"][rows], np.interp(t, T, OMEGA)[rows], atol=tolerance * 8)
+    np.testing.assert_allclose(recording["delta_fb"][rows], np.interp(t, T, DELTA)[rows], atol=tolerance / 2 + 0.02)
+    assert 0.25 < recording["r_fb"].mean() < 0.5
+
+
+def test_columns_are_told_with_type_rate_range_and_zeros(tmp_path: Path) -> None:
+    found = inspect(logger(tmp_path / "log.csv"))
+    battery, duty = found.topics["battery"], found.topics["duty"]
+    assert (battery.count, battery.limits, round(battery.rate, 6)) == (100, (12.1, 12.1, 0.0), 5.0)
+    assert found.topics["x_m"].unit == "m"
+    assert duty.reason == "1 of its cells is no number, first 'ERR' in row 501"
+    assert f"duty: {duty.reason}" in found.notes
+    assert "no column is v_x, v_y, omega; velocities follow from the poses" in found.notes
+    assert found.notes[0].endswith("time in ms from column 'boot_ms'")
+
+
+def test_a_column_that_cannot_be_read_is_listed_with_its_reason(tmp_path: Path) -> None:
+    found = inspect(night(tmp_path / "log.txt"))
+    assert found.topics["State"].reason == "text, 'WARN' first"
+    nested = pa.array([[1.0, 2.0]] * len(T))
+    table = {"t": T, "speed": V_X, "path": nested, "none": pa.nulls(len(T)), "on": V_X > 3, "kind": ["a"] * len(T)}
+    pq.write_table(pa.table(table), tmp_path / "log.parquet")
+    topics = inspect(tmp_path / "log.parquet").topics
+    reasons = {name: one.reason for name, one in topics.items() if one.reason}
+    assert reasons == {
+        "path": "list<element: double>, no number", "none": "no cell has a value", "kind": "text, 'a' first"
+    }  # fmt: skip
+    assert topics["on"].limits is not None
+
+
+def test_a_fast_speed_and_large_angles_without_units_are_asked_about(tmp_path: Path) -> None:
+    head = "t,speed,v_y,yaw_rate,steering,throttle\n"
+    path = rows(
+        tmp_path / "log.csv", head, "{},{},{},{},{},{}", T, 60 * V_X, V_Y, np.degrees(OMEGA), DELTA, 0.4 + 0 * T
+    )
+    text = inspect(path).signal_map()
+    assert "# too fast for m/s: find its unit\n  v_x: {column: speed}" in text
+    assert "# large for rad: deg?\n  omega: {column: yaw_rate}" in text

@@ -1,0 +1,312 @@
+"""Tables as logs: the recording of a bag with the same numbers, whatever the file; and one line for what is none."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+import pytest
+import scipy.io
+
+from dynssm_ros.errors import BagError, ConfigurationError, UserError
+from dynssm_ros.signals.decoding import decoders
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.inspection import inspect
+from dynssm_ros.signals.logs import open_log
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
+
+START = 1_700_000_000_123_456_789
+DEFAULT = load_signal_map("default")
+N = 60
+
+
+def table_map(**columns: Any) -> SignalMap:
+    """A map of columns that are named as their signals, with other sources for ``columns``."""
+    sources = {name: {"column": name} for name in DEFAULT.signals} | {
+        name: source for name, source in columns.items() if name != "time"
+    }
+    return SignalMap(name="own", time=columns.get("time"), signals={k: v for k, v in sources.items() if v})
+
+
+@pytest.fixture
+def columns() -> dict[str, np.ndarray]:
+    """The drive of the fixture ``drive`` as columns; heading as a quaternion has it."""
+    t = np.arange(N) / 100.0
+    theta = 2.0 * np.arctan2(np.sin(0.15), np.cos(0.15))
+    return {
+        "time": START + np.round(t * 1e9).astype(np.int64), "v_x": 10 + t, "v_y": 0.1 * t, "omega": -0.2 * t,
+        "x": 10 * t, "y": np.ones(N), "theta": np.full(N, theta), "throttle_feedback": np.full(N, 0.5),
+        "steering_feedback": 0.01 * t, "throttle_command": np.full(N, 0.55), "steering_command": 0.01 * t + 0.002,
+    }  # fmt: skip
+
+
+def write_csv(path: Path, columns: dict[str, Any], **options: Any) -> None:
+    pa.csv.write_csv(pa.table(columns), path, pa.csv.WriteOptions(**options))
+
+
+def write_struct(path: Path, columns: dict[str, Any]) -> None:
+    scipy.io.savemat(path, {"log": columns, "car": "orca"})
+
+
+WRITERS: dict[str, Callable[[Path, dict[str, Any]], None]] = {
+    "log.csv": write_csv,
+    "tab.txt": lambda path, columns: write_csv(path, columns, delimiter="\t", quoting_style="none"),
+    "log.parquet": lambda path, columns: pq.write_table(pa.table(columns), path),
+    "log.mat": scipy.io.savemat,
+    "packed.mat": lambda path, columns: scipy.io.savemat(path, columns, do_compression=True, oned_as="column"),
+    "struct.mat": write_struct,
+    "log.npz": lambda path, columns: np.savez(path, **columns, T_s=0.01),
+    "packed.npz": lambda path, columns: np.savez_compressed(path, **columns),
+}
+
+
+def assert_same(found: Recording, expected: Recording) -> None:
+    np.testing.assert_array_equal(found.time, expected.time)
+    np.testing.assert_array_equal(found.segment, expected.segment)
+    np.testing.assert_allclose(found.matrix, expected.matrix, rtol=0, atol=1e-15)
+    for name in ("x", "y", "theta"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_table_gives_the_recording_of_a_bag_with_the_same_numbers(
+    make_bag: Any, make_ros1_bag: Any, drive: Any, tmp_path: Path, columns: Any, name: str
+) -> None:
+    WRITERS[name](tmp_path / name, columns)
+    found = extract([tmp_path / name], table_map(), 40.0)
+    assert_same(found, extract([make_bag(drive(N))], DEFAULT, 40.0))
+    assert_same(found, extract([make_ros1_bag(drive(N))], DEFAULT, 40.0))
+    assert (found.info.commands, found.info.signal_map, found.info.source) == ("topics", "own", (name,))
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.parquet", "log.mat", "log.npz"])
+def test_what_a_table_is_follows_from_its_content(tmp_path: Path, columns: Any, name: str) -> None:
+    WRITERS[name](tmp_path / name, columns)
+    (tmp_path / name).rename(tmp_path / "data.log")
+    assert len(extract([tmp_path / "data.log"], table_map(), 40.0)) == 24
+
+
+def test_units_curves_and_offsets_are_those_of_the_map(tmp_path: Path, columns: Any) -> None:
+    as_logged = {
+        **columns, "v_x": columns["v_x"] * 3.6, "omega": np.degrees(columns["omega"]), "y": columns["y"] * 100,
+        "theta": np.degrees(columns["theta"]) % 360, "throttle_feedback": columns["throttle_feedback"] * 100 + 5,
+        "steering_feedback": -np.degrees(columns["steering_feedback"]) * 14,
+    }  # fmt: skip
+    write_csv(tmp_path / "log.csv", as_logged)
+    sources = {
+        "v_x": {"unit": "km/h"}, "omega": {"unit": "deg/s"}, "y": {"unit": "cm"}, "theta": {"unit": "deg"},
+        "throttle_feedback": {"unit": "%", "curve": [[0, -5], [105, 100]]},
+        "steering_feedback": {"unit": "deg", "scale": -1 / 14},
+    }  # fmt: skip
+    mapped = table_map(**{name: {"column": name} | source for name, source in sources.items()})
+    write_csv(tmp_path / "plain.csv", columns)
+    found, plain = (extract([tmp_path / f"{k}.csv"], m, 40.0) for k, m in (("log", mapped), ("plain", table_map())))
+    np.testing.assert_allclose(found.matrix, plain.matrix, atol=1e-12)
+    np.testing.assert_allclose(found["theta"], plain["theta"], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("unit", "time"),
+    [("s", lambda t: t), ("ms", lambda t: np.round(t * 1e3).astype(int)), ("us", lambda t: t * 1e6), 
+     ("ns", lambda t: t * 1e9),
+     ("days", lambda t: 739_000 + t / 86400), ("days", lambda t: 46_000 + t / 86400), ("s", lambda t: 1.7e9 + t),
+     ("ms", lambda t: 1_700_000_000_000 + np.round(t * 1e3).astype(int)), ("us", lambda t: 1.7e15 + t * 1e6)],
+)  # fmt: skip
+def test_the_unit_of_time_follows_from_its_steps(tmp_path: Path, columns: Any, unit: str, time: Any) -> None:
+    write_csv(tmp_path / "log.csv", columns | {"time": time(np.arange(N) / 100.0)})
+    found, told = (
+        extract([tmp_path / "log.csv"], table_map(time=one), 40.0) for one in (None, {"column": "time", "unit": unit})
+    )
+    assert found.duration == pytest.approx(0.6, abs=1e-5)
+    np.testing.assert_array_equal(found.time, told.time)
+
+
+DATES = {
+    "2026-11-29 23:59:59.{:03d}": 1_795_996_799, "2026-11-29T23:59:59.{:03d}Z": 1_795_996_799,
+    "2026-11-30T01:59:59.{:03d}+02:00": 1_795_996_799, "29.11.2026 23:59:59,{:03d}": 1_795_996_799,
+    "11/29/2026 11:59:59.{:03d} PM": 1_795_996_799, "29/11/2026 23:59:59.{:03d}": 1_795_996_799, "23:59:59.{:03d}": 86_399,
+    "23:59:59:{:03d}": 86_399, "59:59.{:03d}": 3_599, "11:59:59.{:03d} pm": 86_399,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", DATES)
+def test_dates_and_times_of_day_are_read(tmp_path: Path, columns: Any, form: str) -> None:
+    write_csv(tmp_path / "log.csv", columns | {"time": [form.format(10 * k) for k in range(N)]}, delimiter=";")
+    found = extract([tmp_path / "log.csv"], table_map(), 40.0)
+    assert found.time[0] == DATES[form] * 1_000_000_000
+    assert len(found) == 24
+
+
+def test_a_time_of_day_goes_on_past_midnight(tmp_path: Path, columns: Any) -> None:
+    stamps = [f"{'23:59:59' if k < 30 else '00:00:00'}.{(700 + 10 * k) % 1000:03d}" for k in range(N)]
+    write_csv(tmp_path / "log.csv", columns | {"time": stamps})
+    found = extract([tmp_path / "log.csv"], table_map(), 40.0)
+    assert (len(found), set(found.segment)) == (24, {0})
+
+
+@pytest.mark.parametrize("kind", ["ns", "us", "ms"])
+def test_timestamps_of_parquet_are_read(tmp_path: Path, columns: Any, kind: str) -> None:
+    stamps = pa.array(columns["time"]).cast(pa.timestamp("ns")).cast(pa.timestamp(kind), safe=False)
+    pq.write_table(pa.table(columns | {"time": stamps}), tmp_path / "log.parquet")
+    assert len(extract([tmp_path / "log.parquet"], table_map(), 40.0)) in (23, 24)
+
+
+def test_cells_without_a_value_are_no_samples(tmp_path: Path, columns: Any) -> None:
+    """As where slow sensors share a table with fast ones."""
+    sparse = [f"{value!r}" if k % 5 == 0 else "" for k, value in enumerate(columns["steering_feedback"].tolist())]
+    write_csv(tmp_path / "log.csv", columns | {"steering_feedback": sparse})
+    recording = extract([tmp_path / "log.csv"], table_map(), 100.0)
+    assert recording.info.held_periods["steering_feedback"] == pytest.approx(0.05)
+
+
+def test_cells_that_are_no_numbers_are_told_or_left_out(tmp_path: Path, columns: Any) -> None:
+    odd = ["ERR" if k in (20, 30) else f"{value!r}" for k, value in enumerate(columns["v_x"].tolist())]
+    write_csv(tmp_path / "log.csv", columns | {"v_x": odd})
+    with pytest.raises(
+        BagError, match=r"column 'v_x' for v_x: 2 of its cells are no number, first 'ERR' in row 21;.*--drop-bad"
+    ):
+        extract([tmp_path / "log.csv"], table_map(), 40.0)
+    recording = extract([tmp_path / "log.csv"], table_map(), 40.0, drop_bad=True)
+    assert recording.info.notes == ("v_x: dropped 2 samples not finite",)
+    write_csv(tmp_path / "log.csv", columns | {"v_x": ["yes"] * N})
+    with pytest.raises(BagError, match="column 'v_x' for v_x: text, 'yes' first; expected numbers"):
+        extract([tmp_path / "log.csv"], table_map(), 40.0, drop_bad=True)
+
+
+def test_stamps_that_run_backwards_are_told_or_left_out(tmp_path: Path, columns: Any) -> None:
+    columns["time"][10] -= 10**9
+    write_csv(tmp_path / "log.csv", columns)
+    with pytest.raises(BagError, match=r"column 'v_x': v_x: sample 10 .* is with a stamp that runs backwards"):
+        extract([tmp_path / "log.csv"], table_map(), 40.0)
+    assert len(extract([tmp_path / "log.csv"], table_map(), 40.0, drop_bad=True)) == 24
+
+
+def test_a_last_line_that_was_cut_off_is_left_out(tmp_path: Path, columns: Any) -> None:
+    write_csv(tmp_path / "log.csv", columns)
+    text = (tmp_path / "log.csv").read_text()
+    (tmp_path / "log.csv").write_text(text[:-60])
+    recording = extract([tmp_path / "log.csv"], table_map(), 40.0)
+    assert len(recording) == 24
+    assert recording.info.notes == (f"left out 1 line with another number of cells, first line {N + 1}",)
+
+
+# --- what is no table, or does not fit the map --------------------------------------------------
+
+REFUSED = {
+    "empty": ("", "the file is empty"),
+    "blank": ("\n \n", "the file is empty"),
+    "text": ("Dear all,\nthis is a text, with commas, here.\nYours\n" * 4, "neither a table nor a bag; expected columns of"),
+    "one column": ("v\n1\n2\n3\n", "neither a table"),
+    "headings alone": ("time,v_x,v_y\n", "neither a table"),
+    "json": (json.dumps({"a": [1, 2], "b": {"c": "x"}}, indent=1), "neither a table"),
+    "twice": ("time,v,time\n" + "1,2,3\n" * 5, "columns 1 and 3 are all named 'time'"),
+    "other lengths": ("t,v\n" + "".join(f"{k},2{',3' * (k % 3)}\n" for k in range(40)), "lines with another number of cells"),
+    "no time": ("a,b\n1,2\n3,1\n2,2\n", "no time column among a, b"),
+    "time stands": ("time,b\n" + "1,2\n" * 9, "'time' rises in 0% of the rows"),
+    "time falls": ("time,b\n" + "".join(f"{-k},{k % 3}\n" for k in range(9)), "'time' rises in 0% of the rows"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_is_no_table_is_one_line(tmp_path: Path, what: str) -> None:
+    content, said = REFUSED[what]
+    path = tmp_path / "log.csv"
+    path.write_text(content)
+    with pytest.raises(BagError, match=r"^[^\n]*$") as caught:
+        inspect(path)
+    assert said in str(caught.value)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("write", "said"),
+    [
+        (lambda path: path.write_bytes(bytes(range(256)) * 9), "not a bag and not a table"),
+        (lambda path: path.write_bytes(b"PAR1" + bytes(50)), "cannot be read"),
+        (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(50)), "a zip file that cannot be read as NumPy's .npz"),
+        (lambda path: path.write_bytes(b"MATLAB 7.3 MAT-file, Platform"), r"version 7.3 \(HDF5\); expected .*'-v7'"),
+        (
+            lambda path: path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(300)),
+            "cannot be read as a MATLAB file|not a table",
+        ),
+        (lambda path: np.savez(path.open("wb"), time=np.arange(9), v=np.arange(8)), "v of 8 values, time of 9 values"),
+        (lambda path: np.savez(path.open("wb"), a=np.ones((9, 2)), b=1.0), "a: a matrix of 9 x 2; b: a single value"),
+        (
+            lambda path: np.savez(path.open("wb"), a=np.array([{}, {}])),
+            "not a table .a: Object arrays cannot be loaded",
+        ),
+        (lambda path: np.savez_compressed(path.open("wb"), a=np.zeros(20_000_000)), "unpacks to 152 MB"),
+        (lambda path: scipy.io.savemat(path, {"a": "x", "b": 1.0}, appendmat=False), "not a table"),
+        (lambda path: pq.write_table(pa.table({"time": pa.array([], pa.int64())}), path), "a table without rows"),
+    ],
+)
+def test_files_that_hold_no_table_are_one_line(tmp_path: Path, write: Any, said: str) -> None:
+    write(tmp_path / "data")
+    with pytest.raises(BagError, match=said) as caught, open_log(tmp_path / "data"):
+        pass
+    assert "\n" not in str(caught.value)
+
+
+def test_tables_and_maps_of_topics_do_not_go_together(make_bag: Any, drive: Any, tmp_path: Path, columns: Any) -> None:
+    write_csv(tmp_path / "log.csv", columns)
+    with pytest.raises(
+        BagError, match=r"log.csv: a table, and signal map default names topics; expected one with columns"
+    ):
+        extract([tmp_path / "log.csv"], DEFAULT, 40.0)
+    with pytest.raises(UserError, match="signal map own: names columns of a table"):
+        extract([make_bag(drive(5))], table_map(), 40.0)
+    with pytest.raises(ConfigurationError, match="names columns of a table"):
+        decoders(table_map())
+    with pytest.raises(BagError, match=r"column 'speed' is missing; the table has time, v_x, v_y"):
+        extract([tmp_path / "log.csv"], table_map(v_x={"column": "speed"}), 40.0)
+    with pytest.raises(BagError, match="time column 'y' rises in 0% of the rows"):
+        extract([tmp_path / "log.csv"], table_map(time={"column": "y"}), 40.0)
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ({"column": "v", "topic": "/a"}, "column 'v' and topic '/a'; expected either"),
+        ({"topic": "/a", "type": "a/msg/B"}, "field is missing"),
+        ({}, "topic is missing; expected topic, type and field, or the column of a table"),
+        ({"column": "v", "unit": "furlong"}, "expected one of m/s km/h"),
+        ({"topic": "/a", "type": "a/msg/B", "field": "c"}, "some are columns of a table, others fields of topics"),
+    ],
+)
+def test_a_source_is_a_field_or_a_column(source: dict[str, str], said: str) -> None:
+    sources: dict[str, Any] = {name: {"column": name} for name in DEFAULT.signals}
+    with pytest.raises(ValueError, match=said):
+        SignalMap(name="own", signals=sources | {"v_x": source})
+
+
+def test_without_command_columns_or_topics_there_are_none(
+    make_bag: Any, drive: Any, tmp_path: Path, columns: Any
+) -> None:
+    del columns["throttle_command"], columns["steering_command"]
+    write_csv(tmp_path / "log.csv", columns)
+    for found in (
+        extract([tmp_path / "log.csv"], table_map(), 40.0),
+        extract([make_bag([one for one in drive(N) if "command" not in one[0]])], DEFAULT, 40.0),
+    ):
+        assert found.info.commands == "none"
+        (note,) = found.info.notes
+        assert note.startswith("no commands in the log (")
+        assert not found["r_cmd"].any()
+
+
+def test_a_table_of_many_rows_is_read_in_pieces(tmp_path: Path) -> None:
+    """Cells are never taken one by one: 300 000 of them would take as many microseconds, several times over."""
+    n = 100_000
+    t = np.arange(n) / 1000.0
+    one = pa.array(np.sin(t))
+    write_csv(tmp_path / "log.csv", {"time": t} | dict.fromkeys(DEFAULT.signals, one))
+    with open_log(tmp_path / "log.csv") as table:
+        assert abs(table.rows / n - 1) < 0.2  # type: ignore[union-attr]
+    assert len(extract([tmp_path / "log.csv"], table_map(), 100.0)) == n // 10
