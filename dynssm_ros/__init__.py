@@ -8,10 +8,14 @@ libraries: they come in with the function that needs them.
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.4.0"
+
+# ONNX Runtime reports to its maker, over the network, unless it finds this as it is loaded
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
     from dynssm_ros.api.calibrate import calibrate

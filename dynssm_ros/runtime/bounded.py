@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dynssm_ros.errors import ArtifactError
+from dynssm_ros.errors import ArtifactError, UserError
 
 TIME_LIMIT_S = 15.0
 """From the start of the process to its answer."""
@@ -46,8 +46,10 @@ def ask(module: str, path: Path, *task: Any) -> None:
             start_new_session=True,
             check=False,
         )
-    except (subprocess.TimeoutExpired, OSError) as error:
-        raise ArtifactError(f"{path}: {_TOO_SLOW} ({error})") from error
+    except subprocess.TimeoutExpired as error:
+        raise ArtifactError(f"{path}: {_TOO_SLOW}; expected an answer within {TIME_LIMIT_S:g} s") from error
+    except OSError as error:
+        raise ArtifactError(f"{path}: cannot be tried in a process of its own ({error.strerror})") from error
     if done.returncode in (-signal.SIGXCPU, -signal.SIGALRM, -signal.SIGKILL):
         raise ArtifactError(f"{path}: {_TOO_SLOW}; expected {_PROCESSOR_S} s and {_MEMORY >> 20} MB to be enough")
     if done.returncode:
@@ -56,19 +58,26 @@ def ask(module: str, path: Path, *task: Any) -> None:
         raise ArtifactError(refusal)
 
 
-def answer(judge: Callable[..., str], prepare: Callable[[], None] = lambda: None) -> None:
+def answer(judge: Callable[..., object], prepare: Callable[[], None] = lambda: None) -> None:
     """In the other process: judges what standard input brings, within the limits.
 
     Args:
-        judge: from path and task to the refusal, empty if there is none; that goes to standard output.
+        judge: path and task; the exception that it raises is the answer.
         prepare: is called first, without limits.
     """
     answered = os.dup(1)
     os.dup2(2, 1)  # what libraries print is no answer
     prepare()
-    task = pickle.load(sys.stdin.buffer)  # noqa: S301 - from the process that started this one
+    path, *task = pickle.load(sys.stdin.buffer)  # noqa: S301 - from the process that started this one
     _limit()
-    os.write(answered, json.dumps(judge(*task)).encode())
+    refusal = ""
+    try:
+        judge(path, *task)
+    except UserError as error:
+        refusal = str(error)
+    except Exception as error:  # of ONNX Runtime, or no memory
+        refusal = f"{path}: cannot be used ({' '.join(f'{type(error).__name__}: {error}'.split())[:200]})"
+    os.write(answered, json.dumps(refusal).encode())
 
 
 def _limit() -> None:

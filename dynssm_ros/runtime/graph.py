@@ -103,13 +103,5 @@ def try_graph(file: Path, content: bytes, rows: int, columns: int) -> None:
     ask("dynssm_ros.runtime.graph", file, content, rows, columns)
 
 
-def _refusal(file: Path, content: bytes, rows: int, columns: int) -> str:
-    try:
-        Graph(file, content, rows, columns)
-    except ArtifactError as error:
-        return str(error)
-    return ""
-
-
 if __name__ == "__main__":
-    answer(_refusal)
+    answer(Graph)

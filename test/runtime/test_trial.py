@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -207,13 +210,32 @@ def test_the_graph_of_a_first_model_is_opened_in_its_own_process(small_model: Pa
 
     use(small_model)
     assert "maps [('window', [5, 7])]" in refusal(lambda: use(small_model, rows=6))
+    assert "model.onnx: cannot be used (MemoryError: " in refusal(lambda: use(small_model, rows=10**9))
     assert refusal(lambda: use(vast_model)).startswith(f"{vast_model / ONNX}: ONNX Runtime refuses it (")
 
 
-def test_a_trial_whose_process_ends_is_a_refusal(tmp_path: Path) -> None:
-    assert (
-        refusal(lambda: ask("no_such_module", tmp_path)) == f"{tmp_path}: the process that tried it ended with status 1"
-    )
+@pytest.mark.timeout(60)
+def test_opening_a_graph_leaves_no_telemetry_at_home(small_model: Path, tmp_path: Path) -> None:
+    script = """import sys, dynssm_ros.runtime.artifact as artifact, dynssm_ros.runtime.onnx_model as onnx_model
+onnx_model.OnnxModel(artifact.open_artifact(sys.argv[1]))"""
+    kept = {
+        name: value for name, value in os.environ.items() if name not in ("ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME")
+    }
+    subprocess.run([sys.executable, "-c", script, small_model], env=kept | {"HOME": str(tmp_path)}, check=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_trial_whose_process_ends_lasts_or_does_not_begin_is_a_refusal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def words() -> str:
+        return refusal(lambda: ask("no_such_module", tmp_path)).removeprefix(f"{tmp_path}: ")
+
+    assert words() == "the process that tried it ended with status 1"
+    monkeypatch.setattr("dynssm_ros.runtime.bounded.TIME_LIMIT_S", 1e-3)
+    assert words() == "takes too long or too much memory; expected an answer within 0.001 s"
+    monkeypatch.setattr("sys.executable", str(tmp_path / "python"))
+    assert words() == "cannot be tried in a process of its own (No such file or directory)"
 
 
 def test_a_model_whose_inputs_say_how_long_it_runs_is_refused_unopened(
