@@ -31,9 +31,10 @@ from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.bags import write_bag
 from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.inspection import inspect
 from dynssm_ros.signals.recording import METADATA_KEY, Recording
 from dynssm_ros.signals.season import Season
-from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import load_vehicle
 
@@ -272,6 +273,40 @@ def bags(_: Path, folder: Path) -> dict[str, Kind]:
     return {"damaged": Kind(DAMAGE, write_file, use), "edited": Kind(EDITS, write, use)}
 
 
+def tables(_: Path, folder: Path) -> dict[str, Kind]:
+    t = np.arange(0.0, 3.0, 0.02)
+    columns = {
+        "t": t,
+        "vx": 3.0 + t,
+        "vy": 0.0 * t,
+        "yaw_rate": np.cos(t),
+        "steering": np.sin(t) / 3,
+        "throttle": 0.4 + 0 * t,
+    }
+    rows = [[f"{value:.3f}" for value in row] for row in np.column_stack(list(columns.values())).tolist()]
+    text = [list(columns), *rows]
+    (folder / "csv").write_text("".join(map(_line, text)))
+    pq.write_table(pa.table(columns), folder / "parquet", write_page_checksum=True)
+    with (folder / "npz").open("wb") as file:
+        np.savez_compressed(file, **columns)
+    contents = {name: (folder / name).read_bytes() for name in ("csv", "parquet", "npz")}
+    mapped = SignalMap.model_validate(yaml.safe_load(inspect(folder / "csv").signal_map()))
+
+    def use(path: Path) -> None:
+        assert inspect(path).topics
+        assert np.isfinite(extract([path], mapped, 50.0, drop_bad=True).matrix).all()
+
+    def write(path: Path, what: Any) -> None:
+        name, damage = what
+        path.write_bytes(damaged(contents[name], damage))
+
+    def write_cells(path: Path, edits: Any) -> None:
+        path.write_text("".join(map(_line, edited(text, edits))), errors="replace")
+
+    damage = st.tuples(st.sampled_from(list(contents)), DAMAGE)
+    return {"damaged": Kind(damage, write, use), "edited": Kind(EDITS, write_cells, use)}
+
+
 def model_folders(model: Path, _: Path) -> dict[str, Kind]:
     card = yaml.safe_load((model / CARD).read_bytes())
     names = sorted(path.name for path in model.iterdir())
@@ -301,7 +336,7 @@ def model_folders(model: Path, _: Path) -> dict[str, Kind]:
 
 KINDS = {
     "vehicle": vehicles, "signals": signal_maps, "model file": model_files, "track": tracks, "recording": recordings,
-    "season": seasons, "bag": bags, "model folder": model_folders,
+    "season": seasons, "bag": bags, "table": tables, "model folder": model_folders,
 }  # fmt: skip
 
 
@@ -312,7 +347,7 @@ def test_a_file_from_outside_is_read_or_refused_in_one_line(
     name: str, form: str, many: bool, laps_bag: Path, small_model: Path, tmp_path: Path
 ) -> None:
     kind = KINDS[name](small_model if name == "model folder" else laps_bag, tmp_path)[form]
-    target = tmp_path / {"recording": "f.parquet", "track": "f.csv"}.get(name, "f.yaml")
+    target = tmp_path / {"recording": "f.parquet", "track": "f.csv", "table": "f.csv"}.get(name, "f.yaml")
     if name in ("bag", "model folder"):
         target = tmp_path / "folder"
     refusals: list[str] = []

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -35,8 +40,8 @@ def npz_arrays(path: Path) -> tuple[Arrays, dict[str, str]]:
     except BagError:
         raise
     except Exception as error:  # zipfile and numpy raise what their decoders do
-        raise BagError(f"{path}: a zip file that cannot be read as NumPy's .npz ({_one_line(error)})") from error
-    return _vectors(found)
+        raise BagError(f"{path}: a zip file that cannot be read as NumPy's .npz ({one_line(error)})") from error
+    return vectors(found)
 
 
 def _array(archive: Any, name: str) -> Any:
@@ -44,12 +49,13 @@ def _array(archive: Any, name: str) -> Any:
     try:
         return archive[name]
     except ValueError as error:
-        return _one_line(error)
+        return one_line(error)
 
 
 def mat_arrays(path: Path) -> tuple[Arrays, dict[str, str]]:
-    """The vectors of a MATLAB file up to version 7.2 by name, those of its only struct if it has no others, and what else
-    is in it, with the reason why it is no column.
+    """As :func:`npz_arrays`, of a MATLAB file up to version 7.2; of its only struct if it has no vectors beside it.
+
+    A process of its own reads it, because a damaged file may end scipy's reader altogether.
 
     Raises:
         BagError: not such a file, damaged, or of version 7.3.
@@ -61,35 +67,27 @@ def mat_arrays(path: Path) -> tuple[Arrays, dict[str, str]]:
                 f"{path}: a MATLAB file of version 7.3 (HDF5); expected one saved with save('{path.name}', '-v7')"
             )
     require(f"{path}: a MATLAB file", "matlab")
-    from scipy.io import loadmat, whosmat
-
-    try:
-        elements = sum(int(np.prod(shape)) for _, shape, _ in whosmat(path))
-        if 8 * elements > largest_unpacked(path.stat().st_size):
-            raise BagError(f"{path}: unpacks to {elements >> 17} MB; expected at most 100 times its size")
-        found = {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
-    except BagError:
-        raise
-    except Exception as error:  # scipy raises what its decoders do
-        raise BagError(f"{path}: cannot be read as a MATLAB file ({_one_line(error)})") from error
-    arrays, left_out = _vectors(found)
-    structs = [
-        name for name, value in found.items() if getattr(value, "dtype", np.dtype("O")).names and value.size == 1
-    ]
-    if not arrays and len(structs) == 1:
-        struct = found[structs[0]].reshape(-1)[0]
-        arrays, left_out = _vectors({name: struct[name] for name in struct.dtype.names})
-    return arrays, left_out
+    with tempfile.TemporaryDirectory(prefix="dynssm-") as folder:
+        found = Path(folder) / "arrays.npz"
+        command = [sys.executable, "-m", "dynssm_ros.signals.mat_file", os.fspath(path), os.fspath(found)]
+        done = subprocess.run(command, capture_output=True, check=False)  # noqa: S603 - a module of ours
+        if done.returncode:
+            raise BagError(f"{path}: cannot be read as a MATLAB file (its reader ended with status {done.returncode})")
+        answer = json.loads(done.stdout)
+        if isinstance(answer, str):
+            raise BagError(f"{path}: cannot be read as a MATLAB file ({answer})")
+        with np.load(found, allow_pickle=False) as archive:
+            return {name: archive[f"{k}"] for k, name in enumerate(answer["names"])}, answer["left_out"]
 
 
-def _vectors(found: dict[str, Any]) -> tuple[Arrays, dict[str, str]]:
+def vectors(found: dict[str, Any]) -> tuple[Arrays, dict[str, str]]:
     """What is a vector of more than one number, and why the rest is not; fields of a record array are vectors."""
     arrays: Arrays = {}
     left_out: dict[str, str] = {}
     for name, value in found.items():
         values = np.asarray(value)
         if isinstance(value, str):
-            left_out[name] = value
+            left_out[name] = value[:80]
         elif values.dtype.names and values.dtype.names == ("s0", "s1", "s2", "arr"):
             left_out[name] = "an object of MATLAB, such as a table; save it as s = table2struct(T, 'ToScalar', true)"
         elif values.dtype.names and values.dtype.kind == "V" and values.size > 1 and values.dtype.hasobject is False:
@@ -107,5 +105,6 @@ def _vectors(found: dict[str, Any]) -> tuple[Arrays, dict[str, str]]:
     return arrays, left_out
 
 
-def _one_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
+    """The text of an error on one line, or its kind where it has none."""
     return " ".join(str(error).split()) or type(error).__name__

@@ -17,6 +17,7 @@ from dynssm_ros.signals.signal_map import TIME_UNITS, UNITS
 ABSENT = ("", "-", "n/a", "N/A", "NA", "#N/A", "#NV", "null", "NULL", "None", "NaT")
 """Cells without a value."""
 _NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$|^[+-]?(?i:nan|inf|infinity)$"
+_THOUSANDS = r"^[+-]?\d{1,3}(?:\.\d{3})+(?:,\d*)?$"  # with a decimal comma
 _SWITCHES = {"true": "1", "false": "0"}
 _LONG = 15  # digits, from which on a double is no longer exact
 _CLOCK = r"(?P<hour>\d{1,2}):(?P<minute>\d{1,2}):(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d{1,9}))?"
@@ -79,16 +80,22 @@ def known_unit(text: str) -> str | None:
 
 def kind_of(cells: list[str], comma: bool) -> str:
     """What the cells of a text column are: ``number``, ``integer``, a date, ``time of day`` or ``text``."""
-    cells = [cell.strip().replace(",", ".") if comma else cell.strip() for cell in cells]
-    cells = [cell for cell in cells if cell not in ABSENT]
+    cells = [cell for cell in (cell.strip() for cell in cells) if cell not in ABSENT]
+    dated, cells = cells, [_with_point(cell) for cell in cells] if comma else cells
     numbers = [bool(re.match(_NUMBER, cell)) or cell.lower() in _SWITCHES for cell in cells]
     if sum(numbers) * 2 >= len(cells):
         whole = all(cell.lstrip("+-").isdigit() for cell in cells)
         return "integer" if whole and any(len(cell) > _LONG for cell in cells) else "number"
     for kind, pattern in _DATES.items():
-        if sum(bool(re.match(pattern, cell)) for cell in cells) * 2 >= len(cells):
+        if sum(bool(re.match(pattern, cell)) for cell in dated) * 2 >= len(cells):
             return kind
     return "text"
+
+
+def _with_point(cell: str) -> str:
+    """A number that is written with a decimal comma and points between thousands; a lone point makes it none."""
+    cell = cell.replace(".", "") if re.match(_THOUSANDS, cell) else cell.replace(".", "?")
+    return cell.replace(",", ".")
 
 
 def is_value(cell: str, comma: bool) -> bool:
@@ -103,7 +110,11 @@ def parsed(text: Any, kind: str, comma: bool) -> tuple[Any, Any]:
     if kind in _DATES:
         found = _nanoseconds(trimmed, kind).cast(pa.timestamp("ns"))
         return found, pc.and_(pc.is_valid(trimmed), pc.is_null(found))
-    plain = pc.replace_substring(trimmed, ",", ".") if comma else trimmed
+    plain = trimmed
+    if comma:
+        grouped = pc.match_substring_regex(trimmed, _THOUSANDS)
+        points = pc.replace_substring(trimmed, ".", "?")
+        plain = pc.replace_substring(pc.if_else(grouped, pc.replace_substring(trimmed, ".", ""), points), ",", ".")
     try:
         return pc.cast(plain, pa.int64() if kind == "integer" else pa.float64()), pa.array(np.zeros(len(text), bool))
     except pa.ArrowInvalid:

@@ -37,7 +37,9 @@ class Layout:
         """What a user may want to know of it, in words."""
         decimal = ", decimal comma" if self.comma else ""
         coded = "" if self.encoding == "utf-8" else f", {self.encoding}"
-        lines = f"{self.above} line{'' if self.above == 1 else 's'} above the first row"
+        lines = (
+            f"{self.above} line{'' if self.above == 1 else 's'} above the first row" if self.above else "no headings"
+        )
         return f"text, columns apart by {_DELIMITERS[self.delimiter]}{decimal}{coded}, {lines}"
 
 

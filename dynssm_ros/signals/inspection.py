@@ -86,7 +86,7 @@ def inspect(path: str | Path, wheelbase: float | None = None, progress: Progress
         if isinstance(log, Table):
             clock = clock_of(log, None)
             topics, begin, end = contents_of_table(log, clock)
-            notes, time = [f"{log.kind}; {clock.told}", *log.notes], TimeColumn(column=clock.column, unit=clock.unit)
+            notes, time = [f"{log.kind}; {clock.told}", *log.notes], clock.as_given
         else:
             topics, begin, end = contents_of_bag(log, progress)
             notes, time = [*log.notes], None

@@ -56,6 +56,7 @@ class TimeColumn(StrictModel):
     unit: Literal["s", "ms", "us", "ns", "days"] | None = Field(
         default=None, description="of its numbers; null for dates and times of day, and where its steps tell"
     )
+    nanoseconds: str | None = Field(default=None, description="column of the ns beside whole seconds, as in ROS stamps")
 
 
 class Source(StrictModel):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,10 @@ _CERTAIN = re.compile(
 _POSSIBLE = re.compile(r"time|stamp|zeit|clock|utc|date|datum", re.IGNORECASE)
 _OTHER = re.compile(
     r"lap|delta|diff|duration|left|best|rate|index|frame|sample|count|\bnr\b|\bid\b|dist|odom|row", re.IGNORECASE
+)
+_SECONDS, _NANOSECONDS = (
+    re.compile(r"sec(s|onds)?$", re.IGNORECASE),
+    ("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds"),
 )
 _RISES = 0.5  # share of rows that are later than the one before, in a time column at all
 _STEPS = {"days": 0.0, "s": 5e-5, "ms": 0.3, "us": 300.0, "ns": 3e5}  # least step of a log, 0.3 ms, in each unit
@@ -37,6 +41,12 @@ class Clock:
     stamps: npt.NDArray[np.int64]  # ns since 1970, midnight, or what the column counts from, (N,)
     known: npt.NDArray[np.bool_]  # rows that have a time, (N,)
     told: str  # what it is, in words
+    nanoseconds: str | None = None  # column of the ns beside whole seconds
+
+    @property
+    def as_given(self) -> TimeColumn:
+        """As a signal map gives it."""
+        return TimeColumn.model_validate({"column": self.column, "unit": self.unit, "nanoseconds": self.nanoseconds})
 
 
 def clock_of(table: Table, given: TimeColumn | None) -> Clock:
@@ -47,6 +57,7 @@ def clock_of(table: Table, given: TimeColumn | None) -> Clock:
     """
     if given is not None:
         clock = _clock(table, given.column, table.read([given.column])[given.column], given.unit)
+        clock = _with_nanoseconds(table, clock, given.nanoseconds)
         if _rising(clock) <= _RISES:
             raise BagError(
                 f"{table.path}: time column '{clock.column}' rises in {_rising(clock):.0%} of the rows; expected one that "
@@ -57,8 +68,14 @@ def clock_of(table: Table, given: TimeColumn | None) -> Clock:
         name for name, heading in table.headings.items() if _POSSIBLE.search(heading.bare) or _certain(table, name)
     ]
     named = [name for name in named if not _OTHER.search(table.headings[name].bare)]
+    pairs = {name: beside for name in table.headings if (beside := _nanoseconds_beside(table, name)) is not None}
+    named = [name for name in dict.fromkeys([*pairs, *named]) if name not in pairs.values()]
     columns = table.read(named)
-    found = [_clock(table, name, column, None) for name, column in columns.items() if not column.reason]
+    found = [
+        _with_nanoseconds(table, _clock(table, name, column, "s" if name in pairs else None), pairs.get(name))
+        for name, column in columns.items()
+        if not column.reason
+    ]
     found.sort(key=lambda clock: (_rising(clock) < 0.99, not _certain(table, clock.column), -_rising(clock)))
     if found and _rising(found[0]) > _RISES:
         return found[0]
@@ -79,6 +96,27 @@ def clock_of(table: Table, given: TimeColumn | None) -> Clock:
     raise BagError(
         f"{table.path}: no time column among {', '.join(table.headings)}; expected one that rises, such as 'time'"
     )
+
+
+def _nanoseconds_beside(table: Table, name: str) -> str | None:
+    """The column with the ns of a column of whole seconds, such as ``stamp.nanosec`` of ``stamp.sec``."""
+    if not _SECONDS.search(name):
+        return None
+    return next(
+        (each for end in _NANOSECONDS if (each := _SECONDS.sub(end, name)) != name and each in table.headings), None
+    )
+
+
+def _with_nanoseconds(table: Table, clock: Clock, name: str | None) -> Clock:
+    """The clock with the ns that stand in a column of their own."""
+    if name is None:
+        return clock
+    column = table.read([name])[name]
+    if column.reason:
+        raise BagError(f"{table.path}: column '{name}' of nanoseconds: {column.reason}; expected numbers")
+    known = clock.known & np.isfinite(column.values)
+    stamps = clock.stamps + np.rint(np.where(known, column.values, 0.0)).astype(np.int64)
+    return replace(clock, stamps=stamps, known=known, told=f"{clock.told} and ns from '{name}'", nanoseconds=name)
 
 
 def _certain(table: Table, name: str) -> bool:

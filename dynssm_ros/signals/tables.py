@@ -97,7 +97,7 @@ def _parquet_table(path: Path) -> Table:
     notes = ["this is a recording of dynssm, which other commands take as it is"] if is_recording else []
 
     def read(wanted: Sequence[str]) -> dict[str, Column]:
-        table = pq.read_table(path, columns=list(wanted), partitioning=None)
+        table = pq.read_table(path, columns=list(wanted), partitioning=None, page_checksum_verification=True)
         return {name: typed_column(table[name], str(table[name].type)) for name in wanted}
 
     return Table(path, "Parquet", rows, {name: heading(name) for name in names}, read, notes)

@@ -144,6 +144,25 @@ def test_dates_and_times_of_day_are_read(tmp_path: Path, columns: Any, form: str
     assert len(found) == 24
 
 
+def test_seconds_and_nanoseconds_may_stand_in_two_columns(tmp_path: Path, columns: Any) -> None:
+    stamps = columns.pop("time")
+    write_csv(tmp_path / "log.csv", columns | {"stamp.sec": stamps // 10**9, "stamp.nanosec": stamps % 10**9})
+    found = inspect(tmp_path / "log.csv").time
+    assert found is not None
+    assert (found.column, found.unit, found.nanoseconds) == ("stamp.sec", "s", "stamp.nanosec")
+    for time in (None, found):
+        assert extract([tmp_path / "log.csv"], table_map(time=time), 40.0).time[0] == START
+
+
+@pytest.mark.parametrize("start", [0, 999_000, 12_345_000])
+def test_points_between_thousands_are_none_of_decimals(tmp_path: Path, columns: Any, start: int) -> None:
+    stamps = [f"{start + 10 * k:,}".replace(",", ".") for k in range(N)]
+    german = {name: [f"{one!r}".replace(".", ",") for one in column.tolist()] for name, column in columns.items()}
+    write_csv(tmp_path / "log.csv", german | {"time": stamps}, delimiter=";", quoting_style="none")
+    recording = extract([tmp_path / "log.csv"], table_map(), 40.0)
+    assert (recording.time[0], len(recording)) == (start * 10**6, 24)
+
+
 def test_a_time_of_day_goes_on_past_midnight(tmp_path: Path, columns: Any) -> None:
     stamps = [f"{'23:59:59' if k < 30 else '00:00:00'}.{(700 + 10 * k) % 1000:03d}" for k in range(N)]
     write_csv(tmp_path / "log.csv", columns | {"time": stamps})
@@ -242,7 +261,8 @@ def test_what_is_no_table_is_one_line(tmp_path: Path, what: str) -> None:
             lambda path: np.savez(path.open("wb"), a=np.array([{}, {}])),
             "not a table .a: Object arrays cannot be loaded",
         ),
-        (lambda path: np.savez_compressed(path.open("wb"), a=np.zeros(20_000_000)), "unpacks to 152 MB"),
+        (lambda path: np.savez_compressed(path.open("wb"), a=np.zeros(9_000_000)), "unpacks to 68 MB"),
+        (lambda path: scipy.io.savemat(path, {"s": {"t": 1.0}, "w": {"t": 1}}, appendmat=False), "not a table .s: no"),
         (lambda path: scipy.io.savemat(path, {"a": "x", "b": 1.0}, appendmat=False), "not a table"),
         (lambda path: pq.write_table(pa.table({"time": pa.array([], pa.int64())}), path), "a table without rows"),
     ],
@@ -252,6 +272,13 @@ def test_files_that_hold_no_table_are_one_line(tmp_path: Path, write: Any, said:
     with pytest.raises(BagError, match=said) as caught, open_log(tmp_path / "data"):
         pass
     assert "\n" not in str(caught.value)
+
+
+def test_a_damaged_matlab_file_ends_its_reader_and_not_us(tmp_path: Path, columns: Any, monkeypatch: Any) -> None:
+    scipy.io.savemat(tmp_path / "log.mat", columns)
+    monkeypatch.setattr("sys.executable", "/bin/false")
+    with pytest.raises(BagError, match=r"cannot be read as a MATLAB file \(its reader ended with status 1\)"):
+        inspect(tmp_path / "log.mat")
 
 
 def test_tables_and_maps_of_topics_do_not_go_together(make_bag: Any, drive: Any, tmp_path: Path, columns: Any) -> None:
