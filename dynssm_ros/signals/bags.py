@@ -28,6 +28,7 @@ from dynssm_ros.errors import BagError
 from dynssm_ros.files import real_path, replacing, require_replaceable
 from dynssm_ros.signals.recover import (
     bad_chunks,
+    has_vast_chunk,
     is_short,
     is_unindexed,
     log_left,
@@ -250,6 +251,8 @@ def _open(paths: list[Path]) -> AnyReader:
             raise BagError(_LOG_LEFT)
         if any(is_unindexed(file) for file in files):
             raise BagError(_NO_INDEX)
+        if any(has_vast_chunk(file) for file in files):
+            raise BagError("a chunk unpacks to far more than a log's")
         if any(is_short(file) for file in files):
             raise BagError("a file is shorter than its header says")
         reader = AnyReader(paths, default_typestore=_TYPESTORE)

@@ -81,6 +81,13 @@ def is_unindexed(file: Path) -> bool:
     return not empty and not (summary.chunk_indexes and all(c.message_index_offsets for c in summary.chunk_indexes))
 
 
+def has_vast_chunk(file: Path) -> bool:
+    """Whether an indexed MCAP file says of a chunk that it unpacks to far more than a log's can."""
+    summary = _index(file) if file.suffix == ".mcap" else None
+    chunks = [] if summary is None else summary.chunk_indexes
+    return any(chunk.uncompressed_size > largest_unpacked(chunk.compressed_size) for chunk in chunks)
+
+
 def is_short(file: Path) -> bool:
     """Whether a SQLite file is shorter than its header says, which SQLite may notice only in the middle of reading."""
     if file.suffix != ".db3":
@@ -249,7 +256,7 @@ def _chunk_content(body: bytes) -> bytes:
     """What is left of a chunk's records: start, end, size and checksum, then the codec's name, then the data."""
     (length,) = struct.unpack_from("<I", body, 28)
     codec, data = body[32 : 32 + length].decode(), body[40 + length :]
-    return b"".join(_pieces(io.BytesIO(data), codec)) if codec else data
+    return b"".join(_bounded(_pieces(io.BytesIO(data), codec), largest_unpacked(len(data)))) if codec else data
 
 
 def _intact_content(body: bytes) -> bytes | None:

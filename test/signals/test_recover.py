@@ -10,10 +10,12 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.signals.bags import open_bag
-from dynssm_ros.signals.recover import is_unindexed, log_left, recover, unpack, unpacked_message
+from dynssm_ros.signals.recover import has_vast_chunk, is_unindexed, log_left, recover, unpack, unpacked_message
 
 Row = tuple[int, int, int, bytes]
 TABLES = """
@@ -140,3 +142,29 @@ def test_what_unpacks_to_far_more_than_it_is_is_refused_before_it_fills_memory_o
         open_bag(tmp_path / "log.mcap.zstd"),
     ):
         pass
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_chunk_that_unpacks_to_far_more_than_it_is_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, indexed: bool
+) -> None:
+    file = tmp_path / "log.mcap"
+    with file.open("wb") as sink:
+        writer = McapWriter(sink, chunk_size=1000, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2")
+        channel = writer.register_channel(
+            "/a", "cdr", writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        )
+        for stamp, length in enumerate((2000, 10 << 20, 2000)):
+            writer.add_message(channel, stamp, bytes(length), stamp)
+        writer.finish()
+    assert not has_vast_chunk(file)
+    monkeypatch.setattr("dynssm_ros.signals.recover._UNPACKED", 1 << 20)
+    assert has_vast_chunk(file)
+    if not indexed:
+        content = file.read_bytes()
+        file.write_bytes(content[: content.rindex(b"/a")])
+        assert not has_vast_chunk(file)
+    assert recover(file, tmp_path / "mended.mcap").messages == 2
+    with open_bag(file) as bag:
+        assert "recovered 2 messages" in bag.notes[-1]
