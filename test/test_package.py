@@ -212,6 +212,39 @@ def test_shipped_models_are_valid(name: str) -> None:
     assert load_model_config(name).name == name
 
 
+# what the policy files of SROS 2 consist of: the parts of an element, and its attributes
+POLICY = {
+    "policy": (["enclaves"], ["version"]),
+    "enclaves": (["enclave"], []),
+    "enclave": (["profiles"], ["path"]),
+    "profiles": (["profile"], []),
+    "profile": (["topics", "services", "actions"], ["ns", "node"]),
+    "topics": (["topic"], ["publish", "subscribe"]),
+    "services": (["service"], ["reply", "request"]),
+    "actions": (["action"], ["call", "execute"]),
+}  # fmt: skip
+
+
+def test_the_security_policy_is_one_of_sros_2_and_its_player_publishes_the_default_topics() -> None:
+    root = ElementTree.parse(ROOT / "config" / "sros2" / "policy.xml").getroot()
+    assert (root.tag, root.get("version")) == ("policy", "0.2.0")
+    for element in root.iter():
+        parts, attributes = POLICY.get(element.tag, ([], []))
+        assert {part.tag for part in element} <= set(parts), element.tag
+        if element.tag in ("topics", "services", "actions"):  # one kind of use each
+            assert len(element.attrib) == 1
+            assert set(element.attrib.values()) <= {"ALLOW", "DENY"}
+            assert element.attrib.keys() <= set(attributes)
+        else:
+            assert list(element.attrib) == attributes, element.tag
+        if element.tag not in POLICY:
+            assert re.fullmatch(r"(/|~/)?[A-Za-z]\w*(/[A-Za-z]\w*)*", element.text or ""), element.text
+    (player,) = (profile for profile in root.iter("profile") if profile.get("node") == "player")
+    published = {topic.text for topic in player.iterfind("topics[@publish]/topic")}
+    recorded = {source.recorded.removeprefix("/") for source in load_signal_map("default").signals.values()}
+    assert published == recorded | {"/clock", "/parameter_events", "/rosout"}
+
+
 MUST_BE_SET = {"predictor": "model", "player": "bag"}
 """Parameters without a usable default. A shipped file leaves them out: it would reset what was said before it."""
 NAMES = {"predictor": "dynssm", "controller": "controller", "simulator": "simulator", "player": "player"}
