@@ -35,7 +35,7 @@ def _column_table(found: Inspection) -> Table:
         (Column("column", brief=True), lambda column: column.name),
         (Column("cells", brief=True), lambda column: column.msgtype),
         (Column("unit", brief=True), lambda column: column.unit),
-        (Column("values", brief=True), lambda column: column.count),
+        (Column("values"), lambda column: column.count),
         (Column("rate", "Hz", brief=True), lambda column: column.rate),
         (Column("longest gap", "s"), lambda column: column.longest_gap),
         (Column("least", brief=True), lambda column: limits[column.name][0]),

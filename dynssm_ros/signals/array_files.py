@@ -19,6 +19,7 @@ from dynssm_ros.extras import require
 from dynssm_ros.signals.recover import largest_unpacked
 
 Arrays = dict[str, npt.NDArray[Any]]
+_WIDEST = 64  # vectors of a matrix
 _HDF5 = b"MATLAB 7.3"
 
 
@@ -81,9 +82,13 @@ def mat_arrays(path: Path) -> tuple[Arrays, dict[str, str]]:
 
 
 def vectors(found: dict[str, Any]) -> tuple[Arrays, dict[str, str]]:
-    """What is a vector of more than one number, and why the rest is not; fields of a record array are vectors."""
+    """What is a vector of more than one number, and why the rest is not.
+
+    Fields of a record array are vectors, and so are rows or columns of a matrix that are as long as all vectors.
+    """
     arrays: Arrays = {}
     left_out: dict[str, str] = {}
+    matrices: Arrays = {}
     for name, value in found.items():
         values = np.asarray(value)
         if isinstance(value, str):
@@ -99,9 +104,17 @@ def vectors(found: dict[str, Any]) -> tuple[Arrays, dict[str, str]]:
         elif values.size < 2:
             left_out[name] = "a single value"
         elif values.size != max(values.shape):
-            left_out[name] = f"a matrix of {' x '.join(map(str, values.shape))}"
+            matrices[name] = values
         else:
             arrays[name] = values.reshape(-1)
+    lengths = {len(values) for values in arrays.values()}
+    length = lengths.pop() if len(lengths) == 1 else -1
+    for name, values in matrices.items():
+        if values.ndim == 2 and length in values.shape and values.size <= length * _WIDEST:
+            rows = values if values.shape[1] == length else values.T
+            arrays |= {f"{name}[{k}]": row for k, row in enumerate(rows)}
+        else:
+            left_out[name] = f"a matrix of {' x '.join(map(str, values.shape))}"
     return arrays, left_out
 
 

@@ -37,6 +37,7 @@ _ALIASES = {
     "milliseconds": "ms", "usec": "us", "µs": "us", "μs": "us", "nsec": "ns", "nanoseconds": "ns", "day": "days",
 }  # fmt: skip
 _BRACKETS = re.compile(r"^(?P<bare>.*?)\s*[\[(<{]\s*(?P<unit>[^\[\](){}<>]*?)\s*[\])>}]\s*$")
+_UNIT_LIKE = re.compile(r"^(?:[^\W\d]{1,4}|.*[/^²°%·*].*)$")
 _ENDING = re.compile(
     r"^(?P<bare>.+)_(?P<unit>m|cm|mm|kmh|kph|mps|mph|deg|rad|pct|percent|degps|dps|radps|s|sec|ms|us|ns|nsec)$"
 )
@@ -66,7 +67,9 @@ def heading(name: str, unit: str = "") -> Heading:
     """Name and unit of a heading such as ``Speed (km/h)``, ``Speed [km/h]`` or ``speed_kmh``; ``unit`` is that of a row of
     units.
     """
-    match = _BRACKETS.match(name) or _ENDING.match(name)
+    match = _BRACKETS.match(name)
+    if match is None or not (known_unit(match["unit"]) or _UNIT_LIKE.match(match["unit"])):  # as in position[steering]
+        match = _ENDING.match(name)
     bare = match["bare"] if match and match["bare"] else name
     return Heading(bare, unit.strip(" []()<>{}") or (match["unit"] if match else ""))
 

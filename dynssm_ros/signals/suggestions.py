@@ -22,7 +22,7 @@ _MOTION = {
     "omega": (r"yaw_?(rate|vel\w*|speed)|gierrate|psi_?dot|angular(_vel\w*)?_z$|gyro_?z$|omega(_?z)?$|^(r|wz|w_z)$",),
     "x": (r"^(pos\w*_|pose_)?x(_pos\w*)?$|position_x$|^(east|easting|pos_?x)$",),
     "y": (r"^(pos\w*_|pose_)?y(_pos\w*)?$|position_y$|^(north|northing|pos_?y)$",),
-    "theta": (r"^(pose_)?(yaw|theta|heading|psi|gierwinkel)(_angle)?$|orientation_yaw$",),
+    "theta": (r"^(pose_)?(yaw|theta|heading|psi|gierwinkel)(_angle)?$|orientation_yaw$", r"^phi$"),
 }
 """Words for signals in headings, in the order in which they are tried."""
 _NOT_MOTION = re.compile(

@@ -93,9 +93,7 @@ def clock_of(table: Table, given: TimeColumn | None) -> Clock:
             f"{table.path}: no time column: '{found[0].column}' rises in {_rising(found[0]):.0%} of the rows; expected one "
             f"that rises (`time: {{column: NAME}}` in the signal map names it)"
         )
-    raise BagError(
-        f"{table.path}: no time column among {', '.join(table.headings)}; expected one that rises, such as 'time'"
-    )
+    raise BagError(f"{table.path}: no time column among {table.told_columns}; expected one that rises, such as 'time'")
 
 
 def _nanoseconds_beside(table: Table, name: str) -> str | None:

@@ -21,6 +21,7 @@ from dynssm_ros.signals.csv_layout import Layout, layout_of
 
 _GROUP_BYTES = 256 << 20  # of columns that are in memory at once
 _MOST_ROWS = 50_000_000  # as of recordings
+_TOLD = 30  # columns that a message names
 _RAGGED = 0.01  # share of lines with another number of cells, from which on a file is no table
 _PARQUET, _ZIP, _MATLAB = b"PAR1", b"PK\x03\x04", b"MATLAB "
 
@@ -36,6 +37,12 @@ class Table:
     read_columns: Callable[[Sequence[str]], dict[str, Column]]
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def told_columns(self) -> str:
+        """Names of the columns, not all of very many."""
+        names = list(self.headings)
+        return ", ".join(names[:_TOLD]) + (f" and {len(names) - _TOLD} more" if len(names) > _TOLD else "")
+
     def read(self, names: Sequence[str]) -> dict[str, Column]:
         """The columns ``names``.
 
@@ -44,7 +51,7 @@ class Table:
         """
         for name in names:
             if name not in self.headings:
-                raise BagError(f"{self.path}: column '{name}' is missing; the table has {', '.join(self.headings)}")
+                raise BagError(f"{self.path}: column '{name}' is missing; the table has {self.told_columns}")
         try:
             found = self.read_columns(list(dict.fromkeys(names)))
         except (OSError, pa.ArrowException, ValueError, KeyError) as error:

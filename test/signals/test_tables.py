@@ -93,6 +93,19 @@ def test_what_a_table_is_follows_from_its_content(tmp_path: Path, columns: Any, 
     assert len(extract([tmp_path / "data.log"], table_map(), 40.0)) == 24
 
 
+@pytest.mark.parametrize("name", ["log.npz", "log.mat"])
+@pytest.mark.parametrize("turned", [False, True])
+def test_rows_or_columns_of_a_matrix_are_columns(tmp_path: Path, columns: Any, name: str, turned: bool) -> None:
+    write_csv(tmp_path / "log.csv", columns)
+    states = np.stack([columns.pop(one) for one in ("v_x", "v_y", "omega")])
+    WRITERS[name](tmp_path / name, columns | {"states": states.T if turned else states, "other": np.ones((3, 4))})
+    named = {one: {"column": f"states[{k}]"} for k, one in enumerate(("v_x", "v_y", "omega"))}
+    found = extract([tmp_path / name], table_map(**named), 40.0)
+    assert_same(found, extract([tmp_path / "log.csv"], table_map(), 40.0))
+    assert found.info.notes[-1] == "other is left out: a matrix of 3 x 4"
+    assert inspect(tmp_path / name).topics["states[1]"].unit == ""
+
+
 def test_units_curves_and_offsets_are_those_of_the_map(tmp_path: Path, columns: Any) -> None:
     as_logged = {
         **columns, "v_x": columns["v_x"] * 3.6, "omega": np.degrees(columns["omega"]), "y": columns["y"] * 100,
@@ -256,7 +269,7 @@ def test_what_is_no_table_is_one_line(tmp_path: Path, what: str) -> None:
             "cannot be read as a MATLAB file|not a table",
         ),
         (lambda path: np.savez(path.open("wb"), time=np.arange(9), v=np.arange(8)), "v of 8 values, time of 9 values"),
-        (lambda path: np.savez(path.open("wb"), a=np.ones((9, 2)), b=1.0), "a: a matrix of 9 x 2; b: a single value"),
+        (lambda path: np.savez(path.open("wb"), a=np.ones((9, 2)), b=1.0), "b: a single value; a: a matrix of 9 x 2"),
         (
             lambda path: np.savez(path.open("wb"), a=np.array([{}, {}])),
             "not a table .a: Object arrays cannot be loaded",
