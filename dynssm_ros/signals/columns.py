@@ -68,7 +68,8 @@ def heading(name: str, unit: str = "") -> Heading:
     units.
     """
     match = _BRACKETS.match(name)
-    if match is None or not (known_unit(match["unit"]) or _UNIT_LIKE.match(match["unit"])):  # as in position[steering]
+    unit_like = match is not None and (known_unit(match["unit"]) or _UNIT_LIKE.match(match["unit"]))
+    if match is None or match["unit"].isdigit() or not unit_like:  # as in position[steering] and states[0]
         match = _ENDING.match(name)
     bare = match["bare"] if match and match["bare"] else name
     return Heading(bare, unit.strip(" []()<>{}") or (match["unit"] if match else ""))
