@@ -194,7 +194,7 @@ def test_the_example_of_the_api_page_runs(tmp_path: Path, monkeypatch: pytest.Mo
     from dynssm_ros.simulation.laps import write_run
 
     monkeypatch.chdir(tmp_path)
-    write_run(dynssm_ros.simulate("orca", "club", duration=24.0, plant="euler", noise=(0.01, 0.01, 0.03)), "bag")
+    write_run(dynssm_ros.simulate("orca", "club", duration=18.0, plant="euler", noise=(0.01, 0.01, 0.03)), "bag")
     (block,) = re.findall(r"```python\n(.*?)```", PAGES["api.md"], re.S)
     made: dict[str, object] = {}
     exec(compile(block, "api.md", "exec"), made)

@@ -59,7 +59,7 @@ def diagnose(
     Example:
         >>> hidden = {"steering_offset": {"offset": 0.03}}
         >>> noise = (0.005, 0.005, 0.02)
-        >>> laps = recorded(simulate("orca", "club", duration=40.0, plant="euler", effects=hidden, noise=noise))
+        >>> laps = recorded(simulate("orca", "club", duration=25.0, plant="euler", effects=hidden, noise=noise))
         >>> [cause.effect for cause in diagnose(laps, "orca", integrator="euler").causes]
         ['steering_offset']
     """

@@ -184,6 +184,7 @@ def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
     assert "`rolling_resistance`, `drive_gain`, `power_limit`, `yaw_inertia`" in text, "drag and mass were hidden"
 
 
+@pytest.mark.slow
 def test_a_case_is_driven_diagnosed_and_read_back(tmp_path: Path) -> None:
     case = Case({"steering_offset": {"offset": 0.02}}, 3, "euler", 30.0)
     assert read_outcome(case, tmp_path) is None

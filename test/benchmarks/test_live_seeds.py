@@ -14,6 +14,7 @@ def test_drives_that_were_lost_stay_on_the_road(seed):
     assert drive.least_room > 0
 
 
+@pytest.mark.slow
 def test_a_drive_depends_on_its_seed_alone(small_model):
     first, again, other = (drive_seeded("orca", seed, 1, small_model) for seed in (1, 1, 2))
     assert first == again

@@ -192,6 +192,7 @@ def test_a_cell_is_driven_with_each_model(small_model, tmp_path):
     assert len(found["calibrated"]["lap_times_s"]) == 2
 
 
+@pytest.mark.slow
 def test_a_car_that_came_fast_into_a_bend_finds_out_of_it_with_a_front_that_grips_less():
     """The true model on a development cell. At the front tyre's peak the program sees no use in steering less."""
     cell, car = Cell("av21", ("club_b", 22), "front_grip"), load_vehicle("av21")

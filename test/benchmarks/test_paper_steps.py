@@ -203,6 +203,7 @@ def test_the_small_run_measures_all_that_it_can(small_run):
     )
 
 
+@pytest.mark.slow
 def test_calibration_starts_mid_range_and_finds_the_simulated_car(quick_run):
     root, results = quick_run
     vehicle, truth = load_vehicle(root / "vehicles/club.topics.yaml"), load_vehicle("orca")

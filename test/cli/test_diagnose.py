@@ -93,6 +93,7 @@ def test_without_a_recording_is_one_line(dynssm: Run, tmp_path: Path) -> None:
     assert (status, err.strip()) == (1, "error: no recording given; expected R.parquet or --reference R.parquet")
 
 
+@pytest.mark.slow
 def test_reference_and_suspect_are_compared(dynssm: Run, offset: tuple[Path, Path], tmp_path: Path) -> None:
     straight = record(Case({}, 2, "euler", 70.0))[0]
     straight.save(tmp_path / "before.parquet")

@@ -201,6 +201,7 @@ def learned_laps(orca, club, laps):
     return race(course, Fixed("file", CarModel.at_any_speed(orca, "rk4", 2), orca.nominal))
 
 
+@pytest.mark.slow
 def test_a_second_lap_is_driven_with_what_the_first_one_told(orca, club):
     outcome = learned_laps(orca, club, 2)
     assert outcome.completed

@@ -97,7 +97,7 @@ def test_effects_of_the_vehicle_are_part_of_the_model(drive: Drive, orca: Vehicl
     assert other.rmse_before.max() > 1e-2, "of the file, whatever is fitted"
 
 
-@pytest.mark.parametrize(("plant", "chosen"), [("euler", "euler"), ("rk4", "rk4")])
+@pytest.mark.parametrize(("plant", "chosen"), [pytest.param("euler", "euler", marks=pytest.mark.slow), ("rk4", "rk4")])
 def test_the_data_choose_how_the_model_steps(orca: Vehicle, plant: PlantKind, chosen: str) -> None:
     """Euler steps fitted to a continuous car make a yaw inertia of their own."""
     laps = dynssm_ros.recorded(dynssm_ros.simulate(orca, "club", duration=20.0, plant=plant, noise=SENSORS, seed=3))

@@ -63,6 +63,7 @@ def test_the_score_test_ranks_the_hidden_effect_first_and_sizes_it(effect: str, 
     assert 0.3 < (best.values[name] - neutral) / (true - neutral) < 3.0
 
 
+@pytest.mark.slow
 def test_without_anything_hidden_no_candidate_pays() -> None:
     given = problem()
     fit = given.fit(CarEstimate.of(ORCA), ())

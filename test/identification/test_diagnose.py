@@ -93,6 +93,7 @@ def test_nothing_is_named_where_nothing_is_hidden(seed: int, laps: Laps) -> None
     assert "right within the noise" in as_text(found)
 
 
+@pytest.mark.slow
 def test_two_causes_are_both_named(laps: Laps) -> None:
     recording, vehicle = laps("odometry_lever_arm", "drag", seed=4)
     found = diagnose(recording, vehicle, integrator="euler", line=LINE, exclude=OTHERS)
@@ -238,6 +239,7 @@ def test_what_is_excluded_is_not_named(lagging: tuple[Recording, Vehicle, Diagno
         diagnose(recording, vehicle, exclude=["witchcraft"])
 
 
+@pytest.mark.slow
 def test_an_extended_car_that_errs_more_where_nobody_looked_is_not_written(
     lagging: tuple[Recording, Vehicle, Diagnosis],
 ) -> None:

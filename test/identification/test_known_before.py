@@ -96,6 +96,7 @@ def test_a_vehicle_file_keeps_it(calibrated: Vehicle, tmp_path: Path) -> None:
     assert load_vehicle(tmp_path / "car.yaml").before == calibrated.before
 
 
+@pytest.mark.slow
 def test_a_diagnosis_is_the_same_before_and_after_a_calibration(recording: Recording, calibrated: Vehicle) -> None:
     shipped, after = (
         diagnose(recording, car, horizon=0.3, integrator="euler", exclude=OTHERS) for car in (ORCA, calibrated)

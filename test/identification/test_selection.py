@@ -190,6 +190,7 @@ def test_a_gain_that_is_hardly_evidence_tells_nothing_apart() -> None:
     assert replace(little, known=1.5, std=4.0).alike
 
 
+@pytest.mark.slow
 def test_what_no_car_has_gives_way_to_what_cannot_be_told_from_it() -> None:
     """Without downforce, tyres that gain less force than load are like a centre of gravity that is lower than measured."""
     av21 = load_vehicle("av21")
@@ -244,7 +245,7 @@ def test_left_out_parts_are_predicted_by_the_others() -> None:
     assert nothing.alike or nothing.std == 0.0
 
 
-@pytest.mark.parametrize("plant", ["euler", "rk4"])
+@pytest.mark.parametrize("plant", ["euler", pytest.param("rk4", marks=pytest.mark.slow)])
 def test_the_integrator_is_that_of_the_data(plant: str) -> None:
     given = stepped(plant, NOISE)
     found = search_causes(given, CarEstimate.of(ORCA), quarters(given), exclude=OTHERS)
@@ -253,7 +254,7 @@ def test_the_integrator_is_that_of_the_data(plant: str) -> None:
     assert np.isfinite(found.selection.fit.objective)
 
 
-@pytest.mark.parametrize("stated", [None, pytest.param("rk4", marks=pytest.mark.slow), "euler"])
+@pytest.mark.parametrize("stated", [*(pytest.param(one, marks=pytest.mark.slow) for one in (None, "rk4")), "euler"])
 def test_the_integrator_is_that_of_the_file_where_the_data_do_not_say(stated: str | None) -> None:
     given = stepped("rk4", (0.2, 0.2, 1.0))
     car = CarEstimate.of(ORCA.model_copy(update={"integrator": stated}))

@@ -57,7 +57,7 @@ def whole(drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicl
     return train(drive(orca, 800), make_config(**WITH_PARTS), orca, tmp_path_factory.mktemp("whole") / "whole.pt")
 
 
-@pytest.mark.parametrize("epoch", [3, pytest.param(5, marks=pytest.mark.slow), 6])
+@pytest.mark.parametrize("epoch", [*(pytest.param(epoch, marks=pytest.mark.slow) for epoch in (3, 5)), 6])
 def test_an_interrupted_stage_is_gone_on_with(
     drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicle, whole: Any, tmp_path: Path, epoch: int
 ) -> None:

@@ -126,6 +126,7 @@ def test_features_are_what_their_names_say(noisy_laps, orca, noisy_model):
     np.testing.assert_allclose(at["mean error of the physics"], (increments - past / scale).mean(1), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_rollouts_of_a_changed_car_stay_as_bounded_as_the_physics(laps, orca, make_config, drive, tmp_path: Path):
     trained = train(laps, make_config(kind="rls", history=0.3), orca, tmp_path / "c.pt")
     model = OnnxModel(save_artifact(trained, tmp_path / "model"))

@@ -392,7 +392,7 @@ def persistence(recording: Recording, config: ModelConfig) -> np.ndarray:
     return increment.square().mean(0).sqrt().numpy()
 
 
-@pytest.mark.parametrize("name", ["whole", "neural_only"])
+@pytest.mark.parametrize("name", ["whole", pytest.param("neural_only", marks=pytest.mark.slow)])
 def test_it_learns_a_car_whose_coefficients_are_wrong(
     laps: Recording, make_config: MakeConfig, orca: Vehicle, checkpoint: Path, name: str
 ) -> None:

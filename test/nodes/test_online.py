@@ -90,7 +90,7 @@ def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(
 def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(rls_model, stints, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
     recording_to_bag(stints[0], bag)
-    run_live(rls_model, bag, 0.02, rate=2.5, duration=8.0, in_step=True, parameters={"online_state": str(state)})
+    run_live(rls_model, bag, 0.02, rate=2.5, duration=5.0, in_step=True, parameters={"online_state": str(state)})
     assert state.is_file()
     second = tmp_path / "second"
     recording_to_bag(stints[1].select(slice(0, 400)), second)

@@ -23,7 +23,9 @@ def ring(direction=1, radius=20.0, half=3.0):
     return Track("ring", ClosedLine(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)), width, width)
 
 
-@pytest.fixture(scope="module", params=[*BUILT_IN, *PUBLISHED])
+@pytest.fixture(
+    scope="module", params=[*BUILT_IN, "ethz", "ethz_mobil", "ims", pytest.param("austin", marks=pytest.mark.slow)]
+)
 def raced(request):
     """A track, the margin of its car and the line."""
     if request.param in PUBLISHED:

@@ -44,6 +44,7 @@ def test_where_the_physics_is_exact_nothing_is_added(
     assert np.all(np.array(trained.validation_rmse) < 1e-4)
 
 
+@pytest.mark.slow
 def test_inputs_without_a_say_get_long_scales() -> None:
     draw = torch.Generator().manual_seed(0)
     x = torch.randn(300, gp.INPUTS, generator=draw).double()

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from benchmarks.rivals.on_track import TYRES, OnTrack
 from dynssm_ros.evaluation.open_loop import evaluate
@@ -41,6 +42,7 @@ def test_tyres_that_the_file_has_wrong_are_found(
         np.testing.assert_allclose(identified, true, atol=0.1 * np.abs(true).max())
 
 
+@pytest.mark.slow
 def test_tyres_that_are_right_stay_and_all_else_too(
     make_fitted: MakeConfig, drive: Callable[..., Recording], orca: Vehicle, tmp_path: Path
 ) -> None:
