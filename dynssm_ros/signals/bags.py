@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, NoReturn
 import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -35,6 +36,7 @@ from dynssm_ros.signals.recover import (
     merge_log,
     recover,
     unpack,
+    unpacked_chunk,
     unpacked_message,
 )
 
@@ -227,6 +229,10 @@ def _ros1_bag(path: Path, named: Path, stack: ExitStack) -> Bag:
         reader = AnyReader([named])
         reader.open()
         stack.callback(reader.close)
+        for file in reader.readers:
+            assert isinstance(file, Ros1Reader)
+            for place, chunk in file.chunks.items():
+                file.chunks[place] = chunk._replace(decompressor=unpacked_chunk)  # within limits
         types = dict(reader.typestore.fielddefs)
         if _HEADER in types:
             types[_HEADER] = _TYPESTORE.fielddefs[_HEADER]

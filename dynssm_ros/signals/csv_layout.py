@@ -16,6 +16,12 @@ _SAMPLE = 1 << 18  # bytes that are looked at
 _JUDGED = 60  # lines by which delimiters are judged
 _DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
 _NONE = "neither a table nor a bag; expected columns of numbers apart by comma, semicolon or tab, or a bag"
+_OTHERS = {
+    b"\xd0\xcf\x11\xe0": "an Excel workbook", b"\x89HDF\r\n": "an HDF5 file", b"MDF     ": "an MDF file",
+    b"UnFinMF ": "an MDF file", b"ULog\x01\x12\x35": "a ULog file", b"LOGG": "a BLF file", b"ARROW1": "a Feather file",
+    b"\x1f\x8b": "a gzip file", b"BZh": "a bzip2 file", b"\xfd7zXZ": "an xz file",
+}  # fmt: skip
+"""Files of other kinds that hold logs, by their first bytes."""
 _LIKE_OTHERS = 0.75  # of the share of values that other rows have
 _LEAST = 0.5  # share of cells that are values
 
@@ -75,6 +81,8 @@ def _lines(path: Path, head: bytes) -> tuple[list[str], str]:
     """The whole lines of a file's beginning, and its encoding."""
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encoding, text = "utf-16", head[: len(head) // 2 * 2].decode("utf-16", "replace")
+    elif (other := next((name for magic, name in _OTHERS.items() if head.startswith(magic)), None)) is not None:
+        raise BagError(f"{path}: {other}, which is not read; expected it unpacked, or exported as CSV")
     elif b"\0" in head:
         raise BagError(
             f"{path}: not a bag and not a table (binary); expected rosbag2, ROS 1, CSV, Parquet, .mat or .npz"

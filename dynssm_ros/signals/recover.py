@@ -30,6 +30,7 @@ from mcap.writer import Writer as McapWriter
 SQLITE_LOGS = ("-wal", "-journal")
 _HEAD = 9  # bytes in front of an MCAP record: what it is, and its length
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_ROS1_CODECS = {b"BZh": "bz2", b"\x04\x22\x4d\x18": "lz4"}
 _UNPACKED, _RATIO = 64 << 20, 100  # bytes that may always be unpacked, and times the packed size
 _ROS_ENCODINGS = ("ros2msg", "ros2idl", "omgidl", "")
 _RECORDS: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.DATA_END: DataEnd}
@@ -139,6 +140,18 @@ def unpacked_message(raw: bytes) -> bytes:
     if not raw.startswith(_ZSTD_MAGIC):
         return raw
     return b"".join(_bounded(_pieces(io.BytesIO(raw), "zstd"), largest_unpacked(len(raw))))
+
+
+def unpacked_chunk(raw: bytes) -> bytes:
+    """A chunk of a ROS 1 bag, whose first record is far shorter than the magic numbers of its codecs would say.
+
+    Raises:
+        OSError: it would be far larger than a chunk can be.
+    """
+    codec = next((name for magic, name in _ROS1_CODECS.items() if raw.startswith(magic)), None)
+    if codec is None:
+        return raw
+    return b"".join(_bounded(_pieces(io.BytesIO(raw), codec), largest_unpacked(len(raw))))
 
 
 def largest_unpacked(packed: int) -> int:

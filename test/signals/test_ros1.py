@@ -72,6 +72,19 @@ def test_a_message_that_is_none_is_told_with_its_topic(make_ros1_bag: Any, drive
         extract([path], DEFAULT, 40.0)
 
 
+@pytest.mark.parametrize("compression", [Writer.CompressionFormat.BZ2, Writer.CompressionFormat.LZ4])
+def test_chunks_that_unpack_to_far_more_than_their_size_are_refused(
+    make_ros1_bag: Any, monkeypatch: pytest.MonkeyPatch, compression: Any
+) -> None:
+    path = make_ros1_bag([("/camera", "sensor_msgs/msg/Image", START, bytes(3_000_000))], compression=compression)
+    assert inspect(path).topics["/camera"].count == 1
+    monkeypatch.setattr("dynssm_ros.signals.recover._UNPACKED", 1 << 20)
+    with pytest.raises(
+        BagError, match=r"run.bag: damaged, reading stopped \(unpacks to more than|a ROS 1 bag that cannot"
+    ):
+        inspect(path)
+
+
 @pytest.mark.parametrize("left", [10, 100, 5000, -100])
 def test_a_bag_that_was_cut_off_ends_in_one_line(make_ros1_bag: Any, drive: Any, tmp_path: Path, left: int) -> None:
     cut = tmp_path / "cut.bag"

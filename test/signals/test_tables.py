@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -257,10 +258,22 @@ def test_what_is_no_table_is_one_line(tmp_path: Path, what: str) -> None:
     assert str(caught.value).startswith(f"{path}: ")
 
 
+def zipped(path: Path, name: str) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(name, "text")
+
+
 @pytest.mark.parametrize(
     ("write", "said"),
     [
         (lambda path: path.write_bytes(bytes(range(256)) * 9), "not a bag and not a table"),
+        (
+            lambda path: path.write_bytes(b"MDF     4.10    " + bytes(50)),
+            "an MDF file, which is not read; expected .* CSV",
+        ),
+        (lambda path: path.write_bytes(b"\x1f\x8b\x08"), "a gzip file"),
+        (lambda path: zipped(path, "[Content_Types].xml"), "an Excel workbook, which is not read"),
+        (lambda path: zipped(path, "notes.txt"), "not a table"),
         (lambda path: path.write_bytes(b"PAR1" + bytes(50)), "cannot be read"),
         (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(50)), "a zip file that cannot be read as NumPy's .npz"),
         (lambda path: path.write_bytes(b"MATLAB 7.3 MAT-file, Platform"), r"version 7.3 \(HDF5\); expected .*'-v7'"),
