@@ -43,27 +43,36 @@ def extract(
         BagError: unreadable, topics or columns missing or of another type, bad samples.
         RecordingError: the signals never overlap in time.
     """
-    recordings = []
-    for path in bags:
-        with open_log(path) as log:
-            signal_map, lack = _with_commands_of(log, signal_map)
-            streams, notes = read_streams(log, signal_map, drop_bad, progress)
-        notes += lack
-        if signal_map.velocities is not None:
-            streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
-            notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")
-        held = held_signals(signal_map, streams, 1e9 / rate)
-        info = RecordingInfo(
-            sampling_time=1 / rate,
-            commands=signal_map.commands,
-            source=(Path(path).name,),
-            signal_map=signal_map.name,
-            held=tuple(held),
-            held_periods=held,
-            notes=tuple(notes),
-        )
-        recordings.append(resample(streams, rate, signal_map.max_gap, signal_map.commands, info))
+    recordings = [_extract(path, signal_map, rate, drop_bad, progress) for path in bags]
+    lacking = [", ".join(one.info.source) for one in recordings if one.info.commands != signal_map.commands]
+    if 0 < len(lacking) < len(recordings):  # commands of some logs alone cannot be joined
+        none, note = signal_map.with_commands("none"), f"no commands in {', '.join(lacking)}; commands: none"
+        recordings = [_extract(path, none, rate, drop_bad, progress, note) for path in bags]
     return concatenate(recordings)
+
+
+def _extract(
+    path: str | Path, signal_map: SignalMap, rate: float, drop_bad: bool, progress: Progress | None, note: str = ""
+) -> Recording:
+    """The recording of one log, whose notes begin with ``note``."""
+    with open_log(path) as log:
+        signal_map, lack = _with_commands_of(log, signal_map)
+        streams, notes = read_streams(log, signal_map, drop_bad, progress)
+    notes = [*([note] if note else []), *notes, *lack]
+    if signal_map.velocities is not None:
+        streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
+        notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")
+    held = held_signals(signal_map, streams, 1e9 / rate)
+    info = RecordingInfo(
+        sampling_time=1 / rate,
+        commands=signal_map.commands,
+        source=(Path(path).name,),
+        signal_map=signal_map.name,
+        held=tuple(held),
+        held_periods=held,
+        notes=tuple(notes),
+    )
+    return resample(streams, rate, signal_map.max_gap, signal_map.commands, info)
 
 
 def _with_commands_of(log: Bag | Table, signal_map: SignalMap) -> tuple[SignalMap, list[str]]:

@@ -354,6 +354,17 @@ def test_without_command_columns_or_topics_there_are_none(
         assert not found["r_cmd"].any()
 
 
+@pytest.mark.parametrize("turn", [1, -1])
+def test_logs_with_and_without_commands_are_joined_without(tmp_path: Path, columns: Any, turn: int) -> None:
+    write_csv(tmp_path / "with.csv", columns)
+    del columns["throttle_command"], columns["steering_command"]
+    write_csv(tmp_path / "without.csv", columns | {"time": columns["time"] + 10**10})
+    recording = extract([tmp_path / name for name in ("with.csv", "without.csv")[::turn]], table_map(), 40.0)
+    assert (recording.info.commands, recording.info.source[::turn]) == ("none", ("with.csv", "without.csv"))
+    assert "no commands in without.csv; commands: none" in recording.info.notes[0]
+    assert not recording["r_cmd"].any()
+
+
 def test_a_table_of_many_rows_is_read_in_pieces(tmp_path: Path) -> None:
     """Cells are never taken one by one: 300 000 of them would take as many microseconds, several times over."""
     n = 100_000
