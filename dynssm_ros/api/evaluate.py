@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dynssm_ros.api.inputs import Log, PathLike, centre_line, joined, opened, several, vehicle_in_windows
 from dynssm_ros.api.settings import MIN_SPEED, CommandsSettings, WorkerSettings, keywords, setting
+from dynssm_ros.errors import DataWarning
 from dynssm_ros.extras import require
 from dynssm_ros.progress import Progress
 from dynssm_ros.vehicle import Vehicle
@@ -81,7 +83,10 @@ def evaluate(
         log, split = log.split_last(s.holdout)[1], f"last {100 * s.holdout:.3g} % of the recording, as one block"
     if not name:
         name = ", ".join(Path(each).name for each in several(recordings) if isinstance(each, (str, Path)))
-    return evaluate(
+    found = evaluate(
         log, with_offline(known), name=name, split=split, min_speed=s.min_speed, horizon_s=s.horizon, stride=s.stride,
         line=line, progress=on_progress, workers=s.workers,
     )  # fmt: skip
+    for note in found.not_tests:
+        warnings.warn(note, DataWarning, stacklevel=3)
+    return found

@@ -13,6 +13,7 @@ from dynssm_ros.extras import require
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
+from dynssm_ros.vehicle.integrators import Integrator
 
 if TYPE_CHECKING:
     from dynssm_ros.learning.models.base import ModelConfig
@@ -87,10 +88,13 @@ def train(
         data = joined(opened(recordings, car), s.commands, s.holdout)
     else:
         data = sampled(_looked_at(recordings, car), s.memory, commands=s.commands, holdout=s.holdout)
-    trained = train(
-        data, config, car, checkpoint, device=s.device, progress=on_progress,
-        calibrate=lambda data, car, integrator: calibrate(data, car, integrator=integrator).vehicle,
-    )  # fmt: skip
+
+    def calibrated(laps: Recording, car: Vehicle, integrator: Integrator | None) -> Vehicle:
+        if integrator in (None, car.integrator) and car.was_calibrated_on(laps.fingerprints):
+            return car
+        return calibrate(laps, car, integrator=integrator).vehicle
+
+    trained = train(data, config, car, checkpoint, device=s.device, progress=on_progress, calibrate=calibrated)
     artifact = save_artifact(trained, folder, {"holdout": s.holdout, "device": s.device}, picture)
     for path in checkpoints(config, checkpoint):
         path.unlink(missing_ok=True)

@@ -75,6 +75,20 @@ class Evaluation:
         return grouped(self.scores)
 
     @property
+    def not_tests(self) -> list[str]:
+        """A sentence for each model that, or whose car, was fitted to a third or more of what it is scored on."""
+        laps, found = set(self.recording.fingerprints), []
+        for name, group in self.groups.items():
+            card, vehicle = group.first.model.card, group.first.model.vehicle
+            before = None if vehicle is None else vehicle.before
+            known = {"was trained": card.laps if card else (), "has a car calibrated": before.laps if before else ()}
+            shares = {how: len(laps & {*theirs}) / len(laps) for how, theirs in known.items()}
+            how = " and ".join(f"{how} on {100 * share:.0f} %" for how, share in shares.items() if 3 * share >= 1)
+            if how:
+                found.append(f"{name} {how} of what it is scored on: expected other laps, or those that were held out")
+        return found
+
+    @property
     def steps(self) -> int:
         """Length of the rollouts in steps."""
         return len(self._rollout.time)
@@ -126,6 +140,7 @@ class Evaluation:
             "rows": len(self.rows),
             "starts": self.starts,
             "persistence_rmse": by_channel(self.persistence_rmse),
+            "not_tests": self.not_tests,
         }
 
 

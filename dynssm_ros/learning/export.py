@@ -121,6 +121,7 @@ def save_artifact(
                 "seed": config.training.seed,
                 **(training or {}),
             },
+            laps=trained.recording.fingerprints,
             checksums={each.name: checksum(each) for each in sorted(folder.iterdir())},
         )
         write_card(card, folder)

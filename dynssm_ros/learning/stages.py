@@ -97,6 +97,9 @@ class _Stages:
         """One stage, from what the model starts from on."""
         car = self.vehicle
         if self.calibrate is not None and (config.with_physics.nominal == "calibrated" or config.online is not None):
+            report = self._report(name, stage)
+            if report is not None:
+                report(0, 0, "calibrating the car")
             car = self.calibrate(data, car, integrator)
         file, start, done = self.files[stage], None, 0
         if config.start is not None:

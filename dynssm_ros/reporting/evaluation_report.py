@@ -52,7 +52,8 @@ def summary_table(evaluation: Evaluation) -> Table:
             lambda group: group.spreads(lambda score: score.latency),
         ),
         caption=f"{len(evaluation.rows):,} one-step predictions and {evaluation.starts:,} rollouts over "
-        f"{evaluation.horizon_s:g} s, the same rows for every model.{_seeds_in_words(evaluation)}",
+        f"{evaluation.horizon_s:g} s, the same rows for every model.{_seeds_in_words(evaluation)}"
+        + "".join(f" No test: {note}." for note in evaluation.not_tests),
     )
 
 

@@ -80,6 +80,7 @@ class ModelCard(StrictModel):
     parameters: int = Field(ge=0, description="weights that training finds")
     flops: int = Field(ge=0, description="floating-point operations per prediction")
     training: dict[str, Any] = Field(default_factory=dict, description="data, split, seed, epochs")
+    laps: tuple[str, ...] = Field(default=(), description="fingerprints of what it was trained on")
     checksums: dict[str, str] = Field(description="SHA-256 of the other files")
 
     @model_validator(mode="after")

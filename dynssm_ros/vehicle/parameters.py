@@ -244,6 +244,10 @@ class Vehicle(StrictModel):
         nominal = [before.nominal[name] for name in COEFFICIENTS]
         return self._known(nominal, std, correlation=before.correlation, before=None)
 
+    def was_calibrated_on(self, laps: Collection[str]) -> bool:
+        """Whether it was calibrated on ``laps`` (fingerprints), on all of them and nothing else."""
+        return self.before is not None and {*self.before.laps} == {*laps}
+
     def calibrated_on(self, laps: Collection[str], given: Vehicle) -> Vehicle:
         """The same car, calibrated on ``laps`` (fingerprints) from the file ``given``."""
         before = given.before or KnownBefore(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.track.tracks import load_track
+from dynssm_ros.vehicle import load_vehicle, save_vehicle
 
 
 @pytest.fixture
@@ -129,3 +131,22 @@ def test_bad_input_gets_one_line_and_leaves_nothing_behind(refused, recording, t
     line = refused("evaluate", recording, *arguments, "--out", tmp_path / "out")
     assert expected in line
     assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_knows_the_rows_is_named_beside_the_table(dynssm, laps_bag, quick_figures, tmp_path, monkeypatch):
+    """One was trained on all of them, one on the first half alone, and a car was calibrated on all."""
+    monkeypatch.chdir(tmp_path)
+    laps, out, car = Path("laps.parquet"), Path("out"), load_vehicle("orca")
+    recording = extract([laps_bag], load_signal_map("default"), 50.0)
+    recording.save(laps)
+    save_vehicle(car.calibrated_on(recording.fingerprints, car), "car.yaml")
+    models = ["--model", "single_track", "--vehicle", "car.yaml"]
+    for name, holdout in (("all", 0.0), ("half", 0.5)):
+        dynssm("train", laps, "--model", "ridge", "--vehicle", "orca", "--holdout", holdout, "--out", name)
+        models += ["--model", name]
+    status, _, err = dynssm("evaluate", laps, *models, "--holdout", 0.5, "--out", out)
+    assert status == 0
+    told = json.loads((out / "results.json").read_text())["not_tests"]
+    assert [note.split(" on ")[0] for note in told] == ["single_track has a car calibrated", "all was trained"]
+    assert [line.removeprefix("warning: ") for line in err.splitlines() if line.startswith("warning: ")] == told
+    assert all(f"No test: {note}." in (out / "results.md").read_text() for note in told)

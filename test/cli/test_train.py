@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,7 +17,9 @@ from dynssm_ros.learning import optimisation as training
 from dynssm_ros.learning import stages
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -139,3 +142,24 @@ def test_without_a_terminal_there_is_no_progress_bar(arguments: list[str]) -> No
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "parameters, best epoch 0, seed 0; one-step RMSE on" in done.stdout
+
+
+def test_a_car_that_was_calibrated_on_these_laps_is_not_calibrated_again(
+    dynssm: Run, laps_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is on others."""
+    laps = tmp_path / "laps.parquet"
+    extract([laps_bag], load_signal_map("default"), 50.0).save(laps)
+    asked: list[int] = []
+
+    def calibrated(recording: Recording, car: Vehicle, **_: object) -> SimpleNamespace:
+        asked.append(len(recording))
+        return SimpleNamespace(vehicle=car)
+
+    monkeypatch.setattr("dynssm_ros.identification.result.calibration.calibrate", calibrated)
+    recording, car = Recording.load(laps), load_vehicle("orca")
+    save_vehicle(car.calibrated_on(recording.fingerprints, car), tmp_path / "car.yaml")
+    for vehicle in (tmp_path / "car.yaml", "orca"):
+        status, _, words = dynssm("train", laps, "--model", "rls", "--vehicle", vehicle, "--out", tmp_path / "model")
+        assert status == 0, words
+        assert len(asked) == (vehicle == "orca")
