@@ -116,6 +116,8 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
         found = {name: one for name, one in found.items() if name not in STATE_SIGNALS}
     elif not found:
         notes.append("no column tells where the car is or how fast; find v_x, v_y and omega, or x, y and theta")
+    if "v_y" in found and _spread(found["v_y"].values) == 0:
+        notes.append(f"{found['v_y'].field}: v_y is constant, so that nothing is known of how the car slides")
     if "v_x" in found and float(np.nanmax(np.abs(found["v_x"].values), initial=0.0)) > _FASTEST:
         found["v_x"] = replace(found["v_x"], note="too fast for m/s: find its unit")
     for name in ("omega", "theta"):

@@ -55,6 +55,16 @@ def clock_of(table: Table, given: TimeColumn | None) -> Clock:
     Raises:
         BagError: there is no time column, or it does not rise.
     """
+    clock = _chosen(table, given)
+    lost = int((~clock.known).sum())
+    if lost:
+        note = f"{lost} row{' has' if lost == 1 else 's have'} no time in column '{clock.column}'; left out"
+        table.notes.extend([note] if note not in table.notes else [])
+    return clock
+
+
+def _chosen(table: Table, given: TimeColumn | None) -> Clock:
+    """The clock of the column that is given, or else found."""
     if given is not None:
         clock = _clock(table, given.column, table.read([given.column])[given.column], given.unit)
         clock = _with_nanoseconds(table, clock, given.nanoseconds)

@@ -19,7 +19,7 @@ from dynssm_ros.signals.array_files import mat_arrays, npz_arrays
 from dynssm_ros.signals.columns import Column, Heading, heading, kind_of, parsed, told_bad, typed_column
 from dynssm_ros.signals.csv_layout import Layout, layout_of
 
-_GROUP_BYTES = 256 << 20  # of columns that are in memory at once
+_GROUP_BYTES, _CELL_BYTES = 512 << 20, 16  # of columns that are in memory at once, and of a cell of them
 _MOST_ROWS = 50_000_000  # as of recordings
 _TOLD = 30  # columns that a message names
 _RAGGED = 0.01  # share of lines with another number of cells, from which on a file is no table
@@ -61,7 +61,7 @@ class Table:
     def groups(self) -> Iterator[dict[str, Column]]:
         """Yields all columns, as many at once as may be in memory."""
         names = list(self.headings)
-        size = max(1, _GROUP_BYTES // (32 * max(self.rows, 1)))
+        size = max(1, _GROUP_BYTES // (_CELL_BYTES * max(self.rows, 1)))
         for first in range(0, len(names), size):
             yield self.read(names[first : first + size])
 

@@ -354,6 +354,14 @@ def test_without_command_columns_or_topics_there_are_none(
         assert not found["r_cmd"].any()
 
 
+def test_rows_without_a_time_are_left_out_with_a_note(tmp_path: Path, columns: Any) -> None:
+    stamps = ["ERR" if k == 7 else "" if k in (20, 21) else str(one) for k, one in enumerate(columns["time"].tolist())]
+    write_csv(tmp_path / "log.csv", columns | {"time": stamps})
+    recording = extract([tmp_path / "log.csv"], table_map(), 40.0)
+    assert (len(recording), recording.info.notes) == (24, ("3 rows have no time in column 'time'; left out",))
+    assert "3 rows have no time in column 'time'; left out" in inspect(tmp_path / "log.csv").notes
+
+
 @pytest.mark.parametrize("turn", [1, -1])
 def test_logs_with_and_without_commands_are_joined_without(tmp_path: Path, columns: Any, turn: int) -> None:
     write_csv(tmp_path / "with.csv", columns)
