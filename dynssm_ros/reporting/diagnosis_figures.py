@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ from dynssm_ros.reporting.evaluation_figures import (
     PALETTE,
     SYMBOLS,
     WIDTH,
+    cut_at_holes,
     label,
     legend_above,
     sheet,
@@ -103,16 +105,17 @@ def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector,
     else:
         bins = _binned(windows.data.rows[0, at])
         there.plot(
-            [windows.data.rows[0, at][b].mean() for b in bins], [gone[b].mean() for b in bins], "o-", color=_COLOURS[2]
+            _of_bins(np.mean, windows.data.rows[0, at], bins), _of_bins(np.mean, gone, bins), "o-", color=_COLOURS[2]
         )
         there.axhline(0.0, color=MEASURED, lw=0.8)
         there.set_xlabel("speed (m/s)")
         there.set_title("at which speed error is gone")
     order, blocks = np.argsort(windows.time), max(1, min(_BLOCKS, len(gone) // _FEWEST))
     parts = np.array_split(order, blocks)
-    over.bar(range(blocks), [gone[part].mean() for part in parts], 0.9, color=_COLOURS[2])
-    ticks = np.unique(np.linspace(0, blocks - 1, 4).round().astype(int))
-    over.set_xticks(ticks, [f"{windows.time[parts[k]].mean():.0f}" for k in ticks])
+    first, last = (windows.time[[part[k] for part in parts]] for k in (0, -1))
+    over.bar(
+        first, [gone[part].mean() for part in parts], np.maximum(last - first, 0.1), align="edge", color=_COLOURS[2]
+    )
     over.axhline(0.0, color=MEASURED, lw=0.8)
     over.set_xlabel("time (s)")
     over.set_title("when: error gone, 1 = the mean error")
@@ -168,7 +171,8 @@ def errors_over_time(improvement: Improvement) -> Figure:
     for column, h in zip(axes.T, (0, improvement.horizon), strict=True):
         for c, (panel, channel) in enumerate(zip(column, STATE_SIGNALS, strict=True)):
             for (name, values), colour in zip(list(improvement.errors.items())[1:], _COLOURS[1:], strict=True):
-                panel.plot(improvement.windows.time[order], values[order, h, c], color=colour, lw=0.8, label=name)
+                line = cut_at_holes(improvement.windows.time[order], values[order, h, c])
+                panel.plot(*line, color=colour, lw=0.8, label=name)
             panel.axhline(0.0, color=MEASURED, lw=0.8)
             panel.set_ylabel(label(channel, " error"))
         column[0].set_title(f"{improvement.horizons[h]:.4g} s ahead")
@@ -182,18 +186,18 @@ def errors_over(abscissa: str, x: Vector, improvement: Improvement) -> Figure:
     """Mean and spread of the errors over what ``x`` ``(W,)`` is, one step and the horizon ahead, a column per channel."""
     figure, axes = sheet(4.6, 2, 3, sharex=True)
     bins = _binned(x)
-    centre = [x[b].mean() for b in bins]
+    centre = _of_bins(np.mean, x, bins)
     for row, h in enumerate((0, improvement.horizon)):
         for c, channel in enumerate(STATE_SIGNALS):
             panel: Axes = axes[row, c]
             reach = 0.0
             for (name, errors), colour in zip(improvement.errors.items(), _COLOURS, strict=True):
-                mean = np.array([errors[b, h, c].mean() for b in bins])
+                mean = _of_bins(np.mean, errors[:, h, c], bins)
                 panel.plot(centre, mean, "o-", color=colour, ms=2.5, label=name)
                 if colour != NO_MODEL:
-                    spread = np.array([errors[b, h, c].std() for b in bins])
+                    spread = _of_bins(np.std, errors[:, h, c], bins)
                     panel.fill_between(centre, mean - spread, mean + spread, color=colour, alpha=0.15, lw=0)
-                    reach = max(reach, float((np.abs(mean) + spread).max()))
+                    reach = max(reach, float(np.nanmax(np.abs(mean) + spread)))
             panel.set_ylim(-1.25 * reach, 1.25 * reach) if reach > 0 else None
             panel.axhline(0.0, color=MEASURED, lw=0.8)
             if row == 0:
@@ -205,10 +209,15 @@ def errors_over(abscissa: str, x: Vector, improvement: Improvement) -> Figure:
 
 
 def _binned(x: Vector) -> list[npt.NDArray[np.intp]]:
-    """Numbers of the values in equally wide bins, without bins that are nearly empty."""
+    """Numbers of the values in equally wide bins; of none in bins that are nearly empty."""
     low, high = np.quantile(x, [0.005, 0.995])
     edges = np.linspace(low, high, _BINS + 1)[1:-1]
     number = np.searchsorted(edges, x)
     bins = [np.flatnonzero(number == k) for k in range(_BINS)]
-    filled = [b for b in bins if len(b) >= _FEWEST]
-    return filled or [np.arange(len(x))]
+    filled = [b if len(b) >= _FEWEST else b[:0] for b in bins]
+    return filled if any(map(len, filled)) else [np.arange(len(x))]
+
+
+def _of_bins(what: Callable[[Vector], Any], values: Vector, bins: list[npt.NDArray[np.intp]]) -> Vector:
+    """A statistic of the values in each bin; NaN, where lines break, of none."""
+    return np.array([what(values[b]) if len(b) else np.nan for b in bins])

@@ -36,6 +36,7 @@ NO_MODEL = "#9a9a9a"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#332288", "#882255", "#999933")
 WIDTH = 9.6  # inches; the width of a report's text
 MAX_POINTS = 1500  # more points on a line than this are not seen
+_ROOM_FOR_TICKS = 30  # letters of tick labels in a third of the width
 OUTLYING = 3.0  # a model whose largest value exceeds the models' median by this factor may leave the panel
 MAX_BAR = 2.0  # bars end at this multiple of persistence, and say how long they are
 STYLE: dict[Any, Any] = {
@@ -218,7 +219,7 @@ def adapted_parameters(time: Vector, theta: Vector, vehicle: Vehicle) -> Figure:
     figure, axes = sheet(9.6, 6, 3, sharex=True)
     axes = axes.ravel()
     every = slice(None, None, max(1, len(time) // MAX_POINTS))
-    abscissa, values = _cut_at_holes(time[every], theta[every])
+    abscissa, values = cut_at_holes(time[every], theta[every])
     for k, name in enumerate(COEFFICIENTS):
         panel: Axes = axes[k]
         lower, upper = vehicle.lower[k], vehicle.upper[k]
@@ -298,6 +299,8 @@ def regime_errors(labels: Sequence[str], what: str, rmse: Mapping[str, Vector], 
             panel.errorbar(places + 0.06 * (depth - (len(rmse) - 1) / 2), shown, whiskers, **bars, **style)
         panel.set_title(label(channel, ": RMSE"))
         panel.set_xticks(places, labels)
+        if sum(map(len, labels)) > _ROOM_FOR_TICKS:
+            panel.tick_params(axis="x", rotation=50)
         panel.set_xlabel(what)
         panel.set_xlim(-0.5, len(labels) - 0.5)
         panel.set_ylim(0.0, room({name: values[:, k] for name, values in rmse.items()}))
@@ -305,7 +308,7 @@ def regime_errors(labels: Sequence[str], what: str, rmse: Mapping[str, Vector], 
     return legend_above(figure, axes[0])
 
 
-def _cut_at_holes(x: Vector, values: Vector) -> tuple[Vector, Vector]:
+def cut_at_holes(x: Vector, values: Vector) -> tuple[Vector, Vector]:
     """Inserts a NaN row wherever ``x`` jumps, so that a line is not drawn across."""
     steps = np.diff(x)
     typical = float(np.median(steps)) if len(steps) else 1.0
