@@ -177,6 +177,14 @@ def test_figures_have_a_row_for_one_step_and_one_for_the_horizon(improvement: Im
     assert np.isfinite(y[starts]).any()
 
 
+def test_lines_break_where_there_is_nothing(improvement: Improvement) -> None:
+    x = np.linspace(0.0, 1.0, len(improvement.windows.starts))
+    line = errors_over("speed (m/s)", np.where(x < 0.5, x, x + 9.0), improvement).axes[0].lines[0]
+    speed, mean = (np.asarray(values, dtype=float) for values in line.get_data())
+    assert np.isnan(mean[1:-1]).all()
+    assert (speed[0] < 0.5, speed[-1] > 9.5) == (True, True)
+
+
 def test_each_cause_has_a_picture_of_how_much_where_and_when(lagging: Lagging) -> None:
     found = lagging[2]
     windows, (cause,) = found.improvement.windows, found.causes
