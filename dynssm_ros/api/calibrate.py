@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from dynssm_ros.api.inputs import Log, PathLike, centre_line, joined, opened, vehicle_of
 from dynssm_ros.api.settings import MIN_SPEED, CommandsSettings, keywords, setting
+from dynssm_ros.errors import DataWarning
 from dynssm_ros.extras import require
 from dynssm_ros.progress import Progress
 from dynssm_ros.vehicle import Vehicle
@@ -67,7 +69,15 @@ def calibrate(
     car, s = vehicle_of(vehicle), settings
     data = joined(opened(recordings, car), s.commands, s.holdout)
     line = None if s.track is None else centre_line(s.track, data)
-    return calibrate(
+    found = calibrate(
         data, car, horizon=s.horizon, min_speed=s.min_speed, integrator=s.integrator, starts=s.starts, seed=s.seed,
         on_progress=on_progress, line=line,
     )  # fmt: skip
+    if found.tells_nothing_of:
+        times = ", ".join(f"{name} {ratio:.2g} times" for name, ratio in found.tells_nothing_of.items())
+        warnings.warn(
+            f"{found.horizon:.2g} s ahead the calibrated car errs more than the prediction that nothing changes ({times}): "
+            "signals, units, signs or the vehicle file are wrong, or it lacks an effect (dynssm inspect, dynssm diagnose)",
+            DataWarning, stacklevel=3,
+        )  # fmt: skip
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -61,6 +62,19 @@ def test_a_wrong_car_becomes_the_right_one(dynssm: Run, laps: Path, tmp_path: Pa
     assert (result["on_bound"], result["unidentified"]) == ([], [])
     assert result["horizon_s"] == pytest.approx(0.52)
     assert 0 < result["rows"] < len(Recording.load(laps))
+
+
+def test_a_car_that_predicts_worse_than_that_nothing_changes_is_warned_of(
+    dynssm: Run, laps: Path, tmp_path: Path
+) -> None:
+    """As with a steering whose sign is wrong."""
+    recording = Recording.load(laps).select(slice(0, 500))
+    turned = {name: -recording[name] for name in ("delta_fb", "delta_cmd")}
+    replace(recording, columns=recording.columns | turned).save(laps)
+    status, _, err = dynssm("calibrate", laps, "--vehicle", "orca", *ONE_EULER_START, "--out", tmp_path / "car.yaml")
+    assert status == 0
+    (line,) = [line for line in err.splitlines() if line.startswith("warning: ") and "nothing changes" in line]
+    assert re.search(r"s ahead .* omega [\d.]+ times", line)
 
 
 def test_a_coefficient_on_its_bound_is_told_and_marked(dynssm: Run, laps: Path, tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.effects.base import LAP
 from dynssm_ros.vehicle.integrators import Integrator
+from dynssm_ros.vehicle.single_track import State
 
 _INTEGRATORS: tuple[Integrator, ...] = ("rk4", "euler")  # the first, unless another is clearly closer to the data
 
@@ -47,6 +48,7 @@ class Calibration:
         rmse_before: one-step RMSE ``(3,)`` with the former nominal values; ``rmse_after`` with the calibrated ones.
         rows: number of prediction errors used per channel.
         horizon: length of the simulations (s).
+        over_persistence: error ``(3,)`` at the end of the simulations, over that of the prediction that nothing changes.
     """
 
     vehicle: Vehicle
@@ -58,6 +60,14 @@ class Calibration:
     rmse_after: Vector
     rows: int
     horizon: float
+    over_persistence: Vector
+
+    @property
+    def tells_nothing_of(self) -> dict[str, float]:
+        """By state, :attr:`over_persistence` where the car predicts no better than that nothing changes."""
+        return {
+            name: float(ratio) for name, ratio in zip(State._fields, self.over_persistence, strict=True) if ratio >= 1
+        }
 
 
 def calibrate(
@@ -135,7 +145,16 @@ def _calibration(
         _rmse(one_step, fit.car),
         windows.target.shape[0] * windows.target.shape[1],
         windows.steps * recording.T_s,
+        _over_persistence(windows, problem.errors(fit.car)),
     )
+
+
+def _over_persistence(windows: SimulationWindows, errors: Vector) -> Vector:
+    """RMS of the last ``errors`` over that of the measured changes since the starts, ``(3,)``; 0 where nothing changes."""
+    changes = windows.target[:, -1] - windows.data.rows[:3, windows.starts].T
+    of_nothing = np.sqrt(np.mean(changes**2, axis=0))
+    error = np.sqrt(np.mean(errors[:, -1] ** 2, axis=0))
+    return np.asarray(np.divide(error, of_nothing, out=np.zeros(3), where=of_nothing > 0))
 
 
 def _rmse(one_step: SimulationWindows, car: CarEstimate) -> Vector:
