@@ -16,7 +16,7 @@ import time
 # tests run side by side; libraries read these when they are loaded
 os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -113,6 +113,19 @@ def _sources() -> bytes:
     for path in sorted([*found, REPOSITORY / "constraints.txt", Path(__file__)]):
         digest.update(path.relative_to(REPOSITORY).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.digest()
+
+
+@pytest.fixture(autouse=True)
+def beside_others(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Live tests run two at a time, but for those that need the cores for themselves to keep up with real time."""
+    if request.node.get_closest_marker("live") is None:
+        yield
+        return
+    alone = request.node.get_closest_marker("alone") is not None
+    (REPOSITORY / ".pytest_cache").mkdir(exist_ok=True)
+    with (REPOSITORY / ".pytest_cache" / "live.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+        yield
 
 
 Kept = Callable[[str, Callable[[Path], None]], Path]

@@ -31,7 +31,8 @@ def test_full_brakes_take_the_square_of_the_speed() -> None:
 
 @pytest.mark.slow
 @pytest.mark.live
-@pytest.mark.timeout(200)
+@pytest.mark.alone
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("what", ["frozen", "silent", "rogue coefficients", "invalid requests"])
 def test_a_fault_ends_no_node_is_told_and_braked_for(small_model: Path, what: str) -> None:
     outcome = drive(small_model, Drawn(0, what, 2.0, 0.5, "orca", 0.7))

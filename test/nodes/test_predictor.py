@@ -93,7 +93,12 @@ def heard(car: Any, msgtype: Any, topic: str, qos: Any, wanted: Callable[[Any], 
 
 
 @pytest.mark.parametrize(
-    ("rate", "in_step"), [*(pytest.param(rate, False, marks=pytest.mark.slow) for rate in (50.0, 100.0)), (100.0, True)]
+    ("rate", "in_step"),
+    [
+        pytest.param(50.0, False, marks=[pytest.mark.slow, pytest.mark.alone]),
+        pytest.param(100.0, False, marks=[pytest.mark.slow, pytest.mark.alone]),
+        (100.0, True),
+    ],
 )
 def test_every_odometry_message_after_the_first_window_gets_a_prediction_as_replay_gives_it(
     small_model: Path, laps_bag: Path, tmp_path: Path, rate: float, in_step: bool

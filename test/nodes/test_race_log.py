@@ -20,6 +20,7 @@ from dynssm_ros.signals.standard import recording_to_bag
 from dynssm_ros.vehicle import load_vehicle
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(180)]
+IN_REAL_TIME = [pytest.mark.slow, pytest.mark.alone]
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +39,9 @@ def model(putnam: Path, kept: Callable[[str, Callable[[Path], None]], Path]) -> 
     ("rate", "speed", "seconds", "in_step"),
     [
         (25.0, 4.0, 32.0, True),
-        pytest.param(25.0, 1.0, 8.0, False, marks=pytest.mark.slow),
-        pytest.param(100.0, 1.0, 8.0, False, marks=pytest.mark.slow),
-        pytest.param(100.0, 4.0, 24.0, False, marks=pytest.mark.slow),  # 400 messages a second take a core of their own
+        pytest.param(25.0, 1.0, 8.0, False, marks=IN_REAL_TIME),
+        pytest.param(100.0, 1.0, 8.0, False, marks=IN_REAL_TIME),
+        pytest.param(100.0, 4.0, 24.0, False, marks=IN_REAL_TIME),  # 400 messages a second take a core of their own
     ],
 )
 def test_every_odometry_message_after_the_first_window_gets_a_prediction(
