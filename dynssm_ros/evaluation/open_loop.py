@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -74,7 +74,7 @@ class Evaluation:
         """The scores, those of one model with several seeds joined."""
         return grouped(self.scores)
 
-    @property
+    @cached_property
     def not_tests(self) -> list[str]:
         """A sentence for each model that, or whose car, was fitted to a third or more of what it is scored on."""
         laps, found = set(self.recording.fingerprints), []

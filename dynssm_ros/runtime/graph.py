@@ -89,13 +89,7 @@ class Graph:
 
 
 def try_graph(file: Path, content: bytes, rows: int, columns: int) -> None:
-    """Opens a graph and runs it once, in another process.
-
-    Args:
-        file: that messages name.
-        content: of the file.
-        rows: of a window.
-        columns: of a window.
+    """Opens a graph and runs it once, in another process; for the arguments see :class:`Graph`.
 
     Raises:
         ArtifactError: as :class:`Graph`, or it takes too much time or memory, or ends the process.

@@ -7,11 +7,13 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 
+from dynssm_ros.identification.result.calibration import _over_persistence
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -75,6 +77,17 @@ def test_a_car_that_predicts_worse_than_that_nothing_changes_is_warned_of(
     assert status == 0
     (line,) = [line for line in err.splitlines() if line.startswith("warning: ") and "nothing changes" in line]
     assert re.search(r"s ahead .* omega [\d.]+ times", line)
+
+
+def test_errors_are_compared_with_those_of_nothing_state_by_state() -> None:
+    """Changes by 1, 2 and 4; errors of a half, a quarter and twice as much."""
+    windows = SimpleNamespace(
+        target=np.array([[[0.0, 0, 0], [1, 2, 4]]] * 3),
+        starts=np.arange(3),
+        data=SimpleNamespace(rows=np.zeros((7, 3))),
+    )
+    errors = np.array([[[9.0, 9, 9], [0.5, 0.5, 8]]] * 3)
+    np.testing.assert_allclose(_over_persistence(windows, errors), [0.5, 0.25, 2.0])  # type: ignore[arg-type]
 
 
 def test_a_coefficient_on_its_bound_is_told_and_marked(dynssm: Run, laps: Path, tmp_path: Path) -> None:

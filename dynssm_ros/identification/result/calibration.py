@@ -145,12 +145,12 @@ def _calibration(
         _rmse(one_step, fit.car),
         windows.target.shape[0] * windows.target.shape[1],
         windows.steps * recording.T_s,
-        _over_persistence(windows, problem.errors(fit.car)),
+        _over_persistence(windows, fit.errors.reshape(windows.target.shape)),
     )
 
 
 def _over_persistence(windows: SimulationWindows, errors: Vector) -> Vector:
-    """RMS of the last ``errors`` over that of the measured changes since the starts, ``(3,)``; 0 where nothing changes."""
+    """RMS of the last ``errors`` ``(W, K, 3)`` over that of the measured changes, ``(3,)``; 0 where nothing changes."""
     changes = windows.target[:, -1] - windows.data.rows[:3, windows.starts].T
     of_nothing = np.sqrt(np.mean(changes**2, axis=0))
     error = np.sqrt(np.mean(errors[:, -1] ** 2, axis=0))
