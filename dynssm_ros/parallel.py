@@ -137,7 +137,7 @@ def _ray(workers: Workers) -> Iterator[tuple[type[Exception], ...]]:
     from joblib import parallel_config, register_parallel_backend
     from ray.util.joblib.ray_backend import RayBackend
 
-    class Streaming(RayBackend):
+    class Streaming(RayBackend):  # type: ignore[misc]
         supports_return_generator = True  # its pool can; joblib's own multiprocessing, which it is made of, cannot
 
     register_parallel_backend("ray", Streaming)
@@ -186,15 +186,15 @@ def _dask_client(workers: Workers) -> Iterator[None]:
     from distributed import Client, LocalCluster
 
     if workers.address:
-        with Client(workers.address):  # type: ignore[no-untyped-call]
+        with Client(workers.address):
             yield
         return
     local = {"n_workers": workers.jobs, "threads_per_worker": 1, "dashboard_address": None}
     with (
         TemporaryDirectory() as scratch,
         config.set({"temporary-directory": scratch}),
-        LocalCluster(**local, silence_logs=logging.CRITICAL) as cluster,  # type: ignore[no-untyped-call]
-        Client(cluster),  # type: ignore[no-untyped-call]
+        LocalCluster(**local, silence_logs=logging.CRITICAL) as cluster,
+        Client(cluster),
     ):
         yield
 
