@@ -172,7 +172,7 @@ def _together(values: Sequence[float]) -> Any:
 
 
 @dataclass(frozen=True)
-class _Coefficients:
+class _CoefficientScale:
     """How the coefficients of a vehicle move."""
 
     vehicle: Vehicle
@@ -209,16 +209,16 @@ class _Coefficients:
         return np.asarray(np.where(self.scales, grown, values - self.nominal) / self.std)
 
 
-_KNOWN: dict[int, _Coefficients] = {}
+_KNOWN: dict[int, _CoefficientScale] = {}
 
 
-def _about(vehicle: Vehicle) -> _Coefficients:
+def _about(vehicle: Vehicle) -> _CoefficientScale:
     """How the coefficients move: worked out once for the cars of a fit, which share the vehicle."""
     found = _KNOWN.get(id(vehicle))
     if found is None:  # the number is no other vehicle's while this one is kept
         if len(_KNOWN) > _KEPT:
             _KNOWN.clear()
-        found = _KNOWN[id(vehicle)] = _Coefficients(vehicle)
+        found = _KNOWN[id(vehicle)] = _CoefficientScale(vehicle)
     return found
 
 
