@@ -11,7 +11,7 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from dynssm_ros.errors import RecordingError
-from dynssm_ros.signals.history import History, Refusal, RingBuffer
+from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import RecordingInfo
 from dynssm_ros.signals.resampling import Stream, resample
@@ -41,43 +41,6 @@ def filled(T_s: float = 0.04, H: int = 5, until: float = 1.0, rate: float = 100.
         for values in (feedback((stamp - START) / SECOND), odometry((stamp - START) / SECOND)):
             assert history.add(stamp, values) is None
     return history, stamp
-
-
-# --- the ring buffer ----------------------------------------------------------------------------
-
-
-@given(st.lists(st.integers(1, 50), max_size=200), st.integers(2, 8), st.integers(0, 400))
-def test_the_buffer_is_the_end_of_a_plain_list_and_keeps_what_is_young(
-    steps: list[int], capacity: int, span: int
-) -> None:
-    buffer, plain = RingBuffer(capacity), []
-    for time in np.cumsum(steps, dtype=float).tolist():
-        buffer.append(time, -time, span)
-        plain.append(time)
-        assert len(buffer) == len(buffer.times) == len(buffer.values)
-        assert buffer.times.tolist() == plain[len(plain) - len(buffer) :]
-        np.testing.assert_array_equal(buffer.values, -buffer.times)
-        assert buffer.newest == time
-        # whatever lies inside the span can be interpolated: it starts at or after the oldest sample kept
-        assert len(buffer) == len(plain) or buffer.times[0] <= time - span
-
-
-def test_a_buffer_grows_only_as_far_as_its_span_needs() -> None:
-    buffer = RingBuffer(4)
-    for k in range(10_000):
-        buffer.append(float(k), 0.0, 100.0)
-    assert 100 <= len(buffer) <= 256
-
-
-def test_an_emptied_buffer_is_as_new() -> None:
-    buffer = RingBuffer(2)
-    assert buffer.newest == -inf
-    for k in range(5):
-        buffer.append(float(k), 1.0, 3.0)
-    buffer.clear()
-    assert (len(buffer), buffer.newest, buffer.times.tolist()) == (0, -inf, [])
-    buffer.append(0.0, 2.0, 3.0)
-    assert buffer.values.tolist() == [2.0]
 
 
 # --- against a history that is a plain list -----------------------------------------------------
@@ -215,9 +178,6 @@ def test_the_window_is_the_extractors_where_all_samples_are_known(data: st.DataO
             np.testing.assert_allclose(window, recording.matrix[row - H + 1 : row + 1], rtol=0, atol=1e-5)
         else:
             assert window is Refusal.FILLING
-
-
-# --- rates, jitter, precision -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.4])
