@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Iterator
 from typing import Any, Literal, get_args
 
@@ -38,10 +39,10 @@ from dynssm_ros.runtime.health import Level
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
 from dynssm_ros.signals.signal_map import load_signal_map
-from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
+from dynssm_ros.simulation.external import CommandHolder, Pace, drive_by_commands
 from dynssm_ros.simulation.laps import Sample, SimulationError, drive
 from dynssm_ros.simulation.plant import PLANTS, PlantKind
-from dynssm_ros.simulation.sensing import Sensing, Sensors
+from dynssm_ros.simulation.sensing import MOST_LATE, Sensing, Sensors
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.racing_line import LineKind, line_of
 from dynssm_ros.track.tracks import load_track
@@ -52,7 +53,6 @@ from dynssm_ros.vehicle.kinematics import Pose
 DriverKind = Literal["pure_pursuit", "external"]
 _DIAGNOSTICS = 1.0  # s between them
 _UNANSWERED = 10.0  # s that a command is waited for in lockstep: a driver may be held up for seconds
-_LATE = 1.0  # s; a node that was held up for longer goes on from there and does not catch up
 
 
 class SimulatorNode(Node):
@@ -90,7 +90,7 @@ class SimulatorNode(Node):
         self._track = load_track(track).scaled(scale)
         self._style = Style(aggressiveness, variation)
         self._sensors = self._make_sensors()
-        self._commands = CommandHolder(self._vehicle, watchdog, lambda: self._count * self._vehicle.sampling_time)
+        self._commands = CommandHolder(self._vehicle, watchdog, lambda: self._pace.count * self._vehicle.sampling_time)
         self._obeyed = self._on_road = True
         self._commanded: tuple[int, float] | None = None  # when the last command acts (ns), and when it came (s)
 
@@ -104,17 +104,16 @@ class SimulatorNode(Node):
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
         self._room = self._least = math.inf  # to the borders: now, and the least so far (m)
         self._samples = self._drive()
-        self._first_stamp = int(self.get_clock().now().nanoseconds)
-        self._period = self._vehicle.sampling_time / self._rate
-        self._begin, self._count, self._held_up = time.monotonic() + self._period, 0, 0.0
-        # what an external driver has not seen is not driven: it would be several samples under one command
-        self._catches_up = _LATE if self._driver == "pure_pursuit" else self._period
+        stamp = int(self.get_clock().now().nanoseconds)
+        T_s = self._vehicle.sampling_time
+        self._pace = Pace(T_s, self._rate, time.monotonic(), stamp, waits=self._lockstep)
+        self._stamps: deque[int] = deque(maxlen=1 + MOST_LATE)  # of the last samples (ns)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(self._period, self._on_time, clock=steady)
+        self.create_timer(self._pace.period, self._on_time, clock=steady)
         repeat(self, _DIAGNOSTICS, self._diagnose)
         self.get_logger().info(
             f"{self._vehicle.name} on {self._track.name} ({self._track.length:.4g} m), plant {self._plant}, "
-            f"driver {self._driver}, {1 / self._period:.4g} Hz"
+            f"driver {self._driver}, {1 / self._pace.period:.4g} Hz"
         )
 
     def _make_sensors(self) -> Sensors:
@@ -141,7 +140,10 @@ class SimulatorNode(Node):
         values = self._decoder.decode(message)
         command = Applied(*(values.get(name, math.nan) for name in ("throttle_command", "steering_command")))
         if self._commands.receive(command):
-            self._commanded = header_stamp_ns(message) or self._due, time.monotonic()
+            acts = header_stamp_ns(message) or self._pace.stamp
+            self._commanded = acts, time.monotonic()
+            if not self._lockstep and acts >= self._pace.stamp and self._pace.behind(time.monotonic()):
+                self._step()
         else:
             self.get_logger().warning(
                 f"{COMMAND_TOPIC}: throttle {command.r:g}, steering {command.delta:g} ignored; expected finite numbers",
@@ -149,36 +151,32 @@ class SimulatorNode(Node):
             )
 
     def _on_time(self) -> None:
-        """Publishes the samples that are due; the clock of the steps does not drift from that of the timer."""
+        """Publishes what is due. Nothing is caught up without an answer of an external driver: see :meth:`_on_command`."""
         if self._lockstep and self._is_unanswered():
             return
-        late = time.monotonic() - self._begin - self._count * self._period
-        if late > self._catches_up:
-            self._begin += late
-            self._held_up += late
-            late = 0.0
-        for _ in range(1 + int(late / self._period)):
-            try:
-                sample = next(self._samples)
-            except SimulationError as error:
-                raise FinishedError(str(error)) from error
-            self._publish(sample)
+        behind = self._pace.behind(time.monotonic())
+        for _ in range(1 + behind if self._driver == "pure_pursuit" else 1):
+            self._step()
 
-    @property
-    def _due(self) -> int:
-        """When the next command is to act (ns)."""
-        return self._stamp_of(self._count)
+    def _step(self) -> None:
+        """Drives one sample on."""
+        try:
+            sample = next(self._samples)
+        except SimulationError as error:
+            raise FinishedError(str(error)) from error
+        self._publish(sample)
 
     def _is_unanswered(self) -> bool:
         """Whether the command that is due is still to come, from somebody who was heard lately."""
         if self._commanded is None:
             return False
         acts, came = self._commanded
-        return acts < self._due and time.monotonic() - came < _UNANSWERED
+        return acts < self._pace.stamp and time.monotonic() - came < _UNANSWERED
 
     def _publish(self, sample: Sample) -> None:
         """Actuators first, as a predictor needs them when the odometry arrives."""
-        stamp = self._stamp_of(self._count)
+        stamp = self._pace.stamp
+        self._stamps.append(stamp)
         self._newest, self._room = sample, float(self._track.room(sample.s, sample.lateral))
         self._least = min(self._least, self._room)
         self._publish_feedback(actuators(stamp, sample.feedback))
@@ -189,16 +187,12 @@ class SimulatorNode(Node):
         self._sensors.measure(sample.pose, State(*sample.measured))
         if self._sensors.is_full:
             pose, measured, age = self._sensors.arrived
-            self._publish_odometry(_odometry(self._stamp_of(self._count - age), pose, measured))
-        self._count += 1
-
-    def _stamp_of(self, count: int) -> int:
-        """Stamp (ns) of the sample with this number."""
-        return self._first_stamp + round(count * self._vehicle.sampling_time * 1e9)
+            self._publish_odometry(_odometry(self._stamps[-1 - age], pose, measured))
+        self._pace.count += 1
 
     def _diagnose(self) -> None:
         """Tells what is true of the car, whatever is measured."""
-        if not self._count:
+        if not self._pace.count:
             return
         sample = self._newest
         level, words = (Level.OK, "on the road") if self._room >= 0 else (Level.WARN, "off the road")
@@ -207,7 +201,7 @@ class SimulatorNode(Node):
             "place on the track (m)": f"{sample.s % self._track.length:.3f}",
             "beside the centre line (m)": f"{sample.lateral:.4f}",
             "least room to the borders so far (m)": f"{self._least:.4f}",
-            "held up so far (s)": f"{self._held_up:.3f}",
+            "held up so far (s)": f"{self._pace.held_up:.3f}",
         }
         self._publish_diagnostics(diagnostics(self, "car", self._vehicle.name, level=level, words=words, values=values))
 

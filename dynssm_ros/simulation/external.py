@@ -1,4 +1,6 @@
-"""A car that somebody else drives: it obeys commands as they come, brakes when they stop coming, and stands still well."""
+"""A car in real time that somebody else drives: it obeys commands as they come, brakes when they stop coming, and stands
+still well.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +16,7 @@ from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.low_speed import LowSpeedRolling
 
 Clock = Callable[[], float]
+_CAUGHT_UP_S = 1.0
 
 
 class CommandHolder:
@@ -47,6 +50,46 @@ class CommandHolder:
         """What the actuators do next, ``previous`` being what they do now."""
         wanted = self._last if self.fresh else Applied(self._limits.throttle[0], previous.delta)
         return self._limits.reached(wanted, previous, self._T_s)
+
+
+class Pace:
+    """Which sample of a car in real time is due, and with which stamp.
+
+    A car that was held up for at most a second is behind, and catches up. After longer it goes on from where it is, and the
+    stamps leave out as much time: they stay those of the clock.
+
+    Args:
+        T_s: between the samples, in the car's time (s).
+        rate: of that time over real time.
+        now: real time (s), of any origin.
+        first_stamp: of the first sample, which is due one period later (ns).
+        waits: whether it may always be held up: nothing is caught up, and the stamps leave out nothing.
+    """
+
+    def __init__(self, T_s: float, rate: float, now: float, first_stamp: int, *, waits: bool = False) -> None:
+        self.period = T_s / rate
+        """Between the samples, in real time (s)."""
+        self.count = 0
+        """Samples so far."""
+        self.held_up = 0.0
+        """Real time that is not caught up (s)."""
+        self._T_s, self._rate, self._waits = T_s, rate, waits
+        self._begin, self._first_stamp = now + self.period, first_stamp
+
+    def behind(self, now: float) -> int:
+        """Samples that are late, beside the one that is due."""
+        late = now - self._begin - self.count * self.period
+        if late > (self.period if self._waits else _CAUGHT_UP_S):
+            self._begin += late
+            self.held_up += late
+            self._first_stamp += 0 if self._waits else round(1e9 * self._rate * late)
+            return 0
+        return max(0, int(late / self.period))
+
+    @property
+    def stamp(self) -> int:
+        """Of the next sample (ns)."""
+        return self._first_stamp + round(1e9 * self.count * self._T_s)
 
 
 def drive_by_commands(

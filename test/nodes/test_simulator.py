@@ -210,13 +210,13 @@ def test_a_car_that_was_held_up_drives_nothing_that_its_driver_could_not_answer(
     assert pit.wait_for(lambda: pit.v_x > 0.3)
     newest, seen = max(pit.feedback), time.monotonic()
     pit.process.send_signal(signal.SIGSTOP)
-    pit.wait_for(lambda: False, 0.8)
+    pit.wait_for(lambda: False, 1.3)
     pit.process.send_signal(signal.SIGCONT)
-    assert pit.wait_for(lambda: max(pit.feedback) >= newest + 50 * PERIOD)
-    assert time.monotonic() - seen > 0.4 + 50 * PERIOD * 1e-9
+    assert pit.wait_for(lambda: max(pit.feedback) >= newest + 115 * PERIOD), "its stamps leave the pause out"
+    assert time.monotonic() - seen > 1.0 + 50 * PERIOD * 1e-9
     assert {pit.feedback[stamp] for stamp in list(pit.feedback) if stamp > newest} == {(0.4, 0.0)}
     held_up = "held up so far (s)"
-    assert pit.wait_for(lambda: any(float(values.get(held_up, 0)) > 0.75 for _, _, values in pit.run.diagnostics))
+    assert pit.wait_for(lambda: any(float(values.get(held_up, 0)) > 1.25 for _, _, values in pit.run.diagnostics))
 
 
 def test_in_lockstep_time_waits_for_the_command_that_is_due_and_goes_on_without_a_driver(start_pit: StartPit) -> None:

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from dynssm_ros.simulation.external import CommandHolder, drive_by_commands
+from dynssm_ros.simulation.external import CommandHolder, Pace, drive_by_commands
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.simulation.plant import RK4_STEP
 from dynssm_ros.track.tracks import load_track
@@ -123,3 +123,37 @@ def test_it_goes_on_beside_the_road():
 def test_motion_that_is_not_finite_is_one_clear_line():
     with pytest.raises(SimulationError, match="orca: its motion is not finite after"):
         drive(ORCA, Applied(float("nan"), 0.0), 5)
+
+
+def paced(held_up: float, *, waits: bool = False) -> tuple[Pace, float]:
+    """After ten samples on time, and so long a pause (s); the time then."""
+    pace = Pace(0.02, 2.0, 100.0, 5_000_000_000, waits=waits)
+    assert pace.period == 0.01
+    now = 100.011
+    for _ in range(10):
+        assert pace.behind(now) == 0
+        pace.count += 1
+        now += pace.period
+    return pace, now + held_up
+
+
+def test_a_car_that_was_held_up_shortly_catches_up():
+    pace, now = paced(0.5)
+    assert pace.behind(now) == 50
+    pace.count += 50
+    assert pace.behind(now) == 0
+    assert pace.held_up == 0.0
+    assert pace.stamp == 5_000_000_000 + 60 * 20_000_000
+
+
+def test_stamps_of_a_car_that_was_held_up_for_long_leave_the_time_out():
+    pace, now = paced(3.0)
+    assert pace.behind(now) == 0
+    assert pace.held_up == pytest.approx(3.001)
+    assert pace.stamp == pytest.approx(5e9 + 2e9 * (now - 100.01), abs=1e3), "as late as if it had never been held up"
+
+
+def test_a_car_whose_time_waits_for_its_driver_drives_every_sample():
+    pace, now = paced(3.0, waits=True)
+    assert pace.behind(now) == 0
+    assert pace.stamp == 5_000_000_000 + 10 * 20_000_000
