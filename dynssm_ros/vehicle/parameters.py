@@ -19,6 +19,7 @@ from dynssm_ros import configuration
 from dynssm_ros.arrays import Vector
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.files import replacing
+from dynssm_ros.vehicle import ranges
 from dynssm_ros.vehicle.effects import EFFECTS, Effect, build_effect
 from dynssm_ros.vehicle.integrators import Integrator
 from dynssm_ros.vehicle.single_track import Applied, Coefficients, VehicleConstants
@@ -167,6 +168,20 @@ class Vehicle(StrictModel):
         if twice:
             raise ValueError(f"effect {twice[0]} has a state of its own and can be listed only once")
         return value
+
+    @model_validator(mode="after")
+    def _can_be(self) -> Vehicle:
+        inputs = self.inputs
+        bounds = {name: each.bounds for name, each in self.coefficients.items()}
+        nominal = {name: each.nominal for name, each in self.coefficients.items()}
+        wrong = [
+            *ranges.of_constants(self.constants),
+            *ranges.of_inputs(inputs.throttle, inputs.steering, inputs.steering_rate),
+            *ranges.of_coefficients(self.constants, nominal, bounds, calibrated=self.before is not None),
+        ]
+        if wrong:
+            raise ValueError(wrong[0] + (f"; {len(wrong) - 1} more" if wrong[1:] else ""))
+        return self
 
     @model_validator(mode="after")
     def _effects_can_act(self) -> Vehicle:

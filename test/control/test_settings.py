@@ -14,7 +14,7 @@ from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import CarModel, load_vehicle
 from dynssm_ros.vehicle.limits import vehicle_limits
 
-SIZE = 9.0
+SIZE = 3.0
 
 
 def enlarged(vehicle, size):

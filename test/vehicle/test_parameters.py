@@ -114,6 +114,58 @@ def test_a_wrong_vehicle_file_names_file_field_and_value(
         assert part in message
 
 
+@pytest.mark.parametrize(
+    ("path", "value", "expected"),
+    [
+        ("constants.m", 41.0, "constants.m: 41: in g? expected 0.000715 to 0.357 kg"),
+        ("constants.l_f", 29.0, "constants.l_f: 29: in cm? expected 0.01 to 6 m"),
+        ("constants.l_f", 1.2e3, "constants.l_f: 1200: in mm? expected 0.01 to 6 m"),
+        ("constants.h_cg", 15.0, "constants.h_cg: 15: in cm? expected 0 to 0.062 m"),
+        ("constants.F_z0", 0.402, "constants.F_z0: 0.402: expected 0.121 to 0.282 N"),
+        ("inputs.steering", [-20.0, 20.0], "inputs.steering: -20: in degrees? expected -1.57 to 1.57 rad; 1 more"),
+        ("inputs.throttle", [-100.0, 100.0], "inputs.throttle: -100: in %? expected -1 to 1 as a fraction; 1 more"),
+        ("inputs.steering_rate", 300.0, "inputs.steering_rate: 300: in degrees/s? expected 0.01 to 50 rad/s"),
+        ("coefficients.I_z", {"nominal": 0.0, "bounds": [0.0, 1e-4]}, "coefficients.I_z.bounds: [0, 0.0001]: expected more"),
+        ("coefficients.I_z", {"nominal": 1.0, "bounds": [0.1, 2.0]}, "coefficients.I_z.nominal: 1: expected 3.92e-06 to"),
+        ("coefficients.D_f", {"nominal": -0.2, "bounds": [-0.4, -0.1]}, "coefficients.D_f.bounds: [-0.4, -0.1]: expected"),
+        ("coefficients.D_r", {"nominal": 2.0, "bounds": [1.8, 3.0]}, "coefficients.D_r.nominal: 2: a friction coeff"),
+        ("coefficients.B_f", {"nominal": 0.2, "bounds": [0.1, 30.0]}, "coefficients.B_f.nominal: 0.2: per degree?"),
+        ("coefficients.S_hf", {"nominal": 1.5, "bounds": [-2.0, 2.0]}, "coefficients.S_hf.nominal: 1.5: in degrees?"),
+        ("coefficients.C_m1", {"nominal": 3e-4, "bounds": [1e-4, 1e-3]}, "coefficients.C_m1.nominal: 0.0003: in kN?"),
+    ],
+)  # fmt: skip
+def test_a_car_that_cannot_be_is_refused(tmp_path: Path, path: str, value: Any, expected: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load_vehicle(write(tmp_path, changed(path, value)))
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_lorry_can_be() -> None:
+    m, l_f, l_r = 5000.0, 1.4, 2.4
+    whole = changed("constants", {"m": m, "l_f": l_f, "l_r": l_r, "h_cg": 1.2, "F_z0": 24500.0, "load_transfer": True})
+    forces = {
+        "D_f": 2e4,
+        "D_r": 2e4,
+        "C_m1": 3e4,
+        "C_m2": 800.0,
+        "C_r0": 500.0,
+        "C_r2": 3.0,
+        "I_z": 1.2 * m * l_f * l_r,
+    }
+    for name, value in forces.items():
+        whole["coefficients"][name] = {"nominal": value, "bounds": [0.3 * value, 3 * value]}
+    Vehicle.model_validate(whole)
+
+
+def test_what_a_calibration_found_within_its_bounds_is_not_judged() -> None:
+    whole = load_vehicle("av21_fthd").model_copy(update={"before": None})
+    poor = whole.nominal.copy()
+    poor[COEFFICIENTS.index("D_f")] = 10.0
+    calibrated = whole.with_nominal(poor).calibrated_on(["0"], whole)
+    assert Vehicle.model_validate(calibrated.model_dump()) == calibrated
+
+
 def test_all_that_is_wrong_is_counted(tmp_path: Path) -> None:
     whole = content()
     whole["constants"] |= {"m": -1.0, "l_f": -1.0, "l_r": -1.0}
