@@ -69,7 +69,12 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *(
-                DeclareLaunchArgument(name, default_value="", description=description)
+                DeclareLaunchArgument(
+                    name,
+                    default_value="",
+                    choices=["", "true", "false"] if name in SWITCHES else None,
+                    description=description,
+                )
                 for name, (description, _) in ARGUMENTS.items()
             ),
             DeclareLaunchArgument(
