@@ -55,7 +55,7 @@ def stack(context: LaunchContext) -> list[Node]:
 
 def _parameters(executable: str, given: dict[str, str]) -> dict[str, str | float | bool]:
     values: dict[str, str | float | bool] = {
-        name: float(given[name]) if name in NUMBERS else given[name]
+        name: _number(name, given[name]) if name in NUMBERS else given[name]
         for name, (_, nodes) in ARGUMENTS.items()
         if executable in nodes and given[name]
     }
@@ -63,6 +63,13 @@ def _parameters(executable: str, given: dict[str, str]) -> dict[str, str | float
     if executable == "controller" and given["lockstep"] == "true":
         values["max_late"] = 10.0  # the stamps of a car whose time waits fall behind
     return values | ({"driver": "external"} if executable == "simulator" else {})
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise RuntimeError(f'argument "{name}": "{text}", expected a number') from None
 
 
 def generate_launch_description() -> LaunchDescription:

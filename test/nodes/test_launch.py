@@ -143,6 +143,8 @@ def test_controller_launch_file_starts_the_stack_that_is_asked_for(
     held = {node.named["executable"]: node.named["parameters"][-1] for node in all_launched(file, lockstep="true")}
     assert held["simulator"]["lockstep"] is True
     assert "lockstep" not in held["controller"]
+    with pytest.raises(RuntimeError, match='"scale": "big", expected a number'):
+        all_launched(file, scale="big")
     (alone,) = all_launched(file, simulator="false")
     assert alone.named["executable"] == "controller"
 
