@@ -63,7 +63,7 @@ setup(
         "numpy>=1.26",
         "onnxruntime>=1.19",  # the deployed predictor
         "safetensors>=0.4",  # weights without pickle
-        "pyarrow>=15",  # recordings
+        "pyarrow>=15,<26",  # recordings; 26 refuses the numpy 1.26 of Ubuntu 24.04
         "pydantic>=2.7",  # configuration
         "typing-extensions>=4.8",
         "pyyaml>=6.0.1",
