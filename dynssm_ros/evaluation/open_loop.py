@@ -34,7 +34,7 @@ from dynssm_ros.parallel import HERE, Workers, each
 from dynssm_ros.runtime.contract import WindowModel, WindowPrediction
 from dynssm_ros.runtime.online import Learned
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.signals.signal_map import Commands
+from dynssm_ros.signals.signal_map import STATE_SIGNALS, Commands
 from dynssm_ros.track.lap_position import first_lap
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle import Vehicle
@@ -76,7 +76,9 @@ class Evaluation:
 
     @cached_property
     def not_tests(self) -> list[str]:
-        """A sentence for each model that, or whose car, was fitted to a third or more of what it is scored on."""
+        """A sentence for each model that, or whose car, was fitted to a third or more of what it is scored on, and one on
+        rows that were interpolated.
+        """
         laps, found = set(self.recording.fingerprints), []
         for name, group in self.groups.items():
             card, vehicle = group.first.model.card, group.first.model.vehicle
@@ -86,6 +88,10 @@ class Evaluation:
             how = " and ".join(f"{how} on {100 * share:.0f} %" for how, share in shares.items() if 3 * share >= 1)
             if how:
                 found.append(f"{name} {how} of what it is scored on: expected other laps, or those that were held out")
+        between = {name: share for name, share in self.recording.info.interpolated.items() if name in STATE_SIGNALS}
+        if between:
+            told = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in between.items())
+            found.append(f"{told} lies between slower samples: expected a recording at their rate (see its notes)")
         return found
 
     @property

@@ -24,6 +24,7 @@ def topic_table(found: Inspection) -> Table:
         (Column("messages", brief=True), lambda topic: topic.count),
         (Column("rate", "Hz", brief=True), lambda topic: topic.rate),
         (Column("longest gap", "s", brief=True), lambda topic: topic.longest_gap),
+        (Column("stamped by", brief=True), lambda topic: topic.stamped),
         (Column("stamp to log", "s"), lambda topic: topic.lateness),
     )
 
@@ -84,6 +85,7 @@ def inspection_json(found: Inspection) -> dict[str, Any]:
                 "rate_hz": finite(topic.rate),
                 "longest_gap_s": topic.longest_gap,
                 "lateness_s": finite(topic.lateness),
+                "stamped": topic.stamped,
                 "unit": topic.unit,
                 "reason": topic.reason,
             }

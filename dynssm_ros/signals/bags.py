@@ -63,20 +63,36 @@ class Bag:
     path: Path
     reader: AnyReader
     mend: Callable[[str], AnyReader]  # a reader of what can be read of a bag in which that damage was met
-    notes: list[str] = field(default_factory=list)
+    mended: list[str] = field(default_factory=list)  # what was recovered
     ros1_types: Any = None  # the types of a ROS 1 bag, with the header of ROS 2
 
     @cached_property
     def types(self) -> dict[str, str]:
-        """Message type of each topic."""
-        return {c.topic: c.msgtype for c in self.reader.connections}
+        """Message type of each topic; of several that of most messages, the others are not read."""
+        return {topic: max(counts, key=lambda name: counts[name]) for topic, counts in self._counts.items()}
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of messages of each topic."""
-        counts: dict[str, int] = {}
+        """Number of messages of each topic, of its type."""
+        return {topic: counts[self.types[topic]] for topic, counts in self._counts.items()}
+
+    @property
+    def notes(self) -> list[str]:
+        """What was recovered, and which messages are not read as their topic has another type."""
+        others = [
+            f"topic {topic}: {count} messages of another type, {name}, are left out"
+            for topic, counts in self._counts.items()
+            for name, count in counts.items()
+            if name != self.types[topic] and count
+        ]
+        return [*self.mended, *others]
+
+    @property
+    def _counts(self) -> dict[str, Counter[str]]:
+        """Number of messages of each topic by type."""
+        counts: dict[str, Counter[str]] = {}
         for c in self.reader.connections:
-            counts[c.topic] = counts.get(c.topic, 0) + c.msgcount
+            counts.setdefault(c.topic, Counter())[c.msgtype] += c.msgcount
         return counts
 
     def require(self, topic: str, msgtype: str) -> None:
@@ -125,7 +141,7 @@ class Bag:
                 yield message
 
     def _stored(self, topics: Sequence[str]) -> Iterator[BagMessage]:
-        wanted = [c for c in self.reader.connections if c.topic in topics]
+        wanted = [c for c in self.reader.connections if c.topic in topics and c.msgtype == self.types[c.topic]]
         if not wanted:
             return
         try:
@@ -166,7 +182,7 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
     """
     path = Path(path)
     if not os.path.exists(path):  # unlike Path.exists, False where looking is forbidden
-        raise BagError(f"{path}: no such bag")
+        raise BagError(f"{path}: no such file")
     suffix = bag_suffix(path)
     with ExitStack() as stack:
         notes: list[str] = []

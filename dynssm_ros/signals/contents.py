@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,8 +16,9 @@ from dynssm_ros.errors import BagError
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.bags import Bag
 from dynssm_ros.signals.columns import Column, known_unit
-from dynssm_ros.signals.decoding import header_stamp_ns
+from dynssm_ros.signals.decoding import LOG_TIME, frames_told, header_stamp_ns, stamped_by
 from dynssm_ros.signals.signal_map import compile_field
+from dynssm_ros.signals.stamps import Lateness
 from dynssm_ros.signals.table_clock import Clock
 from dynssm_ros.signals.tables import Table
 
@@ -47,13 +49,18 @@ class TopicContent:
     unit: str = ""  # of a column, as its heading says
     reason: str = ""  # why its samples, or some of them, cannot be read
     limits: tuple[float, float, float] | None = None  # of all cells of a column: least, largest, share of zeros
+    stamped: str = ""  # by what the samples are stamped: header, the name of a field, log time; empty of a column
+    late: Lateness = field(default=Lateness(np.empty(0), np.empty(0)), repr=False)  # of the samples that have a stamp
+    frames: Mapping[str, int] = field(default_factory=dict, repr=False)  # samples by the frames that they name
 
 
 def contents_of_bag(bag: Bag, progress: Progress | None) -> tuple[dict[str, TopicContent], int, int]:
     """All topics that have messages, with the log's first and last time (ns); one that cannot be read has a reason."""
     counts = {topic: count for topic, count in bag.counts.items() if count}
     times = {topic: array("q") for topic in counts}
-    lateness: dict[str, list[float]] = {topic: [] for topic in counts}
+    late: dict[str, list[tuple[float, float]]] = {topic: [] for topic in counts}
+    frames: dict[str, Counter[str]] = {topic: Counter() for topic in counts}
+    stamped = dict.fromkeys(counts, "")
     sampled: dict[str, list[tuple[int, dict[str, float]]]] = {topic: [] for topic in counts}
     described = {topic for topic in counts if bag.types[topic] in bag.typestore(bag.types[topic]).types}
     reasons = {topic: "the log does not describe its type" for topic in counts if topic not in described}
@@ -68,8 +75,10 @@ def contents_of_bag(bag: Bag, progress: Progress | None) -> tuple[dict[str, Topi
                 reasons.setdefault(topic, str(error).rpartition(f"topic {topic}: ")[2])
             else:
                 stamp = header_stamp_ns(message)
-                if stamp is not None:
-                    lateness[topic].append((log_time - stamp) / 1e9)
+                stamped[topic] = (stamped[topic] if stamp == 0 else "") or (stamped_by(message) if stamp else LOG_TIME)
+                frames[topic][frames_told(message)] += 1
+                if stamp:  # 0 is unset
+                    late[topic].append((log_time / 1e9, (log_time - stamp) / 1e9))
                 sampled[topic].append((log_time, numbers))
         times[topic].append(log_time)
         if progress is not None:
@@ -86,10 +95,13 @@ def contents_of_bag(bag: Bag, progress: Progress | None) -> tuple[dict[str, Topi
             counts[topic],
             1.0 / max(float(np.median(apart)), 1e-9) if len(apart) else math.nan,
             float(apart.max()) if len(apart) else 0.0,
-            float(np.median(lateness[topic])) if lateness[topic] else math.nan,
+            float(np.median([seconds for _, seconds in late[topic]])) if late[topic] else math.nan,
             np.array([time - begin for time, _ in sampled[topic]]) / 1e9,
             {path: np.array([values.get(path, math.nan) for _, values in sampled[topic]]) for path in paths},
             reason=reasons.get(topic, ""),
+            stamped=stamped[topic],
+            late=Lateness(*np.array(late[topic]).reshape(-1, 2).T),
+            frames=frames[topic],
         )
     return found, begin, end
 

@@ -14,6 +14,9 @@ from dynssm_ros.signals.velocities import LiveVelocities
 Frames = tuple[str, str]
 """``frame_id`` of the header and ``child_frame_id``."""
 
+LOG_TIME = "log time"
+_OWN_STAMPS = ("stamp", "timestamp")  # of messages without a header, builtin_interfaces/Time
+
 
 class _Reading(NamedTuple):
     signal: str
@@ -113,12 +116,36 @@ def decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
 
 
 def header_stamp_ns(message: Any) -> int | None:
-    """The header stamp in integer nanoseconds, or ``None`` where the message has no header."""
+    """The stamp of the header or, without one, of the message itself (``stamp``), in integer nanoseconds; ``None`` where
+    there is neither.
+    """
+    _, stamp = _stamp(message)
+    return None if stamp is None else int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def stamped_by(message: Any) -> str:
+    """What says when a message was measured: ``header``, the name of a field of its own, or :data:`LOG_TIME`."""
+    return _stamp(message)[0]
+
+
+def _stamp(message: Any) -> tuple[str, Any]:
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    if hasattr(stamp, "nanosec"):
+        return "header", stamp
+    for name in _OWN_STAMPS:
+        stamp = getattr(message, name, None)
+        if hasattr(stamp, "nanosec"):
+            return name, stamp
+    return LOG_TIME, None
+
+
+def frames_told(message: Any) -> str:
+    """The frame of a message and that of its twist as people read them, ``odom -> base_link``; empty without a header."""
     try:
-        stamp = message.header.stamp
-        return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+        frame = str(message.header.frame_id)
     except AttributeError:
-        return None
+        return ""
+    return f"{frame} -> {message.child_frame_id}" if hasattr(message, "child_frame_id") else frame
 
 
 def frames_of(message: Any) -> Frames | None:

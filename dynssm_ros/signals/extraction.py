@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,16 +12,15 @@ import numpy as np
 from dynssm_ros.errors import BagError, RecordingError
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.bags import Bag
-from dynssm_ros.signals.decoding import decoders, header_stamp_ns, to_si
+from dynssm_ros.signals.decoding import LOG_TIME, decoders, frames_told, header_stamp_ns, stamped_by, to_si
 from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
-from dynssm_ros.signals.resampling import Stream, resample
+from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
 from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, POSE_SIGNALS, STATE_SIGNALS, SignalMap
+from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, frames_note
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import Table
 from dynssm_ros.signals.velocities import velocities_along
-
-_SLOW = 1.5  # periods of the grid between samples, from which on a signal is slower than it
 
 
 def extract(
@@ -57,7 +57,7 @@ def _extract(
     """The recording of one log, whose notes begin with ``note``."""
     with open_log(path) as log:
         signal_map, lack = _with_commands_of(log, signal_map)
-        streams, notes = read_streams(log, signal_map, drop_bad, progress)
+        streams, stamped, notes = read_streams(log, signal_map, drop_bad, progress)
     notes = [*([note] if note else []), *notes, *lack]
     if signal_map.velocities is not None:
         streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
@@ -70,13 +70,14 @@ def _extract(
         signal_map=signal_map.name,
         held=tuple(held),
         held_periods=held,
+        stamped=stamped,
         notes=tuple(notes),
     )
     return resample(streams, rate, signal_map.max_gap, signal_map.commands, info)
 
 
 def _with_commands_of(log: Bag | Table, signal_map: SignalMap) -> tuple[SignalMap, list[str]]:
-    """The map, without commands where the log has none of their topics or columns, and a note on it."""
+    """The map, without commands where the log lacks a topic or column of them, and a note on it."""
     if signal_map.commands != "topics":
         return signal_map, []
     sources = [signal_map.signals[name] for name in COMMAND_SIGNALS]
@@ -84,7 +85,7 @@ def _with_commands_of(log: Bag | Table, signal_map: SignalMap) -> tuple[SignalMa
         missing = [f"column '{one.column}'" for one in sources if one.column and one.column not in log.headings]
     else:
         missing = [f"topic {one.recorded}" for one in sources if not one.column and not log.counts.get(one.recorded)]
-    if len(missing) < len(sources):
+    if not missing:
         return signal_map, []
     told = " and ".join(dict.fromkeys(missing))
     return signal_map.with_commands("none"), [f"no commands in the log ({told}); commands: none"]
@@ -115,7 +116,7 @@ def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: f
     for name, source in signal_map.active_signals().items():
         stamps = streams[name].stamps if name in streams else np.empty(0, np.int64)
         between = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-        usual = "zero" if between > _SLOW * period and name not in (*STATE_SIGNALS, *POSE_SIGNALS) else "first"
+        usual = "zero" if between > SLOW * period and name not in (*STATE_SIGNALS, *POSE_SIGNALS) else "first"
         if (source.hold or usual) == "zero":
             held[name] = between / 1e9
     return held
@@ -123,25 +124,29 @@ def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: f
 
 def read_streams(
     log: Bag | Table, signal_map: SignalMap, drop_bad: bool = False, progress: Progress | None = None
-) -> tuple[dict[str, Stream], list[str]]:
+) -> tuple[dict[str, Stream], dict[str, str], list[str]]:
     """Reads the samples of every mapped signal; memory holds these and one message, or the columns, at a time.
 
-    Stamps are header stamps, and log times only where a message has no header; of tables those of their time column.
+    Stamps are those of headers or of the messages themselves, and log times only where there is neither; of tables
+    those of their time column.
 
     Returns:
-        The streams by signal name, and notes on what was recovered or dropped.
+        The streams by signal name, by what those of a bag are stamped, and notes on what was recovered or dropped.
 
     Raises:
         BagError: a topic, field or column is missing, or samples are bad and ``drop_bad`` is off.
     """
     if isinstance(log, Table):
-        found, notes = _table_streams(log, signal_map, drop_bad), list(log.notes)
+        found, stamped, notes = _table_streams(log, signal_map, drop_bad), {}, list(log.notes)
     else:
-        found, notes = _bag_streams(log, signal_map, progress), list(log.notes)
+        found, stamped, told = _bag_streams(log, signal_map, progress)
+        notes = [*log.notes, *told]
     streams: dict[str, Stream] = {}
     for name, source in signal_map.active_signals().items():
         place = f"column '{source.column}'" if source.column else f"topic {source.recorded}"
-        stream, dropped = clean(found[name], f"{log.path}: {place}: {name}", drop_bad)
+        hopeless = name in POSE_SIGNALS and len(found[name].values) > 0 and not np.isfinite(found[name].values).any()
+        where = f"{log.path}: {place}: {name}" + (f" = {source.field}" if source.field.startswith("yaw(") else "")
+        stream, dropped = clean(found[name], where, drop_bad or hopeless, signal_map.jump_ns)
         if dropped:
             notes.append(f"{name}: dropped {dropped}")
         if len(stream.stamps):
@@ -153,28 +158,52 @@ def read_streams(
         if name not in POSE_SIGNALS or not counted:
             raise BagError(f"{log.path}: {place} {lack if counted else 'has no messages'}, needed for {name}")
         notes.append(f"{name}: {place} {lack}; left out")
-    return streams, notes
+    return streams, stamped, notes
 
 
-def _bag_streams(bag: Bag, signal_map: SignalMap, progress: Progress | None) -> dict[str, Stream]:
-    """The samples of every mapped signal, as they came."""
+def _bag_streams(
+    bag: Bag, signal_map: SignalMap, progress: Progress | None
+) -> tuple[dict[str, Stream], dict[str, str], list[str]]:
+    """The samples of every mapped signal, as they came, by what each topic is stamped, and notes on stamps and frames."""
     by_topic = decoders(signal_map)
     for topic, decoder in by_topic.items():
         bag.require(topic, decoder.msgtype)
-    samples = _Samples()
+    samples, stamped = _Samples(), dict.fromkeys(by_topic, "")
+    frames: dict[str, Counter[str]] = {topic: Counter() for topic in by_topic}
     total = sum(bag.counts[topic] for topic in by_topic)
     for done, (topic, log_time, raw) in enumerate(bag.messages(list(by_topic)), 1):
         message = bag.decode(topic, raw)
-        stamp = header_stamp_ns(message)
+        stamped[topic] = stamped[topic] or stamped_by(message)
         try:
             present = by_topic[topic].decode(message)
         except BagError as error:
             raise BagError(f"{bag.path}: {error}") from error
-        samples.add(topic, log_time if stamp is None else stamp, present)
+        samples.add(topic, log_time, header_stamp_ns(message) or 0, present)
+        frames[topic][frames_told(message)] += 1
         if progress is not None:
             progress(done, total)
+    notes: list[str] = []
+    lateness: dict[str, Lateness] = {}
+    by_log_time = {topic for topic, by in stamped.items() if by == LOG_TIME}
+    for topic in by_topic:
+        logged, stamps = samples.times(topic)
+        unset = int((stamps == 0).sum())
+        if topic in by_log_time:
+            notes.append(f"{topic}: messages without a stamp; they count by log time")
+        elif unset > 1:  # one may be where simulated time begins
+            notes.append(f"{topic}: {unset} of {len(stamps)} messages have the stamp 0; they count by log time")
+            by_log_time.add(topic)
+            stamped[topic] = LOG_TIME if unset == len(stamps) else stamped[topic]
+        order = np.argsort(logged, kind="stable")
+        order = order[stamps[order] != 0]
+        lateness[topic] = Lateness(logged[order] / 1e9, (logged[order] - stamps[order]) / 1e9)
+        notes += frames_note(topic, frames[topic])
+    notes += clock_notes(lateness, signal_map.odometry_topic)
     active = signal_map.active_signals().items()
-    return {name: samples.stream(name, round(source.delay * 1e9)) for name, source in active}
+    streams = {
+        name: samples.stream(name, round(source.delay * 1e9), source.recorded in by_log_time) for name, source in active
+    }
+    return streams, {name: stamped[source.recorded] for name, source in active}, notes
 
 
 def _table_streams(table: Table, signal_map: SignalMap, drop_bad: bool) -> dict[str, Stream]:
@@ -204,62 +233,37 @@ class _Samples:
     """What messages carried, in the order of the messages; signals that always come together share their stamps."""
 
     def __init__(self) -> None:
-        self._together: dict[tuple[str, ...], tuple[array[int], array[int], array[float]]] = {}
+        self._together: dict[tuple[str, ...], tuple[array[int], array[int], array[int], array[float]]] = {}
         self._messages = 0
 
-    def add(self, topic: str, stamp: int, present: Mapping[str, float]) -> None:
-        """Adds a message of ``topic`` at ``stamp`` (ns) with the signals that it carried."""
+    def add(self, topic: str, log_time: int, stamp: int, present: Mapping[str, float]) -> None:
+        """Adds a message of ``topic`` at ``stamp`` (ns; 0: unset) with the signals that it carried."""
         key = (topic, *present)
         if key not in self._together:
-            self._together[key] = array("q"), array("q"), array("d")
-        numbers, stamps, values = self._together[key]
+            self._together[key] = array("q"), array("q"), array("q"), array("d")
+        numbers, logged, stamps, values = self._together[key]
         self._messages += 1
         numbers.append(self._messages)
+        logged.append(log_time)
         stamps.append(stamp)
         values.extend(present.values())
 
-    def stream(self, signal: str, delay: int) -> Stream:
-        """The samples of a signal as they came, with stamps ``delay`` ns earlier."""
+    def stream(self, signal: str, delay: int, unstamped: bool) -> Stream:
+        """The samples of a signal as they came, with stamps ``delay`` ns earlier; log times instead of unset ones."""
         numbers, stamps, values = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0)]
         for (_, *signals), kept in self._together.items():
             if signal in signals:
                 numbers.append(np.frombuffer(kept[0], np.int64))
-                stamps.append(np.frombuffer(kept[1], np.int64))
-                values.append(np.frombuffer(kept[2]).reshape(-1, len(signals))[:, signals.index(signal)])
+                given = np.frombuffer(kept[2], np.int64)
+                stamps.append(np.where(given == 0, np.frombuffer(kept[1], np.int64), given) if unstamped else given)
+                values.append(np.frombuffer(kept[3]).reshape(-1, len(signals))[:, signals.index(signal)])
         order = np.argsort(np.concatenate(numbers), kind="stable")
         return Stream(np.concatenate(stamps)[order] - delay, np.concatenate(values)[order])
 
-
-def clean(stream: Stream, where: str, drop_bad: bool) -> tuple[Stream, str]:
-    """Checks a stream for values that are not finite and for stamps that repeat or run backwards.
-
-    Returns:
-        The stream, without bad samples if ``drop_bad``, and what was dropped (empty if nothing).
-
-    Raises:
-        BagError: a bad sample and ``drop_bad`` is off; names the first.
-    """
-    stamps, values = stream.stamps, stream.values
-    finite = np.isfinite(values)
-    oldest = np.iinfo(np.int64).min
-    newest = np.maximum.accumulate(np.concatenate([[oldest], np.where(finite, stamps, oldest)]))[:-1]
-    kinds = {
-        "not finite": ~finite,
-        "with a repeated stamp": finite & (stamps == newest),
-        "with a stamp that runs backwards": finite & (stamps < newest),
-    }
-    dropped: list[str] = []
-    for kind, bad in kinds.items():
-        if not bad.any():
-            continue
-        k = int(np.flatnonzero(bad)[0])
-        if not drop_bad:
-            raise BagError(
-                f"{where}: sample {k} at {stamps[k] / 1e9:.3f} s, value {values[k]:g}, is {kind} ({bad.sum()} such); "
-                f"expected finite values at increasing stamps (--drop-bad leaves such samples out)"
-            )
-        dropped.append(f"{bad.sum()} samples {kind}")
-    if not dropped:
-        return stream, ""
-    keep = ~np.logical_or.reduce(list(kinds.values()))
-    return Stream(stamps[keep], values[keep]), ", ".join(dropped)
+    def times(self, topic: str) -> tuple[Stamps, Stamps]:
+        """Log times and stamps (ns; 0: unset) of the messages of a topic, in no order."""
+        kept = [one for (name, *_), one in self._together.items() if name == topic]
+        both = [
+            np.concatenate([np.empty(0, np.int64), *(np.frombuffer(one[k], np.int64) for one in kept)]) for k in (1, 2)
+        ]
+        return both[0], both[1]

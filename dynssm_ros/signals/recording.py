@@ -53,6 +53,12 @@ class RecordingInfo(StrictModel):
     held_periods: dict[str, float] = Field(
         default_factory=dict, description="usual time from one sample of a held signal to the next (s)"
     )
+    stamped: dict[str, str] = Field(
+        default_factory=dict, description="by what each signal of a bag is stamped: header, stamp, log time"
+    )
+    interpolated: dict[str, float] = Field(
+        default_factory=dict, description="share of the rows that lie between slower samples, by signal"
+    )
     notes: tuple[str, ...] = Field(default=(), description="what was recovered, dropped or bridged")
 
 
@@ -345,13 +351,15 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
                 )
     names = [name for name in first.columns if all(name in other.columns for other in recordings)]
     offsets = np.cumsum([0] + [int(r.segment[-1]) + 1 if len(r) else 0 for r in recordings[:-1]])
-    periods = [r.info.held_periods for r in recordings]
+    infos = [r.info for r in recordings]
     info = first.info.model_copy(
         update={
             "source": tuple(s for r in recordings for s in r.info.source),
             "notes": tuple(n for r in recordings for n in r.info.notes),
             "held": tuple(dict.fromkeys(name for r in recordings for name in r.info.held)),
-            "held_periods": {k: max(each.get(k, 0.0) for each in periods) for k in sorted(set().union(*periods))},
+            "held_periods": _largest([info.held_periods for info in infos]),
+            "interpolated": _largest([info.interpolated for info in infos]),
+            "stamped": {name: by for info in infos for name, by in info.stamped.items()},
         }
     )
     return Recording(
@@ -360,3 +368,8 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
         np.concatenate([r.segment + offset for r, offset in zip(recordings, offsets, strict=True)]).astype(np.int32),
         {name: np.concatenate([r.columns[name] for r in recordings]) for name in names},
     )
+
+
+def _largest(values: Sequence[dict[str, float]]) -> dict[str, float]:
+    """The largest of several values by name, 0 where one has none."""
+    return {name: max(each.get(name, 0.0) for each in values) for name in sorted(set().union(*values))}

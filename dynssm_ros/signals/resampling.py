@@ -15,6 +15,9 @@ from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, ROUNDING, STATE_SIGNALS, Commands, Hold
 
 Stamps = npt.NDArray[np.int64]
+SLOW = 1.5
+"""Periods of the grid between samples, from which on a signal is slower than it."""
+_FEW = 0.05  # of the rows that lie between slower samples, as single ones that were lost
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,7 @@ def resample(
         )
     apart = (np.diff(grid[rows]) > 1.5 * period) | (np.diff(numbers[:, rows], axis=1) != 0).any(axis=0)
     segment = np.concatenate([[0], np.cumsum(apart)]).astype(np.int32)
+    info = _with_interpolated(info, streams, grid[rows], period)
     sampled = {name: values[rows] for name, values in sampled.items()}
     inputs = model_inputs(sampled)
     columns = {name: sampled[name] for name in STATE_SIGNALS} | inputs._asdict()
@@ -108,3 +112,24 @@ def resample(
         columns["r_cmd"] = lookahead_commands(inputs.r_fb, segment)
         columns["delta_cmd"] = lookahead_commands(inputs.delta_fb, segment)
     return Recording(info, grid[rows], segment, columns)
+
+
+def _with_interpolated(
+    info: RecordingInfo, streams: Mapping[str, Stream], rows: Stamps, period: float
+) -> RecordingInfo:
+    """The metadata with the share of the ``rows`` (ns) that lie between slower samples, and a note on them."""
+    shares: dict[str, float] = {}
+    told: dict[str, list[str]] = {}  # signals by what is told of them
+    for name, stream in streams.items():
+        if name in info.held or len(stream.stamps) < 2:
+            continue
+        after = np.clip(np.searchsorted(stream.stamps, rows - round(ROUNDING * period)), 1, len(stream.stamps) - 1)
+        between = np.diff(stream.stamps)[after - 1]
+        slow = (between > SLOW * period) & (np.abs(stream.stamps[after] - rows) > ROUNDING * period)
+        if slow.mean() > _FEW:
+            shares[name] = round(float(slow.mean()), 3)
+            rate = f"{1e9 / float(np.median(between[slow])):.3g}"
+            what = f"{100 * shares[name]:.0f} % of the rows lie between samples at {rate} Hz"
+            told.setdefault(f"{what}, so that errors on them come out too small (--rate {rate})", []).append(name)
+    notes = tuple(f"{', '.join(names)}: {what}" for what, names in told.items())
+    return info.model_copy(update={"interpolated": shares, "notes": (*info.notes, *notes)})

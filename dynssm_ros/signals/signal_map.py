@@ -153,6 +153,15 @@ class SignalMap(StrictModel):
     )
     signals: dict[str, Source]
 
+    @model_validator(mode="before")
+    @classmethod
+    def _without_commands(cls, content: Any) -> Any:
+        """A map that names no command has none, unless it says where they come from."""
+        if not isinstance(content, dict) or "commands" in content or not isinstance(content.get("signals"), dict):
+            return content
+        named = any(name in content["signals"] for name in COMMAND_SIGNALS)
+        return content if named else content | {"commands": "none"}
+
     @model_validator(mode="after")
     def _known_and_complete(self) -> SignalMap:
         unknown = [name for name in self.signals if name not in SIGNALS]
@@ -194,6 +203,11 @@ class SignalMap(StrictModel):
     def max_gap_ns(self) -> int:
         """``max_gap`` in integer nanoseconds."""
         return round(self.max_gap * 1e9)
+
+    @property
+    def jump_ns(self) -> int:
+        """Time between stamps from which on a lone one is not believed, by node and extractor (ns)."""
+        return max(500_000_000, 2 * self.max_gap_ns)
 
     def with_commands(self, commands: Commands | None) -> SignalMap:
         """The same map with another source of commands; ``None`` keeps it.

@@ -14,7 +14,9 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.columns import heading
 from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, pose_fields
+from dynssm_ros.signals.decoding import LOG_TIME
 from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, STATE_SIGNALS, UNITS
+from dynssm_ros.signals.stamps import clock_notes, frames_note
 
 _MOTION = {
     "v_y": (r"(^|_)(v|vel|velocity|linear)_?(y|lat\w*)$|^v?_?lat\w*_(vel\w*|speed)$|^vlat|quergeschw",),
@@ -49,7 +51,6 @@ _OTHER = re.compile(
 _RADIANS, _SHARE = 1.6, 1.5  # larger values are no road-wheel angle in rad, and no throttle between -1 and 1
 _AGREES = 0.5  # correlation with the curvature, from which on a scale is told
 _UNIT = (0.6, 1.7)  # wheelbase times curvature per unit, for a signal that is the road-wheel angle in rad already
-_CLOCK = 1.0  # s by which the stamps of topics may be apart
 _FASTEST = 110.0  # m/s
 _MOST = {"omega": 15.0, "theta": 60.0}  # range in rad/s, and in rad, from which on degrees are likelier
 _DRIVING = 0.3  # of the largest speed, from which on curvature is compared
@@ -83,7 +84,7 @@ def suggest(
     for name in ("steering_feedback", "steering_command"):
         if name in signals:
             signals[name] = _scaled_steering(signals[name], signals, wheelbase)
-    notes += _clocks(topics, signals)
+    notes += _stamps(signals)
     return signals
 
 
@@ -244,17 +245,21 @@ def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) 
     return float(np.polyfit(values[fast], curvature, 1)[0])
 
 
-def _clocks(topics: dict[str, TopicContent], signals: dict[str, Suggestion]) -> list[str]:
-    """Topics of signals whose stamps are of another clock than the odometry's."""
-    if "v_x" not in signals:
-        return []
-    reference = signals["v_x"].topic
+def _stamps(signals: dict[str, Suggestion]) -> list[str]:
+    """What is to be said of the stamps and frames of the topics that the signals come from."""
     used = {suggestion.topic.name: suggestion.topic for suggestion in signals.values()}
-    return [
-        f"{topic.name} is stamped {topic.lateness - reference.lateness:+.3g} s against {reference.name}: another clock?"
-        for topic in used.values()
-        if abs(topic.lateness - reference.lateness) > _CLOCK
+    found = [
+        f"{name}: messages without a stamp; they count by log time"
+        for name, one in used.items()
+        if one.stamped == LOG_TIME
     ]
+    found += [note for name, one in used.items() for note in frames_note(name, one.frames)]
+    first = signals.get("v_x", signals.get("x"))
+    return (
+        found
+        if first is None
+        else found + clock_notes({name: one.late for name, one in used.items()}, first.topic.name)
+    )
 
 
 def _spread(values: Vector) -> float:

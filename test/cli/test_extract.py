@@ -123,7 +123,7 @@ def test_an_older_recording_is_kept_when_extraction_fails(tmp_path: Path, run: R
     assert run(write(tmp_path / "bag"), *arguments)[0] == 0
     before = out.read_bytes()
     status, _, err = run(tmp_path / "missing", *arguments)
-    assert (status, err) == (1, f"error: {tmp_path}/missing: no such bag\n")
+    assert (status, err) == (1, f"error: {tmp_path}/missing: no such file\n")
     assert out.read_bytes() == before
     assert [p.name for p in out.parent.iterdir()] == ["r.parquet"]
 
@@ -140,7 +140,7 @@ def bad_bags(folder: Path) -> dict[str, tuple[Path, str]]:
     with write_bag(folder / "empty"):
         pass
     return {
-        "missing": (folder / "nowhere", "no such bag"),
+        "missing": (folder / "nowhere", "no such file"),
         "empty folder": (
             folder / "empty folder",
             "not a bag; expected a rosbag2 folder, a .mcap or .db3 file, or a ROS 1 bag",
@@ -235,5 +235,5 @@ def test_as_its_own_process_the_error_is_one_line_too(tmp_path: Path) -> None:
         env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
     )
     assert (ended.returncode, ended.stdout) == (1, "")
-    assert ended.stderr == f"error: {tmp_path}/none: no such bag\n"
+    assert ended.stderr == f"error: {tmp_path}/none: no such file\n"
     assert list(tmp_path.iterdir()) == []

@@ -63,4 +63,4 @@ def test_a_table_is_shown_and_extracted_by_the_same_commands(dynssm: Run, refuse
 
 def test_what_is_no_bag_ends_in_one_line(refused: Refused, tmp_path: Path) -> None:
     line = refused("inspect", tmp_path / "nothing")
-    assert "no such bag" in line
+    assert "no such file" in line

@@ -52,7 +52,7 @@ def test_the_bag_itself_is_never_replaced(refused: Refused, laps_bag: Path, smal
     ("changes", "words"),
     [
         ({"model": "gone"}, "gone: no such model folder; `dynssm train` writes one"),
-        ({"bag": "gone"}, "gone: no such bag"),
+        ({"bag": "gone"}, "gone: no such file"),
         ({"signals": "gone"}, "'gone' is neither a file nor a shipped name (av21, default)"),
         ({"signals": "av21"}, "missing throttle_command, steering_command"),
         ({"signals": "other.yaml"}, "topic /other/odometry is missing; the bag has /vehicle/actuator_command"),

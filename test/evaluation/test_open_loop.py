@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -193,3 +194,9 @@ def test_published_orca_run_is_a_single_track_trajectory(orca_bag):
     score = evaluate(recording, {"truth": SingleTrack(load_vehicle("orca"))}, calls=3).scores["truth"]
     assert score.rmse.max() < 1e-12
     assert score.rollout.fde < 1e-12
+
+
+def test_rows_between_slower_samples_are_no_test(recording):
+    info = recording.info.model_copy(update={"interpolated": {"v_x": 0.8, "omega": 0.5, "x": 0.8}})
+    (told,) = evaluate(replace(recording, info=info), {"still": Persistence(5, recording.T_s)}).not_tests
+    assert told.startswith("80 % of v_x, 50 % of omega lies between slower samples: expected")

@@ -77,7 +77,7 @@ def test_a_part_of_a_bag_is_played_with_its_clock(laps_bag: Path) -> None:
     ("parameters", "expected"),
     [
         ([], "parameter bag: not set"),
-        (["bag:=/nowhere"], "/nowhere: no such bag"),
+        (["bag:=/nowhere"], "/nowhere: no such file"),
     ],
 )
 def test_a_wrong_start_is_one_clear_line(parameters: list[str], expected: str) -> None:

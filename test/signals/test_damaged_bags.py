@@ -364,7 +364,7 @@ def test_what_is_not_a_bag_is_told_in_one_line(tmp_path: Path, typestore: Any) -
 
 
 def test_a_bag_that_is_not_there_is_told(tmp_path: Path) -> None:
-    with pytest.raises(BagError, match="nowhere: no such bag"):
+    with pytest.raises(BagError, match="nowhere: no such file"):
         read(tmp_path / "nowhere")
 
 

@@ -1,0 +1,135 @@
+"""When samples were measured: which of them have a stamp to believe, and which topics are stamped by another clock."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.errors import BagError
+from dynssm_ros.signals.resampling import Stamps, Stream
+
+_JUMP = 500_000_000  # ns between two stamps, from which on the second is believed only with others near it
+_SEVERAL = 0.1  # of the steps go back, from which on several publishers are likelier than a fault
+_APART = 0.2  # s by which clocks may be apart; what is measured late is rarely later than that
+_DRIFT = 0.1  # s by which clocks may come apart over a log
+_KNOWN = {18: "GPS time is 18 s ahead of UTC", 19: "TAI is 19 s ahead of GPS time", 37: "TAI is 37 s ahead of UTC"}
+
+
+class Lateness(NamedTuple):
+    """How much later than its stamp each message of a topic was recorded: log times and latenesses (s), each ``(N,)``."""
+
+    time: Vector
+    late: Vector
+
+
+def clean(stream: Stream, where: str, drop_bad: bool, jump: int = _JUMP) -> tuple[Stream, str]:
+    """Checks a stream for values that are not finite and for stamps that repeat, run backwards or are far ahead.
+
+    Of stamps more than ``jump`` ns apart those count that most samples agree with, so that a few far ahead cost no others.
+
+    Returns:
+        The stream, without bad samples if ``drop_bad``, and what was dropped (empty if nothing).
+
+    Raises:
+        BagError: a bad sample and ``drop_bad`` is off; names the first.
+    """
+    stamps, values = stream.stamps, stream.values
+    finite = np.isfinite(values)
+    believed = finite.copy()
+    believed[finite] = _in_line(stamps[finite], jump)
+    oldest = np.iinfo(np.int64).min
+    newest = np.maximum.accumulate(np.concatenate([[oldest], np.where(believed, stamps, oldest)]))[:-1]
+    kinds = {
+        "not finite": ~finite,
+        "with a repeated stamp": finite & (stamps == newest),
+        "with a stamp that runs backwards": finite & (stamps < newest),
+        "with a stamp far ahead of those that follow": finite & ~believed & (stamps > newest),
+    }
+    back = int((np.diff(stamps[finite]) < 0).sum())
+    several = "; do several nodes publish the topic?" if back > max(_SEVERAL * len(stamps), 2) else ""
+    dropped: list[str] = []
+    for kind, bad in kinds.items():
+        if not bad.any():
+            continue
+        k = int(np.flatnonzero(bad)[0])
+        if not drop_bad:
+            raise BagError(
+                f"{where}: sample {k} at {stamps[k] / 1e9:.3f} s, value {values[k]:g}, is {kind} ({bad.sum()} such"
+                f"{several}); expected finite values at increasing stamps (--drop-bad leaves such samples out)"
+            )
+        dropped.append(f"{bad.sum()} samples {kind}")
+    if not dropped:
+        return stream, ""
+    keep = ~np.logical_or.reduce(list(kinds.values()))
+    return Stream(stamps[keep], values[keep]), ", ".join(dropped) + several
+
+
+def _in_line(stamps: Stamps, jump: int) -> npt.NDArray[np.bool_]:
+    """Whether each stamp belongs to the runs, without jumps inside, that hold most samples while time goes forward."""
+    cuts = np.flatnonzero(np.abs(np.diff(stamps)) > jump) + 1
+    if not (np.diff(stamps)[cuts - 1] < 0).any():
+        return np.ones(len(stamps), dtype=bool)
+    runs = [slice(a, b) for a, b in pairwise([0, *cuts.tolist(), len(stamps)])]
+    before: list[int] = []  # of each run the one that precedes it in its best line, or -1
+    ends: list[int] = []  # of the best lines so far, by their last stamp; longer ones end later
+    counts: list[int] = []
+    last: list[int] = []
+    for number, run in enumerate(runs):
+        first, end = int(stamps[run].min()), int(stamps[run].max())
+        k = bisect_left(ends, first) - 1
+        before.append(last[k] if k >= 0 else -1)
+        count = run.stop - run.start + (counts[k] if k >= 0 else 0)
+        k = bisect_left(ends, end)
+        if (k > 0 and counts[k - 1] >= count) or (k < len(ends) and ends[k] == end and counts[k] >= count):
+            continue
+        while k < len(ends) and counts[k] <= count:
+            del ends[k], counts[k], last[k]
+        ends.insert(k, end)
+        counts.insert(k, count)
+        last.insert(k, number)
+    kept, number = np.zeros(len(stamps), dtype=bool), last[-1]
+    while number >= 0:
+        kept[runs[number]] = True
+        number = before[number]
+    return kept
+
+
+def clock_notes(topics: Mapping[str, Lateness], reference: str) -> list[str]:
+    """Sentences on topics that are stamped by another clock than the topic ``reference``; of those with stamps alone."""
+    own = topics.get(reference)
+    if own is None or not len(own.late):
+        return []
+    found = []
+    for name, topic in topics.items():
+        if name == reference or not len(topic.late):
+            continue
+        apart = float(np.median(topic.late) - np.median(own.late))
+        drift = _change(topic) - _change(own)
+        if abs(drift) > _DRIFT:
+            found.append(f"{name} is stamped by a clock that drifts by {abs(drift):.2g} s against {reference}'s")
+        elif abs(apart) > _APART:
+            way = "before" if apart > 0 else "after"
+            known = next((f" ({told})" for s, told in _KNOWN.items() if abs(abs(apart) - s) < _APART), "")
+            found.append(f"{name} is stamped {abs(apart):.3g} s {way} {reference}: another clock?{known}")
+    return found
+
+
+def _change(topic: Lateness) -> float:
+    """By how much lateness grows from the first third of a topic's messages to the last (s)."""
+    third = len(topic.late) // 3
+    return float(np.median(topic.late[-third:]) - np.median(topic.late[:third])) if third else 0.0
+
+
+def frames_note(topic: str, frames: Mapping[str, int]) -> list[str]:
+    """A sentence on a topic whose messages name several frames, with how many name the commonest."""
+    if len(frames) < 2:
+        return []
+    common = sorted(frames.items(), key=lambda one: -one[1])[:3]
+    told = ", ".join(f"{name or 'none'} ({count})" for name, count in common)
+    return [f"{topic}: its messages are in several frames: {told}; do several nodes publish it?"]
