@@ -111,7 +111,7 @@ def installed(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytes
 
 @pytest.mark.slow
 @pytest.mark.live
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 def test_an_environment_installed_anew_extracts_replays_and_predicts_live_on_dds(
     installed: Path, laps_bag: Path, small_model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
