@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -21,7 +21,7 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Ros1Reader
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin, Writer, storage_mcap
 from rosbags.typesys import Stores, get_typestore
 
 from dynssm_ros import __version__
@@ -38,6 +38,7 @@ from dynssm_ros.signals.recover import (
     unpack,
     unpacked_chunk,
     unpacked_message,
+    unpacked_to,
 )
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
@@ -46,6 +47,8 @@ _HEADER = "std_msgs/msg/Header"
 _NO_INDEX = "it has no index"
 _LOG_LEFT = "its recorder was killed"
 _TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
+# rosbags unpacks a chunk whole, whatever its index says of its size
+storage_mcap.DECOMPRESSORS |= {codec: partial(unpacked_to, codec) for codec in ("zstd", "lz4")}
 
 
 class BagMessage(NamedTuple):

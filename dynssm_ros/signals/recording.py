@@ -23,6 +23,7 @@ from dynssm_ros.configuration import StrictModel, describe
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.files import replacing, require_replaceable
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
+from dynssm_ros.signals.recover import vast_table
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, Commands
 
 METADATA_KEY = b"dynssm"
@@ -237,6 +238,8 @@ class Recording:
             raise RecordingError(f"{path}: the recording is empty")
         if file.metadata.num_rows > _MOST_ROWS:
             raise RecordingError(f"{path}: {file.metadata.num_rows} rows; expected at most {_MOST_ROWS}")
+        if vast := vast_table(path, file.metadata):
+            raise RecordingError(f"{path}: {vast}")
         time, segment = (_column(file, name, kind, path) for name, kind in (("time", "int64"), ("segment", "int32")))
         known = [name for name in COLUMN_UNITS if name in file.schema_arrow.names]
         columns = {name: _column(file, name, "double", path) for name in known}

@@ -32,6 +32,7 @@ _HEAD = 9  # bytes in front of an MCAP record: what it is, and its length
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _ROS1_CODECS = {b"BZh": "bz2", b"\x04\x22\x4d\x18": "lz4"}
 _UNPACKED, _RATIO = 64 << 20, 100  # bytes that may always be unpacked, and times the packed size
+_CELL_BYTES = 8  # of a column of a table in memory, however it is packed
 _ROS_ENCODINGS = ("ros2msg", "ros2idl", "omgidl", "")
 _RECORDS: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.DATA_END: DataEnd}
 _TABLE_LEAF = 0x0D
@@ -154,9 +155,26 @@ def unpacked_chunk(raw: bytes) -> bytes:
     return b"".join(_bounded(_pieces(io.BytesIO(raw), codec), largest_unpacked(len(raw))))
 
 
+def unpacked_to(codec: str, raw: bytes, size: int) -> bytes:
+    """What is said to unpack to ``size`` bytes; less where it is damaged.
+
+    Raises:
+        OSError: it would be larger.
+    """
+    return b"".join(_bounded(_pieces(io.BytesIO(raw), codec), size))
+
+
 def largest_unpacked(packed: int) -> int:
     """Bytes that so many ``packed`` ones may unpack to."""
     return max(_UNPACKED, _RATIO * packed)
+
+
+def vast_table(file: Path, footer: Any) -> str:
+    """What is wrong with a Parquet file whose ``footer`` says that it unpacks to far more than a log can; else nothing."""
+    groups = (footer.row_group(k).total_byte_size for k in range(footer.num_row_groups))
+    size = max(sum(groups), _CELL_BYTES * footer.num_rows)
+    vast = size > largest_unpacked(file.stat().st_size)
+    return f"unpacks to {size >> 20} MB; expected at most {_RATIO} times its size" if vast else ""
 
 
 def _bounded(pieces: Iterator[bytes], room: int) -> Iterator[bytes]:
@@ -165,10 +183,11 @@ def _bounded(pieces: Iterator[bytes], room: int) -> Iterator[bytes]:
     Raises:
         OSError: there is not.
     """
+    left = room
     for piece in pieces:
-        room -= len(piece)
-        if room < 0:
-            raise OSError(f"unpacks to more than {_UNPACKED >> 20} MB, {_RATIO} times its size, or the free disk")
+        left -= len(piece)
+        if left < 0:
+            raise OSError(f"unpacks to more than {room} bytes; expected what it says, or what a log can")
         yield piece
 
 

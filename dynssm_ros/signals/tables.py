@@ -18,6 +18,7 @@ from dynssm_ros.errors import BagError
 from dynssm_ros.signals.array_files import mat_arrays, npz_arrays
 from dynssm_ros.signals.columns import Column, Heading, heading, kind_of, parsed, told_bad, typed_column
 from dynssm_ros.signals.csv_layout import Layout, layout_of
+from dynssm_ros.signals.recover import vast_table
 
 _GROUP_BYTES, _CELL_BYTES = 512 << 20, 16  # of columns that are in memory at once, and of a cell of them
 _MOST_ROWS = 50_000_000  # as of recordings
@@ -98,6 +99,9 @@ def _parquet_table(path: Path) -> Table:
     with pq.ParquetFile(path) as file:
         names, rows = file.schema_arrow.names, file.metadata.num_rows
         is_recording = b"dynssm" in (file.schema_arrow.metadata or {})
+        vast = vast_table(path, file.metadata)
+    if vast:
+        raise BagError(f"{path}: {vast}")
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise BagError(f"{path}: two columns are named '{twice}'; expected different names")

@@ -22,6 +22,7 @@ from dynssm_ros.signals.inspection import inspect
 from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
+from dynssm_ros.signals.tables import open_table
 
 START = 1_700_000_000_123_456_789
 DEFAULT = load_signal_map("default")
@@ -382,3 +383,17 @@ def test_a_table_of_many_rows_is_read_in_pieces(tmp_path: Path) -> None:
     with open_log(tmp_path / "log.csv") as table:
         assert abs(table.rows / n - 1) < 0.2  # type: ignore[union-attr]
     assert len(extract([tmp_path / "log.csv"], table_map(), 100.0)) == n // 10
+
+
+@pytest.mark.parametrize("dictionary", [True, False])
+def test_a_parquet_file_that_unpacks_to_far_more_than_it_is_is_refused_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dictionary: bool
+) -> None:
+    """Of one value, whether its rows or its pages are many bytes."""
+    file = tmp_path / "log.parquet"
+    table = pa.table({"time": np.zeros(300_000), "v": np.zeros(300_000)})
+    pq.write_table(table, file, compression="zstd", use_dictionary=dictionary)
+    assert open_table(file).rows == 300_000
+    monkeypatch.setattr("dynssm_ros.signals.recover._UNPACKED", 1 << 20)
+    with pytest.raises(BagError, match=r"log.parquet: unpacks to \d MB; expected at most 100 times its size"):
+        open_table(file)
