@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from dynssm_ros.api.extract import extract
     from dynssm_ros.api.inputs import load_model
     from dynssm_ros.api.inspect import inspect
+    from dynssm_ros.api.learn import learn
     from dynssm_ros.api.race import race
     from dynssm_ros.api.replay import replay
     from dynssm_ros.api.season import extract_season, review_season
@@ -55,6 +56,7 @@ __all__ = [
     "extract",
     "extract_season",
     "inspect",
+    "learn",
     "load_model",
     "load_vehicle",
     "race",

@@ -44,9 +44,14 @@ def protecting(inputs: Collection[Path], force: bool = False) -> Iterator[None]:
         _FORCED.reset(tokens[1])
 
 
+def forced() -> bool:
+    """Whether ``--force`` was given."""
+    return _FORCED.get()
+
+
 def require_replaceable(path: str | Path, ours: bool, what: str) -> None:
     """Raises a :class:`UserError` where something else than ``what`` we write is at ``path``, unless that is forced."""
-    if os.path.lexists(path) and not ours and not _FORCED.get():
+    if os.path.lexists(path) and not ours and not forced():
         raise UserError(f"{path}: exists and is not {what}; not replaced (another name, or --force)")
 
 
@@ -68,7 +73,7 @@ def _require_writable(target: Path) -> None:
     for one in _INPUTS.get():
         if here in one.parents:
             raise UserError(f"{target}: the command reads {one.name} there; an output never replaces an input")
-    if os.path.isfile(here) and here.suffix in LOG_SUFFIXES and not _FORCED.get():
+    if os.path.isfile(here) and here.suffix in LOG_SUFFIXES and not forced():
         raise UserError(f"{target}: exists and looks like a log; not replaced (another name, or --force)")
 
 
@@ -136,7 +141,7 @@ def _clear_away(target: Path, begin: str) -> None:
 
 def _require_nothing_else(target: Path, aside: Path, may_hold: Collection[str]) -> None:
     """Checks that a folder which is replaced holds nothing of somebody else's."""
-    if not (os.path.isdir(aside) and os.path.isdir(target)) or _FORCED.get():
+    if not (os.path.isdir(aside) and os.path.isdir(target)) or forced():
         return
     foreign = sorted(set(os.listdir(target)) - set(os.listdir(aside)) - set(may_hold))
     if foreign:

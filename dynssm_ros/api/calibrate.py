@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from dynssm_ros.api.inputs import Log, PathLike, centre_line, joined, opened, vehicle_of
-from dynssm_ros.api.settings import MIN_SPEED, CommandsSettings, keywords, setting
-from dynssm_ros.errors import DataWarning
+from dynssm_ros.api.inputs import Log, PathLike, centre_line, held_out, joined, opened, vehicle_of
+from dynssm_ros.api.settings import HOLDOUT, MIN_SPEED, CommandsSettings, keywords, setting
+from dynssm_ros.errors import DataWarning, RecordingError
 from dynssm_ros.extras import require
+from dynssm_ros.files import forced
 from dynssm_ros.progress import Progress
+from dynssm_ros.signals.recording import COLUMN_UNITS
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.integrators import Integrator
 
@@ -31,7 +35,7 @@ class CalibrateSettings(CommandsSettings):
         None, "Steps of the model.", otherwise="rk4, unless euler is clearly closer to the laps"
     )
     min_speed: float | None = MIN_SPEED
-    holdout: float = setting(0.0, "Leave the last fraction of each recording out.", ge=0.0, le=0.9)
+    holdout: float | None = HOLDOUT
     starts: int = setting(3, "Starting points of the search.", ge=1)
     seed: int = setting(0, "Of the random starting points.", ge=0)
     track: Any = setting(
@@ -57,6 +61,9 @@ def calibrate(
         settings: all keywords as one object.
         on_progress: called after each starting point.
 
+    Raises:
+        RecordingError: the calibrated car predicts a state no better than that nothing changes; see also ``--force``.
+
     Example:
         >>> laps = recorded(simulate("orca", "club", duration=20.0))
         >>> found = calibrate(laps, "orca")
@@ -67,17 +74,38 @@ def calibrate(
     from dynssm_ros.identification.result.calibration import calibrate
 
     car, s = vehicle_of(vehicle), settings
-    data = joined(opened(recordings, car), s.commands, s.holdout)
+    logs = opened(recordings, car)
+    left_out = held_out(logs, s.holdout, car)
+    data = joined(logs, s.commands, left_out)
     line = None if s.track is None else centre_line(s.track, data)
     found = calibrate(
         data, car, horizon=s.horizon, min_speed=s.min_speed, integrator=s.integrator, starts=s.starts, seed=s.seed,
         on_progress=on_progress, line=line,
     )  # fmt: skip
-    if found.tells_nothing_of:
-        times = ", ".join(f"{name} {ratio:.2g} times" for name, ratio in found.tells_nothing_of.items())
-        warnings.warn(
-            f"{found.horizon:.2g} s ahead the calibrated car errs more than the prediction that nothing changes ({times}): "
-            "signals, units, signs or the vehicle file are wrong, or it lacks an effect (dynssm inspect, dynssm diagnose)",
-            DataWarning, stacklevel=3,
-        )  # fmt: skip
+    found = replace(found, vehicle=found.vehicle.with_held_out(left_out))
+    require_physics(found)
     return found
+
+
+def require_physics(found: Calibration) -> None:
+    """Checks that the car predicts each state better than that nothing changes.
+
+    Raises:
+        RecordingError: it does not; with ``--force`` it is a :class:`DataWarning`.
+    """
+    if not found.tells_nothing_of:
+        return
+    errors = zip(STATE_SIGNALS, found.rmse_ahead, found.persistence, strict=True)
+    told = ", ".join(
+        f"{name} {error:.3g} against {still:.3g} {COLUMN_UNITS[name]}"
+        for name, error, still in errors
+        if name in found.tells_nothing_of
+    )
+    words = (
+        f"{found.horizon:.2g} s ahead the calibrated car errs no less than the prediction that nothing changes ({told}): "
+        "expected less; look at sign, unit and time of these states and of the inputs (dynssm inspect), at the vehicle file, "
+        "and at what it lacks (dynssm diagnose)"
+    )
+    if not forced():
+        raise RecordingError(f"{words}; --force writes it all the same")
+    warnings.warn(words, DataWarning, stacklevel=4)

@@ -21,8 +21,11 @@ class DiagnoseSettings(CommandsSettings, WorkerSettings):
     """Settings of :func:`diagnose`."""
 
     horizon: float = setting(0.5, "Time that is simulated from a measured state on (s).", ge=0.0)
-    holdout: float = setting(
-        0.25, "Share at the end that only measures the improvement; whole laps if there are three.", le=0.8
+    holdout: float | None = setting(
+        None,
+        "Share at the end that only measures the improvement; whole laps if there are three.",
+        otherwise="what the vehicle file left out of the same recording, else 0.25",
+        le=0.8,
     )
     min_speed: float | None = MIN_SPEED
     integrator: Integrator | None = setting(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from dynssm_ros.api.settings import MIN_SPEED, CommandsSettings, WorkerSettings,
 from dynssm_ros.errors import DataWarning
 from dynssm_ros.extras import require
 from dynssm_ros.progress import Progress
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
@@ -25,8 +26,8 @@ class EvaluateSettings(CommandsSettings, WorkerSettings):
 
     holdout: float | None = setting(
         None,
-        "Score only this last fraction of the recording, as one block.",
-        otherwise="the whole recording",
+        "Score only this last fraction of each recording, as one block.",
+        otherwise="what the models and their cars left out of it, else the whole recording",
         gt=0.0,
         le=1.0,
     )
@@ -75,12 +76,12 @@ def evaluate(
     if not isinstance(known, Mapping):
         known = open_models(known, None if vehicle is None else vehicle_in_windows(vehicle))
     car = next((model.vehicle for model in known.values() if model.vehicle is not None), None)
-    log = joined(opened(recordings, car))
+    logs = opened(recordings, car)
+    log = joined(logs)
     line = first_lap(log) if s.track is None else centre_line(s.track, log)
-    log = log.with_commands(s.commands or shared_commands(known))
-    split = "whole recording"
-    if s.holdout is not None:
-        log, split = log.split_last(s.holdout)[1], f"last {100 * s.holdout:.3g} % of the recording, as one block"
+    shares = [_scored_share(each, known.values(), s.holdout) for each in logs]
+    last = [each.split_last(share)[1] for each, share in zip(logs, shares, strict=True)]
+    log, split = joined(last, s.commands or shared_commands(known)), _in_words(shares)
     if not name:
         name = ", ".join(Path(each).name for each in several(recordings) if isinstance(each, (str, Path)))
     found = evaluate(
@@ -90,3 +91,19 @@ def evaluate(
     for note in found.not_tests:
         warnings.warn(note, DataWarning, stacklevel=3)
     return found
+
+
+def _scored_share(recording: Recording, models: Iterable[WindowModel], holdout: float | None) -> float:
+    """Share at the end of a recording that is scored: the least that models left out, 1 if none did."""
+    if holdout is not None:
+        return holdout
+    cars = [model.vehicle for model in models if model.vehicle is not None]
+    return min((car.held_out[recording.beginning] for car in cars if recording.beginning in car.held_out), default=1.0)
+
+
+def _in_words(shares: Sequence[float]) -> str:
+    words = [f"last {100 * share:.3g} %" if share < 1 else "whole recording" for share in shares]
+    if len(set(words)) > 1:
+        return f"of the recordings in turn: {'; '.join(words)}"
+    one = "the recording" if len(words) == 1 else "each recording"
+    return words[0] if shares[0] == 1 else f"{words[0]} of {one}, as one block"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,9 +81,23 @@ def opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
     return found
 
 
-def joined(recordings: Sequence[Recording], commands: Commands | None = None, holdout: float = 0.0) -> Recording:
-    """Recordings one after the other, each without its last fraction ``holdout``."""
-    return concatenate([each.with_commands(commands).split_last(holdout)[0] for each in recordings])
+def joined(
+    recordings: Sequence[Recording], commands: Commands | None = None, shares: Mapping[str, float] | None = None
+) -> Recording:
+    """Recordings one after the other, each without its last share in ``shares``; see :func:`held_out`."""
+    held = shares or {}
+    return concatenate(
+        [each.with_commands(commands).split_last(held.get(each.beginning, 0.0))[0] for each in recordings]
+    )
+
+
+def held_out(logs: Iterable[Recording | str], holdout: float | None, car: Vehicle) -> dict[str, float]:
+    """Share at the end of each recording, or of its :attr:`Recording.beginning`, that is left out.
+
+    It is ``holdout`` if given, else what the vehicle file says was left out of this recording before, else 0.
+    """
+    begins = [log.beginning if isinstance(log, Recording) else log for log in logs]
+    return {each: car.held_out.get(each, 0.0) if holdout is None else holdout for each in begins}
 
 
 def files(logs: Log | Sequence[Log]) -> Iterator[Log]:

@@ -107,6 +107,13 @@ Effects = Annotated[dict[str, dict[str, float]], BeforeValidator(_effects)]
 PLANT_HELP = "euler: one step per T_s, as in the published data; rk4: steps of 1 ms; double_track: four wheels."
 # fields of several classes
 EFFECTS = setting({}, "Physics that no model knows of; repeatable.", option="--effect")
+HOLDOUT = setting(
+    None,
+    "Leave the last fraction of each recording out, for an evaluation on it.",
+    otherwise="what the vehicle file left out of the same recording, else 0",
+    ge=0.0,
+    le=0.9,
+)
 EPOCHS = setting(None, "Epochs of each stage, instead of the model file's.", ge=1)
 MIN_SPEED = setting(
     None, "Leave out stretches below this speed (m/s).", otherwise="the vehicle file's minimum_speed", ge=0.0

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from dynssm_ros.api.inputs import Log, PathLike, files, joined, opened, vehicle_in_windows
-from dynssm_ros.api.settings import EPOCHS, CommandsSettings, keywords, setting
+from dynssm_ros.api.calibrate import require_physics
+from dynssm_ros.api.inputs import Log, PathLike, files, held_out, joined, opened, vehicle_in_windows
+from dynssm_ros.api.settings import EPOCHS, HOLDOUT, CommandsSettings, keywords, setting
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
 from dynssm_ros.progress import NamedProgress
@@ -24,9 +25,7 @@ if TYPE_CHECKING:
 class TrainSettings(CommandsSettings):
     """Settings of :func:`train`."""
 
-    holdout: float = setting(
-        0.0, "Leave the last fraction of each recording out, for an evaluation on it.", ge=0.0, le=0.9
-    )
+    holdout: float | None = HOLDOUT
     seed: int | None = setting(None, "Instead of the model file's.", ge=0)
     epochs: int | None = EPOCHS
     device: str = setting("cpu", "cpu or cuda.")
@@ -85,17 +84,25 @@ def train(
     config = model_config(model, seed=s.seed, epochs=s.epochs)
     checkpoint, car = folder.with_name(f"{folder.name}.checkpoint.pt"), vehicle_in_windows(vehicle)
     if s.memory is None:
-        data = joined(opened(recordings, car), s.commands, s.holdout)
+        logs = opened(recordings, car)
+        left_out = held_out(logs, s.holdout, car)
+        data = joined(logs, s.commands, left_out)
     else:
-        data = sampled(_looked_at(recordings, car), s.memory, commands=s.commands, holdout=s.holdout)
+        paths, begins = zip(*_looked_at(recordings, car), strict=True)
+        left_out = held_out(begins, s.holdout, car)
+        data = sampled(paths, s.memory, commands=s.commands, holdouts=[left_out[each] for each in begins])
+    car = car.with_held_out(left_out)
 
     def calibrated(laps: Recording, car: Vehicle, integrator: Integrator | None) -> Vehicle:
         if integrator in (None, car.integrator) and car.was_calibrated_on(laps.fingerprints):
             return car
-        return calibrate(laps, car, integrator=integrator).vehicle
+        found = calibrate(laps, car, integrator=integrator)
+        if len(laps) == len(data):  # parts of the laps only tell how large errors are
+            require_physics(found)
+        return found.vehicle
 
     trained = train(data, config, car, checkpoint, device=s.device, progress=on_progress, calibrate=calibrated)
-    artifact = save_artifact(trained, folder, {"holdout": s.holdout, "device": s.device}, picture)
+    artifact = save_artifact(trained, folder, {"holdout": _in_brief(left_out), "device": s.device}, picture)
     for path in checkpoints(config, checkpoint):
         path.unlink(missing_ok=True)
     return TrainingResult(trained, artifact)
@@ -109,14 +116,18 @@ def model_config(model: ModelConfig | PathLike, **training: Any) -> ModelConfig:
     return config.with_training(**{name: value for name, value in training.items() if value is not None})
 
 
-def _looked_at(logs: Log | Sequence[Log], car: Vehicle) -> list[Path]:
-    """Files of recordings, each of which was looked at; see :func:`~dynssm_ros.api.inputs.opened`."""
+def _in_brief(shares: Mapping[str, float]) -> float | dict[str, float]:
+    """The share of all recordings, or that of each."""
+    return next(iter(shares.values())) if len(set(shares.values())) == 1 else dict(shares)
+
+
+def _looked_at(logs: Log | Sequence[Log], car: Vehicle) -> list[tuple[Path, str]]:
+    """Files of recordings, each of which was looked at, see :func:`~dynssm_ros.api.inputs.opened`, and their beginnings."""
     found = []
     for log in files(logs):
         if isinstance(log, Recording):
             raise ConfigurationError(
                 "memory: a recording that is not in a file takes its memory already; expected files"
             )
-        opened(log, car)
-        found.append(Path(log))
+        found += [(Path(log), one.beginning) for one in opened(log, car)]
     return found

@@ -21,6 +21,7 @@ from dynssm_ros.cli.diagnose import diagnose
 from dynssm_ros.cli.evaluate import evaluate
 from dynssm_ros.cli.extract import extract
 from dynssm_ros.cli.inspect import inspect
+from dynssm_ros.cli.learn import learn
 from dynssm_ros.cli.race import race
 from dynssm_ros.cli.replay import replay
 from dynssm_ros.cli.season import season
@@ -41,7 +42,7 @@ app = typer.Typer(
 # click's base of all usage errors, wherever typer keeps its click
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
-for command in (inspect, simulate, extract, calibrate, train, sweep, evaluate, replay, diagnose, season, race):
+for command in (learn, inspect, simulate, extract, calibrate, train, sweep, evaluate, replay, diagnose, season, race):
     app.command()(command)
 
 

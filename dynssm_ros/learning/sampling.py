@@ -14,7 +14,7 @@ _LEAST_ROWS = 2000
 
 
 def sampled(
-    files: Sequence[Path], memory: float, *, commands: Commands | None = None, holdout: float = 0.0
+    files: Sequence[Path], memory: float, *, commands: Commands | None = None, holdouts: Sequence[float] = ()
 ) -> Recording:
     """The middle of each recording, one after the other: all rows if they fit, else in proportion to its length.
 
@@ -22,7 +22,7 @@ def sampled(
         files: recordings of one car.
         memory: what the rows may take in training (MB).
         commands: source of the command inputs; the recordings' own if not given.
-        holdout: last fraction of each that is left out.
+        holdouts: last fraction of each that is left out; of none, if not given.
 
     Raises:
         ConfigurationError: too little memory to train on.
@@ -31,9 +31,10 @@ def sampled(
     if kept < _LEAST_ROWS:
         least = _LEAST_ROWS * _BYTES / 1e6
         raise ConfigurationError(f"memory {memory:g} MB: room for {kept} rows; expected at least {least:g} MB")
-    counts = [count - round(count * holdout) for count in map(row_count, files)]
-    share = min(1.0, kept / sum(counts))
-    middles = [slice(round(n * (1 - share) / 2), round(n * (1 + share) / 2)) for n in counts]
+    shares = holdouts or [0.0] * len(files)
+    counts = [count - round(count * share) for count, share in zip(map(row_count, files), shares, strict=True)]
+    part = min(1.0, kept / sum(counts))
+    middles = [slice(round(n * (1 - part) / 2), round(n * (1 + part) / 2)) for n in counts]
     return concatenate(
         [
             Recording.load(file).with_commands(commands).select(middle)

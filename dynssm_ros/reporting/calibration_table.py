@@ -40,6 +40,8 @@ def calibration_json(result: Calibration) -> dict[str, Any]:
         "unidentified": list(result.unidentified),
         "rmse_before": by_channel(result.rmse_before),
         "rmse_after": by_channel(result.rmse_after),
+        "rmse_ahead": by_channel(result.rmse_ahead),
+        "persistence": by_channel(result.persistence),
         "rows": result.rows,
         "horizon_s": result.horizon,
     }

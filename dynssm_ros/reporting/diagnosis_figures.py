@@ -37,6 +37,7 @@ _COLOURS = (NO_MODEL, PALETTE[1], PALETTE[0])  # as given, recalibrated, extende
 _SECONDS = 15.0  # of the stretch that is shown in full
 _PLACES = 400  # of the lap at which a cause is drawn
 _BLOCKS = 24  # parts of the time
+_MOST_RECORDINGS = 4  # that have panels of their own
 _LONGEST = 2.2  # of the recalibrated car's error; what the car as given exceeds leaves the panel
 
 
@@ -44,8 +45,7 @@ _LONGEST = 2.2  # of the recalibrated car's error; what the car as given exceeds
 def simulated_and_measured(improvement: Improvement) -> Figure:
     """The liveliest held-out stretch: measured, and simulations that start anew from measured states."""
     windows = improvement.windows
-    T_s, rows = windows.data.T_s, windows.data.rows
-    at = windows.starts
+    rows, at = windows.data.rows, windows.starts
     shown = at[liveliest(windows.time, rows[:3, at].T, _SECONDS)]
     starts = [int(shown[0])]
     for start in shown:
@@ -53,10 +53,11 @@ def simulated_and_measured(improvement: Improvement) -> Figure:
             starts.append(int(start))
     runs = replace(windows, starts=np.array(starts))
     figure, axes = sheet(5.4, 3, sharex=True)
+    clock = windows.data.context["t"]  # of the recording that the stretch lies in
     whole = np.arange(starts[0], starts[-1] + windows.steps + 1)
     here = runs.starts[:, None] + np.arange(windows.steps + 1)
     for c, (panel, channel) in enumerate(zip(axes, STATE_SIGNALS, strict=True)):
-        panel.plot(whole * T_s, rows[c, whole], color=MEASURED, lw=2.2, alpha=0.75, label="measured")
+        panel.plot(clock[whole], rows[c, whole], color=MEASURED, lw=2.2, alpha=0.75, label="measured")
         panel.set_ylabel(label(channel))
         low, high = np.ptp(rows[c, whole]) * np.array([-0.4, 0.4]) + [rows[c, whole].min(), rows[c, whole].max()]
         panel.set_ylim(low, high)
@@ -64,7 +65,7 @@ def simulated_and_measured(improvement: Improvement) -> Figure:
         predicted = runs.errors(car) + runs.target
         path = np.concatenate([np.moveaxis(rows[:3, runs.starts], 0, 1)[:, None], predicted], axis=1)
         path = np.concatenate([path, np.full((len(path), 1, 3), np.nan)], axis=1)  # lifts the pen
-        t = np.concatenate([here, here[:, -1:]], axis=1) * T_s
+        t = clock[np.concatenate([here, here[:, -1:]], axis=1)]
         for c, panel in enumerate(axes):
             panel.plot(t.ravel(), path[..., c].ravel(), color=colour, lw=1.0, label=name)
     axes[-1].set_xlabel("time (s)")
@@ -84,7 +85,7 @@ def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector,
     profile = effect.along_lap(lap, bend)
     figure = Figure(figsize=(WIDTH, 4.6 if profile else 2.8), layout="constrained")
     grid = figure.add_gridspec(2 if profile else 1, 3, height_ratios=[2.6, 1.4] if profile else None)
-    size, there, over = (figure.add_subplot(grid[0, k]) for k in range(3))
+    size, there = (figure.add_subplot(grid[0, k]) for k in range(2))
     scale = np.maximum((without**2).mean(axis=0), 1e-300)
     left = np.sqrt((with_it**2).mean(axis=0) / scale)
     size.bar(range(3), np.ones(3), 0.7, color=_COLOURS[1])
@@ -110,15 +111,12 @@ def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector,
         there.axhline(0.0, color=MEASURED, lw=0.8)
         there.set_xlabel("speed (m/s)")
         there.set_title("at which speed error is gone")
-    order, blocks = np.argsort(windows.time), max(1, min(_BLOCKS, len(gone) // _FEWEST))
-    parts = np.array_split(order, blocks)
-    first, last = (windows.time[[part[k] for part in parts]] for k in (0, -1))
-    over.bar(
-        first, [gone[part].mean() for part in parts], np.maximum(last - first, 0.1), align="edge", color=_COLOURS[2]
-    )
-    over.axhline(0.0, color=MEASURED, lw=0.8)
-    over.set_xlabel("time (s)")
-    over.set_title("when: error gone, 1 = the mean error")
+    driven = [np.flatnonzero(windows.number == number) for number in np.unique(windows.number)[:_MOST_RECORDINGS]]
+    panels = grid[0, 2].subgridspec(len(driven), 1).subplots(sharey=True, squeeze=False)[:, 0]
+    for over, rows in zip(panels, driven, strict=True):
+        _error_gone(over, windows.data.context["t"][windows.starts[rows]], gone[rows], _BLOCKS // len(driven))
+    panels[0].set_title("when: error gone, 1 = the mean error")
+    panels[-1].set_xlabel("time (s)" if len(driven) == 1 else "time of each recording (s)")
     if profile:
         what, values = profile
         along = figure.add_subplot(grid[1, :])
@@ -126,6 +124,16 @@ def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector,
         along.plot(lap * length, values, color=_COLOURS[2])
         along.set(xlabel="position on the lap (m)", ylabel=what)
     return figure
+
+
+def _error_gone(panel: Axes, t: Vector, gone: Vector, blocks: int) -> None:
+    """Bars of the mean of ``gone`` in blocks of the times ``t`` (s) of one recording."""
+    parts = np.array_split(np.argsort(t), max(1, min(blocks, len(gone) // _FEWEST)))
+    first, last = (t[[part[k] for part in parts]] for k in (0, -1))
+    panel.bar(
+        first, [gone[part].mean() for part in parts], np.maximum(last - first, 0.1), align="edge", color=_COLOURS[2]
+    )
+    panel.axhline(0.0, color=MEASURED, lw=0.8)
 
 
 @styled
@@ -164,14 +172,17 @@ def evidence(tried: Mapping[str, float], named: Sequence[str]) -> Figure:
 
 
 @styled
-def errors_over_time(improvement: Improvement) -> Figure:
-    """Errors one step and the horizon ahead over time, of the recalibrated and of the extended car."""
+def errors_over_time(improvement: Improvement, number: int) -> Figure:
+    """Errors one step and the horizon ahead over the time of one recording, of the recalibrated and of the extended car."""
     figure, axes = sheet(5.0, 3, 2, sharex=True)
-    order = np.argsort(improvement.windows.time)
+    windows = improvement.windows
+    chosen = np.flatnonzero(windows.number == number)
+    t = windows.data.context["t"][windows.starts[chosen]]
+    order = np.argsort(t)
     for column, h in zip(axes.T, (0, improvement.horizon), strict=True):
         for c, (panel, channel) in enumerate(zip(column, STATE_SIGNALS, strict=True)):
             for (name, values), colour in zip(list(improvement.errors.items())[1:], _COLOURS[1:], strict=True):
-                line = cut_at_holes(improvement.windows.time[order], values[order, h, c])
+                line = cut_at_holes(t[order], values[chosen[order], h, c])
                 panel.plot(*line, color=colour, lw=0.8, label=name)
             panel.axhline(0.0, color=MEASURED, lw=0.8)
             panel.set_ylabel(label(channel, " error"))

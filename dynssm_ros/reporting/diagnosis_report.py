@@ -24,6 +24,7 @@ from dynssm_ros.vehicle.effects import EFFECTS
 _LITTLE = 0.02  # of the squared error; less is not worth a word
 _WIDTH = 110
 _MANY_TIMES = 2.0  # farther off, a percentage says nothing
+_MOST_RECORDINGS = 6  # whose errors are drawn over time
 _FEW = 4  # parameters of a curve that are shown one by one
 
 
@@ -234,7 +235,10 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
         "improvement", diagnosis_figures.improvement_by_horizon(improvement), _improvement_table(improvement)
     )
     yield prose.section("systematic", table=_systematic_table(improvement))
-    yield prose.section("over_time", diagnosis_figures.errors_over_time(improvement))
+    numbers = np.unique(windows.number).tolist()
+    for number in numbers[:_MOST_RECORDINGS]:
+        where = f" in {diagnosis.recordings.names[number]}" if len(numbers) > 1 else ""
+        yield prose.section("over_time", diagnosis_figures.errors_over_time(improvement, number), where=where)
     # what was going on half the way into the simulation
     rows, at = windows.data.rows, windows.starts + round(horizon / windows.data.T_s / 2)
     against = {

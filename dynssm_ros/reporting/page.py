@@ -7,13 +7,16 @@ that ends with a report.
 from __future__ import annotations
 
 import base64
+import html
 import io
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from importlib.resources import files
 from pathlib import Path
+from typing import Literal
 
 import matplotlib as mpl
 import yaml
@@ -24,7 +27,9 @@ from dynssm_ros import __version__
 from dynssm_ros.files import replacing
 from dynssm_ros.reporting.tables import Table
 
+State = Literal["ok", "look", "wrong"]
 RASTER_DPI = 160  # of the rasterised parts of a figure
+_FIGURE = re.compile(r'<h2>(.*?)</h2>\s*<p>(.*?)</p>\s*<img alt=".*?" src="(data:[^"]*)">', re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -33,8 +38,18 @@ class Section:
 
     title: str
     text: str
-    figure: Figure | None = None
+    figure: Figure | str | None = None  # or its ``data:`` address
     table: Table | None = None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A line that a report begins with: what was judged, how it is, why, and the page with more about it."""
+
+    name: str
+    state: State
+    text: str
+    link: str = ""
 
 
 @dataclass(frozen=True)
@@ -49,6 +64,7 @@ class Report:
     sections: Sequence[Section]
     protocol: Mapping[str, str] = field(default_factory=dict)
     table: Table | None = None
+    verdicts: Sequence[Verdict] = ()
 
     def html(self) -> str:
         """The report as HTML text."""
@@ -88,8 +104,16 @@ def _template(name: str) -> str:
     return files(__package__).joinpath("templates", name).read_text(encoding="utf-8")
 
 
-def svg_uri(figure: Figure) -> str:
+def figures_of(page: Path) -> list[Section]:
+    """The sections with a figure of a report that was saved."""
+    found = _FIGURE.findall(page.read_text(encoding="utf-8"))
+    return [Section(html.unescape(title), html.unescape(text), figure) for title, text, figure in found]
+
+
+def svg_uri(figure: Figure | str) -> str:
     """The figure as a ``data:`` address of an SVG image; the same figure gives the same text."""
+    if isinstance(figure, str):
+        return figure
     buffer = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "dynssm"}):
         bare = dict.fromkeys(("Date", "Creator", "Format", "Type"))

@@ -117,8 +117,15 @@ class Recording:
     def fingerprints(self) -> tuple[str, ...]:
         """Of the first rows in every ten seconds, by which the same laps are known again, whole or in part; sorted."""
         first = np.flatnonzero(np.diff(self.time // _FINGERPRINT_NS, prepend=-1))
-        rows = [self.states(slice(k, k + _FINGERPRINT_ROWS)).tobytes() for k in first.tolist()]
-        return tuple(sorted({hashlib.sha256(row).hexdigest()[:8] for row in rows}))
+        return tuple(sorted(set(map(self._fingerprint, first.tolist()))))
+
+    @property
+    def beginning(self) -> str:
+        """Fingerprint of the first rows; the recording is known by it if its end is cut off."""
+        return self._fingerprint(0)
+
+    def _fingerprint(self, row: int) -> str:
+        return hashlib.sha256(self.states(slice(row, row + _FINGERPRINT_ROWS)).tobytes()).hexdigest()[:8]
 
     def window_ends(self, H: int, horizon: int = 1, min_speed: float = -np.inf) -> Indices:
         """Rows ``t`` such that rows ``t-H+1 .. t+horizon`` lie in one segment and nowhere below ``min_speed``.

@@ -6,7 +6,7 @@ Names and units are the paper's (Table I); a file is checked completely when it 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -130,6 +130,10 @@ class Vehicle(StrictModel):
     before: KnownBefore | None = Field(
         default=None,
         description="what was known before the calibration: laps that were calibrated on tell nothing new a second time",
+    )
+    held_out: dict[str, float] = Field(
+        default_factory=dict,
+        description="share at the end of a recording (fingerprint of its first rows) that calibration and training left out",
     )
 
     @property
@@ -273,6 +277,15 @@ class Vehicle(StrictModel):
         )
         known = before.model_copy(update={"laps": tuple(sorted({*before.laps, *laps})[:_LAPS])})
         return self.model_copy(update={"before": known})
+
+    def with_held_out(self, shares: Mapping[str, float]) -> Vehicle:
+        """The same car, of which the last ``shares`` of recordings (fingerprints of their first rows) were left out.
+
+        Of a recording that is known the lesser share counts: what the car was fitted to it stays fitted to.
+        """
+        lesser = {name: min(share, self.held_out.get(name, share)) for name, share in shares.items()}
+        kept = {name: share for name, share in (self.held_out | lesser).items() if share > 0}
+        return self.model_copy(update={"held_out": kept})
 
     def unmeasured(self) -> Vehicle:
         """The same car of which nothing but the bounds is known: values in their middle, no standard deviations."""

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from dynssm_ros.identification.result.calibration import _over_persistence
+from dynssm_ros.identification.result.calibration import _ahead
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import load_signal_map
@@ -66,17 +66,22 @@ def test_a_wrong_car_becomes_the_right_one(dynssm: Run, laps: Path, tmp_path: Pa
     assert 0 < result["rows"] < len(Recording.load(laps))
 
 
-def test_a_car_that_predicts_worse_than_that_nothing_changes_is_warned_of(
+def test_a_car_that_predicts_worse_than_that_nothing_changes_is_written_by_force_alone(
     dynssm: Run, laps: Path, tmp_path: Path
 ) -> None:
     """As with a steering whose sign is wrong."""
-    recording = Recording.load(laps).select(slice(0, 500))
+    recording, car = Recording.load(laps).select(slice(0, 500)), tmp_path / "car.yaml"
     turned = {name: -recording[name] for name in ("delta_fb", "delta_cmd")}
     replace(recording, columns=recording.columns | turned).save(laps)
-    status, _, err = dynssm("calibrate", laps, "--vehicle", "orca", *ONE_EULER_START, "--out", tmp_path / "car.yaml")
-    assert status == 0
-    (line,) = [line for line in err.splitlines() if line.startswith("warning: ") and "nothing changes" in line]
-    assert re.search(r"s ahead .* omega [\d.]+ times", line)
+    arguments = ["calibrate", laps, "--vehicle", "orca", *ONE_EULER_START, "--holdout", 0.2, "--out", car]
+    status, _, err = dynssm(*arguments)
+    (line,) = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert (status, car.exists()) == (1, False)
+    assert re.search(r"s ahead .* omega [\d.]+ against [\d.]+ rad/s\).* sign, unit and time", line)
+    status, _, err = dynssm(*arguments, "--force")
+    assert (status, car.exists()) == (0, True)
+    assert line.removeprefix("error: ").split(";")[0] in err
+    assert load_vehicle(car).held_out == {recording.beginning: 0.2}
 
 
 def test_errors_are_compared_with_those_of_nothing_state_by_state() -> None:
@@ -87,7 +92,7 @@ def test_errors_are_compared_with_those_of_nothing_state_by_state() -> None:
         data=SimpleNamespace(rows=np.zeros((7, 3))),
     )
     errors = np.array([[[9.0, 9, 9], [0.5, 0.5, 8]]] * 3)
-    np.testing.assert_allclose(_over_persistence(windows, errors), [0.5, 0.25, 2.0])  # type: ignore[arg-type]
+    np.testing.assert_allclose(_ahead(windows, errors), [[0.5, 0.5, 8], [1, 2, 4]])  # type: ignore[arg-type]
 
 
 def test_a_coefficient_on_its_bound_is_told_and_marked(dynssm: Run, laps: Path, tmp_path: Path) -> None:

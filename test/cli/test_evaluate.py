@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
+from dynssm_ros.api import evaluate
+from dynssm_ros.errors import DataWarning
+from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
@@ -131,6 +134,28 @@ def test_bad_input_gets_one_line_and_leaves_nothing_behind(refused, recording, t
     line = refused("evaluate", recording, *arguments, "--out", tmp_path / "out")
     assert expected in line
     assert not (tmp_path / "out").exists()
+
+
+def test_what_the_car_file_left_out_is_left_out_of_training_and_scored(dynssm, laps_bag, tmp_path, monkeypatch):
+    """Until another share is asked for, which is warned of where it was trained on."""
+    monkeypatch.chdir(tmp_path)
+    recording, car = extract([laps_bag], load_signal_map("default"), 50.0), load_vehicle("orca")
+    recording.save("laps.parquet")
+    save_vehicle(car.with_held_out({recording.beginning: 0.25}), "car.yaml")
+    dynssm("train", "laps.parquet", "--model", "ridge", "--vehicle", "car.yaml", "--out", "model")
+    assert open_artifact(tmp_path / "model").card.training["holdout"] == 0.25
+    found = evaluate("laps.parquet", ["model", "persistence"], stride=50)
+    assert (found.split, found.not_tests) == ("last 25 % of the recording, as one block", [])
+    with pytest.warns(DataWarning, match="model was trained on"):
+        assert evaluate("laps.parquet", ["model"], holdout=0.9, stride=50).not_tests
+
+
+def test_several_recordings_are_scored_at_the_end_of_each(recording):
+    log = Recording.load(recording)
+    first, second = log.split_last(0.5)
+    found = evaluate([first, second], ["persistence"], holdout=0.5, stride=50)
+    assert found.split == "last 50 % of each recording, as one block"
+    assert set(found.recording.time) == {*first.split_last(0.5)[1].time, *second.split_last(0.5)[1].time}
 
 
 def test_a_model_that_knows_the_rows_is_named_beside_the_table(dynssm, laps_bag, quick_figures, tmp_path, monkeypatch):

@@ -63,6 +63,15 @@ def test_the_end_of_each_recording_is_held_out(days: list[Recording]) -> None:
     assert together.split.startswith("of each recording ")
 
 
+def test_what_the_vehicle_left_out_is_held_out_and_noted(days: list[Recording]) -> None:
+    together = RecordingSet.of(days, 0.25, known={days[1].beginning: 0.4})
+    held = together.held_out[together.number == 1]
+    assert held.mean() == pytest.approx(0.4, abs=1e-3)
+    assert (np.diff(held.astype(int)) >= 0).all()
+    assert together.shares[days[1].beginning] == pytest.approx(0.4, abs=1e-3)
+    assert "as when the vehicle was calibrated" in together.split
+
+
 def test_a_short_recording_is_not_drowned_by_a_long_one() -> None:
     together = RecordingSet.of([recorded(300.0, 1), recorded(40.0, 2)], 0.25)
     fitted = fit_windows(together.recording, together.rows(), 0.4, 0.0, together.held_out)

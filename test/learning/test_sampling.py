@@ -31,11 +31,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.mark.parametrize(("holdout", "rows"), [(0.0, 6003), (0.5, 3002)])
 def test_the_sample_is_of_all_logs_and_within_the_memory(files: list[Path], holdout: float, rows: int) -> None:
-    sample = sampled(files, 2400 * ROW_MB, holdout=holdout)
+    sample = sampled(files, 2400 * ROW_MB, holdouts=[holdout] * len(files))
     assert len(sample) == pytest.approx(2400, abs=5)
     assert len(sample.info.source) == 3
     np.testing.assert_allclose(np.bincount(sample.segment) / len(sample), [0.5, 1 / 3, 1 / 6], atol=0.01)
-    assert len(sampled(files, 1000.0, holdout=holdout)) == pytest.approx(rows, abs=1)
+    assert len(sampled(files, 1000.0, holdouts=[holdout] * len(files))) == pytest.approx(rows, abs=1)
     first = Recording.load(files[0]).time
     last = first[round((1 - holdout) * len(first)) - 1]
     assert last > sample.time[sample.segment == 0].max() > sample.time[sample.segment == 0].min() > first[0]

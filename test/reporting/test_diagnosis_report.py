@@ -17,6 +17,7 @@ from dynssm_ros.identification.search.candidates import Candidate
 from dynssm_ros.reporting.diagnosis_figures import (
     cause_pictures,
     errors_over,
+    errors_over_time,
     improvement_by_horizon,
     simulated_and_measured,
 )
@@ -197,6 +198,25 @@ def test_each_cause_has_a_picture_of_how_much_where_and_when(lagging: Lagging) -
     np.testing.assert_allclose([bar.get_height() for bar in size.patches[3:]], ratio)
     assert "where" in there.get_title("left")
     assert "when" in over.get_title("left")
+
+
+def test_each_recording_has_panels_of_its_own_time(lagging: Lagging) -> None:
+    found = lagging[2]
+    windows, (cause,) = found.improvement.windows, found.causes
+    half = len(windows.starts) // 2
+    second = np.arange(windows.data.rows.shape[1]) >= windows.starts[half]
+    clock = windows.data.context["t"] - np.where(second, 7000.0, 0.0)
+    data = replace(windows.data, number=second.astype(np.intp), context=windows.data.context | {"t": clock})
+    both = replace(windows, data=data)
+    improvement = replace(found.improvement, windows=both)
+    with_it = improvement.errors["extended"][:, improvement.horizon]
+    figure = cause_pictures(both, cause.without, with_it, EFFECTS[cause.effect](**cause.values))
+    panels = [panel for panel in figure.axes if panel.get_label() != "<colorbar>"]
+    assert [panel.get_title("left")[:4] for panel in panels] == ["erro", "wher", "when", ""]
+    times = [errors_over_time(improvement, k).axes[0].lines[0].get_xdata() for k in (0, 1)]
+    own = [clock[both.starts[:half]], clock[both.starts[half:]]]
+    for drawn, t in zip(times, own, strict=True):
+        assert (np.nanmin(np.asarray(drawn)), np.nanmax(np.asarray(drawn))) == (t.min(), t.max())
 
 
 def test_the_bank_of_a_cambered_road_is_drawn_along_the_lap(lagging: Lagging) -> None:

@@ -257,3 +257,10 @@ def test_correlations_that_cannot_be_are_refused(tmp_path: Path, correlation: li
     file.write_text(yaml.safe_dump(content), encoding="utf-8")
     with pytest.raises(ConfigurationError, match=expected):
         load_vehicle(file)
+
+
+def test_of_what_a_car_was_fitted_to_the_least_share_was_left_out(orca: Vehicle) -> None:
+    once = orca.with_held_out({"a": 0.25, "b": 0.0})
+    assert once.held_out == {"a": 0.25}
+    assert once.with_held_out({"a": 0.5, "c": 0.1}).held_out == {"a": 0.25, "c": 0.1}
+    assert once.with_held_out({"a": 0.0}).held_out == {}

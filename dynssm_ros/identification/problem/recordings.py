@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -82,8 +82,9 @@ class RecordingSet:
 
     @classmethod
     def of(
-        cls, recordings: Sequence[Recording], holdout: float, line: ClosedLine | None = None, suspects: Group = ()
-    ) -> RecordingSet:
+        cls, recordings: Sequence[Recording], holdout: float, line: ClosedLine | None = None, suspects: Group = (),
+        known: Mapping[str, float] | None = None,
+    ) -> RecordingSet:  # fmt: skip
         """Joins recordings and holds out the share ``holdout`` at the end of each; whole laps if there are three.
 
         Args:
@@ -91,6 +92,7 @@ class RecordingSet:
             holdout: share of each.
             line: along which places are counted; ``None``: of each road the first full lap among the fitted rows.
             suspects: numbers of the recordings in which something may have changed.
+            known: other shares of some recordings (:attr:`Recording.beginning`), each held out as one block.
 
         Raises:
             RecordingError: sampling times or command protocols differ, or there is none.
@@ -98,7 +100,7 @@ class RecordingSet:
         joined = concatenate(recordings)
         number = np.repeat(np.arange(len(recordings)), [len(one) for one in recordings])
         clock = np.concatenate([(one.time - one.time[0]) / 1e9 for one in recordings])
-        cuts = [_cut(one, holdout) for one in recordings]
+        cuts = [_cut(one, holdout, (known or {}).get(one.beginning)) for one in recordings]
         held = np.concatenate([np.arange(len(one)) >= cut for one, (cut, _) in zip(recordings, cuts, strict=True)])
         levels = Levels.of(recordings, suspects)
         ends, splits = zip(*cuts, strict=True)
@@ -116,6 +118,12 @@ class RecordingSet:
     def has_places(self) -> bool:
         """Whether each recording's place on a lap is known."""
         return all(line is not None for line in self.lines)
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Share at the end of each recording (:attr:`Recording.beginning`) that is held out."""
+        each = ((self._part(k), self.held_out[self.number == k]) for k in range(len(self.names)))
+        return {part.beginning: float(held.mean()) for part, held in each}
 
     def rows(self) -> RecordedRows:
         """As simulations read them, with the place on the lap; ``t`` is the recording's own clock."""
@@ -207,8 +215,11 @@ def _in_words(splits: Sequence[str]) -> str:
     return "of each recording " + (splits[0] if len(set(splits)) == 1 else "in turn: " + "; ".join(splits))
 
 
-def _cut(recording: Recording, holdout: float) -> tuple[int, str]:
+def _cut(recording: Recording, holdout: float, known: float | None) -> tuple[int, str]:
     """First held-out row, and in words."""
+    if known is not None:
+        first = len(recording.split_last(known)[0])
+        return first, f"the last {100 * known:.0f} % as one block, as when the vehicle was calibrated"
     N, lap = len(recording), lap_number(recording, first_lap(recording))
     if lap is not None:
         # laps are counted from the first row's place, so that the last full ones are held out

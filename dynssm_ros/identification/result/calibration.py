@@ -48,7 +48,7 @@ class Calibration:
         rmse_before: one-step RMSE ``(3,)`` with the former nominal values; ``rmse_after`` with the calibrated ones.
         rows: number of prediction errors used per channel.
         horizon: length of the simulations (s).
-        over_persistence: error ``(3,)`` at the end of the simulations, over that of the prediction that nothing changes.
+        rmse_ahead: error ``(3,)`` at the end of the simulations; ``persistence`` that of the prediction that nothing changes.
     """
 
     vehicle: Vehicle
@@ -60,14 +60,14 @@ class Calibration:
     rmse_after: Vector
     rows: int
     horizon: float
-    over_persistence: Vector
+    rmse_ahead: Vector
+    persistence: Vector
 
     @property
     def tells_nothing_of(self) -> dict[str, float]:
-        """By state, :attr:`over_persistence` where the car predicts no better than that nothing changes."""
-        return {
-            name: float(ratio) for name, ratio in zip(State._fields, self.over_persistence, strict=True) if ratio >= 1
-        }
+        """By state, how many times the error of :attr:`persistence` the car makes, where it is no better."""
+        each = zip(State._fields, self.rmse_ahead, self.persistence, strict=True)
+        return {name: float(error / still) for name, error, still in each if 0 < still <= error}
 
 
 def calibrate(
@@ -145,16 +145,15 @@ def _calibration(
         _rmse(one_step, fit.car),
         windows.target.shape[0] * windows.target.shape[1],
         windows.steps * recording.T_s,
-        _over_persistence(windows, fit.errors.reshape(windows.target.shape)),
+        *_ahead(windows, fit.errors.reshape(windows.target.shape)),
     )
 
 
-def _over_persistence(windows: SimulationWindows, errors: Vector) -> Vector:
-    """RMS of the last ``errors`` ``(W, K, 3)`` over that of the measured changes, ``(3,)``; 0 where nothing changes."""
+def _ahead(windows: SimulationWindows, errors: Vector) -> tuple[Vector, Vector]:
+    """RMS ``(3,)`` of the last ``errors`` ``(W, K, 3)``, and of the measured changes."""
     changes = windows.target[:, -1] - windows.data.rows[:3, windows.starts].T
-    of_nothing = np.sqrt(np.mean(changes**2, axis=0))
-    error = np.sqrt(np.mean(errors[:, -1] ** 2, axis=0))
-    return np.asarray(np.divide(error, of_nothing, out=np.zeros(3), where=of_nothing > 0))
+    error, still = (np.asarray(np.sqrt(np.mean(each**2, axis=0))) for each in (errors[:, -1], changes))
+    return error, still
 
 
 def _rmse(one_step: SimulationWindows, car: CarEstimate) -> Vector:

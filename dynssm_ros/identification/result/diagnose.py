@@ -42,7 +42,7 @@ def diagnose(
     vehicle: Vehicle,
     *,
     horizon: float = tuning.HORIZONS_S[0],
-    holdout: float = tuning.HOLDOUT,
+    holdout: float | None = None,
     min_speed: float | None = None,
     integrator: Integrator | None = None,
     line: ClosedLine | None = None,
@@ -58,6 +58,7 @@ def diagnose(
         vehicle: the nominal car. How well its coefficients are known decides whether one that has to move is a cause.
         horizon: time that is simulated from a measured state on (s).
         holdout: share of each recording, at its end, that neither fit nor selection sees; whole laps if there are three.
+            ``None``: what the vehicle file left out of the same recording, else a quarter.
         min_speed: stretches below are left out (m/s); ``None``: the vehicle file's.
         integrator: of the simulation; ``None``: the vehicle's, else Runge-Kutta, unless others are clearly closer.
         line: of the track, from which positions on the lap are counted; ``None``: the first full lap of the recording.
@@ -100,6 +101,7 @@ def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle
     extended = live.extended(known, suspects[-1] if suspects else None)
     extended = extended.model_copy(update={"integrator": windows.integrator})
     extended = extended.calibrated_on(at.recordings.recording.select(~at.recordings.held_out).fingerprints, vehicle)
+    extended = extended.with_held_out(at.recordings.shares)
     std = np.sqrt(np.diag(covariance))
     causes = [
         _cause(one, rest, selection, at.recordings, std)
@@ -227,16 +229,18 @@ def _prepare(
     vehicle: Vehicle,
     *,
     horizon: float,
-    holdout: float,
+    holdout: float | None,
     min_speed: float | None,
     line: ClosedLine | None,
 ) -> _Prepared:
     """Checks what was given, holds laps out and lays the simulations along the rest; see :func:`diagnose`."""
     least, most = tuning.HOLDOUT_RANGE
-    if not least <= holdout <= most:
-        raise ConfigurationError(f"holdout {holdout:g}: expected a share between {least:g} and {most:g}")
+    share = tuning.HOLDOUT if holdout is None else holdout
+    if not least <= share <= most:
+        raise ConfigurationError(f"holdout {share:g}: expected a share between {least:g} and {most:g}")
+    known = {name: share for name, share in vehicle.held_out.items() if least <= share <= most}
     suspects = tuple(range(len(recordings), len(recordings) + len(suspect)))
-    together = RecordingSet.of([*recordings, *suspect], holdout, line, suspects)
+    together = RecordingSet.of([*recordings, *suspect], share, line, suspects, known=known if holdout is None else None)
     recording = together.recording
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
     asked, T_s = steps_of(horizon, recording.T_s), recording.T_s
@@ -262,13 +266,13 @@ def _prepare(
         "Fit": f"{len(fitted)} simulations of {steps * T_s:g} s, from {speed:g} m/s",
         "Measured on": f"{len(unseen)} simulations of up to {unseen.steps * T_s:g} s",
     }
-    known = vehicle.known_before(recording.fingerprints)
-    if known is not vehicle:
+    before = vehicle.known_before(recording.fingerprints)
+    if before is not vehicle:
         notes.append(
             "the vehicle file was calibrated on these laps, which tell nothing new a second time: its coefficients count as "
             "they were known before"
         )
-    car = CarEstimate.of(known).at(vehicle.nominal)
+    car = CarEstimate.of(before).at(vehicle.nominal)
     return _Prepared(together, fitted, together.left_out(fitted.starts), asked, unseen, car, notes, protocol)
 
 
