@@ -107,7 +107,7 @@ def paths(arguments: Sequence[str]) -> tuple[list[Path], list[Path]]:
         UserError: an argument is not UTF-8.
     """
     inputs, outputs, option = list[Path](), list[Path](), ""
-    names = (*_NAMES, "--model") if arguments[:1] in (["train"], ["sweep"]) else _NAMES
+    names = (*_NAMES, "--model") if arguments[:1] in (["train"], ["sweep"], ["learn"]) else _NAMES
     for word in arguments:
         if any("\ud800" <= letter <= "\udfff" for letter in word):
             raise UserError(f"argument {word!a}: expected UTF-8")  # as which reports and recordings note it

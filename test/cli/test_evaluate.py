@@ -146,7 +146,7 @@ def test_what_the_car_file_left_out_is_left_out_of_training_and_scored(dynssm, l
     assert open_artifact(tmp_path / "model").card.training["holdout"] == 0.25
     found = evaluate("laps.parquet", ["model", "persistence"], stride=50)
     assert (found.split, found.not_tests) == ("last 25 % of the recording, as one block", [])
-    with pytest.warns(DataWarning, match="model was trained on"):
+    with pytest.warns(DataWarning, match="ridge was trained on"):
         assert evaluate("laps.parquet", ["model"], holdout=0.9, stride=50).not_tests
 
 
