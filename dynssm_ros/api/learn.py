@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dynssm_ros import __version__
-from dynssm_ros.api.inputs import PathLike, several
+from dynssm_ros.api.inputs import PathLike
 from dynssm_ros.api.settings import CommandsSettings, keywords, setting
 from dynssm_ros.configuration import find_config
 from dynssm_ros.errors import ConfigurationError
@@ -133,7 +133,8 @@ def learn(
         "a folder of dynssm learn",
     )
     known: dict[str, Any] = json.loads((folder / STATE).read_text())["steps"] if (folder / STATE).is_file() else {}
-    steps = list(plan([Path(log) for log in several(logs)], str(vehicle), folder, settings))
+    given = [logs] if isinstance(logs, (str, Path)) else logs
+    steps = list(plan(list(map(Path, given)), str(vehicle), folder, settings))
     records: list[StepRecord] = []
     for number, step in enumerate(steps, 1):
         told(f"[{number}/{len(steps)}] {step.words}")
@@ -159,6 +160,7 @@ def plan(logs: Sequence[Path], vehicle: str, out: Path, settings: LearnSettings)
     for log in logs:
         if not os.path.exists(log):
             raise ConfigurationError(f"{log}: no such log")
+    words: tuple[str, ...]
     rate = f"{s.rate or 1 / load_vehicle(vehicle).sampling_time:g}"
     for log, name in zip(logs, names, strict=True):
         seen = out / "inspection" / name

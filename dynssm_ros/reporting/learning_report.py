@@ -92,7 +92,7 @@ def _car(out: Path, of: dict[str, list[StepRecord]]) -> Verdict:
     found = _read(out / "calibration.json")
     pairs = [(name, found["rmse_ahead"][name], found["persistence"][name]) for name in STATE_SIGNALS]
     told = ", ".join(
-        f"{name} {text(error)} (nothing changes: {text(still)}) {COLUMN_UNITS[name]}" for name, error, still in pairs
+        f"{name} {text(error)} {COLUMN_UNITS[name]} ({text(still)} if nothing changed)" for name, error, still in pairs
     )
     told = f"calibrated; {found['horizon_s']:.2g} s ahead it errs by {told}"
     if any(0 < still <= error for _, error, still in pairs):
