@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from dynssm_ros.runtime.health import Level
+from dynssm_ros.api import recorded, simulate
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.health import Health, Level
 from dynssm_ros.runtime.hindsight import Hindsight
+from dynssm_ros.runtime.onnx_model import OnnxModel
+from dynssm_ros.runtime.predictor import Prediction, Predictor
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.signal_map import load_signal_map
 
 T_S = 40_000_000  # ns
 SCALE = (0.3, 0.1, 0.2)
@@ -64,3 +73,65 @@ def test_of_a_car_that_stands_nothing_is_said() -> None:
         hindsight.measured(stamp, (0.0, 0.0, 0.0))
         hindsight.predicted(stamp + T_S, (9.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert hindsight.verdict()[0] is Level.OK
+
+
+BEGINS, ENDS, SECOND = 300, 420, 50  # rows of 20 ms
+Row = dict[str, float]
+
+
+@pytest.fixture(scope="module")
+def laps() -> Recording:
+    """A car with four wheels, with the usual noise."""
+    return recorded(simulate("orca", "club", plant="double_track", duration=9.0, noise=(0.01, 0.01, 0.03), seed=5))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (lambda row, laps, k: {}, False),
+        (lambda row, laps, k: {"delta_fb": -row["delta_fb"], "delta_cmd": -row["delta_cmd"]}, True),
+        (lambda row, laps, k: {"omega": 0.5 * row["omega"]}, True),
+        (lambda row, laps, k: {"v_x": 3.6 * row["v_x"]}, True),
+        (lambda row, laps, k: {name: laps.columns[name][k - 15] for name in ("v_x", "v_y", "omega")}, True),
+        (lambda row, laps, k: {"r_fb": laps.columns["r_fb"][BEGINS], "r_cmd": 0.0}, False),
+        (lambda row, laps, k: {"delta_fb": laps.columns["delta_fb"][BEGINS], "delta_cmd": 0.0}, True),
+    ],
+    ids=["nothing", "steering sign", "yaw rate halved", "km/h", "0.3 s late", "throttle frozen", "steering frozen"],
+)
+def test_the_verdict_is_not_ok_while_predictions_are_worse_than_none_for_a_second(
+    small_model: Path, laps: Recording, wrong: Callable[[Row, Recording, int], Row], told: bool
+) -> None:
+    """As of the middle of a drive something is wrong; what is predicted is compared with the car as it truly is."""
+    predictor, health = (
+        Predictor(OnnxModel(open_artifact(small_model)), load_signal_map("default")),
+        Health(("/o",), 9.9),
+    )
+    scale, errors, alarms = predictor.model.card.normalisation.increment_scale, [], []
+    states = np.stack([laps.columns[name] for name in ("v_x", "v_y", "omega")], axis=1)
+    for k in range(ENDS):
+        row = {name: float(values[k]) for name, values in laps.columns.items()}
+        row |= wrong(row, laps, k) if k >= BEGINS else {}
+        stamp = 10**12 + k * 20_000_000
+        health.arrived("/o", k / 50)
+        actuators = {"throttle": row["r_fb"], "steering": row["delta_fb"]}
+        predictor.observe(stamp, {f"{name}_feedback": value for name, value in actuators.items()})
+        commands = {
+            "throttle_command": row["r_fb"] + row["r_cmd"],
+            "steering_command": row["delta_fb"] + row["delta_cmd"],
+        }
+        predictor.observe(stamp, commands)
+        outcome = predictor.predict(stamp, {name: row[name] for name in ("v_x", "v_y", "omega", "x", "y", "theta")})
+        if isinstance(outcome, Prediction):
+            health.predicted(0.001, 0.0)
+            both = (outcome.state, states[k])
+            errors.append([np.mean(((one - states[k + 1]) / scale) ** 2) for one in both])
+        else:
+            health.refused(outcome)
+        health.hindsight = predictor.hindsight()
+        ok = health.verdict(k / 50)[0] is Level.OK
+        if k >= BEGINS:
+            own, none = np.sum(errors[-SECOND:], axis=0)
+            assert not (ok and own > none and k >= BEGINS + SECOND), k
+            alarms += [] if ok else [k]
+    assert bool(alarms) == told
+    assert not told or alarms[0] < BEGINS + SECOND

@@ -7,7 +7,8 @@ import pytest
 
 from dynssm_ros.simulation.external import CommandHolder, Pace, drive_by_commands
 from dynssm_ros.simulation.laps import SimulationError
-from dynssm_ros.simulation.plant import RK4_STEP
+from dynssm_ros.simulation.laps import drive as drive_laps
+from dynssm_ros.simulation.plant import RK4_STEP, make_plant, plant_type
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, load_vehicle
 from dynssm_ros.vehicle.low_speed import LowSpeedRolling
@@ -157,3 +158,27 @@ def test_a_car_whose_time_waits_for_its_driver_drives_every_sample():
     pace, now = paced(3.0, waits=True)
     assert pace.behind(now) == 0
     assert pace.stamp == 5_000_000_000 + 10 * 20_000_000
+
+
+def room_left(vehicle, track, sample, watchdog):
+    """The least until the car stands (m), when its driver falls silent at a sample of a lap."""
+    low = LowSpeedRolling(vehicle, plant_type("euler").step(vehicle))
+    car = make_plant(vehicle, "euler", sample.pose, sample.state, last=(low,), line=track.centre)
+    T_s = vehicle.sampling_time
+    watch = Watch()
+    holder, feedback, s, least = CommandHolder(vehicle, watchdog, watch), sample.feedback, sample.s, np.inf
+    holder.receive(sample.command)
+    while car.state.v_x > 0.05:
+        feedback = holder.command(feedback)
+        car.advance(feedback, s)
+        watch.now += T_s
+        s, lateral = (float(value) for value in track.project(car.pose[:2], near=s))
+        least = min(least, float(track.room(s, lateral)))
+    return least
+
+
+def test_a_car_whose_driver_falls_silent_in_a_bend_leaves_a_narrow_road():
+    laps = list(itertools.islice(drive_laps(ORCA, CLUB, seed=1), 600))[150::15]
+    rooms = np.array([room_left(ORCA, CLUB, sample, 0.2) for sample in laps])
+    assert 0.6 < np.mean(rooms < 0) < 0.9
+    assert -1.0 < rooms.min() < -0.6
