@@ -315,7 +315,10 @@ def _open_files(path: Path, scratch: Path, damage: str, notes: list[str]) -> Any
     except (OSError, sqlite3.Error) as error:
         raise BagError(f"{path}: cannot be read ({_one_line(error)})") from error
     if not files:
-        raise BagError(f"{path}: not a bag; expected a rosbag2 folder, a .mcap or .db3 file, or a ROS 1 bag ({damage})")
+        raise BagError(
+            f"{path}: not a bag; expected a rosbag2 folder, a .mcap or .db3 file, or a ROS 1 bag ({damage}); `dynssm extract "
+            f"--bag` makes one of a table"
+        )
     usable = [file for file in found if file is not None]
     if not usable:
         raise BagError(f"{path}: nothing could be recovered; {notes[-1]}")

@@ -53,7 +53,9 @@ def test_the_bag_itself_is_never_replaced(refused: Refused, laps_bag: Path, smal
     [
         ({"model": "gone"}, "gone: no such model folder; `dynssm train` writes one"),
         ({"bag": "gone"}, "gone: no such file"),
-        ({"signals": "gone"}, "'gone' is neither a file nor a shipped name (av21, default)"),
+        ({"bag": "log.csv"}, "log.csv: not a bag; expected a rosbag2 folder"),
+        ({"bag": "log.csv"}, "`dynssm extract --bag` makes one of a table"),
+        ({"signals": "gone"}, "'gone' is neither a file nor a shipped name (autoware, av21, default, f1tenth, vesc)"),
         ({"signals": "av21"}, "missing throttle_command, steering_command"),
         ({"signals": "other.yaml"}, "topic /other/odometry is missing; the bag has /vehicle/actuator_command"),
     ],
@@ -72,6 +74,7 @@ def test_what_is_not_there_is_one_line_and_leaves_nothing(
     for source in other["signals"].values():
         source["topic"] = source["topic"].replace("vehicle/odometry", "/other/odometry")
     Path("other.yaml").write_text(yaml.safe_dump(other))
+    Path("log.csv").write_text("t,v_x\n0.0,1.0\n0.1,1.1\n")
     given = {"bag": str(laps_bag), "model": str(small_model), "signals": "default"} | changes
     options = ("--model", given["model"], "--signals", given["signals"], "--out", "out")
     line = refused("replay", given["bag"], *options)
