@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import codecs
 import csv
+import io
 from collections import Counter
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.signals.columns import ABSENT, is_value, known_unit
 
 _SAMPLE = 1 << 18  # bytes that are looked at
 _JUDGED = 60  # lines by which delimiters are judged
-_DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
-_NONE = "neither a table nor a bag; expected columns of numbers apart by comma, semicolon or tab, or a bag"
+_DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blanks"}
+_NONE = "neither a table nor a bag; expected columns of numbers apart by comma, semicolon, tab or blanks, or a bag"
 _OTHERS = {
     b"\xd0\xcf\x11\xe0": "an Excel workbook", b"\x89HDF\r\n": "an HDF5 file", b"MDF     ": "an MDF file",
     b"UnFinMF ": "an MDF file", b"ULog\x01\x12\x35": "a ULog file", b"LOGG": "a BLF file", b"ARROW1": "a Feather file",
@@ -77,6 +79,31 @@ def layout_of(path: Path) -> Layout:
     return Layout(encoding, delimiter, comma, tuple(names), tuple(units), first, sum(written) / len(written))
 
 
+class OneBlank(io.RawIOBase):
+    """A text file whose columns are apart by any number of blanks, read as UTF-8 with one blank between them."""
+
+    def __init__(self, path: Path, encoding: str) -> None:
+        self._file = path.open(encoding="utf-8-sig" if encoding == "utf-8" else encoding, errors="replace")
+        self._left = b""
+
+    def readable(self) -> bool:
+        """True."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Fills ``buffer`` as far as there is text left; the number of bytes."""
+        while not self._left and (lines := self._file.readlines(_SAMPLE)):
+            self._left = "".join(f"{' '.join(line.split())}\n" for line in lines).encode()
+        count = min(len(buffer), len(self._left))
+        buffer[:count], self._left = self._left[:count], self._left[count:]
+        return count
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+        super().close()
+
+
 def _lines(path: Path, head: bytes) -> tuple[list[str], str]:
     """The whole lines of a file's beginning, and its encoding."""
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -99,6 +126,8 @@ def _lines(path: Path, head: bytes) -> tuple[list[str], str]:
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        return line.lstrip("#% ").split() if "\t" not in line else []
     try:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
     except csv.Error:

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from dynssm_ros.errors import BagError
 from dynssm_ros.signals.array_files import mat_arrays, npz_arrays
 from dynssm_ros.signals.columns import Column, Heading, heading, kind_of, parsed, told_bad, typed_column
-from dynssm_ros.signals.csv_layout import Layout, layout_of
+from dynssm_ros.signals.csv_layout import Layout, OneBlank, layout_of
 from dynssm_ros.signals.recover import vast_table
 
 _GROUP_BYTES, _CELL_BYTES = 512 << 20, 16  # of columns that are in memory at once, and of a cell of them
@@ -156,9 +156,10 @@ def _text_columns(path: Path, layout: Layout, wanted: Sequence[str], notes: list
         ragged.append(row)
         return "skip" if len(ragged) < 1000 else "error"
 
-    encoding = {"utf-8": "utf8"}.get(layout.encoding, layout.encoding)
+    blanks = layout.delimiter == " "
+    encoding = {"utf-8": "utf8"}.get("utf-8" if blanks else layout.encoding, layout.encoding)
     reader = pa.csv.open_csv(
-        path,
+        OneBlank(path, layout.encoding) if blanks else path,
         pa.csv.ReadOptions(
             use_threads=False, skip_rows=layout.above, column_names=list(layout.names), encoding=encoding
         ),

@@ -197,7 +197,9 @@ def test_a_wrong_signal_map_ends_with_one_line_and_no_output(
 def test_an_unknown_signal_map_lists_the_shipped_ones(tmp_path: Path, run: Run) -> None:
     out = tmp_path / "out" / "r.parquet"
     ended = run(write(tmp_path / "bag", 10), "--signals", "porsche", "--rate", 25, "--out", out)
-    assert_refused(ended, out.parent, "'porsche' is neither a file nor a shipped name (autoware, av21, default, f1tenth, vesc)")
+    assert_refused(
+        ended, out.parent, "'porsche' is neither a file nor a shipped name (autoware, av21, default, f1tenth, vesc)"
+    )
 
 
 def test_commands_that_the_map_does_not_have_are_refused(tmp_path: Path, run: Run) -> None:

@@ -53,6 +53,11 @@ def write_csv(path: Path, columns: dict[str, Any], **options: Any) -> None:
     pa.csv.write_csv(pa.table(columns), path, pa.csv.WriteOptions(**options))
 
 
+def write_blanks(path: Path, columns: dict[str, Any], width: int = 24) -> None:
+    rows = [columns, *zip(*(values.tolist() for values in columns.values()), strict=True)]
+    path.write_text("# a log\n" + "".join("".join(f"{cell!s:>{width}}" for cell in row) + "\n" for row in rows))
+
+
 def write_struct(path: Path, columns: dict[str, Any]) -> None:
     scipy.io.savemat(path, {"log": columns, "car": "orca"})
 
@@ -60,6 +65,7 @@ def write_struct(path: Path, columns: dict[str, Any]) -> None:
 WRITERS: dict[str, Callable[[Path, dict[str, Any]], None]] = {
     "log.csv": write_csv,
     "tab.txt": lambda path, columns: write_csv(path, columns, delimiter="\t", quoting_style="none"),
+    "blanks.txt": write_blanks,
     "log.parquet": lambda path, columns: pq.write_table(pa.table(columns), path),
     "log.mat": scipy.io.savemat,
     "packed.mat": lambda path, columns: scipy.io.savemat(path, columns, do_compression=True, oned_as="column"),
@@ -86,6 +92,20 @@ def test_a_table_gives_the_recording_of_a_bag_with_the_same_numbers(
     assert_same(found, extract([make_bag(drive(N))], DEFAULT, 40.0))
     assert_same(found, extract([make_ros1_bag(drive(N))], DEFAULT, 40.0))
     assert (found.info.commands, found.info.signal_map, found.info.source) == ("topics", "own", (name,))
+
+
+@pytest.mark.parametrize(
+    "lines", ["# t v_x\n0.0 1.5\n", "t   v_x\n  0.0   1.5\n", "0.0  1.5\n", "\ufefft  v_x\n0,0  1,5\n"]
+)
+def test_columns_apart_by_blanks_are_found(tmp_path: Path, lines: str) -> None:
+    text = lines + "".join(f"{0.1 * k:.1f}   {1 + k}.25 \n" for k in range(1, 40))
+    text = text.replace(".", ",") if "," in lines else text
+    (tmp_path / "log.txt").write_text(text, encoding="utf-8")
+    with open_log(tmp_path / "log.txt") as table:
+        names = list(table.headings)
+        read = table.read(names)
+    assert names == (["t", "v_x"] if "v_x" in lines else ["column_1", "column_2"])
+    np.testing.assert_array_equal(read[names[1]].values[[0, 1, -1]], [1.5, 2.25, 40.25])
 
 
 @pytest.mark.parametrize("name", ["log.csv", "log.parquet", "log.mat", "log.npz"])
