@@ -29,7 +29,7 @@ from dynssm_ros.reporting.tables import Table
 
 State = Literal["ok", "look", "wrong"]
 RASTER_DPI = 160  # of the rasterised parts of a figure
-_FIGURE = re.compile(r'<h2>(.*?)</h2>\s*<p>(.*?)</p>\s*<img alt=".*?" src="(data:[^"]*)">', re.DOTALL)
+_FIGURE = re.compile(r'<h2>([^<]*)</h2>\s*<p>([^<]*)</p>\s*<img alt="[^"]*" src="(data:[^"]*)">')
 
 
 @dataclass(frozen=True)

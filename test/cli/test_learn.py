@@ -14,6 +14,7 @@ from dynssm_ros import api
 from dynssm_ros.api.learn import LearnSettings, plan
 from dynssm_ros.errors import UserError
 from dynssm_ros.progress import OnProgress
+from dynssm_ros.reporting.page import Report, Section, figures_of
 
 STATES = {"v_x": 0.1, "v_y": 0.1, "omega": 0.1}
 RESULTS: dict[str, dict[str, object]] = {
@@ -149,3 +150,9 @@ def test_a_folder_of_something_else_is_not_written_to(log: Path, tmp_path: Path,
     with pytest.raises(UserError, match="is not a folder of dynssm learn"):
         api.learn(log, "orca", tmp_path, run=commands)
     assert not commands.verbs
+
+
+def test_figures_are_taken_from_the_sections_that_have_them(tmp_path: Path) -> None:
+    drawn = Section("Errors <over> time", "Less & less.", "data:x")
+    Report("", "", [Section("Without", "A table."), drawn]).save(tmp_path / "report.html")
+    assert figures_of(tmp_path / "report.html") == [drawn]
