@@ -136,8 +136,9 @@ def read_streams(
     Raises:
         BagError: a topic, field or column is missing, or samples are bad and ``drop_bad`` is off.
     """
+    stamped: dict[str, str] = {}
     if isinstance(log, Table):
-        found, stamped, notes = _table_streams(log, signal_map, drop_bad), {}, list(log.notes)
+        found, notes = _table_streams(log, signal_map, drop_bad), list(log.notes)
     else:
         found, stamped, told = _bag_streams(log, signal_map, progress)
         notes = [*log.notes, *told]
