@@ -129,10 +129,10 @@ def learn(
     folder, told = Path(out), on_progress or (lambda words: None)
     require_replaceable(
         folder,
-        (folder / STATE).is_file() or (folder.is_dir() and not any(folder.iterdir())),
+        os.path.isfile(folder / STATE) or (os.path.isdir(folder) and not any(folder.iterdir())),
         "a folder of dynssm learn",
     )
-    known: dict[str, Any] = json.loads((folder / STATE).read_text())["steps"] if (folder / STATE).is_file() else {}
+    known: dict[str, Any] = json.loads((folder / STATE).read_text())["steps"] if os.path.isfile(folder / STATE) else {}
     given = [logs] if isinstance(logs, (str, Path)) else logs
     steps = list(plan(list(map(Path, given)), str(vehicle), folder, settings))
     records: list[StepRecord] = []
@@ -196,7 +196,7 @@ def plan(logs: Sequence[Path], vehicle: str, out: Path, settings: LearnSettings)
 
 def _names(logs: Sequence[Path]) -> list[str]:
     """Of the logs' files and folders; a number tells those of one name apart."""
-    stems = [log.stem if log.is_file() else log.absolute().name for log in logs]
+    stems = [log.stem if os.path.isfile(log) else log.absolute().name for log in logs]
     return [f"{stem}_{k}" if stems.count(stem) > 1 else stem for k, stem in enumerate(stems, 1)]
 
 
