@@ -19,7 +19,7 @@ from dynssm_ros.api.settings import CommandsSettings, keywords, setting
 from dynssm_ros.configuration import find_config
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
-from dynssm_ros.files import content_key, digest, forced, require_replaceable, write_json
+from dynssm_ros.files import content_key, digest, forced, require_no_input, require_replaceable, write_json
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle import load_vehicle
 
@@ -127,6 +127,7 @@ def learn(
     from dynssm_ros.reporting.learning_report import StepRecord, learning_report
 
     folder, told = Path(out), on_progress or (lambda words: None)
+    require_no_input(folder)
     require_replaceable(
         folder,
         os.path.isfile(folder / STATE) or (os.path.isdir(folder) and not any(folder.iterdir())),
