@@ -8,7 +8,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 STATE = "learn.json"
 _MARKS = ("warning: ", "note: ")
 _WIDTH = "120"  # of what a step prints, which is no terminal
-
-Run = Callable[[Sequence[str], OnProgress], int]
-"""Runs a command of ``dynssm``, calls with each line that it prints, returns its exit status."""
 
 
 class LearnSettings(CommandsSettings):
@@ -55,7 +52,7 @@ class LearnSettings(CommandsSettings):
 
 
 @dataclass(frozen=True)
-class Step:
+class LearningStep:
     """A command, what it reads and what it writes."""
 
     name: str
@@ -100,7 +97,6 @@ def learn(
     *,
     settings: LearnSettings,
     on_progress: OnProgress | None = None,
-    run: Run | None = None,
 ) -> Learning:
     """Goes from logs to a car, a diagnosis, a model and its test; writes ``OUT/index.html``, which begins with the verdicts.
 
@@ -113,7 +109,6 @@ def learn(
         out: folder to write.
         settings: all keywords as one object.
         on_progress: called with each line that a step prints.
-        run: runs the commands; each in a process of its own if not given.
 
     Raises:
         ConfigurationError: no log, a file that is not there, or a folder that something else wrote.
@@ -144,7 +139,7 @@ def learn(
             told("as before")
             records.append(StepRecord.model_validate(before))
             continue
-        records.append(_done(step, key, run or _in_a_process, told))
+        records.append(_done(step, key, told))
         known[step.words] = records[-1].model_dump(mode="json")
         write_json(folder / STATE, {"steps": known})
         if records[-1].failure:
@@ -153,7 +148,7 @@ def learn(
     return Learning(folder, tuple(records))
 
 
-def plan(logs: Sequence[Path], vehicle: str, out: Path, settings: LearnSettings) -> Iterator[Step]:
+def plan(logs: Sequence[Path], vehicle: str, out: Path, settings: LearnSettings) -> Iterator[LearningStep]:
     """The steps, in order."""
     s, car, names = settings, find_config("vehicles", vehicle), _names(logs)
     if not logs:
@@ -166,14 +161,14 @@ def plan(logs: Sequence[Path], vehicle: str, out: Path, settings: LearnSettings)
     for log, name in zip(logs, names, strict=True):
         seen = out / "inspection" / name
         words = ("inspect", str(log), "--vehicle", vehicle, "--out", str(seen), "--json", str(seen / "inspection.json"))
-        yield Step("inspect", words, (log, car), (seen / "signals.yaml", seen / "inspection.json"))
+        yield LearningStep("inspect", words, (log, car), (seen / "signals.yaml", seen / "inspection.json"))
     signals = s.signals or str(out / "inspection" / names[0] / "signals.yaml")
     chosen = find_config("signals", signals) if s.signals else Path(signals)
     commands = () if s.commands is None else ("--commands", s.commands)
     recordings = [out / "recordings" / f"{name}.parquet" for name in names]
     for log, recording in zip(logs, recordings, strict=True):
         words = ("extract", str(log), "--signals", signals, "--rate", rate, *commands, "--out", str(recording))
-        yield Step("extract", words, (log, chosen), (recording,))
+        yield LearningStep("extract", words, (log, chosen), (recording,))
     laps, track = tuple(map(str, recordings)), () if s.track is None else ("--track", s.track)
     roads = (Path(s.track),) if s.track and os.path.isfile(s.track) else ()
     excluded = [word for effect in s.exclude for word in ("--exclude", effect)]
@@ -184,15 +179,15 @@ def plan(logs: Sequence[Path], vehicle: str, out: Path, settings: LearnSettings)
         "calibrate", *laps, "--vehicle", vehicle, "--holdout", f"{s.holdout:g}", *track, "--out", str(fitted),
         "--json", str(figures),
     )  # fmt: skip
-    yield Step("calibrate", words, (*recordings, car, *roads), (fitted, figures))
+    yield LearningStep("calibrate", words, (*recordings, car, *roads), (fitted, figures))
     words = ("diagnose", *laps, "--vehicle", str(fitted), *track, *excluded, *jobs, "--out", str(out / "diagnosis"))
-    yield Step("diagnose", words, (*recordings, fitted, *roads), (found, out / "diagnosis" / "results.json"))
+    yield LearningStep("diagnose", words, (*recordings, fitted, *roads), (found, out / "diagnosis" / "results.json"))
     model = out / "model"
     words = ("train", *laps, "--model", s.model, "--vehicle", str(found), "--out", str(model))
-    yield Step("train", words, (*recordings, found, find_config("models", s.model)), (model,))
+    yield LearningStep("train", words, (*recordings, found, find_config("models", s.model)), (model,))
     rivals = ("--model", "single_track", "--model", "persistence", "--vehicle", str(found))
     words = ("evaluate", *laps, "--model", str(model), *rivals, *track, *jobs, "--out", str(out / "evaluation"))
-    yield Step("evaluate", words, (*recordings, model, found, *roads), (out / "evaluation" / "results.json",))
+    yield LearningStep("evaluate", words, (*recordings, model, found, *roads), (out / "evaluation" / "results.json",))
 
 
 def _names(logs: Sequence[Path]) -> list[str]:
@@ -201,7 +196,7 @@ def _names(logs: Sequence[Path]) -> list[str]:
     return [f"{stem}_{k}" if stems.count(stem) > 1 else stem for k, stem in enumerate(stems, 1)]
 
 
-def _done(step: Step, key: str, run: Run, told: OnProgress) -> StepRecord:
+def _done(step: LearningStep, key: str, told: OnProgress) -> StepRecord:
     """What became of a step that was run."""
     from dynssm_ros.reporting.learning_report import StepRecord
 
@@ -211,7 +206,7 @@ def _done(step: Step, key: str, run: Run, told: OnProgress) -> StepRecord:
         lines.append(line)
         told(line)
 
-    status = run([*(["--force"] if forced() else []), *step.command], on_line)
+    status = _in_a_process([*(["--force"] if forced() else []), *step.command], on_line)
     errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
     return StepRecord(
         name=step.name, command=step.words,
@@ -222,6 +217,7 @@ def _done(step: Step, key: str, run: Run, told: OnProgress) -> StepRecord:
 
 
 def _in_a_process(command: Sequence[str], on_line: OnProgress) -> int:
+    """Runs a command of ``dynssm``, calls with each line that it prints, returns its exit status."""
     words = [sys.executable, "-m", "dynssm_ros.cli.main", *command]
     with subprocess.Popen(  # noqa: S603 - own command
         words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ | {"COLUMNS": _WIDTH}

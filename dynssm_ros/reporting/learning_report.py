@@ -135,7 +135,7 @@ def _model(out: Path, of: dict[str, list[StepRecord]]) -> Verdict:
     )
     if found["not_tests"]:
         return Verdict("model", "look", f"{told}. No test: {'; '.join(found['not_tests'])}", link)
-    if ade[mine] is None or ade[mine] >= min(ade["persistence"] or 0.0, float("inf")):
+    if ade[mine] is None or ade[mine] >= (ade["persistence"] or 0.0):
         return Verdict("model", "wrong", f"{told}: no better than that nothing changes", link)
     if ade[mine] > (ade["single_track"] or float("inf")):
         return Verdict("model", "look", f"{told}: what was learned beside the car does not help on these laps", link)

@@ -43,7 +43,6 @@ class TopicContent:
     count: int  # number of messages
     rate: float  # median by log time (Hz); NaN with fewer than two messages
     longest_gap: float  # longest time between two messages by log time (s)
-    lateness: float  # median of log time less header stamp (s); NaN without headers
     time: Vector = field(repr=False)  # log time of the samples (s since the log's first message), (N,)
     values: dict[str, Vector] = field(repr=False)  # numbers of the samples by field, (N,); NaN where a message lacks it
     unit: str = ""  # of a column, as its heading says
@@ -52,6 +51,11 @@ class TopicContent:
     stamped: str = ""  # by what the samples are stamped: header, the name of a field, log time; empty of a column
     late: Lateness = field(default=Lateness(np.empty(0), np.empty(0)), repr=False)  # of the samples that have a stamp
     frames: Mapping[str, int] = field(default_factory=dict, repr=False)  # samples by the frames that they name
+
+    @property
+    def lateness(self) -> float:
+        """Median of log time less stamp (s); NaN without stamps."""
+        return float(np.median(self.late.late)) if len(self.late.late) else math.nan
 
 
 def contents_of_bag(bag: Bag, progress: Progress | None) -> tuple[dict[str, TopicContent], int, int]:
@@ -95,7 +99,6 @@ def contents_of_bag(bag: Bag, progress: Progress | None) -> tuple[dict[str, Topi
             counts[topic],
             1.0 / max(float(np.median(apart)), 1e-9) if len(apart) else math.nan,
             float(apart.max()) if len(apart) else 0.0,
-            float(np.median([seconds for _, seconds in late[topic]])) if late[topic] else math.nan,
             np.array([time - begin for time, _ in sampled[topic]]) / 1e9,
             {path: np.array([values.get(path, math.nan) for _, values in sampled[topic]]) for path in paths},
             reason=reasons.get(topic, ""),
@@ -132,7 +135,6 @@ def _column_content(name: str, unit: str, column: Column, clock: Clock, begin: i
         len(there),
         1.0 / max(float(np.median(apart)), 1e-9) if len(apart) else math.nan,
         float(apart.max()) if len(apart) else 0.0,
-        math.nan,
         (clock.stamps[there[::step]] - begin) / 1e9,
         {} if column.reason or column.is_time else {name: values[::step]},
         known_unit(unit) or unit,

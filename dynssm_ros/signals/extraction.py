@@ -17,7 +17,7 @@ from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
 from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, POSE_SIGNALS, STATE_SIGNALS, SignalMap
-from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, frames_note
+from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, frames_note, log_time_note
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import Table
 from dynssm_ros.signals.velocities import velocities_along
@@ -190,7 +190,7 @@ def _bag_streams(
         logged, stamps = samples.times(topic)
         unset = int((stamps == 0).sum())
         if topic in by_log_time:
-            notes.append(f"{topic}: messages without a stamp; they count by log time")
+            notes.append(log_time_note(topic))
         elif unset > 1:  # one may be where simulated time begins
             notes.append(f"{topic}: {unset} of {len(stamps)} messages have the stamp 0; they count by log time")
             by_log_time.add(topic)

@@ -118,13 +118,13 @@ class History:
     """The raw signals of the recent past and the model's window on them.
 
     Args:
-        signal_map: which signals there are; its ``max_gap`` restarts the window after a hole in the data.
+        signal_map: which signals there are; its ``max_gap`` restarts the window after a hole in the data. Stamps further
+            back than its ``jump_ns`` mean that time was set back, not disorder. They are believed, as those that are further
+            ahead, when a second message confirms them.
         T_s: sampling time of the window (s).
         H: number of rows of the window.
         held: signals that keep their last sample until the next; the others are interpolated.
         max_age: how much older than the requested instant the newest sample of a signal may be (s).
-        jump: stamps further back than this (s) mean that time was set back, not disorder. They are believed, as those
-            that are further ahead, when a second message confirms them.
     """
 
     def __init__(
@@ -134,7 +134,6 @@ class History:
         H: int,
         *,
         max_age: float = 0.2,
-        jump: float = 0.5,
         held: Collection[str] = (),
     ) -> None:
         velocities = STATE_SIGNALS if signal_map.velocities else ()
@@ -145,7 +144,7 @@ class History:
         self._delays = {name: sources[name].delay * 1e9 if name in sources else 0.0 for name in self._buffers}
         self._max_gap = float(signal_map.max_gap_ns)
         self._max_age = max_age * 1e9
-        self._jump = max(jump * 1e9, 2 * self._max_gap)
+        self._jump = float(signal_map.jump_ns)
         self._suspect: tuple[int, dict[str, float]] | None = None  # a message whose stamp (ns) may be an outlier
         self._epoch: int | None = None
         self.resize(T_s, H, held)

@@ -31,6 +31,8 @@ Hold = Literal["zero", "first"]
 """What a signal is between two samples: the last one, or on a line to the next."""
 ROUNDING = 1e-6
 """Periods by which an instant of a grid may miss a sample."""
+JUMP_NS = 500_000_000
+"""Time between two stamps (ns) up to which the second is not doubted, however short ``max_gap`` is."""
 
 UNITS = {
     "m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kt": 1852 / 3600, "ft/s": 0.3048, "rad": 1.0, "deg": math.pi / 180,
@@ -206,8 +208,8 @@ class SignalMap(StrictModel):
 
     @property
     def jump_ns(self) -> int:
-        """Time between stamps from which on a lone one is not believed, by node and extractor (ns)."""
-        return max(500_000_000, 2 * self.max_gap_ns)
+        """Time between stamps from which on the second is believed only if others confirm it (ns)."""
+        return max(JUMP_NS, 2 * self.max_gap_ns)
 
     def with_commands(self, commands: Commands | None) -> SignalMap:
         """The same map with another source of commands; ``None`` keeps it.

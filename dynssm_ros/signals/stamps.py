@@ -13,8 +13,8 @@ import numpy.typing as npt
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import BagError
 from dynssm_ros.signals.resampling import Stamps, Stream
+from dynssm_ros.signals.signal_map import JUMP_NS
 
-_JUMP = 500_000_000  # ns between two stamps, from which on the second is believed only with others near it
 _SEVERAL = 0.1  # of the steps go back, from which on several publishers are likelier than a fault
 _APART = 0.2  # s by which clocks may be apart; what is measured late is rarely later than that
 _DRIFT = 0.1  # s by which clocks may come apart over a log
@@ -28,7 +28,7 @@ class Lateness(NamedTuple):
     late: Vector
 
 
-def clean(stream: Stream, where: str, drop_bad: bool, jump: int = _JUMP) -> tuple[Stream, str]:
+def clean(stream: Stream, where: str, drop_bad: bool, jump: int = JUMP_NS) -> tuple[Stream, str]:
     """Checks a stream for values that are not finite and for stamps that repeat, run backwards or are far ahead.
 
     Of stamps more than ``jump`` ns apart those count that most samples agree with, so that a few far ahead cost no others.
@@ -124,6 +124,11 @@ def _change(topic: Lateness) -> float:
     """By how much lateness grows from the first third of a topic's messages to the last (s)."""
     third = len(topic.late) // 3
     return float(np.median(topic.late[-third:]) - np.median(topic.late[:third])) if third else 0.0
+
+
+def log_time_note(topic: str) -> str:
+    """A sentence on a topic whose messages have no stamp."""
+    return f"{topic}: messages without a stamp; they count by log time"
 
 
 def frames_note(topic: str, frames: Mapping[str, int]) -> list[str]:

@@ -16,7 +16,7 @@ from dynssm_ros.signals.columns import heading
 from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, pose_fields
 from dynssm_ros.signals.decoding import LOG_TIME
 from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, STATE_SIGNALS, UNITS
-from dynssm_ros.signals.stamps import clock_notes, frames_note
+from dynssm_ros.signals.stamps import clock_notes, frames_note, log_time_note
 
 _MOTION = {
     "v_y": (r"(^|_)(v|vel|velocity|linear)_?(y|lat\w*)$|^v?_?lat\w*_(vel\w*|speed)$|^vlat|quergeschw",),
@@ -248,18 +248,12 @@ def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) 
 def _stamps(signals: dict[str, Suggestion]) -> list[str]:
     """What is to be said of the stamps and frames of the topics that the signals come from."""
     used = {suggestion.topic.name: suggestion.topic for suggestion in signals.values()}
-    found = [
-        f"{name}: messages without a stamp; they count by log time"
-        for name, one in used.items()
-        if one.stamped == LOG_TIME
-    ]
+    found = [log_time_note(name) for name, one in used.items() if one.stamped == LOG_TIME]
     found += [note for name, one in used.items() for note in frames_note(name, one.frames)]
     first = signals.get("v_x", signals.get("x"))
-    return (
-        found
-        if first is None
-        else found + clock_notes({name: one.late for name, one in used.items()}, first.topic.name)
-    )
+    if first is not None:
+        found += clock_notes({name: one.late for name, one in used.items()}, first.topic.name)
+    return found
 
 
 def _spread(values: Vector) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -63,7 +64,9 @@ def _written(verb: str, options: dict[str, str]) -> list[Path]:
 def commands(monkeypatch: pytest.MonkeyPatch) -> Commands:
     """Commands that recordings need not be read for."""
     monkeypatch.setattr("dynssm_ros.reporting.learning_report._length", lambda files: "1 recording, 10 s")
-    return Commands()
+    made = Commands()
+    monkeypatch.setattr(sys.modules["dynssm_ros.api.learn"], "_in_a_process", made)
+    return made
 
 
 @pytest.fixture
@@ -86,20 +89,20 @@ def lines(out: Path) -> dict[str, str]:
 def test_what_is_unchanged_is_not_run_again(commands: Commands, log: Path, tmp_path: Path) -> None:
     """A map that was corrected by hand is kept, and what hangs on it is done anew."""
     out, told = tmp_path / "out", list[str]()
-    assert api.learn(log, "orca", out, run=commands).failure == ""
+    assert api.learn(log, "orca", out).failure == ""
     assert commands.verbs == WAY
     assert lines(out) == dict.fromkeys(("data", "car", "diagnosis", "model"), "ok")
-    api.learn(log, "orca", out, run=commands, on_progress=told.append)
+    api.learn(log, "orca", out, on_progress=told.append)
     assert (len(commands.verbs), told.count("as before")) == (6, 6)
     assert f"[1/6] dynssm inspect {log} --vehicle orca" in told[0]
     (out / "inspection" / "run" / "signals.yaml").write_text("corrected")
-    api.learn(log, "orca", out, run=commands)
+    api.learn(log, "orca", out)
     assert commands.verbs[6:] == ["extract"]  # whose recording is the same again
     log.write_text("time\n0\n1\n")
-    api.learn(log, "orca", out, run=commands)
+    api.learn(log, "orca", out)
     assert commands.verbs[7:] == ["inspect", "extract"]
     (out / "car.yaml").unlink()
-    api.learn(log, "orca", out, run=commands, settings=LearnSettings(holdout=0.25))
+    api.learn(log, "orca", out, settings=LearnSettings(holdout=0.25))
     assert commands.verbs[9:] == ["calibrate"]
 
 
@@ -107,11 +110,11 @@ def test_a_failed_step_ends_it_and_is_told_first(commands: Commands, log: Path, 
     out = tmp_path / "out"
     commands.lines = {"calibrate": ["error: signs are wrong"], "extract": ["warning: v_y is rough"]}
     commands.status = {"calibrate": 1}
-    assert api.learn(log, "orca", out, run=commands).failure == "signs are wrong"
+    assert api.learn(log, "orca", out).failure == "signs are wrong"
     assert lines(out) == {"data": "look", "car": "wrong", "diagnosis": "look", "model": "look"}
     assert "v_y is rough" in (out / "index.html").read_text()
     commands.status = {}
-    api.learn(log, "orca", out, run=commands)
+    api.learn(log, "orca", out)
     assert commands.verbs[3:] == WAY[2:]
 
 
@@ -133,7 +136,7 @@ def test_verdicts_follow_from_the_results(
     verb: str, changed: dict[str, object], name: str, state: str,
 ) -> None:  # fmt: skip
     monkeypatch.setitem(RESULTS, verb, RESULTS[verb] | changed)
-    api.learn(log, "orca", tmp_path / "out", run=commands)
+    api.learn(log, "orca", tmp_path / "out")
     assert lines(tmp_path / "out") == dict.fromkeys(("data", "car", "diagnosis", "model"), "ok") | {name: state}
 
 
@@ -148,7 +151,7 @@ def test_several_logs_have_recordings_of_their_own(tmp_path: Path) -> None:
 
 def test_a_folder_of_something_else_is_not_written_to(log: Path, tmp_path: Path, commands: Commands) -> None:
     with pytest.raises(UserError, match="is not a folder of dynssm learn"):
-        api.learn(log, "orca", tmp_path, run=commands)
+        api.learn(log, "orca", tmp_path)
     assert not commands.verbs
 
 

@@ -154,7 +154,7 @@ def test_a_car_that_was_calibrated_on_these_laps_is_not_calibrated_again(
 
     def calibrated(recording: Recording, car: Vehicle, **_: object) -> SimpleNamespace:
         asked.append(len(recording))
-        return SimpleNamespace(vehicle=car, tells_nothing_of={})
+        return SimpleNamespace(vehicle=car, tells_nothing_of=[])
 
     monkeypatch.setattr("dynssm_ros.identification.result.calibration.calibrate", calibrated)
     recording, car = Recording.load(laps), load_vehicle("orca")

@@ -133,7 +133,7 @@ def test_any_sequence_of_messages_is_answered_as_by_a_plain_list(
     sequence: list[tuple[float, dict[str, float]]],
 ) -> None:
     plain = PlainHistory(0.02, 4)
-    history = History(NO_COMMANDS, 0.02, 4, max_age=MAX_AGE, jump=JUMP_BACK, held=plain.held)
+    history = History(NO_COMMANDS, 0.02, 4, max_age=MAX_AGE, held=plain.held)
     stamp = START
     for move, taken in sequence:
         stamp += round(move * SECOND)

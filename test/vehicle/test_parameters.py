@@ -155,7 +155,7 @@ def test_a_lorry_can_be() -> None:
     }
     for name, value in forces.items():
         whole["coefficients"][name] = {"nominal": value, "bounds": [0.3 * value, 3 * value]}
-    Vehicle.model_validate(whole)
+    assert Vehicle.model_validate(whole).constants.m == m
 
 
 def test_what_a_calibration_found_within_its_bounds_is_not_judged() -> None:

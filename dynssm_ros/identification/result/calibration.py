@@ -64,10 +64,10 @@ class Calibration:
     persistence: Vector
 
     @property
-    def tells_nothing_of(self) -> dict[str, float]:
-        """By state, how many times the error of :attr:`persistence` the car makes, where it is no better."""
+    def tells_nothing_of(self) -> list[str]:
+        """The states whose error is no less than :attr:`persistence`."""
         each = zip(State._fields, self.rmse_ahead, self.persistence, strict=True)
-        return {name: float(error / still) for name, error, still in each if 0 < still <= error}
+        return [name for name, error, still in each if 0 < still <= error]
 
 
 def calibrate(
