@@ -215,7 +215,7 @@ def _in_words(splits: Sequence[str]) -> str:
     return "of each recording " + (splits[0] if len(set(splits)) == 1 else "in turn: " + "; ".join(splits))
 
 
-def _cut(recording: Recording, holdout: float, known: float | None) -> tuple[int, str]:
+def _cut(recording: Recording, holdout: float, known: float | None = None) -> tuple[int, str]:
     """First held-out row, and in words."""
     if known is not None:
         first = len(recording.split_last(known)[0])
