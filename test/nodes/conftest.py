@@ -130,6 +130,14 @@ class Car:
         seen = len(self.run.diagnostics)
         return self.collector.wait_for(lambda: any(words in m for _, m, _ in self.run.diagnostics[seen:]), timeout)
 
+    def steps_until_diagnosed(self, words: str, limit: int = 600) -> list[int]:
+        """Drives until a status contains ``words``, which may be true only of a car that drives; stamps as of ``step``."""
+        expected: list[int] = []
+        while not self.diagnosed(words, timeout=0.05):
+            assert len(expected) < limit, f"never said '{words}'; diagnostics: {self.run.diagnostics[-1:]}"
+            expected.append(self.step())
+        return expected
+
     def set_parameter(self, name: str, value: object) -> tuple[bool, str]:
         result = self._call(SetParameters, "set_parameters", [(name, value)]).results[0]
         return result.successful, result.reason

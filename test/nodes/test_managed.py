@@ -54,11 +54,11 @@ def test_a_predictor_is_configured_stands_by_and_takes_over_with_its_window_full
 
     car.wait_for_match()
     silent = [car.step() for _ in range(10)]
-    assert car.diagnosed("inactive, publishes nothing: predicting"), run.diagnostics[-1:]
+    silent += car.steps_until_diagnosed("inactive, publishes nothing: predicting")
     assert change(collector, "dynssm", ACTIVATE)
     assert car.answered(car.step()), "the first odometry, as the window is full"
     assert not set(silent) & set(run.predicted)
-    assert car.diagnosed("predicting")
+    car.steps_until_diagnosed("predicting")
 
     assert change(collector, "dynssm", DEACTIVATE)
     unanswered = car.step()
