@@ -24,7 +24,7 @@ EXTRAS = {
     # tracks, simulated cars and the controller: derivatives of the vehicle equations, and the DAQP solver
     "race": ["casadi>=3.8", "scipy>=1.12"],
     # figures and pages
-    "report": ["matplotlib>=3.9", "jinja2>=3.1", "scipy>=1.12"],
+    "report": ["matplotlib>=3.9", "plotly>=6.0", "jinja2>=3.1", "scipy>=1.12"],
     # logs in MATLAB files; all of the above read them too
     "matlab": ["scipy>=1.12"],
     # what a diagnosis leaves, as a formula

@@ -12,7 +12,7 @@ from dynssm_ros.errors import ConfigurationError, UserError
 EXTRAS: dict[str, tuple[str, ...]] = {
     "train": ("torch", "onnx", "onnxscript", "scipy"),
     "race": ("casadi", "scipy"),
-    "report": ("matplotlib", "jinja2", "scipy"),
+    "report": ("matplotlib", "plotly", "jinja2", "scipy"),
     "matlab": ("scipy",),
     "formula": ("sklearn",),
     "scale": ("joblib",),

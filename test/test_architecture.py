@@ -42,7 +42,7 @@ ROS = {
     "rcl_interfaces", "rclpy", "rosgraph_msgs", "sensor_msgs", "std_msgs",
 }  # fmt: skip
 OWNERS = {
-    "torch": {"learning"}, "casadi": {"control"}, "matplotlib": {"reporting"},
+    "torch": {"learning"}, "casadi": {"control"}, "matplotlib": {"reporting"}, "plotly": {"reporting"},
     "jinja2": {"reporting"}, "joblib": {"parallel"}, "ray": {"parallel"}, "distributed": {"parallel"},
     "optuna": {"evaluation"}, "sklearn": {"identification"}, "typer": {"cli"}, "rich": {"cli", "reporting"},
 }  # fmt: skip

@@ -15,7 +15,7 @@ from dynssm_ros.evaluation.open_loop import Evaluation
 from dynssm_ros.evaluation.regimes import COASTING, QUANTITIES, Regime
 from dynssm_ros.evaluation.rollout import branches
 from dynssm_ros.evaluation.score import Group, Score
-from dynssm_ros.reporting import evaluation_figures, track_figures
+from dynssm_ros.reporting import evaluation_figures, interactive, track_figures
 from dynssm_ros.reporting.page import Prose, Report, Section
 from dynssm_ros.reporting.tables import Column, Table, percent, text
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
@@ -185,7 +185,15 @@ def markdown(evaluation: Evaluation) -> str:
 
 def _prose(evaluation: Evaluation) -> Prose:
     bars, coasting = percent(evaluation_figures.MAX_BAR), percent(COASTING)
-    return Prose("evaluation", evaluation=evaluation, cut=_CUT, max_bar=bars, coasting=coasting)
+    return Prose(
+        "evaluation",
+        evaluation=evaluation,
+        cut=_CUT,
+        max_bar=bars,
+        coasting=coasting,
+        most_rows=interactive.MOST_ROWS,
+        longest_gap=interactive.LONGEST_GAP,
+    )
 
 
 def _protocol(evaluation: Evaluation) -> dict[str, str]:
@@ -217,7 +225,11 @@ def _sections(evaluation: Evaluation) -> Iterator[Section]:
     time = (recording.time[evaluation.rows + 1] - recording.time[0]) / 1e9  # since the start of the recording (s)
     rmse = _over_seeds(evaluation, lambda score: score.rmse)
     yield prose.section("relative", evaluation_figures.relative_errors(*rmse, evaluation.persistence_rmse))
-    yield prose.section("measured", evaluation_figures.predicted_and_measured(time, evaluation.measured, states))
+    yield prose.section(
+        "measured",
+        evaluation_figures.predicted_and_measured(time, evaluation.measured, states),
+        zoomed=_zoomed(evaluation, time, states),
+    )
     yield prose.section("change", evaluation_figures.increments(evaluation.current, evaluation.measured, states))
     yield prose.section("rollouts", evaluation_figures.rollout_growth(horizon, *_over_seeds(evaluation, _growth)))
     yield prose.section("trajectories", _trajectories(evaluation))
@@ -237,6 +249,17 @@ def _sections(evaluation: Evaluation) -> Iterator[Section]:
         yield prose.section("coverage", table=covered)
     latency = {name: group.first.latency_us for name, group in groups.items()}
     yield prose.section("latency", evaluation_figures.latency_histogram(latency))
+
+
+def _zoomed(evaluation: Evaluation, time: Vector, states: dict[str, Vector]) -> str:
+    """Predictions, measurements and inputs of the first rows that a page can hold."""
+    first = slice(interactive.MOST_ROWS)
+    inputs = {
+        name: evaluation.recording[column][evaluation.rows[first]]
+        for name, column in (("r", "r_fb"), ("δ (rad)", "delta_fb"))
+    }
+    shown = {name: values[first] for name, values in states.items()}
+    return interactive.predicted_and_measured(time[first], evaluation.measured[first], shown, inputs)
 
 
 def _trajectories(evaluation: Evaluation) -> Figure:

@@ -29,17 +29,21 @@ from dynssm_ros.reporting.tables import Table
 
 State = Literal["ok", "look", "wrong"]
 RASTER_DPI = 160  # of the rasterised parts of a figure
-_FIGURE = re.compile(r'<h2>([^<]*)</h2>\s*<p>([^<]*)</p>\s*<img alt="[^"]*" src="(data:[^"]*)">')
+_FIGURE = re.compile(r'<h2>([^<]*)</h2>\s*<p>([^<]*)</p>\s*<img[^>]* alt="[^"]*" src="(data:[^"]*)">')
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report: one or two sentences on how to read the figure below them, or the table below that."""
+    """A part of a report: one or two sentences on how to read the figure below them, or the table below that.
+
+    On a screen the ``zoomed`` figure stands for the ``figure``, which is printed.
+    """
 
     title: str
     text: str
     figure: Figure | str | None = None  # or its ``data:`` address
     table: Table | None = None
+    zoomed: str = ""  # HTML of reporting/interactive.py
 
 
 @dataclass(frozen=True)
@@ -90,10 +94,12 @@ class Prose:
         self.words = yaml.safe_load(_template(f"{page}.yaml"))
         self._values = values
 
-    def section(self, name: str, figure: Figure | None = None, table: Table | None = None, **more: object) -> Section:
+    def section(
+        self, name: str, figure: Figure | None = None, table: Table | None = None, zoomed: str = "", **more: object
+    ) -> Section:
         """The section of a name, its texts filled with ``more`` values too."""
         title, text = (words.format(**self._values, **more) for words in self.words[name])
-        return Section(title, text, figure, table)
+        return Section(title, text, figure, table, zoomed)
 
     def protocol(self, **more: object) -> dict[str, str]:
         """How what is reported was obtained, by name."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 from dataclasses import replace
+from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from dynssm_ros.reporting.evaluation_report import (
     summary_table,
     verdict,
 )
+from dynssm_ros.reporting.interactive import predicted_and_measured
 from dynssm_ros.reporting.page import Report, Section, svg_uri
 from dynssm_ros.reporting.tables import Column, Table
 from dynssm_ros.runtime.baselines import Persistence, SingleTrack
@@ -45,6 +48,25 @@ class Adaptive:
         share = 0.5 + 0.4 * np.sin(windows[:, -1, :1] * np.arange(1.0, 18))
         theta = self.vehicle.lower + share * (self.vehicle.upper - self.vehicle.lower)
         return self.truth.predict(windows)._replace(theta=theta, variance=np.full((len(windows), 3), 1e-6))
+
+
+class Tags(HTMLParser):
+    """The tags of a page with their attributes, and its style; what scripts hold is text."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found, self.style, self._inside = [], "", ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+        self._inside = tag
+
+    def handle_data(self, data):
+        self.style += data if self._inside == "style" else ""
+
+    def handle_endtag(self, tag):
+        self._inside = ""
 
 
 @pytest.fixture(scope="module")
@@ -126,11 +148,31 @@ def test_a_recording_without_positions_is_said_to_have_none(evaluation):
 
 
 def test_page_loads_nothing_from_elsewhere(page):
-    assert not re.search(r"""(src|href)\s*=(?!"data:)""", page)
-    assert not re.search(r"@import|url\(|<script|<link", page)
+    tags = Tags(page)
+    addresses = [value for _, given in tags.found for name, value in given.items() if name in ("src", "href")]
+    assert addresses
+    assert all(address.startswith("data:") for address in addresses)
+    assert not {"link", "iframe", "object"} & {tag for tag, _ in tags.found}
+    assert not re.search(r"@import|url\(", tags.style)
     for encoded in re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page):
         svg = base64.b64decode(encoded).decode()
         assert not re.search(r'href="(?!#|data:)', svg)
+
+
+def test_the_zoomed_figure_has_the_values_of_each_row_and_no_line_across_a_gap() -> None:
+    time = np.array([0.0, 0.02, 0.04, 9.0, 9.02])
+    measured, predicted = np.arange(15.0).reshape(5, 3), np.arange(15.0).reshape(5, 3) + 0.5
+    drawn = predicted_and_measured(time, measured, {"a<b>": predicted}, {"r": time})
+    data = json.loads(re.search(r"Plotly\.newPlot\(\s*\"zoomed\",\s*(\[.*?\]),\s*\{\"template\"", drawn, re.S)[1])
+
+    def values(of, axis):
+        return np.frombuffer(base64.b64decode(of[axis]["bdata"]), of[axis]["dtype"])
+
+    assert len(data) == 3 + 2 * 3 + 2
+    np.testing.assert_allclose(values(data[0], "x"), [0.0, 0.02, 0.04, np.nan, 1.04, 1.06], rtol=1e-6)
+    np.testing.assert_array_equal(values(data[0], "y"), [0.0, 3.0, 6.0, np.nan, 9.0, 12.0])
+    np.testing.assert_array_equal(values(data[4], "y"), [0.5, 0.5, 0.5, np.nan, 0.5, 0.5])
+    assert "a<b>" not in drawn
 
 
 def test_page_shows_every_figure(report, page):
