@@ -74,6 +74,8 @@ def opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
     found = []
     for log in files(logs):
         recording = log if isinstance(log, Recording) else Recording.load(log)
+        if car is not None:
+            recording.require_set_point(car.inputs.set_point, f"vehicle {car.name}")
         if car is not None and math.isclose(car.sampling_time, recording.T_s):  # else the command ends with that
             for words in implausible_rows(recording, car):
                 warnings.warn(f"{name_of(log)}: {words}", DataWarning, stacklevel=3)

@@ -157,7 +157,7 @@ class LiveController:
         self._pilot = Controller(self.remote, vehicle.inputs, reference, track, settings, clock=clock)
         self._pursuit = Driver(vehicle, reference.line, vehicle_limits(vehicle), _LAUNCH_STYLE)
         self._reference = reference
-        self._brakes = vehicle.inputs.throttle[0]
+        self._brakes = vehicle.inputs.full_brakes
         self._max_age, self._max_gap, self._max_late = max_age, max_gap * 1e9, max_late
         self._track = track
         self._contract = Plausibility(vehicle, frames=frames)

@@ -285,5 +285,5 @@ def manoeuvres(now: Applied, limits: InputLimits, N: int, T_s: float) -> Vector:
         turn = share * left if share >= 0 else -share * right
         each[:, 1] = np.diff(now.delta + np.clip(turn - now.delta, -reach, reach), prepend=now.delta)
         if brakes:
-            each[0, 0] = limits.throttle[0] - now.r
+            each[0, 0] = limits.full_brakes - now.r
     return increments

@@ -184,7 +184,7 @@ class _Drive:
         rolling = LowSpeedRolling(vehicle, plant_type(course.plant).step(vehicle))
         self._car = make_plant(vehicle, course.plant, pose, state, last=(rolling,), line=track.centre)
         self._course = course
-        self._feedback = Applied(0.0, 0.0)
+        self._feedback = Applied(vehicle.inputs.coasting(state.v_x), 0.0)
         self._sensors = Sensors(course.sensing, vehicle.sampling_time)
         self._limit = PATIENCE * course.laps * course.reference.lap_time
         self._rows: list[tuple[Any, ...]] = []

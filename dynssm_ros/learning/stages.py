@@ -243,6 +243,7 @@ def _train(
 ) -> Trained:
     """One stage; ``start`` is the outcome of the stage before."""
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
+    recording.require_set_point(vehicle.inputs.set_point, f"vehicle {vehicle.name}")
     torch.set_num_threads(1)  # batches are small: more threads wait for each other longer than they compute
     vehicle = config.with_physics.modelled(vehicle)
     H = config.rows(vehicle.sampling_time)

@@ -186,9 +186,13 @@ class ControllerNode(ManagedNode):
         self._health.arrived(ODOMETRY_TOPIC, self._now())  # now: a step that took long is no silence of the odometry
         self._newest = stamp
         if outcome is not None:
-            self._publish_command(actuators(stamp + self._driver.answered_after, outcome))
+            self._send(stamp + self._driver.answered_after, outcome)
             if not self._driver.brakes.reason:
                 self._driver.learn()
+
+    def _send(self, acts: int, command: Applied) -> None:
+        """Publishes a command that acts from an instant on (ns)."""
+        self._publish_command(actuators(acts, command, self._driver.vehicle.inputs.set_point))
 
     def _watch(self) -> None:
         """Brakes while there is no good odometry, and looks for others who command."""
@@ -217,11 +221,11 @@ class ControllerNode(ManagedNode):
 
     def _brake(self) -> None:
         if self._newest is None:
-            self._publish_command(actuators(int(self.get_clock().now().nanoseconds), self._driver.brake()))
+            self._send(int(self.get_clock().now().nanoseconds), self._driver.brake())
         else:
             silence = self._health.age(ODOMETRY_TOPIC, self._now())
             acts = self._newest + self._driver.answered_after + round(silence * 1e9)
-            self._publish_command(actuators(acts, self._driver.brake(acts)))
+            self._send(acts, self._driver.brake(acts))
 
     def _diagnose(self) -> None:
         now, driver, health = self._now(), self._driver, self._health

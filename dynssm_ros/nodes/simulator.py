@@ -38,7 +38,7 @@ from dynssm_ros.nodes.support import (
 from dynssm_ros.runtime.health import Level
 from dynssm_ros.signals.decoding import decoders, header_stamp_ns
 from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_TOPIC
-from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.signals.signal_map import STANDARD_MAPS, command_signals, load_signal_map
 from dynssm_ros.simulation.external import CommandHolder, Pace, drive_by_commands
 from dynssm_ros.simulation.laps import Sample, SimulationError, drive
 from dynssm_ros.simulation.plant import PLANTS, PlantKind
@@ -99,7 +99,7 @@ class SimulatorNode(Node):
         if self._driver == "pure_pursuit":
             self._publish_command = output(self, JointState, COMMAND_TOPIC).publish
         else:
-            self._decoder = decoders(load_signal_map("default"))[COMMAND_TOPIC]
+            self._decoder = decoders(load_signal_map(STANDARD_MAPS[self._vehicle.inputs.set_point]))[COMMAND_TOPIC]
             listen(self, JointState, relative(COMMAND_TOPIC), self._on_command)
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
         self._room = self._least = math.inf  # to the borders: now, and the least so far (m)
@@ -138,7 +138,7 @@ class SimulatorNode(Node):
 
     def _on_command(self, message: JointState) -> None:
         values = self._decoder.decode(message)
-        command = Applied(*(values.get(name, math.nan) for name in ("throttle_command", "steering_command")))
+        command = Applied(*(values.get(name, math.nan) for name in command_signals(self._vehicle.inputs.set_point)))
         if self._commands.receive(command):
             acts = header_stamp_ns(message) or self._pace.stamp
             self._commanded = acts, time.monotonic()
@@ -146,7 +146,7 @@ class SimulatorNode(Node):
                 self._step()
         else:
             self.get_logger().warning(
-                f"{COMMAND_TOPIC}: throttle {command.r:g}, steering {command.delta:g} ignored; expected finite numbers",
+                f"{COMMAND_TOPIC}: {command.r:g} and steering {command.delta:g} ignored; expected finite numbers",
                 throttle_duration_sec=1.0,
             )
 
@@ -179,9 +179,9 @@ class SimulatorNode(Node):
         self._stamps.append(stamp)
         self._newest, self._room = sample, float(self._track.room(sample.s, sample.lateral))
         self._least = min(self._least, self._room)
-        self._publish_feedback(actuators(stamp, sample.feedback))
+        self._publish_feedback(actuators(stamp, sample.feedback, self._vehicle.inputs.set_point))
         if self._driver == "pure_pursuit":
-            self._publish_command(actuators(stamp, sample.command))
+            self._publish_command(actuators(stamp, sample.command, self._vehicle.inputs.set_point))
         else:
             self._tell(sample)
         self._sensors.measure(sample.pose, State(*sample.measured))

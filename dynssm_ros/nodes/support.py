@@ -34,6 +34,7 @@ from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.extras import load_plugins
 from dynssm_ros.nodes.executor import EnduringExecutor, failures
 from dynssm_ros.vehicle import Applied
+from dynssm_ros.vehicle.single_track import SetPoint
 
 NodeType = TypeVar("NodeType", bound=Node)
 
@@ -155,9 +156,9 @@ def choose(node: Node, name: str, default: str, allowed: tuple[str, ...], descri
     return value
 
 
-def actuators(stamp: int, applied: Applied) -> JointState:
-    """Throttle and steering as a message with ``stamp`` (ns)."""
-    message = JointState(name=["throttle", "steering"], position=[float(applied.r), float(applied.delta)])
+def actuators(stamp: int, applied: Applied, set_point: SetPoint = "throttle") -> JointState:
+    """Throttle or speed set-point, and steering, as a message with ``stamp`` (ns)."""
+    message = JointState(name=[set_point, "steering"], position=[float(applied.r), float(applied.delta)])
     set_stamp(message.header, stamp)
     return message
 

@@ -147,7 +147,7 @@ def _motion(race: Race, with_effects: bool = True, theta: Vector | None = None) 
     vehicle = course.vehicle
     effects = [effect for effect in vehicle.active_effects if with_effects and not effect.SENSOR]
     acting = Coefficients(*(vehicle.nominal if theta is None else theta.T))
-    car = CarModel(vehicle.constants, vehicle.sampling_time, effects)
+    car = CarModel(vehicle.constants, vehicle.sampling_time, effects, set_point=vehicle.inputs.set_point)
     return car.motion(State(*race.state.T), Applied(*race.command.T), acting, context=context)
 
 

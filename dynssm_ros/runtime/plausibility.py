@@ -28,8 +28,12 @@ _BEYOND = 1.5  # times a limit
 _SPIN = 3.0  # times the yaw rate of the tightest corner at the limit
 _HARD = 4.0  # times the car's accelerations: kerbs, hits
 _NOISE = 0.5  # jump that is no sign of anything, in units of the car's own speed and yaw rate
-_COLUMNS = {"throttle_feedback": "r_fb", "steering_feedback": "delta_fb"}
-_COMMANDED = {"throttle_command", "steering_command"}  # not measured: a controller may ask for anything
+_COLUMNS = {"throttle_feedback": "r_fb", "speed_feedback": "r_fb", "steering_feedback": "delta_fb"}
+_COMMANDED = {
+    "throttle_command",
+    "speed_command",
+    "steering_command",
+}  # not measured: a controller may ask for anything
 _NAME = 60  # characters of a frame's name that are told
 _SINGLE = 1e-6  # rounding of what a graph computes
 _FARTHEST = 1e8  # m; coordinates of the whole earth are below
@@ -70,8 +74,10 @@ def ranges(vehicle: Vehicle) -> dict[str, Range]:
         "omega": Range(-yaw, yaw, turning, yaw_noise),
         **dict.fromkeys(("x", "y"), Range(-_FARTHEST, _FARTHEST, 0.0, math.inf)),
     }
-    throttle = min(inputs.throttle[0], -1.0), max(inputs.throttle[1], 1.0)  # a fraction, whatever this car uses of it
-    for actuator, (low, high) in (("throttle", throttle), ("steering", inputs.steering)):
+    first = inputs.throttle
+    if inputs.set_point == "throttle":  # a fraction, whatever this car uses of it
+        first = min(first[0], -1.0), max(first[1], 1.0)
+    for actuator, (low, high) in ((inputs.set_point, first), ("steering", inputs.steering)):
         middle, half = (low + high) / 2, (high - low) / 2
         of_actuator = Range(middle - _BEYOND * half, middle + _BEYOND * half, 2 * half / _ACTUATOR_RANGE_S, 2 * half)
         found |= dict.fromkeys((f"{actuator}_feedback", f"{actuator}_command"), of_actuator)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.errors import ArtifactError
+from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.runtime.contract import WindowPrediction
 from dynssm_ros.runtime.health import Level
 from dynssm_ros.runtime.hindsight import Hindsight
@@ -307,8 +307,14 @@ def live_signal_map(model: OnnxModel, signal_map: SignalMap) -> SignalMap:
 
     Raises:
         ArtifactError: the model was trained with ``lookahead``, which does not exist live.
-        ConfigurationError: it needs command topics and the map has none.
+        ConfigurationError: it needs command topics and the map has none, or the map is of another kind of car.
     """
+    vehicle = model.vehicle
+    if signal_map.set_point != vehicle.inputs.set_point:
+        raise ConfigurationError(
+            f"signal map {signal_map.name}: has {signal_map.set_point}_feedback, but vehicle {vehicle.name} has "
+            f"inputs.set_point: {vehicle.inputs.set_point}; expected {vehicle.inputs.set_point}_feedback"
+        )
     if model.commands == "lookahead":
         raise ArtifactError(
             f"{model.artifact.path}: trained with commands 'lookahead', which look into the future and do not exist "

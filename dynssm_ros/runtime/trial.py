@@ -131,6 +131,7 @@ def _steady_windows(model: OnnxModel) -> Vector:
     """Straight drives at constant speeds ``(3, H, 7)``."""
     windows = np.zeros((len(_STEADY_SPEEDS), model.H, len(WINDOW_COLUMNS)))
     windows[:, :, 0] = model.vehicle.minimum_speed + np.array(_STEADY_SPEEDS)[:, None] * Plausibility(model.vehicle).top
+    windows[:, :, WINDOW_COLUMNS.index("r_fb")] = model.vehicle.inputs.coasting(windows[:, :, 0])
     return windows
 
 

@@ -75,7 +75,7 @@ class Wiring:
         self._factors = np.stack([factors for _, factors, _ in suspicions])[:, None]
         longer = np.array([factor for _, _, factor in suspicions])[:, None]
         suspected = constants.model_copy(update={"l_f": constants.l_f * longer, "l_r": constants.l_r * longer})
-        self._car = CarModel(suspected, T_s, (), "rk4", 2)
+        self._car = CarModel(suspected, T_s, (), "rk4", 2, set_point=vehicle.inputs.set_point)
 
     def add(self, stamp: int, row: Vector) -> None:
         """Takes the newest row of a window, with the columns ``WINDOW_COLUMNS`` ``(7,)``; ``stamp`` in ns."""

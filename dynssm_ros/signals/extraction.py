@@ -16,7 +16,7 @@ from dynssm_ros.signals.decoding import LOG_TIME, decoders, frames_told, header_
 from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
-from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, POSE_SIGNALS, STATE_SIGNALS, SignalMap
+from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, SignalMap
 from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, frames_note, log_time_note
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import Table
@@ -66,6 +66,7 @@ def _extract(
     info = RecordingInfo(
         sampling_time=1 / rate,
         commands=signal_map.commands,
+        set_point=signal_map.set_point,
         source=(Path(path).name,),
         signal_map=signal_map.name,
         held=tuple(held),
@@ -80,7 +81,7 @@ def _with_commands_of(log: Bag | Table, signal_map: SignalMap) -> tuple[SignalMa
     """The map, without commands where the log lacks a topic or column of them, and a note on it."""
     if signal_map.commands != "topics":
         return signal_map, []
-    sources = [signal_map.signals[name] for name in COMMAND_SIGNALS]
+    sources = [signal_map.signals[name] for name in signal_map.command_signals]
     if isinstance(log, Table):
         missing = [f"column '{one.column}'" for one in sources if one.column and one.column not in log.headings]
     else:

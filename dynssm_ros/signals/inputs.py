@@ -1,4 +1,4 @@
-"""Raw actuator signals to the model's inputs: signed throttle, and commands as increments on top of the feedback.
+"""Raw actuator signals to the model's inputs: signed throttle or speed, and commands as increments on the feedback.
 
 Only here do absolute commands become increments and brakes negative throttle, for extractor and live window alike.
 """
@@ -19,7 +19,7 @@ WINDOW_COLUMNS = ("v_x", "v_y", "omega", "r_fb", "delta_fb", "r_cmd", "delta_cmd
 
 
 class ModelInputs(NamedTuple):
-    """Feedback and command increments, each of shape ``(N,)``: fraction, rad, fraction, rad."""
+    """Feedback and command increments, each of shape ``(N,)``: fraction, or m/s of a speed set-point, and rad."""
 
     r_fb: Vector
     delta_fb: Vector
@@ -29,16 +29,17 @@ class ModelInputs(NamedTuple):
 
 def model_inputs(signals: Mapping[str, Any]) -> ModelInputs:
     """From sampled signals by name, each ``(N,)``; without commands the increments are zero."""
-    r_fb = signed_throttle(signals["throttle_feedback"], signals.get("brake_feedback"))
+    first = "speed" if "speed_feedback" in signals else "throttle"
+    r_fb = signed_throttle(signals[f"{first}_feedback"], signals.get("brake_feedback"))
     delta_fb = signals["steering_feedback"]
-    if "throttle_command" not in signals:
+    if f"{first}_command" not in signals:
         return ModelInputs(r_fb, delta_fb, np.zeros_like(r_fb), np.zeros_like(delta_fb))
-    r = signed_throttle(signals["throttle_command"], signals.get("brake_command"))
+    r = signed_throttle(signals[f"{first}_command"], signals.get("brake_command"))
     return ModelInputs(r_fb, delta_fb, r - r_fb, signals["steering_command"] - delta_fb)
 
 
 def signed_throttle(throttle: Vector, brake: Vector | None) -> Vector:
-    """One signed throttle in [-1, 1]: minus the brake where it is pressed, else the throttle."""
+    """One signed throttle: minus the brake where it is pressed, else the throttle; a speed set-point as it is."""
     return throttle if brake is None else np.where(brake > 0.0, -brake, throttle)
 
 

@@ -25,6 +25,7 @@ from dynssm_ros.files import replacing, require_replaceable
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
 from dynssm_ros.signals.recover import vast_table
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, Commands
+from dynssm_ros.vehicle.single_track import SetPoint
 
 METADATA_KEY = b"dynssm"
 _ARROW_SCHEMA = b"ARROW:schema"
@@ -40,12 +41,17 @@ COLUMN_UNITS = {
 }  # fmt: skip
 
 
+_INPUTS: dict[SetPoint, str] = {"throttle": "a throttle", "speed": "a speed set-point"}
+_IN_SPEED = {"r_fb": "m/s", "r_cmd": "m/s"}
+
+
 class RecordingInfo(StrictModel):
     """What a recording says of itself."""
 
     version: int = Field(default=1, ge=1, le=1, description="format version")
     sampling_time: float = Field(gt=0, description="T_s (s)")
     commands: Commands = Field(description="where u_t comes from")
+    set_point: SetPoint = Field(default="throttle", description="what r_fb and r_cmd are: fractions, or speeds in m/s")
     source: tuple[str, ...] = Field(default=(), description="names of the bags or simulations")
     signal_map: str = ""
     held: tuple[str, ...] = Field(
@@ -198,14 +204,25 @@ class Recording:
                 f"extract with --rate {1 / T_s:g}"
             )
 
+    def require_set_point(self, set_point: SetPoint, of: str) -> None:
+        """Checks that this recording's first input is what ``of`` something that shall use it takes.
+
+        Raises:
+            RecordingError: it is not.
+        """
+        if self.info.set_point != set_point:
+            raise RecordingError(
+                f"recording {', '.join(self.info.source)}: its first input is {_INPUTS[self.info.set_point]}, but {of} "
+                f"takes {_INPUTS[set_point]} (inputs.set_point: {set_point})"
+            )
+
     def save(self, path: str | Path) -> None:
         """Writes Parquet with the metadata and checksums of its pages inside, atomically."""
         arrays = {"time": pa.array(self.time), "segment": pa.array(self.segment)}
         arrays |= {name: pa.array(values) for name, values in self.columns.items()}
+        units = COLUMN_UNITS | (_IN_SPEED if self.info.set_point == "speed" else {})
         fields = [
-            pa.field(
-                name, array.type, metadata={b"unit": COLUMN_UNITS.get(name, "ns" if name == "time" else "").encode()}
-            )
+            pa.field(name, array.type, metadata={b"unit": units.get(name, "ns" if name == "time" else "").encode()})
             for name, array in arrays.items()
         ]
         schema = pa.schema(fields, metadata={METADATA_KEY: self.info.model_dump_json().encode()})
@@ -352,7 +369,7 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
     if len(recordings) == 1:
         return first
     for other in recordings[1:]:
-        for name in ("sampling_time", "commands"):
+        for name in ("sampling_time", "commands", "set_point"):
             have, want = getattr(other.info, name), getattr(first.info, name)
             if have != want:
                 raise RecordingError(

@@ -17,6 +17,7 @@ from pydantic import Field, field_validator, model_validator
 
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel
+from dynssm_ros.vehicle.single_track import SetPoint
 
 Commands = Literal["topics", "lookahead", "none"]
 """Where ``u_t`` comes from: recorded command topics, the next feedback sample (offline only), or nowhere (zero)."""
@@ -25,7 +26,11 @@ STATE_SIGNALS = ("v_x", "v_y", "omega")
 POSE_SIGNALS = ("x", "y", "theta")
 REQUIRED_SIGNALS = (*STATE_SIGNALS, "throttle_feedback", "steering_feedback")
 COMMAND_SIGNALS = ("throttle_command", "steering_command")
-SIGNALS = (*REQUIRED_SIGNALS, *POSE_SIGNALS, *COMMAND_SIGNALS, "brake_feedback", "brake_command")
+_OF_THROTTLE = ("throttle_feedback", "throttle_command", "brake_feedback", "brake_command")
+STANDARD_MAPS: dict[SetPoint, str] = {"throttle": "default", "speed": "default_speed"}
+"""Shipped maps of the package's own topics."""
+SPEED_SIGNALS = ("speed_feedback", "speed_command")
+SIGNALS = (*REQUIRED_SIGNALS, *POSE_SIGNALS, *COMMAND_SIGNALS, "brake_feedback", "brake_command", *SPEED_SIGNALS)
 
 Hold = Literal["zero", "first"]
 """What a signal is between two samples: the last one, or on a line to the next."""
@@ -161,7 +166,7 @@ class SignalMap(StrictModel):
         """A map that names no command has none, unless it says where they come from."""
         if not isinstance(content, dict) or "commands" in content or not isinstance(content.get("signals"), dict):
             return content
-        named = any(name in content["signals"] for name in COMMAND_SIGNALS)
+        named = any(name in content["signals"] for name in (*COMMAND_SIGNALS, "speed_command"))
         return content if named else content | {"commands": "none"}
 
     @model_validator(mode="after")
@@ -171,7 +176,9 @@ class SignalMap(StrictModel):
             raise ValueError(f"signals: unknown '{unknown[0]}'; expected {' '.join(SIGNALS)}")
         if len({bool(source.column) for source in self.signals.values()}) > 1:
             raise ValueError("signals: some are columns of a table, others fields of topics; expected either")
-        needed = REQUIRED_SIGNALS + (COMMAND_SIGNALS if self.commands == "topics" else ())
+        if self.set_point == "speed" and (other := [name for name in self.signals if name in _OF_THROTTLE]):
+            raise ValueError(f"signals.{other[0]}: the input is a speed set-point; expected either speed or throttle")
+        needed = self.required + (self.command_signals if self.commands == "topics" else ())
         if self.velocities is not None:
             double = [name for name in STATE_SIGNALS if name in self.signals]
             if double:
@@ -190,6 +197,21 @@ class SignalMap(StrictModel):
             if types.setdefault(source.recorded, source.type) != source.type:
                 raise ValueError(f"signals: topic {source.topic} is given two types")
         return self
+
+    @property
+    def set_point(self) -> SetPoint:
+        """What the first input is: a throttle, or the set-point of a speed controller."""
+        return "speed" if any(name in self.signals for name in SPEED_SIGNALS) else "throttle"
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """The signals that are needed: state, first input and steering."""
+        return required_signals(self.set_point)
+
+    @property
+    def command_signals(self) -> tuple[str, str]:
+        """The commands of both inputs."""
+        return command_signals(self.set_point)
 
     @property
     def is_of_table(self) -> bool:
@@ -224,8 +246,18 @@ class SignalMap(StrictModel):
 
     def active_signals(self) -> dict[str, Source]:
         """The signals that are read: command topics only where ``commands: topics``."""
-        skipped = () if self.commands == "topics" else (*COMMAND_SIGNALS, "brake_command")
+        skipped = () if self.commands == "topics" else (*self.command_signals, "brake_command")
         return {name: source for name, source in self.signals.items() if name not in skipped}
+
+
+def required_signals(set_point: SetPoint) -> tuple[str, ...]:
+    """The signals that a recording needs: state, first input and steering."""
+    return *STATE_SIGNALS, f"{set_point}_feedback", "steering_feedback"
+
+
+def command_signals(set_point: SetPoint) -> tuple[str, str]:
+    """The commands of both inputs."""
+    return f"{set_point}_command", "steering_command"
 
 
 def load_signal_map(name_or_path: str | Path) -> SignalMap:

@@ -20,6 +20,7 @@ from dynssm_ros.signals.messages import (
 )
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import POSE_SIGNALS
+from dynssm_ros.vehicle.single_track import SetPoint
 
 _ORDER = 1000  # ns between the log times of the messages of one instant: actuators first, odometry last
 
@@ -32,6 +33,7 @@ def write_standard_bag(
     *,
     feedback: Vector,
     command: Vector | None,
+    set_point: SetPoint = "throttle",
 ) -> None:
     """Writes a rosbag2 with odometry, actuator feedback and, if given, absolute commands; all stamped ``time``.
 
@@ -40,18 +42,23 @@ def write_standard_bag(
         time: stamps (ns), ``(N,)``.
         state: ``v_x, v_y, omega`` (m/s, m/s, rad/s), ``(N, 3)``.
         pose: ``x, y, theta`` (m, m, rad), ``(N, 3)``.
-        feedback: throttle (fraction) and steering (rad), ``(N, 2)``.
-        command: absolute throttle and steering, ``(N, 2)``.
+        feedback: throttle (fraction) or speed set-point (m/s), and steering (rad), ``(N, 2)``.
+        command: the same as absolute commands, ``(N, 2)``.
+        set_point: which of the two; it names the joint.
     """
+
+    def actuators(stamp: int, values: Vector) -> object:
+        return joint_state(stamp, {set_point: float(values[0]), "steering": float(values[1])})
+
     with write_bag(path) as bag:
         bag.add_topic(FEEDBACK_TOPIC, JOINT_STATE)
         if command is not None:
             bag.add_topic(COMMAND_TOPIC, JOINT_STATE)
         bag.add_topic(ODOMETRY_TOPIC, ODOMETRY)
         for k, stamp in enumerate(time.tolist()):
-            bag.write(FEEDBACK_TOPIC, stamp, _actuators(stamp, feedback[k]))
+            bag.write(FEEDBACK_TOPIC, stamp, actuators(stamp, feedback[k]))
             if command is not None:
-                bag.write(COMMAND_TOPIC, stamp + _ORDER, _actuators(stamp, command[k]))
+                bag.write(COMMAND_TOPIC, stamp + _ORDER, actuators(stamp, command[k]))
             bag.write(ODOMETRY_TOPIC, stamp + 2 * _ORDER, odometry(stamp, tuple(pose[k]), tuple(state[k])))
 
 
@@ -70,8 +77,7 @@ def recording_to_bag(recording: Recording, path: str | Path) -> None:
     )
     has_commands = recording.info.commands == "topics"
     state = recording.states(slice(None))
-    write_standard_bag(path, recording.time, state, pose, feedback=feedback, command=command if has_commands else None)
-
-
-def _actuators(stamp: int, values: Vector) -> object:
-    return joint_state(stamp, {"throttle": float(values[0]), "steering": float(values[1])})
+    write_standard_bag(
+        path, recording.time, state, pose, feedback=feedback, command=command if has_commands else None,
+        set_point=recording.info.set_point,
+    )  # fmt: skip

@@ -48,7 +48,7 @@ class CommandHolder:
 
     def command(self, previous: Applied) -> Applied:
         """What the actuators do next, ``previous`` being what they do now."""
-        wanted = self._last if self.fresh else Applied(self._limits.throttle[0], previous.delta)
+        wanted = self._last if self.fresh else Applied(self._limits.full_brakes, previous.delta)
         return self._limits.reached(wanted, previous, self._T_s)
 
 

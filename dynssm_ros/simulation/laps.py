@@ -62,7 +62,9 @@ class Run:
     state: Vector  # true v_x, v_y, omega (m/s, m/s, rad/s), (N, 3)
     measured: Vector  # the same with the vehicle's effects on the measurement and noise, (N, 3)
     pose: Vector  # x, y, theta (m, m, rad unwrapped), (N, 3)
-    feedback: Vector  # throttle (fraction) and steering (rad): the commands of the step before, (N, 2)
+    feedback: (
+        Vector  # throttle (fraction) or speed set-point (m/s), steering (rad): the commands of the step before, (N, 2)
+    )
     command: Vector  # absolute throttle and steering from this step to the next, (N, 2)
     s: Vector  # along the centre line since its first point (m), counted on over the laps, (N,)
     lateral: Vector  # beside it (m, positive left), (N,)
@@ -105,7 +107,7 @@ def drive(
     v_x = 0.7 * driver.speed(0.0)
     state = State(v_x, 0.0, v_x * float(line.curvature(0.0)))
     car = make_plant(vehicle, plant, Pose(float(x), float(y), theta), state, line=track.centre)
-    feedback, on_line = Applied(0.0, 0.0), 0.0
+    feedback, on_line = Applied(vehicle.inputs.coasting(v_x), 0.0), 0.0
     s = float(track.project([x, y])[0])
     for k in itertools.count():
         pose, state, time = car.pose, car.state, k * vehicle.sampling_time
@@ -181,7 +183,10 @@ def as_recording(run: Run) -> Recording:
         )
     )
     info = RecordingInfo(
-        sampling_time=run.vehicle.sampling_time, commands="topics", source=(f"{run.vehicle.name} on {run.track.name}",)
+        sampling_time=run.vehicle.sampling_time,
+        commands="topics",
+        set_point=run.vehicle.inputs.set_point,
+        source=(f"{run.vehicle.name} on {run.track.name}",),
     )
     return Recording(info, run.time, np.zeros(len(run.time), dtype=np.int32), columns)
 
@@ -195,7 +200,10 @@ def write_run(run: Run, path: str | Path) -> None:
     Raises:
         BagError: ``path`` exists and is no bag.
     """
-    write_standard_bag(path, run.time, run.measured, run.pose, feedback=run.feedback, command=run.command)
+    write_standard_bag(
+        path, run.time, run.measured, run.pose, feedback=run.feedback, command=run.command,
+        set_point=run.vehicle.inputs.set_point,
+    )  # fmt: skip
 
 
 def _check_motion(vehicle: Vehicle, track: Track, time: float, pose: Pose, state: State) -> None:

@@ -100,13 +100,16 @@ class SingleTrackPlant:
         substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
         self._pieces = substeps if delay > 0 else 1  # a late reading falls between two steps
         T_s, substeps = vehicle.sampling_time / self._pieces, substeps // self._pieces
-        self._car = CarModel(vehicle.constants, T_s, acting, integrator, substeps, xp=SCALAR, measured=False)
+        self._car = CarModel(
+            vehicle.constants, T_s, acting, integrator, substeps,
+            xp=SCALAR, set_point=vehicle.inputs.set_point, measured=False,
+        )  # fmt: skip
         self._steps = 0
         self._line = line
         require_context(effects, {*self._context(0.0), *Pose._fields}, "simulation")
         self._effect_states = self._car.settled(
             state,
-            Applied(0.0, 0.0),
+            Applied(vehicle.inputs.coasting(state.v_x), 0.0),
             self._theta,
             dict(zip(_Odometer.POSE, pose, strict=True)),
             context=self._context(0.0),

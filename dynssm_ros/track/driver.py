@@ -12,7 +12,7 @@ from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.limits import Limits
-from dynssm_ros.vehicle.single_track import cornering_stiffness
+from dynssm_ros.vehicle.single_track import cornering_stiffness, speed_error_for
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Driver:
         return math.atan(wheelbase * (curvature + error))
 
     def _throttle(self, time: float, state: State, s: float, offset: float, previous: Applied) -> float:
-        """The throttle that removes the speed error in a few steps, with what resists the car added."""
+        """The throttle or set-point that removes the speed error in a few steps, with what resists the car added."""
         th, car = self._theta, self._vehicle.constants
         horizon = 5 * self._vehicle.sampling_time
         ahead = s + state.v_x * horizon
@@ -100,4 +100,6 @@ class Driver:
         error = slowed * tighter * self.speed(ahead) - state.v_x
         cornering = car.m * state.v_x * state.omega * math.sin(previous.delta) * car.l_r / (car.l_f + car.l_r)
         force = car.m * error / horizon + th.C_r0 + th.C_r2 * state.v_x**2 + cornering
+        if self._vehicle.inputs.set_point == "speed":
+            return float(state.v_x) + speed_error_for(th, force)
         return float(force / max(th.C_m1 - th.C_m2 * state.v_x, 0.1 * th.C_m1))

@@ -25,6 +25,7 @@ from dynssm_ros.vehicle.single_track import (
     Array,
     Coefficients,
     Motion,
+    SetPoint,
     Stage,
     StageEffect,
     State,
@@ -54,13 +55,17 @@ class CarModel:
     substeps: int = 1  # integration steps per step
     _: KW_ONLY
     xp: Any = np  # array namespace: numpy, torch, casadi or ``SCALAR``
+    set_point: SetPoint = "throttle"  # what the first input asks for
     measured: bool = True  # whether states are measured ones, as models step them, or true ones, as a plant does
 
     @classmethod
     def of(cls, vehicle: Vehicle, integrator: Integrator | None = None, substeps: int = 1, *, xp: Any = np) -> CarModel:
         """The car of a vehicle file with its effects; without ``integrator`` with the one that it was calibrated for."""
         integrator = integrator or vehicle.model_integrator
-        return cls(vehicle.constants, vehicle.sampling_time, vehicle.active_effects, integrator, substeps, xp=xp)
+        return cls(
+            vehicle.constants, vehicle.sampling_time, vehicle.active_effects, integrator, substeps,
+            xp=xp, set_point=vehicle.inputs.set_point,
+        )  # fmt: skip
 
     @classmethod
     def at_any_speed(
@@ -136,6 +141,7 @@ class CarModel:
             h_cg=car.h_cg,
             F_z0=car.F_z0,
             load_transfer=car.load_transfer,
+            set_point=self.set_point,
             effect_states=dict(effect_states or {}),
             context=context or {},
             h=h,

@@ -63,7 +63,7 @@ def vehicle_limits(vehicle: Vehicle, top_speed: float = TOP_SPEED) -> Limits:
 
 
 def _straight_ahead(vehicle: Vehicle, speed: Vector, r: float) -> Vector:
-    """Longitudinal acceleration (m/s^2) at ``speed`` under throttle ``r``, shape ``(M,)``."""
+    """Longitudinal acceleration (m/s^2) at ``speed`` under the first input ``r``, shape ``(M,)``."""
     zero = np.zeros_like(speed)
     return np.asarray(_settled(vehicle, State(speed, zero, zero), Applied(r + zero, zero)).a_x)
 
@@ -78,7 +78,7 @@ def _cornering(vehicle: Vehicle, speed: Vector) -> Vector:
     slip = np.concatenate([-slip[::-1], slip])
     v_x = np.repeat(coarse[:, None], len(slip), axis=1)
     zero = np.zeros_like(v_x)
-    q = _settled(vehicle, State(v_x, -v_x * np.tan(slip), zero), Applied(zero, zero))
+    q = _settled(vehicle, State(v_x, -v_x * np.tan(slip), zero), Applied(vehicle.inputs.coasting(v_x), zero))
     share_of_front = q.l_r / (q.l_f + q.l_r)
     front = np.broadcast_to(q.F_fy / (q.m * share_of_front), v_x.shape)
     rear = np.broadcast_to(q.F_ry / (q.m * (1 - share_of_front)), v_x.shape)

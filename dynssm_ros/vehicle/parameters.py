@@ -22,7 +22,7 @@ from dynssm_ros.files import replacing
 from dynssm_ros.vehicle import ranges
 from dynssm_ros.vehicle.effects import EFFECTS, Effect, build_effect
 from dynssm_ros.vehicle.integrators import Integrator
-from dynssm_ros.vehicle.single_track import Applied, Coefficients, VehicleConstants
+from dynssm_ros.vehicle.single_track import Applied, Array, Coefficients, SetPoint, VehicleConstants
 
 COEFFICIENT_UNITS: dict[str, str] = {
     "B_f": "1/rad", "C_f": "1", "D_f": "N", "E_f": "1",
@@ -58,7 +58,14 @@ class Coefficient(StrictModel):
 class InputLimits(StrictModel):
     """What the actuators can do."""
 
-    throttle: tuple[float, float] = Field(description="range of the signed throttle (fraction, negative brakes)")
+    set_point: SetPoint = Field(
+        default="throttle",
+        description="what the first input asks for: throttle, a share of the drive force; speed (m/s), held by a controller "
+        "in the car with gain C_m2 and largest force C_m1",
+    )
+    throttle: tuple[float, float] = Field(
+        description="range of the signed throttle (fraction, negative brakes), or of the speed set-point (m/s)"
+    )
     steering: tuple[float, float] = Field(description="range of the road-wheel angle (rad)")
     steering_rate: float = Field(gt=0, description="largest steering speed (rad/s)")
 
@@ -74,6 +81,16 @@ class InputLimits(StrictModel):
             float(min(max(wanted.r, self.throttle[0]), self.throttle[1])),
             float(min(max(wanted.delta, self.steering[0]), self.steering[1])),
         )
+
+    @property
+    def full_brakes(self) -> float:
+        """The first input that stops the car: least throttle, or the speed set-point nearest to 0."""
+        low, high = self.throttle
+        return low if self.set_point == "throttle" else min(max(low, 0.0), high)
+
+    def coasting(self, v_x: Array) -> Array:
+        """The first input that neither drives nor brakes at speed ``v_x`` (m/s); the shape is kept."""
+        return 0.0 * v_x if self.set_point == "throttle" else v_x
 
     @field_validator("throttle", "steering")
     @classmethod
@@ -180,8 +197,10 @@ class Vehicle(StrictModel):
         nominal = {name: each.nominal for name, each in self.coefficients.items()}
         wrong = [
             *ranges.of_constants(self.constants),
-            *ranges.of_inputs(inputs.throttle, inputs.steering, inputs.steering_rate),
-            *ranges.of_coefficients(self.constants, nominal, bounds, calibrated=self.before is not None),
+            *ranges.of_inputs(inputs.set_point, inputs.throttle, inputs.steering, inputs.steering_rate),
+            *ranges.of_coefficients(
+                self.constants, nominal, bounds, calibrated=self.before is not None, set_point=inputs.set_point
+            ),
         ]
         if wrong:
             raise ValueError(wrong[0] + (f"; {len(wrong) - 1} more" if wrong[1:] else ""))
@@ -199,6 +218,13 @@ class Vehicle(StrictModel):
     def nominal(self) -> Vector:
         """theta_0, shape ``(17,)``, in the order of ``COEFFICIENTS``."""
         return np.array([self.coefficients[name].nominal for name in COEFFICIENTS])
+
+    @property
+    def input_unit(self) -> float:
+        """Change of the first input from no drive force to all of it: 1 of a throttle, else a speed error (m/s)."""
+        if self.inputs.set_point == "throttle":
+            return 1.0
+        return self.coefficients["C_m1"].nominal / self.coefficients["C_m2"].nominal
 
     @property
     def lower(self) -> Vector:

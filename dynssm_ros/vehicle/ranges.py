@@ -8,7 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
-from dynssm_ros.vehicle.single_track import GRAVITY, VehicleConstants
+from dynssm_ros.vehicle.single_track import GRAVITY, SetPoint, VehicleConstants
+
+_SPEED = 30.0  # up to which a throttle beyond 1 may be meant as m/s; per cent are larger
+_SETTLING_S = 0.005, 20.0  # m / C_m2 of a speed controller
 
 
 class PlausibleRange(NamedTuple):
@@ -41,17 +44,31 @@ def of_constants(car: VehicleConstants) -> Iterator[str]:
     yield from _outside("constants.F_z0", car.F_z0, load)
 
 
-def of_inputs(throttle: tuple[float, float], steering: tuple[float, float], rate: float) -> Iterator[str]:
+def of_inputs(
+    set_point: SetPoint, throttle: tuple[float, float], steering: tuple[float, float], rate: float
+) -> Iterator[str]:
     """What is wrong with the limits of the actuators."""
     for value in throttle:
-        yield from _outside("inputs.throttle", value, PlausibleRange(-1.0, 1.0, "as a fraction", "in %? "))
+        mistake = "in %? " if abs(value) > _SPEED else "a speed (set_point: speed)? "
+        fraction, speed = (
+            PlausibleRange(-1.0, 1.0, "as a fraction", mistake),
+            PlausibleRange(-120.0, 120.0, "m/s", "in km/h? "),
+        )
+        yield from _outside("inputs.throttle", value, speed if set_point == "speed" else fraction)
+    if set_point == "speed" and not throttle[1] > 0:
+        yield f"inputs.throttle: up to {throttle[1]:g} m/s; expected a speed set-point above 0"
     for value in steering:
         yield from _outside("inputs.steering", value, PlausibleRange(-1.57, 1.57, "rad", "in degrees? "))
     yield from _outside("inputs.steering_rate", rate, PlausibleRange(0.01, 50.0, "rad/s", "in degrees/s? "))
 
 
 def of_coefficients(
-    car: VehicleConstants, nominal: Mapping[str, float], bounds: Mapping[str, tuple[float, float]], *, calibrated: bool
+    car: VehicleConstants,
+    nominal: Mapping[str, float],
+    bounds: Mapping[str, tuple[float, float]],
+    *,
+    calibrated: bool,
+    set_point: SetPoint,
 ) -> Iterator[str]:
     """What is wrong with the coefficients: values that are 0 or of the wrong sign, and those of no car.
 
@@ -79,6 +96,12 @@ def of_coefficients(
             inertia / 10, inertia * 10, f"kg m^2, within a factor of 10 of m l_f l_r = {inertia:.3g}"
         ),
     }
+    if set_point == "speed":
+        yield from _not_positive("C_m1", bounds["C_m1"])
+        yield from _not_positive("C_m2", bounds["C_m2"])
+        quick, slow = _SETTLING_S
+        of_controller = f"N s/m, so that the speed settles within {quick:g} to {slow:g} s"
+        plausible["C_m2"] = PlausibleRange(car.m / slow, car.m / quick, of_controller)
     for name, each in plausible.items():
         low, high = bounds[name]
         if not calibrated:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
@@ -26,6 +26,9 @@ from dynssm_ros.configuration import StrictModel
 
 GRAVITY = 9.81  # m/s^2
 INSTANT = 1e-3  # time that a single evaluation stands for (s)
+
+SetPoint = Literal["throttle", "speed"]
+"""What the first input asks for: a share of the drive force, or a speed that the car's own controller holds."""
 
 Array = Any  # float, numpy array, torch tensor or casadi expression: whatever ``xp`` computes with
 
@@ -64,7 +67,10 @@ class State(NamedTuple):
 
 
 class Applied(NamedTuple):
-    """Applied inputs: throttle ``r`` as a fraction (negative brakes), road-wheel steering ``delta`` in rad."""
+    """Applied inputs: throttle ``r`` as a fraction (negative brakes), road-wheel steering ``delta`` in rad.
+
+    Of a car with a speed set-point ``r`` is that speed (m/s).
+    """
 
     r: Array
     delta: Array
@@ -102,6 +108,7 @@ class Motion:
     h_cg: Array
     F_z0: Array
     load_transfer: bool
+    set_point: SetPoint = "throttle"
     # slip angles (rad), force of drive and brakes, what resistances leave of it, axle loads, lateral tyre forces (N)
     alpha_f: Array = 0.0
     alpha_r: Array = 0.0
@@ -203,8 +210,27 @@ def slip(xp: Any, q: Motion) -> None:
 
 def drive(xp: Any, q: Motion) -> None:
     """Longitudinal force of the rear axle with rolling resistance and drag, Eq. (6)."""
-    q.F_d = (q.theta.C_m1 - q.theta.C_m2 * q.v_x) * q.r
+    if q.set_point == "speed":
+        q.F_d = speed_controller_force(q.theta, q.r - q.v_x)
+    else:
+        q.F_d = (q.theta.C_m1 - q.theta.C_m2 * q.v_x) * q.r
     q.F_rx = q.F_d - q.theta.C_r0 - q.theta.C_r2 * q.v_x * q.v_x
+
+
+def speed_controller_force(th: Coefficients, error: Array) -> Array:
+    """Force (N) of a first-order speed controller at a speed ``error``, set-point less speed (m/s).
+
+    ``F / (1 + (F / C_m1)^4)^(1/4)`` with ``F = C_m2 error``: proportional, softly limited to ``C_m1`` on both sides.
+    """
+    force = th.C_m2 * error
+    square = (force / th.C_m1) * (force / th.C_m1)  # Python's own power of large numbers raises
+    return force / (1.0 + square * square) ** 0.25
+
+
+def speed_error_for(th: Coefficients, force: float, most: float = 0.98) -> float:
+    """The speed error (m/s) at which the controller gives ``force`` (N), or its share ``most`` of the limit."""
+    share = min(max(force / th.C_m1, -most), most)
+    return float(th.C_m1 * share / (th.C_m2 * (1.0 - share**4) ** 0.25))
 
 
 def loads(xp: Any, q: Motion) -> None:

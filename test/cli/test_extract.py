@@ -198,7 +198,9 @@ def test_an_unknown_signal_map_lists_the_shipped_ones(tmp_path: Path, run: Run) 
     out = tmp_path / "out" / "r.parquet"
     ended = run(write(tmp_path / "bag", 10), "--signals", "porsche", "--rate", 25, "--out", out)
     assert_refused(
-        ended, out.parent, "'porsche' is neither a file nor a shipped name (autoware, av21, default, f1tenth, vesc)"
+        ended,
+        out.parent,
+        "'porsche' is neither a file nor a shipped name (autoware, av21, default, default_speed,",
     )
 
 

@@ -55,7 +55,10 @@ def test_the_bag_itself_is_never_replaced(refused: Refused, laps_bag: Path, smal
         ({"bag": "gone"}, "gone: no such file"),
         ({"bag": "log.csv"}, "log.csv: not a bag; expected a rosbag2 folder"),
         ({"bag": "log.csv"}, "`dynssm extract --bag` makes one of a table"),
-        ({"signals": "gone"}, "'gone' is neither a file nor a shipped name (autoware, av21, default, f1tenth, vesc)"),
+        (
+            {"signals": "gone"},
+            "'gone' is neither a file nor a shipped name (autoware, av21, default, default_speed, ",
+        ),
         ({"signals": "av21"}, "missing throttle_command, steering_command"),
         ({"signals": "other.yaml"}, "topic /other/odometry is missing; the bag has /vehicle/actuator_command"),
     ],

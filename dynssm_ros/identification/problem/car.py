@@ -14,7 +14,7 @@ from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.identification import tuning
 from dynssm_ros.vehicle import COEFFICIENTS, Coefficients, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, Effect
-from dynssm_ros.vehicle.single_track import VehicleConstants
+from dynssm_ros.vehicle.single_track import SetPoint, VehicleConstants
 
 Values = dict[str, float]
 _KEPT = 64  # vehicles whose coefficients are kept at hand
@@ -141,6 +141,7 @@ class CarBatch(NamedTuple):
     theta: Coefficients
     constants: Any
     effects: tuple[Effect, ...]
+    set_point: SetPoint
 
     @classmethod
     def of(cls, cars: Sequence[CarEstimate], number: Indices) -> CarBatch:
@@ -162,7 +163,7 @@ class CarBatch(NamedTuple):
                 about = EFFECTS[name].PARAMETERS
                 columns = {k: v if about[k].shape else np.where(acts, v, about[k].neutral) for k, v in columns.items()}
             own.append(EFFECTS[name](**columns))
-        return cls(theta, constants, (*first.vehicle.active_effects, *own))
+        return cls(theta, constants, (*first.vehicle.active_effects, *own), first.vehicle.inputs.set_point)
 
 
 def _together(values: Sequence[float]) -> Any:

@@ -240,7 +240,9 @@ class SimulationWindows:
         return {name: given[name] if name in given else signals[name][rows] for name, rows in at.items()}
 
     def _bound(self, fleet: CarBatch) -> CarModel:
-        return CarModel(fleet.constants, self.data.T_s, fleet.effects, self.integrator, self.substeps)
+        return CarModel(
+            fleet.constants, self.data.T_s, fleet.effects, self.integrator, self.substeps, set_point=fleet.set_point
+        )
 
 
 def recorded_rows(recording: Recording, context: dict[str, Vector]) -> RecordedRows:
@@ -250,11 +252,11 @@ def recorded_rows(recording: Recording, context: dict[str, Vector]) -> RecordedR
 
 
 def rows_per_sample(recording: Recording) -> tuple[int, int]:
-    """Rows from one sample of the applied throttle and steering to the next; see :class:`RecordedRows`."""
+    """Rows from one sample of the applied first input and steering to the next; see :class:`RecordedRows`."""
     source = "command" if recording.info.commands == "topics" else "feedback"
     throttle, steering = (
         max(1, round(recording.info.held_periods.get(f"{name}_{source}", 0.0) / recording.T_s))
-        for name in ("throttle", "steering")
+        for name in (recording.info.set_point, "steering")
     )
     return throttle, steering
 

@@ -102,6 +102,7 @@ def calibrate(
         ConfigurationError: an effect of the vehicle needs a signal that the recording does not have.
     """
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
+    recording.require_set_point(vehicle.inputs.set_point, f"vehicle {vehicle.name}")
     context = _context(recording, vehicle, line)
     require_context(vehicle.active_effects, context, f"recording {', '.join(recording.info.source)}")
     speed = vehicle.minimum_speed if min_speed is None else min_speed

@@ -243,6 +243,7 @@ def _prepare(
     together = RecordingSet.of([*recordings, *suspect], share, line, suspects, known=known if holdout is None else None)
     recording = together.recording
     recording.require_sampling_time(vehicle.sampling_time, f"vehicle {vehicle.name}")
+    recording.require_set_point(vehicle.inputs.set_point, f"vehicle {vehicle.name}")
     asked, T_s = steps_of(horizon, recording.T_s), recording.T_s
     if asked < 2:
         raise ConfigurationError(f"horizon {horizon:g} s: expected at least two sampling times ({2 * T_s:g} s)")
