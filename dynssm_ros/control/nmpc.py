@@ -181,7 +181,13 @@ class Nmpc:
         heading = line.heading(s)
         x[1:, 2] = now[2] + np.cumsum((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi)
         x[:-1, V_X] = np.diff(s) / self.model.car.T_s
-        return Plan(x, np.zeros((N, len(INPUTS))))
+        u = np.zeros((N, len(INPUTS)))
+        if (
+            self._program.limits.set_point == "speed"
+        ):  # far from the speed its controller is at its limit, with no slope
+            u[:, 0] = np.diff(x[:-1, V_X], prepend=now[R])
+            x[1:, R] = x[:-1, V_X]
+        return Plan(x, u)
 
     def _parameters(self, adapted: Adapted, t: float) -> Vector:
         p = np.empty((self.settings.N, PARAMETERS))

@@ -96,7 +96,7 @@ class HorizonProgram:
             H[: 2 * N, : 2 * N] += by_u.T @ by_u
             g[: 2 * N] += by_u.T @ errors
         g[: 2 * N] -= w.progress * tangent[-1] @ moves[-1] / length
-        rates = np.tile([w.throttle, w.steering], N) / h
+        rates = np.tile(self.settings.rates, N) / h
         H[np.diag_indices(self.variables)] += 2 * np.concatenate(
             [rates, np.full(N, h * w.border), [max(w.terminal_speed, 1.0)]]
         )
@@ -151,7 +151,7 @@ class HorizonProgram:
         slips = np.array([self.model.slip_angles(each[1:], p)[0] for each in x])
         slipping = np.max(np.abs(slips) - self._slip_bounds(margins.slip), axis=-1)
         each_step = w.along * along**2 + w.across * across**2 + w.border * _soft(np.maximum(outside, slipping))
-        costs = np.sum(h * each_step + u**2 @ [w.throttle, w.steering] / h, axis=-1)
+        costs = np.sum(h * each_step + u**2 @ self.settings.rates / h, axis=-1)
         costs += w.terminal_across * across[:, -1] ** 2
         if w.progress > 0:
             costs -= w.progress * (along[:, -1] + (points[..., -1] - self.at.on_line) / length)

@@ -56,7 +56,7 @@ class Weights:
     along: float  # of the squared distance from the reference point along the line
     across: float  # likewise across it
     progress: float  # gain per length that the horizon's last point lies further along the line
-    throttle: float = 0.07  # of its squared rate (fraction per time)
+    throttle: float = 0.07  # of its squared rate (full drive force per time)
     steering: float = 15.0  # likewise (rad per time)
     border: float = 160.0  # price of the larger of what is beyond a border and a slip's bound (rad); of its square too
     terminal_speed: float = 0.0  # likewise of speed at the end above that from which the car can go on; 0: not bounded
@@ -93,6 +93,7 @@ class Settings:
     follows: Follows = "chosen"  # at a rate that the data choose, at a fixed one, or not at all; see disturbance
     evidence: bool = True
     travel: Travel = "middle"  # what carries the pose over a step
+    input_unit: float = 1.0  # change of the first input from no drive force to all of it: a fraction, or m/s
 
     @classmethod
     def of(
@@ -123,12 +124,20 @@ class Settings:
         slip = _slip(_FRONT_USED, th.B_f, th.C_f, th.E_f), _slip(_REAR_USED, th.B_r, th.C_r, th.E_r)
         lag_bound = _LAG_BOUND_WHEELBASES * scale.length
         follows: Follows = "always" if offset_free else "chosen" if evidence else "never"
-        return cls(scale, objective, steps, vehicle.sampling_time, half_width, slip, lag_bound, follows, evidence)
+        return cls(
+            scale, objective, steps, vehicle.sampling_time, half_width, slip, lag_bound, follows, evidence,
+            input_unit=vehicle.input_unit,
+        )  # fmt: skip
 
     @property
     def weights(self) -> Weights:
         """Those of the objective."""
         return WEIGHTS[self.objective]
+
+    @property
+    def rates(self) -> tuple[float, float]:
+        """Weights of the squared increments of both inputs, as they are (fraction or m/s, and rad)."""
+        return self.weights.throttle / self.input_unit**2, self.weights.steering
 
 
 def _slip(share: float, B: float, C: float, E: float) -> float:

@@ -218,7 +218,7 @@ def evaluate(
         if progress is not None:
             progress(done, len(models) * each_model)
 
-    regimes = driving_regimes(recording.rows(rows))
+    regimes = driving_regimes(recording.rows(rows), recording.info.set_point)
     time = (recording.time[rows + 1] - recording.time[0]) / 1e9
     lively = rows[liveliest(time, recording.states(rows + 1), max(_DRAWN_S, steps * recording.T_s))]
     drawn = lively[: len(lively) - steps + 1 : steps]  # rollouts one after the other

@@ -15,7 +15,9 @@ import numpy.typing as npt
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.metrics import rmse
 from dynssm_ros.signals.inputs import applied_inputs
+from dynssm_ros.vehicle.single_track import SetPoint
 
+COASTING_SPEED = 0.05  # speed error (m/s) that neither drives nor brakes to speak of: resistances take about as much
 COASTING = 0.02  # applied throttle (fraction) that neither drives nor brakes to speak of
 QUANTITIES = {"speed": "speed", "lateral_acceleration": "lateral acceleration", "throttle": "throttle"}
 """Quantities that define the regimes, with their titles."""
@@ -46,16 +48,19 @@ class Regime:
         return int(self.member.sum())
 
 
-def driving_regimes(rows: Vector) -> tuple[Regime, ...]:
+def driving_regimes(rows: Vector, set_point: SetPoint = "throttle") -> tuple[Regime, ...]:
     """The regimes that occur in ``rows``.
 
     Speed ``v_x`` and lateral acceleration ``|v_x omega|`` are divided at round numbers over their range; the applied
-    throttle tells braking, coasting (within 2 % of zero) and accelerating. Each of the model's input rows ``(N, 7)`` belongs
+    throttle tells braking, coasting (within 2 % of zero) and accelerating; of a speed set-point its distance from ``v_x``
+    does (within 5 cm/s). Each of the model's input rows ``(N, 7)`` belongs
     to one regime of every quantity; those of a quantity ascend.
     """
     v_x, omega = rows[:, 0], rows[:, 2]
-    throttle = np.asarray(applied_inputs(rows.T).r)
-    kinds = np.digitize(throttle, [-COASTING, np.nextafter(COASTING, 1.0)])
+    driving, coasting = np.asarray(applied_inputs(rows.T).r), COASTING
+    if set_point == "speed":
+        driving, coasting = driving - v_x, COASTING_SPEED
+    kinds = np.digitize(driving, [-coasting, np.nextafter(coasting, 1.0)])
     return (
         *_bins("speed", v_x, "m/s"),
         *_bins("lateral_acceleration", np.abs(v_x * omega), "m/s²"),

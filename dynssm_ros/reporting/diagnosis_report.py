@@ -245,8 +245,11 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
         "speed (m/s)": rows[0, at],
         "lateral acceleration (m/s²)": rows[0, at] * rows[2, at],
         "steering (rad)": rows[4, at] + rows[6, at],
-        "throttle (negative: brake)": rows[3, at] + rows[5, at],
     }
+    if diagnosis.recordings.recording.info.set_point == "throttle":
+        against["throttle (negative: brake)"] = rows[3, at] + rows[5, at]
+    else:
+        against["speed set-point less speed (m/s)"] = rows[3, at] + rows[5, at] - rows[0, at]
     if windows.data.on_one_lap:
         against["position on the lap (m)"] = windows.data.context["s"][at]
     for label, values in against.items():

@@ -14,6 +14,7 @@ _PANELS = {
     "$v_y$ (m/s)": ("v_y",),
     r"$\omega$ (rad/s)": ("omega",),
     "throttle, brake": ("throttle_feedback", "throttle_command", "brake_feedback", "brake_command"),
+    "speed set-point (m/s)": ("speed_feedback", "speed_command"),
     "steering": ("steering_feedback", "steering_command"),
 }
 

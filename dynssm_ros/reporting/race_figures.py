@@ -109,7 +109,8 @@ def stamp_period(races: Sequence[Race]) -> float:
 def profiles(races: Sequence[Race]) -> Figure:
     """State and commands over the position on the track."""
     rows = [(label(c), k, "state") for k, c in enumerate(STATE_SIGNALS)]
-    rows += [("throttle", 0, "command"), ("steering (rad)", 1, "command")]
+    throttle = all(race.course.vehicle.inputs.set_point == "throttle" for race in races)
+    rows += [("throttle" if throttle else "speed set-point (m/s)", 0, "command"), ("steering (rad)", 1, "command")]
     return _panels(races, [(name, [getattr(race, what)[:, k] for race in races]) for name, k, what in rows])
 
 

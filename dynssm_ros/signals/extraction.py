@@ -16,7 +16,7 @@ from dynssm_ros.signals.decoding import LOG_TIME, decoders, frames_told, header_
 from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
-from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, SignalMap
+from dynssm_ros.signals.signal_map import POSE_SIGNALS, SPEED_SIGNALS, STATE_SIGNALS, SignalMap
 from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, frames_note, log_time_note
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import Table
@@ -111,13 +111,15 @@ def pose_velocities(streams: Mapping[str, Stream], window: float, where: str) ->
 def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: float) -> dict[str, float]:
     """The signals that keep their last sample until the next, on a grid of ``period`` (ns), and how long they do (s).
 
-    Actuators that come more slowly than the rows would else look ahead of what a live node knows.
+    Actuators that come more slowly than the rows would else look ahead of what a live node knows. A set-point stays until
+    the next one.
     """
     held = {}
     for name, source in signal_map.active_signals().items():
         stamps = streams[name].stamps if name in streams else np.empty(0, np.int64)
         between = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-        usual = "zero" if between > SLOW * period and name not in (*STATE_SIGNALS, *POSE_SIGNALS) else "first"
+        slow = between > SLOW * period and name not in (*STATE_SIGNALS, *POSE_SIGNALS)
+        usual = "zero" if slow or name in SPEED_SIGNALS else "first"
         if (source.hold or usual) == "zero":
             held[name] = between / 1e9
     return held

@@ -14,8 +14,8 @@ from dynssm_ros.errors import BagError
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.contents import TopicContent, contents_of_bag, contents_of_table
 from dynssm_ros.signals.logs import open_log
-from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, REQUIRED_SIGNALS, SIGNALS, STATE_SIGNALS, TimeColumn
-from dynssm_ros.signals.suggestions import Suggestion, suggest
+from dynssm_ros.signals.signal_map import SIGNALS, STATE_SIGNALS, TimeColumn, command_signals, required_signals
+from dynssm_ros.signals.suggestions import Suggestion, set_point_of, suggest
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import Table
 
@@ -36,7 +36,8 @@ class Inspection:
     @property
     def missing(self) -> tuple[str, ...]:
         """Signals that every signal map needs and for which nothing was found."""
-        needed = REQUIRED_SIGNALS[len(STATE_SIGNALS) :] if self.poses_alone else REQUIRED_SIGNALS
+        required = required_signals(set_point_of(self.signals))
+        needed = required[len(STATE_SIGNALS) :] if self.poses_alone else required
         return tuple(name for name in needed if name not in self.signals)
 
     @property
@@ -46,7 +47,7 @@ class Inspection:
 
     def signal_map(self) -> str:
         """The suggested signal map as YAML; what is missing or uncertain stands there as a comment."""
-        commands = "topics" if set(COMMAND_SIGNALS) <= set(self.signals) else "none"
+        commands = "topics" if set(command_signals(set_point_of(self.signals))) <= set(self.signals) else "none"
         name = re.sub(r"\W+", "_", Path(self.name).stem) or "own"
         check, give = ("columns, units", "column") if self.time else ("fields", "topic, type and field")
         lines = [f"# Suggested by `dynssm inspect` from {self.name}. Check {check} and scales before you use it.",

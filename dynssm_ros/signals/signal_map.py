@@ -93,7 +93,7 @@ class Source(StrictModel):
     hold: Hold | None = Field(
         default=None,
         description="between samples: zero, the last one; first, a line to the next, which a live node does not know. null: "
-        "zero for actuators and commands that come more slowly than the rows of a recording, else first",
+        "zero for set-points, and for actuators and commands that come more slowly than the rows of a recording, else first",
     )
 
     @model_validator(mode="after")

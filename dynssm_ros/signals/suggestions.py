@@ -7,6 +7,7 @@ are seen.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,8 +16,9 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.columns import heading
 from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, pose_fields
 from dynssm_ros.signals.decoding import LOG_TIME
-from dynssm_ros.signals.signal_map import COMMAND_SIGNALS, STATE_SIGNALS, UNITS
+from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals
 from dynssm_ros.signals.stamps import clock_notes, frames_note, log_time_note
+from dynssm_ros.vehicle.single_track import SetPoint
 
 _MOTION = {
     "v_y": (r"(^|_)(v|vel|velocity|linear)_?(y|lat\w*)$|^v?_?lat\w*_(vel\w*|speed)$|^vlat|quergeschw",),
@@ -41,7 +43,10 @@ _WORDS = {
     "throttle": re.compile(r"throttle|accel\w*pedal|pedal_(?:output|position)|gas|duty|drossel", re.IGNORECASE),
     "brake": re.compile(r"brake|brems", re.IGNORECASE),
 }
-_COMMAND = re.compile(r"cmd|command|target|desired|setpoint|request", re.IGNORECASE)
+_COMMAND = re.compile(r"cmd|command|target|desired|set_?point|request|soll", re.IGNORECASE)
+_SPEED = re.compile(r"(^|[_\[])(speed|velocity|vel|v|(?:soll)?geschw\w*)($|[_\]])", re.IGNORECASE)
+_SET = re.compile(r"ackermann|(^|[\s_/\[])v_?set|position\[speed\]", re.IGNORECASE)
+_NO_SPEED = re.compile(r"steer|angular|ang_?vel|wheel|lat\w*_?vel|\.y$|\.z$|rate", re.IGNORECASE)
 _MEASURED = re.compile(r"report|feedback|measured|actual|angle|position|output|pressure", re.IGNORECASE)
 _OTHER = re.compile(
     r"rate|veloc|speed|torque|current|status|state|enable|fault|counter|temp|rolling|valid|overrid|timeout|limit|effort"
@@ -51,6 +56,7 @@ _OTHER = re.compile(
 _RADIANS, _SHARE = 1.6, 1.5  # larger values are no road-wheel angle in rad, and no throttle between -1 and 1
 _AGREES = 0.5  # correlation with the curvature, from which on a scale is told
 _UNIT = (0.6, 1.7)  # wheelbase times curvature per unit, for a signal that is the road-wheel angle in rad already
+_TURN = 0.1  # rad, of a heading that changes
 _FASTEST = 110.0  # m/s
 _MOST = {"omega": 15.0, "theta": 60.0}  # range in rad/s, and in rad, from which on degrees are likelier
 _DRIVING = 0.3  # of the largest speed, from which on curvature is compared
@@ -78,8 +84,9 @@ def suggest(
     """A source for each signal for which one is found; what to look at is added to ``notes``."""
     motion = _motion(topics, notes) if is_table else _odometry(topics, notes)
     used = {one.field for one in motion.values()} if is_table else set()
-    signals = motion | _actuators({name: one for name, one in topics.items() if name not in used})
-    if not set(COMMAND_SIGNALS) <= set(signals):  # of no use alone
+    others = {name: one for name, one in topics.items() if name not in used}
+    signals = motion | _with_set_point(_actuators(others), _speed_set_points(others), notes)
+    if not set(command_signals(set_point_of(signals))) <= set(signals):  # of no use alone
         signals = {name: source for name, source in signals.items() if not name.endswith("_command")}
     for name in ("steering_feedback", "steering_command"):
         if name in signals:
@@ -161,6 +168,15 @@ def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Su
     best = max(moving, key=lambda topic: topic.count)
     if len(moving) > 1:
         notes.append(f"several odometries move: {', '.join(topic.name for topic in moving)}; taken is {best.name}")
+    omega = best.values[TWIST["omega"]]
+    turning = [topic for topic in topics.values() if topic.msgtype in POSES and _moves(topic) and _turns(topic)]
+    if _spread(omega) == 0 and turning:
+        pose = max(turning, key=lambda topic: (topic is not best, topic.count))
+        notes.append(
+            f"{best.name}: omega is constant {float(omega[0]):g} while the car turns; velocities follow from the poses of "
+            f"{pose.name}"
+        )
+        return {signal: Suggestion(pose, path) for signal, path in pose_fields(pose.msgtype).items()}
     if _spread(best.values[TWIST["v_y"]]) == 0:
         notes.append(f"{best.name}: v_y is constant, so that nothing is known of how the car slides")
     fields = TWIST | pose_fields(ODOMETRY) if _moves(best) else TWIST
@@ -170,6 +186,10 @@ def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Su
 def _moves(topic: TopicContent) -> bool:
     fields = pose_fields(topic.msgtype)
     return any(_spread(topic.values[fields[name]]) > 0 for name in ("x", "y") if fields[name] in topic.values)
+
+
+def _turns(topic: TopicContent) -> bool:
+    return _spread(topic.values.get(pose_fields(topic.msgtype)["theta"], np.empty(0))) > _TURN
 
 
 def _actuators(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:
@@ -198,6 +218,49 @@ def _actuators(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:
             note = "no feedback found: the command is taken for it"
             found[f"{actuator}_feedback"] = replace(command, note=note)
     return found
+
+
+def _speed_set_points(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:
+    """The speed that a car is asked for: as it acts and, where there are two, as it is commanded."""
+    found: dict[str, list[Suggestion]] = {"feedback": [], "command": []}
+    for topic in topics.values():
+        for path in topic.values:
+            leaf, name = path.rsplit(".", 1)[-1], f"{topic.name} {path}"
+            is_speed = _SPEED.search(_plain(leaf)) or _SPEED.search(leaf)
+            asked = _SET.search(f"{topic.msgtype} {path}") or _COMMAND.search(name)
+            if is_speed and asked and not _NO_SPEED.search(path):
+                kind = "command" if _COMMAND.search(name) else "feedback"
+                found[kind].append(_with_unit(Suggestion(topic, path), "m/s"))
+    best = {
+        kind: max(some, key=lambda one: (_spread(one.values), one.topic.count)) for kind, some in found.items() if some
+    }
+    if "feedback" not in best and "command" in best:
+        return {"speed_feedback": best["command"]}
+    return {f"speed_{kind}": one for kind, one in best.items()}
+
+
+def _with_set_point(
+    found: dict[str, Suggestion], asked: dict[str, Suggestion], notes: list[str]
+) -> dict[str, Suggestion]:
+    """The actuators, with a speed set-point where no throttle is found."""
+    if not asked:
+        return found
+    one = asked["speed_feedback"]
+    where = one.field if one.field == one.topic.name else f"{one.topic.name}: {one.field}"
+    words = f"{where} is a set-point of the speed, no throttle"
+    if "throttle_feedback" in found:
+        notes.append(
+            f"{words}; for a vehicle with inputs.set_point: speed map it as speed_feedback, instead of the throttle"
+        )
+        return found
+    notes.append(f"{words}; take a vehicle with inputs.set_point: speed, such as f1tenth")
+    without = {name: each for name, each in found.items() if not name.startswith(("throttle", "brake"))}
+    return without | {name: replace(each, note="a set-point") for name, each in asked.items()}
+
+
+def set_point_of(signals: Iterable[str]) -> SetPoint:
+    """What the first input of these signals is."""
+    return "speed" if "speed_feedback" in set(signals) else "throttle"
 
 
 def _scaled(actuator: str, suggestion: Suggestion) -> Suggestion:

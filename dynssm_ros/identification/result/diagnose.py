@@ -369,7 +369,8 @@ def _check_signals(recording: Recording) -> list[str]:
         if np.ptp(recording[name]) == 0:
             raise RecordingError(f"{where}: {name} is constant at {recording[name][0]:g}; expected a measured channel")
     notes = []
-    for name, feedback, command in (("throttle", "r_fb", "r_cmd"), ("steering", "delta_fb", "delta_cmd")):
+    first = "throttle" if recording.info.set_point == "throttle" else "speed set-point"
+    for name, feedback, command in ((first, "r_fb", "r_cmd"), ("steering", "delta_fb", "delta_cmd")):
         if np.ptp(recording[feedback] + recording[command]) == 0:
             notes.append(f"{name} is constant: effects that need it to change cannot be judged")
     return notes
