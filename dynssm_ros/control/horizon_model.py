@@ -107,13 +107,14 @@ class HorizonModel:
     def _slip_angles(self, x: Any, p: Any, slowest: float) -> Any:
         import casadi as ca
 
-        car, at = self.car.under(ca), self._split(x, p, slowest)
-        state = car.true_state(at.state, at.effect_states)
+        car, at = self.car.under(ca), self._split(x, p)
+        moving = at.state._replace(v_x=at_least(at.state.v_x, slowest))
+        state = car.true_state(moving, at.effect_states)
         q = car.motion(state, at.applied, at.theta, at.effect_states, context=at.context, h=car.T_s)
         return ca.vertcat(q.alpha_f, q.alpha_r)
 
-    def _split(self, x: Any, p: Any, slowest: float) -> _Symbols:
-        """State and parameters as the equations take them, with at least ``slowest`` (m/s) of speed."""
+    def _split(self, x: Any, p: Any) -> _Symbols:
+        """State and parameters as the equations take them."""
         import casadi as ca
 
         x_pos, y_pos, heading, *moving = ca.vertsplit(x)
@@ -121,7 +122,7 @@ class HorizonModel:
         theta, correction, context = (list(islice(parameters, n)) for n in (len(COEFFICIENTS), 3, len(CONTEXT)))
         return _Symbols(
             Pose(x_pos, y_pos, heading),
-            State(at_least(moving[0], slowest), *moving[1:3]),
+            State(*moving[:3]),
             Applied(*moving[3:5]),
             dict(zip(self.car.effect_states, moving[5:], strict=True)),
             Coefficients(*theta),
@@ -132,7 +133,7 @@ class HorizonModel:
     def _following(self, x: Any, u: Any, p: Any) -> Any:
         import casadi as ca
 
-        car, at = self.car.under(ca), self._split(x, p, SLOWEST)  # standing still the slip angles have no derivative
+        car, at = self.car.under(ca), self._split(x, p)
         now, applied = at.state, Applied(at.applied.r + u[0], at.applied.delta + u[1])
         state, effect_states = car.step(now, applied, at.theta, at.effect_states, context=at.context)
         state = State(*(value + by for value, by in zip(state, at.correction, strict=True)))

@@ -134,14 +134,15 @@ class Recording:
         return hashlib.sha256(self.states(slice(row, row + _FINGERPRINT_ROWS)).tobytes()).hexdigest()[:8]
 
     def window_ends(self, H: int, horizon: int = 1, min_speed: float = -np.inf) -> Indices:
-        """Rows ``t`` such that rows ``t-H+1 .. t+horizon`` lie in one segment and nowhere below ``min_speed``.
+        """Rows ``t`` such that rows ``t-H+1 .. t+horizon`` lie in one segment, nowhere slower than ``min_speed`` (m/s),
+        forwards or backwards.
 
         Windows are formed from these by indexing; no ``(N, H, 7)`` array is ever stored.
         """
         rows = np.arange(H - 1, len(self) - horizon)
         if len(rows) == 0:
             return rows
-        slow = np.concatenate([[0], np.cumsum(self.columns["v_x"] < min_speed)])
+        slow = np.concatenate([[0], np.cumsum(np.abs(self.columns["v_x"]) < min_speed)])
         first, last = rows - H + 1, rows + horizon
         usable = (self.segment[first] == self.segment[last]) & (slow[last + 1] == slow[first])
         return np.asarray(rows[usable])

@@ -142,6 +142,7 @@ class CarModel:
             F_z0=car.F_z0,
             load_transfer=car.load_transfer,
             set_point=self.set_point,
+            reverse=car.reverse,
             effect_states=dict(effect_states or {}),
             context=context or {},
             h=h,

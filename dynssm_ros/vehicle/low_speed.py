@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from dynssm_ros.vehicle.single_track import Array, Coefficients, Motion, StageEffect, settling_rate
+from dynssm_ros.vehicle.single_track import Array, Coefficients, Motion, StageEffect, rolling, settling_rate
 
 if TYPE_CHECKING:
     from dynssm_ros.vehicle.parameters import Vehicle
 
 
 class LowSpeedRolling(StageEffect):
-    """Takes the place of the tyres at low speed: the wheels roll without slip, and never backwards.
+    """Takes the place of the tyres at low speed: the wheels roll without slip, forwards or backwards.
 
     The tyres' response quickens as the car slows down. Below the speed at which it is as quick as the integrator's steps
-    forward Euler rings; and the resistance of the nominal model would push a standing car back.
+    forward Euler rings.
 
     Args:
         vehicle: the car.
@@ -27,17 +27,13 @@ class LowSpeedRolling(StageEffect):
         """Speed up to which the wheels roll (m/s)."""
 
     def accelerations(self, xp: Any, q: Motion) -> None:
-        """Sets the rates of the state such that it rolls within one step."""
-        omega = q.v_x * xp.tan(q.delta) / (q.l_f + q.l_r)
+        """Sets the rates of the state such that it rolls within one step, and comes to rest before it turns back."""
         rest = -q.v_x / self._step
-        rolling = (
-            _where(q.a_x > rest, q.a_x, rest),
-            (q.l_r * omega - q.v_y) / self._step,
-            (omega - q.omega) / self._step,
-        )
-        slow = q.v_x <= self.speed
+        a_x = _where((q.a_x - rest) * q.v_x < 0, rest, q.a_x)
+        slow = abs(q.v_x) <= self.speed
+        rates = (a_x, *rolling(xp, q, self._step))
         q.a_x, q.a_y, q.omega_dot = (
-            _where(slow, *pair) for pair in zip(rolling, (q.a_x, q.a_y, q.omega_dot), strict=True)
+            _where(slow, *pair) for pair in zip(rates, (q.a_x, q.a_y, q.omega_dot), strict=True)
         )
 
 

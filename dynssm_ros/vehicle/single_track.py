@@ -88,6 +88,11 @@ class VehicleConstants(StrictModel):
     h_cg: float = Field(ge=0, description="height of the centre of gravity (m)")
     F_z0: float = Field(gt=0, description="nominal axle load (N) at which D and S_v hold")
     load_transfer: bool = Field(description="scale lateral forces with the axle loads")
+    reverse: bool = Field(
+        default=False,
+        description="a negative throttle drives the car backwards once it stands, as speed controllers of model cars do; "
+        "false: it only brakes",
+    )
 
 
 @dataclass
@@ -109,6 +114,9 @@ class Motion:
     F_z0: Array
     load_transfer: bool
     set_point: SetPoint = "throttle"
+    reverse: bool = False
+    # direction of travel, from -1 (backwards) through 0 (standing) to 1
+    direction: Array = 1.0
     # slip angles (rad), force of drive and brakes, what resistances leave of it, axle loads, lateral tyre forces (N)
     alpha_f: Array = 0.0
     alpha_r: Array = 0.0
@@ -202,19 +210,49 @@ def inputs(xp: Any, q: Motion) -> None:
     """The measured state and the applied inputs, as they are."""
 
 
+def standing_speed(wheelbase: Array) -> Array:
+    """Speed (m/s) below which a car of that ``wheelbase`` (m) passes over to standing: 0.1 for 1:43, 0.7 for a race car.
+
+    Its Froude number ``v^2 / (g L)`` is 1/64 there. At full lock it corners with less than a hundredth of g, so that its
+    tyres hardly slip.
+    """
+    return (GRAVITY * wheelbase) ** 0.5 / 8
+
+
 def slip(xp: Any, q: Motion) -> None:
-    """Slip angles with their shifts, Eq. (4) and (5); arctan2 keeps them defined at standstill."""
-    q.alpha_f = q.delta - xp.arctan2(q.l_f * q.omega + q.v_y, abs(q.v_x)) + q.theta.S_hf
-    q.alpha_r = xp.arctan2(q.l_r * q.omega - q.v_y, abs(q.v_x)) + q.theta.S_hr
+    """Slip angles with their shifts, Eq. (4) and (5), by the direction of travel.
+
+    A car that reverses is one that steers at its rear and drives forwards, seen from behind. So steering and shifts, which
+    are angles of the wheels, change their sign; the part of the axle's own motion does not. Below the standing speed the
+    direction passes over smoothly (cubic), and the speed that divides stays above 3/8 of the standing one.
+    """
+    standing = standing_speed(q.l_f + q.l_r)
+    speed = abs(q.v_x)
+    slow = speed < standing
+    top = speed + slow * (standing - speed)
+    share = q.v_x / top  # from -1 to 1
+    square = share * share
+    q.direction = share * (3 - square) / 2
+    rolled = top + standing * (square * (6 - square) - 5) / 8
+    q.alpha_f = q.direction * q.delta - xp.arctan2(q.l_f * q.omega + q.v_y, rolled) + q.direction * q.theta.S_hf
+    q.alpha_r = xp.arctan2(q.l_r * q.omega - q.v_y, rolled) + q.direction * q.theta.S_hr
 
 
 def drive(xp: Any, q: Motion) -> None:
-    """Longitudinal force of the rear axle with rolling resistance and drag, Eq. (6)."""
+    """Longitudinal force of the rear axle with rolling resistance and drag, Eq. (6), against the direction of travel.
+
+    Brakes act against it too: the negative throttle of a car that has no ``reverse``. A car that stands is held by the
+    resistance until the drive overcomes it.
+    """
+    C_r0, standing = q.theta.C_r0, 1 - q.direction * q.direction
+    speed = q.direction * q.v_x  # as smooth as the direction
     if q.set_point == "speed":
         q.F_d = speed_controller_force(q.theta, q.r - q.v_x)
     else:
-        q.F_d = (q.theta.C_m1 - q.theta.C_m2 * q.v_x) * q.r
-    q.F_rx = q.F_d - q.theta.C_r0 - q.theta.C_r2 * q.v_x * q.v_x
+        r = q.r if q.reverse else q.r + (q.direction - 1) * (q.r - abs(q.r)) / 2
+        q.F_d = (q.theta.C_m1 - q.theta.C_m2 * speed) * r
+    held = (abs(q.F_d + C_r0) - abs(q.F_d - C_r0)) / 2  # the drive, as far as the resistance reaches
+    q.F_rx = q.F_d - (q.direction * C_r0 + standing * held) - q.theta.C_r2 * q.v_x * speed
 
 
 def speed_controller_force(th: Coefficients, error: Array) -> Array:
@@ -251,18 +289,31 @@ def tyres(xp: Any, q: Motion) -> None:
 
 
 def forces(xp: Any, q: Motion) -> None:
-    """Sums the tyre forces in the body frame, the numerators of Eq. (1) to (3)."""
-    q.F_x = q.F_rx - q.F_fy * xp.sin(q.delta)
+    """Sums the tyre forces in the body frame, the numerators of Eq. (1) to (3). Rolling wheels do not hold the car back."""
+    q.F_x = q.F_rx - q.direction * q.direction * q.F_fy * xp.sin(q.delta)
     across = q.F_fy * xp.cos(q.delta)
     q.F_y = q.F_ry + across
     q.M_z = q.l_f * across - q.l_r * q.F_ry
 
 
 def accelerations(xp: Any, q: Motion) -> None:
-    """Newton and Euler in the rotating body frame, Eq. (1) to (3)."""
+    """Newton and Euler in the rotating body frame, Eq. (1) to (3); towards standstill the wheels roll without slip.
+
+    There the tyres respond within any step: forward Euler would ring, and a car that stands would slide.
+    """
     q.a_x = q.F_x / q.m + q.v_y * q.omega
-    q.a_y = q.F_y / q.m - q.v_x * q.omega
-    q.omega_dot = q.M_z / q.theta.I_z
+    a_y = q.F_y / q.m - q.v_x * q.omega
+    omega_dot = q.M_z / q.theta.I_z
+    sliding = q.direction * q.direction
+    rolling_a_y, rolling_omega_dot = rolling(xp, q, q.h)
+    q.a_y = sliding * a_y + (1 - sliding) * rolling_a_y
+    q.omega_dot = sliding * omega_dot + (1 - sliding) * rolling_omega_dot
+
+
+def rolling(xp: Any, q: Motion, h: float) -> tuple[Array, Array]:
+    """Rates of ``v_y`` and ``omega`` with which the wheels roll without slip after ``h`` seconds, forwards or backwards."""
+    omega = q.v_x * xp.tan(q.delta) / (q.l_f + q.l_r)
+    return (q.l_r * omega - q.v_y) / h, (omega - q.omega) / h
 
 
 def lateral_force(xp: Any, alpha: Array, *, B: Array, C: Array, D: Array, E: Array, S_v: Array) -> Array:

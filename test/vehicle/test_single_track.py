@@ -245,14 +245,6 @@ def test_the_default_step_is_one_forward_euler_step(vehicle: Vehicle) -> None:
     np.testing.assert_array_equal(following, state + 0.02 * np.stack([q.a_x, q.a_y, q.omega_dot]))
 
 
-def test_slip_is_defined_at_standstill_and_in_reverse(vehicle: Vehicle) -> None:
-    q = CarModel(vehicle.constants, 0.04).motion(
-        State(np.array([0.0, -1.0]), 0.0, 0.0), Applied(0.0, 0.1), without_shifts(vehicle)
-    )
-    assert np.isfinite([q.a_x, q.a_y, q.omega_dot]).all()
-    np.testing.assert_allclose(q.alpha_f, 0.1)
-
-
 def test_memory_and_context_are_not_changed_by_motion(vehicle: Vehicle) -> None:
     effect_states, context = {"own": 1.0}, {"time": 2.0}
     q = CarModel(vehicle.constants, 0.04).motion(

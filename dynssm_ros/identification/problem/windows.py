@@ -115,7 +115,7 @@ class SimulationWindows:
         """The same in Euler steps of the sampling time, or in Runge-Kutta steps that are short for :func:`settling_rate`."""
         if integrator == "euler":
             return replace(self, integrator=integrator, substeps=1)
-        slow = max(float(np.quantile(self.data.rows[0, self.starts], 0.05)), 0.1)
+        slow = max(float(np.quantile(np.abs(self.data.rows[0, self.starts]), 0.05)), 0.1)
         rate = settling_rate(Coefficients(*vehicle.nominal), vehicle.constants) / slow
         count = int(np.clip(np.ceil(self.data.T_s * rate / tuning.STEP_LIMIT), 1, tuning.MAX_SUBSTEPS))
         return replace(self, integrator=integrator, substeps=count)

@@ -130,7 +130,7 @@ def _signals(windows: SimulationWindows) -> dict[str, Vector]:
         "steering": delta + delta_cmd,
         "steering speed": change[4],
         "throttle": r + r_cmd,
-        "sideslip": v_y / np.maximum(v_x, 0.1),
+        "sideslip": v_y / np.maximum(np.abs(v_x), 0.1),
         "time": windows.time,
     }
 

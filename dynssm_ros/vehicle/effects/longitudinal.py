@@ -25,7 +25,7 @@ class Drag(Effect):
     coefficient: Array = 0.0
 
     def drive(self, xp: Any, q: Motion) -> None:
-        q.F_rx = q.F_rx - self.coefficient * q.v_x * q.v_x
+        q.F_rx = q.F_rx - self.coefficient * q.v_x * abs(q.v_x)
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class RollingResistance(Effect):
     coefficient: Array = 0.0
 
     def drive(self, xp: Any, q: Motion) -> None:
-        q.F_rx = q.F_rx - self.coefficient * q.m * GRAVITY
+        q.F_rx = q.F_rx - q.direction * self.coefficient * q.m * GRAVITY
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class PowerLimit(Effect):
     inverse_speed: Array = 0.0
 
     def drive(self, xp: Any, q: Motion) -> None:
-        asked = at_least(q.F_d, 0.0) * self.inverse_speed * q.v_x / q.theta.C_m1  # of all the power
+        asked = at_least(q.F_d * q.direction, 0.0) * self.inverse_speed * abs(q.v_x) / q.theta.C_m1  # of all the power
         missing = q.F_d * (1.0 - (1.0 + asked**_SHARP) ** (-1.0 / _SHARP))
         q.F_rx = q.F_rx - missing
         q.F_d = q.F_d - missing
