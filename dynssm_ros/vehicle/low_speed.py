@@ -29,7 +29,8 @@ class LowSpeedRolling(StageEffect):
     def accelerations(self, xp: Any, q: Motion) -> None:
         """Sets the rates of the state such that it rolls within one step, and comes to rest before it turns back."""
         rest = -q.v_x / self._step
-        a_x = _where((q.a_x - rest) * q.v_x < 0, rest, q.a_x)
+        turns = (q.a_x < rest) * (q.v_x > 0) + (q.a_x > rest) * (q.v_x < 0)
+        a_x = _where(turns, rest, q.a_x)
         slow = abs(q.v_x) <= self.speed
         rates = (a_x, *rolling(xp, q, self._step))
         q.a_x, q.a_y, q.omega_dot = (

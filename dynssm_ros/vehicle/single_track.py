@@ -246,12 +246,15 @@ def drive(xp: Any, q: Motion) -> None:
     """
     C_r0, standing = q.theta.C_r0, 1 - q.direction * q.direction
     speed = q.direction * q.v_x  # as smooth as the direction
+    gain = q.theta.C_m1 - q.theta.C_m2 * speed
     if q.set_point == "speed":
-        q.F_d = speed_controller_force(q.theta, q.r - q.v_x)
+        q.F_d = drives = speed_controller_force(q.theta, q.r - q.v_x)
+    elif q.reverse:
+        q.F_d = drives = gain * q.r
     else:
-        r = q.r if q.reverse else q.r + (q.direction - 1) * (q.r - abs(q.r)) / 2
-        q.F_d = (q.theta.C_m1 - q.theta.C_m2 * speed) * r
-    held = (abs(q.F_d + C_r0) - abs(q.F_d - C_r0)) / 2  # the drive, as far as the resistance reaches
+        drives = gain * (q.r + abs(q.r)) / 2
+        q.F_d = drives + q.direction * (gain * (q.r - abs(q.r)) / 2)
+    held = (abs(drives + C_r0) - abs(drives - C_r0)) / 2  # of the drive, as far as the resistance reaches
     q.F_rx = q.F_d - (q.direction * C_r0 + standing * held) - q.theta.C_r2 * q.v_x * speed
 
 
