@@ -210,7 +210,7 @@ class PredictorNode(ManagedNode):
     def _observe(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int], frames: Frames | None) -> None:
         """Takes a message into the history."""
         stamp, _ = self._arrived(decoder, message, times)
-        refusal = self._predictor.observe(stamp, decoder.decode(message), frames)
+        refusal = self._predictor.observe(stamp, decoder.decode(message, stamp), frames)
         if refusal is not None:
             self._health.refused(refusal)
 
@@ -218,7 +218,7 @@ class PredictorNode(ManagedNode):
         if waited(times) > self._predictor.model.T_s:  # the instant that it would predict has passed
             message, times = self._newest(decoder, message, times)
         stamp, arrived = self._arrived(decoder, message, times)
-        outcome = self._predictor.predict(stamp, decoder.decode(message), frames_of(message))
+        outcome = self._predictor.predict(stamp, decoder.decode(message, stamp), frames_of(message))
         if not isinstance(outcome, Prediction):
             self._health.refused(outcome)
             return

@@ -52,7 +52,7 @@ def replay(bag: Bag, predictor: Predictor, progress: Callable[[int, int], None] 
         message = bag.decode(topic, raw)
         stamp = header_stamp_ns(message)
         stamp = log_time if stamp is None else stamp
-        values = by_topic[topic].decode(message)
+        values = by_topic[topic].decode(message, stamp)
         if topic == predictor.signal_map.odometry_topic:
             frames = frames_of(message)
             yield Replayed(log_time, stamp, predictor.predict(stamp, values, frames), frames or ("", ""))

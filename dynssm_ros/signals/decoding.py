@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dynssm_ros.errors import BagError, ConfigurationError
+from dynssm_ros.signals.estimation import MEASURED, LiveEstimation
 from dynssm_ros.signals.signal_map import Accessor, SignalMap, Source, compile_field
 from dynssm_ros.signals.velocities import LiveVelocities
 
@@ -54,8 +55,10 @@ class TopicDecoder:
         """Names of the signals that this topic carries."""
         return tuple(reading.signal for reading in self._readings)
 
-    def decode(self, message: Any) -> dict[str, float]:
+    def decode(self, message: Any, stamp: int | None = None) -> dict[str, float]:
         """The signals present in ``message`` in SI units; a joint that it does not name is left out.
+
+        ``stamp`` (ns) is when it was measured, for decoders that follow the motion; of the header if not given.
 
         Raises:
             BagError: the message type has no such field, or the field is not a number.
@@ -85,15 +88,36 @@ class _PoseDecoder(TopicDecoder):
         super().__init__(topic, msgtype, signal_map)
         self._velocities = LiveVelocities(window)
 
-    def decode(self, message: Any) -> dict[str, float]:
+    def decode(self, message: Any, stamp: int | None = None) -> dict[str, float]:
         """As :class:`TopicDecoder`, with ``v_x``, ``v_y`` and ``omega`` as soon as there are poses enough."""
-        values, stamp = super().decode(message), header_stamp_ns(message)
+        values, stamp = super().decode(message), header_stamp_ns(message) if stamp is None else stamp
         return values if stamp is None else values | self._velocities.add(stamp, values)
 
 
+class _SensorDecoder(TopicDecoder):
+    """Gives what the motion is estimated from to the estimation; its result comes with the topic of ``omega``."""
+
+    def __init__(self, topic: str, msgtype: str, signal_map: SignalMap, estimation: LiveEstimation) -> None:
+        super().__init__(topic, msgtype, signal_map)
+        self._estimation = estimation
+        self._tells = topic == signal_map.odometry_topic
+
+    def decode(self, message: Any, stamp: int | None = None) -> dict[str, float]:
+        """As :class:`TopicDecoder`, with what is estimated instead of what it is estimated from."""
+        values, stamp = super().decode(message), header_stamp_ns(message) if stamp is None else stamp
+        rest = {name: value for name, value in values.items() if name not in MEASURED}
+        if stamp is None:
+            return rest
+        self._estimation.add(stamp, values)
+        return rest | self._estimation.at(stamp) if self._tells else rest
+
+
 def live_decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
-    """As :func:`decoders`, with velocities from the poses so far where the map has none."""
+    """As :func:`decoders`, with velocities from poses or sensors so far where the map has none."""
     found = decoders(signal_map)
+    if signal_map.estimation is not None:
+        estimation = LiveEstimation(signal_map)
+        return {topic: _SensorDecoder(topic, one.msgtype, signal_map, estimation) for topic, one in found.items()}
     if signal_map.velocities is not None:
         topic = signal_map.odometry_topic
         found[topic] = _PoseDecoder(topic, found[topic].msgtype, signal_map, signal_map.velocities.window)

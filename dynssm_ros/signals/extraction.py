@@ -13,10 +13,11 @@ from dynssm_ros.errors import BagError, RecordingError
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.bags import Bag
 from dynssm_ros.signals.decoding import LOG_TIME, decoders, frames_told, header_stamp_ns, stamped_by, to_si
+from dynssm_ros.signals.estimation import MEASURED, estimated, noise_notes
 from dynssm_ros.signals.logs import open_log
-from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
+from dynssm_ros.signals.recording import V_Y_DEVIATION, Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
-from dynssm_ros.signals.signal_map import POSE_SIGNALS, SPEED_SIGNALS, STATE_SIGNALS, SignalMap
+from dynssm_ros.signals.signal_map import POSE_SIGNALS, SENSORS, SPEED_SIGNALS, STATE_SIGNALS, SignalMap
 from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, frames_note, log_time_note
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import Table
@@ -62,6 +63,10 @@ def _extract(
     if signal_map.velocities is not None:
         streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
         notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")
+    deviations: dict[str, float] = {}
+    if signal_map.estimation is not None:
+        streams, deviations, told = estimated_velocities(streams, signal_map, str(path))
+        notes += told
     held = held_signals(signal_map, streams, 1e9 / rate)
     info = RecordingInfo(
         sampling_time=1 / rate,
@@ -72,6 +77,7 @@ def _extract(
         held=tuple(held),
         held_periods=held,
         stamped=stamped,
+        standard_deviations=deviations,
         notes=tuple(notes),
     )
     return resample(streams, rate, signal_map.max_gap, signal_map.commands, info)
@@ -106,6 +112,48 @@ def pose_velocities(streams: Mapping[str, Stream], window: float, where: str) ->
     if not len(rows):
         raise RecordingError(f"{where}: {len(stamps)} poses; expected more in a row, for windows of {window:g} s")
     return {name: Stream(stamps[rows], values) for name, values in zip(STATE_SIGNALS, found.T, strict=True)}
+
+
+def estimated_velocities(
+    streams: Mapping[str, Stream], signal_map: SignalMap, where: str
+) -> tuple[dict[str, Stream], dict[str, float], list[str]]:
+    """Streams with estimated velocities, and a pose by fixes, instead of those that they are estimated from.
+
+    Returns:
+        The streams, the standard deviation of each velocity (root mean square), and notes.
+
+    Raises:
+        RecordingError: ``omega`` and ``v_x`` are nowhere known together.
+    """
+    settings = signal_map.estimation
+    assert settings is not None
+    samples = {name: (one.stamps, one.values) for name, one in streams.items()}
+    found = estimated(samples, settings, signal_map.max_gap_ns, where=where)
+    kept = {name: one for name, one in streams.items() if name not in (*STATE_SIGNALS, *SENSORS)}
+    kept |= {name: Stream(found.stamps, one) for name, one in zip(STATE_SIGNALS, found.states.T, strict=True)}
+    kept[V_Y_DEVIATION] = Stream(found.stamps, found.deviations[:, 1])
+    used = [name for name in MEASURED if name in streams]
+    typical, most = np.quantile(found.deviations[:, 1], [0.5, 0.95])
+    notes = [
+        f"v_x, v_y, omega: estimated from {', '.join(used)}; standard deviation of v_y {typical:.2g} m/s, 95 % below "
+        f"{most:.2g}",
+        *noise_notes(samples, settings),
+    ]
+    known = np.isfinite(found.poses).all(axis=1)
+    if "theta" not in streams and known.any():
+        kept |= {
+            name: Stream(found.stamps[known], one[known]) for name, one in zip(POSE_SIGNALS, found.poses.T, strict=True)
+        }
+        if found.origin is not None:
+            origin = ", ".join(f"{angle:.7f}" for angle in found.origin)
+            notes.append(
+                f"x, y: east and north of latitude, longitude {origin} (estimation.origin shares it between logs)"
+            )
+    elif "theta" not in streams and ("x" in streams or "latitude" in streams):
+        kept = {name: one for name, one in kept.items() if name not in POSE_SIGNALS}
+        notes.append("x, y, theta: left out, as the positions never tell the heading")
+    squares = np.sqrt((found.deviations**2).mean(axis=0)).tolist()
+    return kept, dict(zip(STATE_SIGNALS, squares, strict=True)), notes
 
 
 def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: float) -> dict[str, float]:

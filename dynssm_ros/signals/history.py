@@ -14,7 +14,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.inputs import model_inputs
-from dynssm_ros.signals.signal_map import ROUNDING, STATE_SIGNALS, SignalMap
+from dynssm_ros.signals.signal_map import ROUNDING, SENSORS, STATE_SIGNALS, SignalMap
 
 
 class Refusal(Enum):
@@ -136,12 +136,12 @@ class History:
         max_age: float = 0.2,
         held: Collection[str] = (),
     ) -> None:
-        velocities = STATE_SIGNALS if signal_map.velocities else ()
-        self.names = (*velocities, *signal_map.active_signals())
+        inputs = [name for name in signal_map.active_signals() if name not in (*STATE_SIGNALS, *SENSORS)]
+        self.names = (*STATE_SIGNALS, *inputs)
         self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
         self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
         sources = signal_map.signals
-        self._delays = {name: sources[name].delay * 1e9 if name in sources else 0.0 for name in self._buffers}
+        self._delays = {name: sources[name].delay * 1e9 if name in inputs else 0.0 for name in self._buffers}
         self._max_gap = float(signal_map.max_gap_ns)
         self._max_age = max_age * 1e9
         self._jump = float(signal_map.jump_ns)

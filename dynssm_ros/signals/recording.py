@@ -28,6 +28,7 @@ from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, Commands
 from dynssm_ros.vehicle.single_track import SetPoint
 
 METADATA_KEY = b"dynssm"
+V_Y_DEVIATION = "v_y_std"
 _ARROW_SCHEMA = b"ARROW:schema"
 """Under which pyarrow keeps names and metadata a second time."""
 _UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError)  # names that are no text, or those of several columns
@@ -37,7 +38,7 @@ _MOST_ROWS = 50_000_000  # five days at 100 Hz
 _OFF_GRID = 0.01  # of T_s that rows may be off their grid
 COLUMN_UNITS = {
     "v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "r_fb": "1", "delta_fb": "rad", "r_cmd": "1", "delta_cmd": "rad",
-    "x": "m", "y": "m", "theta": "rad",
+    "x": "m", "y": "m", "theta": "rad", "v_y_std": "m/s",
 }  # fmt: skip
 
 
@@ -66,6 +67,9 @@ class RecordingInfo(StrictModel):
     interpolated: dict[str, float] = Field(
         default_factory=dict, description="share of the rows that lie between slower samples, by signal"
     )
+    standard_deviations: dict[str, float] = Field(
+        default_factory=dict, description="of estimated velocities, root mean square over the rows (m/s, rad/s)"
+    )
     notes: tuple[str, ...] = Field(default=(), description="what was recovered, dropped or bridged")
 
 
@@ -77,7 +81,8 @@ class Recording:
         info: sampling time, source and history.
         time: header-stamp time of each row (int64 ns), shape ``(N,)``; uniform inside a segment.
         segment: number of the gap-free stretch a row belongs to, non-decreasing, shape ``(N,)``.
-        columns: ``WINDOW_COLUMNS`` and, where known, the pose ``x y theta`` (m, m, rad unwrapped), each ``(N,)``.
+        columns: ``WINDOW_COLUMNS`` and, where known, the pose ``x y theta`` (m, m, rad unwrapped) and the
+            standard deviation ``v_y_std`` of an estimated ``v_y`` (m/s), each ``(N,)``.
     """
 
     info: RecordingInfo
@@ -387,6 +392,7 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
             "held": tuple(dict.fromkeys(name for r in recordings for name in r.info.held)),
             "held_periods": _largest([info.held_periods for info in infos]),
             "interpolated": _largest([info.interpolated for info in infos]),
+            "standard_deviations": _largest([info.standard_deviations for info in infos]),
             "stamped": {name: by for info in infos for name, by in info.stamped.items()},
         }
     )

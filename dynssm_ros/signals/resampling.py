@@ -11,7 +11,7 @@ import numpy.typing as npt
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.signals.inputs import lookahead_commands, model_inputs
-from dynssm_ros.signals.recording import Recording, RecordingInfo
+from dynssm_ros.signals.recording import V_Y_DEVIATION, Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, ROUNDING, STATE_SIGNALS, Commands, Hold
 
 Stamps = npt.NDArray[np.int64]
@@ -107,7 +107,7 @@ def resample(
     sampled = {name: values[rows] for name, values in sampled.items()}
     inputs = model_inputs(sampled)
     columns = {name: sampled[name] for name in STATE_SIGNALS} | inputs._asdict()
-    columns |= {name: sampled[name] for name in POSE_SIGNALS if name in sampled}
+    columns |= {name: sampled[name] for name in (*POSE_SIGNALS, V_Y_DEVIATION) if name in sampled}
     if commands == "lookahead":
         columns["r_cmd"] = lookahead_commands(inputs.r_fb, segment)
         columns["delta_cmd"] = lookahead_commands(inputs.delta_fb, segment)

@@ -17,6 +17,7 @@ from pydantic import Field, field_validator, model_validator
 
 from dynssm_ros import configuration
 from dynssm_ros.configuration import StrictModel
+from dynssm_ros.signals.motion_filter import Estimation
 from dynssm_ros.vehicle.single_track import SetPoint
 
 Commands = Literal["topics", "lookahead", "none"]
@@ -30,7 +31,17 @@ _OF_THROTTLE = ("throttle_feedback", "throttle_command", "brake_feedback", "brak
 STANDARD_MAPS: dict[SetPoint, str] = {"throttle": "default", "speed": "default_speed"}
 """Shipped maps of the package's own topics."""
 SPEED_SIGNALS = ("speed_feedback", "speed_command")
-SIGNALS = (*REQUIRED_SIGNALS, *POSE_SIGNALS, *COMMAND_SIGNALS, "brake_feedback", "brake_command", *SPEED_SIGNALS)
+SENSORS = ("a_x", "a_y", "latitude", "longitude", "v_east", "v_north")
+"""From which velocities are estimated; no columns of a recording."""
+SIGNALS = (
+    *REQUIRED_SIGNALS,
+    *POSE_SIGNALS,
+    *COMMAND_SIGNALS,
+    "brake_feedback",
+    "brake_command",
+    *SPEED_SIGNALS,
+    *SENSORS,
+)
 
 Hold = Literal["zero", "first"]
 """What a signal is between two samples: the last one, or on a line to the next."""
@@ -158,7 +169,19 @@ class SignalMap(StrictModel):
     velocities: Velocities | None = Field(
         default=None, description="for cars whose pose alone is measured; null: v_x, v_y and omega are signals"
     )
+    estimation: Estimation | None = Field(
+        default=None, description="for cars whose v_y is not measured; given where a_y is a signal and v_y is not"
+    )
     signals: dict[str, Source]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _that_estimates(cls, content: Any) -> Any:
+        """A map of an accelerometer that leaves out ``v_y`` means that it is estimated."""
+        if not isinstance(content, dict) or not isinstance(content.get("signals"), dict):
+            return content
+        means = "a_y" in content["signals"] and "v_y" not in content["signals"] and not content.get("velocities")
+        return content | {"estimation": content.get("estimation") or {}} if means else content
 
     @model_validator(mode="before")
     @classmethod
@@ -178,6 +201,8 @@ class SignalMap(StrictModel):
             raise ValueError("signals: some are columns of a table, others fields of topics; expected either")
         if self.set_point == "speed" and (other := [name for name in self.signals if name in _OF_THROTTLE]):
             raise ValueError(f"signals.{other[0]}: the input is a speed set-point; expected either speed or throttle")
+        if self.estimation is not None:
+            self._can_estimate()
         needed = self.required + (self.command_signals if self.commands == "topics" else ())
         if self.velocities is not None:
             double = [name for name in STATE_SIGNALS if name in self.signals]
@@ -186,10 +211,13 @@ class SignalMap(StrictModel):
             if len({self.signals[name].topic for name in POSE_SIGNALS if name in self.signals}) > 1:
                 raise ValueError("velocities: x, y and theta come from several topics; expected one")
             needed = (*POSE_SIGNALS, *needed[len(STATE_SIGNALS) :])
+        elif self.estimation is not None:
+            needed = tuple(name for name in needed if name != "v_y")
         missing = [name for name in needed if name not in self.signals]
         if missing:
-            raise ValueError(f"signals: missing {', '.join(missing)} (commands: {self.commands})")
-        for name in (*STATE_SIGNALS, *POSE_SIGNALS):
+            hint = "; map a_y or write `estimation: {}` to have v_y estimated" if missing == ["v_y"] else ""
+            raise ValueError(f"signals: missing {', '.join(missing)} (commands: {self.commands}){hint}")
+        for name in POSE_SIGNALS if self.estimation is not None else (*STATE_SIGNALS, *POSE_SIGNALS):
             if name in self.signals and self.signals[name].delay:
                 raise ValueError(f"signals.{name}.delay: late odometry is the controller's `delay`; expected none")
         types: dict[str, str] = {}
@@ -197,6 +225,18 @@ class SignalMap(StrictModel):
             if types.setdefault(source.recorded, source.type) != source.type:
                 raise ValueError(f"signals: topic {source.topic} is given two types")
         return self
+
+    def _can_estimate(self) -> None:
+        """Checks what only maps that estimate have."""
+        if self.velocities is not None or "v_y" in self.signals:
+            other = "velocities" if self.velocities is not None else "signals.v_y"
+            raise ValueError(f"estimation: v_y comes from {other}; expected either")
+        for one, other in (("latitude", "longitude"), ("v_east", "v_north"), ("x", "y")):
+            pair = [self.signals[name] for name in (one, other) if name in self.signals]
+            if len(pair) == 1 or len({source.topic for source in pair}) > 1:
+                raise ValueError(f"signals: {one} and {other} come alone or apart; expected both from one topic")
+        if "latitude" in self.signals and "x" in self.signals:
+            raise ValueError("signals.latitude: the position is x and y already; expected either")
 
     @property
     def set_point(self) -> SetPoint:
@@ -220,7 +260,12 @@ class SignalMap(StrictModel):
 
     @property
     def odometry_topic(self) -> str:
-        """The topic whose messages trigger predictions and anchor the time grid: that of ``v_x``, or of the pose."""
+        """The topic whose messages trigger predictions and anchor the time grid: that of ``v_x``, or of the pose.
+
+        Where velocities are estimated it is that of ``omega``.
+        """
+        if self.estimation is not None:
+            return self.signals["omega"].recorded
         return self.signals["v_x" if self.velocities is None else "x"].recorded
 
     @property
@@ -245,8 +290,9 @@ class SignalMap(StrictModel):
         return configuration.validate(SignalMap, content, f"signal map {self.name}")
 
     def active_signals(self) -> dict[str, Source]:
-        """The signals that are read: command topics only where ``commands: topics``."""
-        skipped = () if self.commands == "topics" else (*self.command_signals, "brake_command")
+        """The signals that are read: commands only where ``commands: topics``, sensors where velocities are estimated."""
+        skipped: tuple[str, ...] = () if self.commands == "topics" else (*self.command_signals, "brake_command")
+        skipped += () if self.estimation is not None else SENSORS
         return {name: source for name, source in self.signals.items() if name not in skipped}
 
 

@@ -70,6 +70,7 @@ def test_the_signals_of_a_bag_come_out_as_they_went_in(make_bag: Any, drive: Any
         "held_periods": {},
         "stamped": dict.fromkeys(DEFAULT.signals, "header"),
         "interpolated": {},
+        "standard_deviations": {},
         "notes": (),
     }
     t = seconds(recording)
