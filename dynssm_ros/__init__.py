@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from dynssm_ros.api.inputs import load_model
     from dynssm_ros.api.inspect import inspect
     from dynssm_ros.api.learn import learn
+    from dynssm_ros.api.new_vehicle import new_vehicle
     from dynssm_ros.api.race import race
     from dynssm_ros.api.replay import replay
     from dynssm_ros.api.season import extract_season, review_season
@@ -59,6 +60,7 @@ __all__ = [
     "learn",
     "load_model",
     "load_vehicle",
+    "new_vehicle",
     "race",
     "recorded",
     "register_effect",

@@ -29,7 +29,7 @@ EXAMPLES = {
     if test.examples
 }
 COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
-COMMAND_OF = {"review_season": "season", "extract_season": "extract"}
+COMMAND_OF = {"new_vehicle": "vehicle", "review_season": "season", "extract_season": "extract"}
 SCHEMAS: dict[str, type[VerbSettings]] = {
     name: getattr(importlib.import_module(function.__module__), function.__wrapped__.__annotations__["settings"])
     for name, function in ((name, getattr(api, name)) for name in api.__all__)

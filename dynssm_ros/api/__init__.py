@@ -14,6 +14,7 @@ from dynssm_ros.api.extract import extract
 from dynssm_ros.api.inputs import load_model
 from dynssm_ros.api.inspect import inspect
 from dynssm_ros.api.learn import learn
+from dynssm_ros.api.new_vehicle import new_vehicle
 from dynssm_ros.api.race import race
 from dynssm_ros.api.replay import replay
 from dynssm_ros.api.season import extract_season, review_season
@@ -30,6 +31,7 @@ __all__ = [
     "inspect",
     "learn",
     "load_model",
+    "new_vehicle",
     "race",
     "recorded",
     "replay",

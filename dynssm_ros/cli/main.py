@@ -28,6 +28,7 @@ from dynssm_ros.cli.season import season
 from dynssm_ros.cli.simulate import simulate
 from dynssm_ros.cli.sweep import sweep
 from dynssm_ros.cli.train import train
+from dynssm_ros.cli.vehicle import vehicle
 from dynssm_ros.errors import DataWarning, UserError
 from dynssm_ros.extras import load_plugins
 from dynssm_ros.files import protecting, require_no_input
@@ -42,12 +43,26 @@ app = typer.Typer(
 # click's base of all usage errors, wherever typer keeps its click
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 
-for command in (learn, inspect, simulate, extract, calibrate, train, sweep, evaluate, replay, diagnose, season, race):
+for command in (
+    learn,
+    inspect,
+    vehicle,
+    simulate,
+    extract,
+    calibrate,
+    train,
+    sweep,
+    evaluate,
+    replay,
+    diagnose,
+    season,
+    race,
+):
     app.command()(command)
 
 
 _OUTPUTS = ("--out", "--bag", "--json", "--online-state")
-_NAMES = ("--vehicle", "--signals", "--track", "--line", "--car")
+_NAMES = ("--vehicle", "--like", "--signals", "--track", "--line", "--car")
 """Options that take a file or a name; a folder that is called like a name is not read."""
 _M_MMAP_THRESHOLD, _LARGE = -3, 1_000_000  # an option of mallopt(3), and from how many bytes on an array is large
 
