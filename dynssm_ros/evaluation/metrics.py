@@ -80,7 +80,7 @@ def drive_through(
         of them, if nothing learns.
     """
     layer, H = model.online, model.H
-    if layer is None or len(ends := recording.window_ends(H, 0, layer.minimum_speed)) == 0:
+    if layer is None or len(ends := recording.window_ends(H, 0, layer.minimum_speed, layer.least)) == 0:
         yield None, list(asked)
         return
     along, judge = Along(layer), PathJudge(layer, partial(seen_by, model))

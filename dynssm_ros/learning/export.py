@@ -112,6 +112,7 @@ def save_artifact(
             integrator=integrator,
             substeps=substeps,
             normalisation=trained.normalisation,
+            slowest=_slowest(trained),
             covariance=tuple(value**2 for value in trained.validation_rmse),
             online=None if trained.online is None else trained.online.card,
             parameters=sum(p.numel() for p in model.parameters()),
@@ -235,6 +236,12 @@ def load_torch(artifact: Artifact) -> TrainableModel:
         reason = " ".join(str(error).split())
         raise ArtifactError(f"{artifact.weights}: not the weights of the model of {CARD} ({reason})") from error
     return model.eval()
+
+
+def _slowest(trained: Trained) -> float:
+    """Least ``v_x`` (m/s) of the windows that it was trained and validated on."""
+    ends = trained.recording.window_ends(trained.H, min_speed=trained.vehicle.minimum_speed)
+    return float(trained.recording["v_x"][ends].min())
 
 
 def _sample_windows(trained: Trained, count: int = 256) -> Tensor:

@@ -29,6 +29,7 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle.integrators import Integrator
 from dynssm_ros.vehicle.parameters import Vehicle
+from dynssm_ros.vehicle.single_track import standing_speed
 
 FORMAT_VERSION = 1
 CARD, WEIGHTS, ONNX, METRICS = "model.yaml", "weights.safetensors", "model.onnx", "metrics.json"
@@ -75,6 +76,9 @@ class ModelCard(StrictModel):
     integrator: Integrator = "euler"
     substeps: int = Field(default=1, ge=1)
     normalisation: Normalisation
+    slowest: float | None = Field(
+        default=None, description="least v_x that it was trained on (m/s), negative backwards; null: not noted"
+    )
     covariance: tuple[Variance, Variance, Variance] = Field(description="one-step error variances on validation data")
     online: OnlineLayerCard | None = Field(default=None, description="the online layer, if it has one")
     parameters: int = Field(ge=0, description="weights that training finds")
@@ -94,6 +98,13 @@ class ModelCard(StrictModel):
         if set(self.checksums) != set(self.files):
             raise ValueError(f"checksums {sorted(self.checksums)} are not those of {', '.join(self.files)}")
         return self
+
+    @property
+    def least(self) -> float:
+        """``v_x`` (m/s) below which nothing that was learned speaks: a car that stands or reverses, unless trained on."""
+        constants = self.vehicle.constants
+        stands = float(standing_speed(constants.l_f + constants.l_r))
+        return stands if self.slowest is None else min(self.slowest, stands)
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -145,6 +156,7 @@ class Artifact:
             vehicle=card.vehicle,
             integrator=card.integrator,
             substeps=card.substeps,
+            least=card.least,
         )
 
 

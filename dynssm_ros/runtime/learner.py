@@ -21,7 +21,8 @@ Recut = Callable[[], Vector | None]
 class OnlineLearner:
     """The online layer of a model along a drive: what it has learned, and whether its paths are believed.
 
-    Rows slower than the minimum speed teach nothing.
+    Rows at which the layer does not act teach nothing: slower than the minimum speed, or standing and backwards unless
+    that was trained on.
 
     Args:
         model: predicts the windows.
@@ -113,8 +114,8 @@ class OnlineLearner:
         return seen_by(self.model, windows)
 
     def _is_fast(self, window: Vector) -> bool:
-        """Whether the car was as fast as the layer's minimum speed throughout; not if that is not known."""
-        return bool(window[:, 0].min() >= self.layer.minimum_speed)
+        """Whether the layer acts throughout."""
+        return bool(self.layer.acts(window[:, 0]).all())
 
     def _completed(self, row: _Row, now: Vector, recut: Recut | None) -> _Row:
         """``row`` with its inputs as they are known now, ``now`` ``(7,)`` being about the same row."""

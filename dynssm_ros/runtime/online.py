@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import replacing
@@ -111,6 +111,7 @@ class OnlineLayer:
         vehicle: the calibrated car. Below its minimum speed the layer neither learns nor corrects.
         integrator: of the physics.
         substeps: integration steps per sampling time.
+        least: ``v_x`` (m/s) below which it does neither: standing or backwards, unless it was trained on that.
     """
 
     card: OnlineLayerCard
@@ -124,6 +125,11 @@ class OnlineLayer:
     vehicle: Vehicle
     integrator: Integrator = "euler"
     substeps: int = 1
+    least: float = -math.inf
+
+    def acts(self, v_x: Vector) -> Mask:
+        """Whether it learns and corrects at speeds ``v_x`` (m/s); not where that is not known."""
+        return (np.abs(v_x) >= self.minimum_speed) & (v_x >= self.least)
 
     @property
     def T_s(self) -> float:
@@ -350,6 +356,7 @@ def load_layer(
     vehicle: Vehicle,
     integrator: Integrator,
     substeps: int,
+    least: float = -math.inf,
 ) -> OnlineLayer:
     """The layer in ``data``, which :func:`save_layer` wrote to ``path``.
 
@@ -359,7 +366,9 @@ def load_layer(
     n = len(card.features)
     shapes = dict.fromkeys(_PRIOR, (CHANNELS,)) | {"mean": (CHANNELS, n), "covariance": (CHANNELS, n, n)}
     prior, _ = _parsed(data, path, "online layer", shapes)
-    return OnlineLayer(card, **prior, scale=scale, vehicle=vehicle, integrator=integrator, substeps=substeps)
+    return OnlineLayer(
+        card, **prior, scale=scale, vehicle=vehicle, integrator=integrator, substeps=substeps, least=least
+    )
 
 
 def _parsed(

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from dynssm_ros.arrays import Vector
+from dynssm_ros.arrays import Mask, Vector
 from dynssm_ros.runtime.artifact import ONLINE, Artifact, ModelCard
+from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.contract import WindowPrediction
 from dynssm_ros.runtime.graph import Graph
 from dynssm_ros.runtime.online import Seen
@@ -39,6 +40,8 @@ class OnnxModel:
         self.online = artifact.online_layer()
         self.prior = card.checksums.get(ONLINE, "")
         """Names the prior of its online layer, for what was learned from it; empty without one."""
+        self._physics = SingleTrack(card.vehicle, card.integrator, card.substeps)
+        self._scale = np.array(card.normalisation.increment_scale)
         self._open()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -64,11 +67,15 @@ class OnnxModel:
         )
 
     def predict(self, windows: Vector) -> WindowPrediction:
-        """Runs the graph on ``windows``; without variances of its own it has those of the validation data."""
+        """Runs the graph on ``windows``; without variances of its own it has those of the validation data.
+
+        A car that stands or reverses, unless that was trained on, is the physics' alone. That is not validated: the
+        variance is at least that of an increment.
+        """
         by_name = self._graph.run(windows)
         now, theta, physics = windows[:, -1, :3], by_name.get("theta"), by_name.get("physics")
         variance = by_name.get("variance")
-        return WindowPrediction(
+        said = WindowPrediction(
             now + by_name["increment"],
             None if theta is None else theta.astype(np.float64),
             None if physics is None else now + physics,
@@ -77,3 +84,15 @@ class OnnxModel:
             if self.online is None
             else Seen(by_name["features"].astype(np.float64), by_name["nominal_physics"].astype(np.float64)),
         )
+        alone = windows[:, -1, 0] < self.card.least
+        return self._with_physics(said, windows, alone) if alone.any() else said
+
+    def _with_physics(self, said: WindowPrediction, windows: Vector, alone: Mask) -> WindowPrediction:
+        """What was said, and what the nominal physics says of the windows ``alone``."""
+        nominal = self._physics.predict(windows[alone])
+        for part, own in zip(said[:3], nominal[:3], strict=True):
+            if part is not None:
+                part[alone] = own
+        assert said.variance is not None
+        said.variance[alone] = np.maximum(said.variance[alone], self._scale**2)
+        return said

@@ -23,6 +23,7 @@ from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENTS, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.limits import vehicle_limits
+from dynssm_ros.vehicle.single_track import standing_speed
 
 _BEYOND = 1.5  # times a limit
 _SPIN = 3.0  # times the yaw rate of the tightest corner at the limit
@@ -37,6 +38,9 @@ _COMMANDED = {
 _NAME = 60  # characters of a frame's name that are told
 _SINGLE = 1e-6  # rounding of what a graph computes
 _FARTHEST = 1e8  # m; coordinates of the whole earth are below
+_BACKWARDS = 5  # rows over which a car that reverses is seen to speed up: noise is less
+_FEWEST_BACKWARDS = 15  # such rows that are told
+_PUSHES = 0.05  # throttle, below which the road pushes as much
 _ACTUATOR_RANGE_S = 0.01  # an actuator that crosses its range faster than this, does not
 
 
@@ -99,8 +103,29 @@ def implausible_rows(recording: Recording, vehicle: Vehicle) -> Iterator[str]:
                 f"{_place(recording, row)}: {name} = {values[row]:.4g}; expected {limit.low:.4g} to {limit.high:.4g} of "
                 f"vehicle {vehicle.name} ({len(beyond)} such rows)"
             )
+    if (words := _driven_backwards(recording, vehicle)) is not None:
+        yield words
     if recording.has_pose:
         yield from _inconsistent_rows(recording, vehicle)
+
+
+def _driven_backwards(recording: Recording, vehicle: Vehicle) -> str | None:
+    """Whether the throttle drives the car backwards otherwise than its vehicle file has it."""
+    constants = vehicle.constants
+    v_x, r = recording["v_x"], recording["r_fb"]
+    if vehicle.inputs.set_point == "speed":
+        return None
+    ahead = np.append(v_x[_BACKWARDS:], np.full(min(_BACKWARDS, len(v_x)), np.inf))
+    faster = (v_x < -standing_speed(constants.l_f + constants.l_r)) & (ahead < v_x)
+    faster &= (r > _PUSHES) | ((r < -_PUSHES) & (not constants.reverse))
+    if faster.sum() < _FEWEST_BACKWARDS:
+        return None
+    row = int(np.argmax(faster))
+    sign = "positive" if r[faster].mean() > 0 else "negative"
+    return (
+        f"{_place(recording, row)}: speeds up backwards under a {sign} throttle; expected a negative one, and reverse: "
+        f"true in the constants of vehicle {vehicle.name} ({int(faster.sum())} such rows)"
+    )
 
 
 def _inconsistent_rows(recording: Recording, vehicle: Vehicle) -> Iterator[str]:

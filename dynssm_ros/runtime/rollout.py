@@ -51,9 +51,10 @@ class RolloutCorrection:
         assert prediction.seen is not None
         layer, now = self.layer, windows[:, -1, :3]
         increments = self.increments(prediction.seen)
-        fast = (now[:, :1] >= layer.minimum_speed) | (layer.minimum_speed == 0.0)
-        state = np.where(fast, now + increments, prediction.state)
+        state = np.where(layer.acts(now[:, :1]), now + increments, prediction.state)
         variance = self.learned.variance * layer.scale**2
+        if prediction.variance is not None:
+            variance = np.where(now[:, :1] >= layer.least, variance, prediction.variance)
         return prediction._replace(state=state, variance=variance, theta=self.learned.theta)
 
     def believed(self, trusted: bool) -> RolloutCorrection:

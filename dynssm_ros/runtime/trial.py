@@ -99,7 +99,7 @@ def judge(model: OnnxModel, present: ModelCard, rows: Vector) -> bool:
         len(rows) >= model.H
     ) else np.empty((0, model.H, len(WINDOW_COLUMNS)))  # fmt: skip
     measured, windows = rows[model.H :, :3], windows[:-1]
-    fast = windows[:, :, 0].min(axis=1, initial=np.inf) >= present.vehicle.minimum_speed
+    fast = np.abs(windows[:, :, 0]).min(axis=1, initial=np.inf) >= present.vehicle.minimum_speed
     compared = int(fast.sum()) >= _FEWEST
     if not compared:
         windows = _steady_windows(model)

@@ -138,16 +138,17 @@ class Recording:
     def _fingerprint(self, row: int) -> str:
         return hashlib.sha256(self.states(slice(row, row + _FINGERPRINT_ROWS)).tobytes()).hexdigest()[:8]
 
-    def window_ends(self, H: int, horizon: int = 1, min_speed: float = -np.inf) -> Indices:
+    def window_ends(self, H: int, horizon: int = 1, min_speed: float = -np.inf, least: float = -np.inf) -> Indices:
         """Rows ``t`` such that rows ``t-H+1 .. t+horizon`` lie in one segment, nowhere slower than ``min_speed`` (m/s),
-        forwards or backwards.
+        forwards or backwards, and nowhere with a ``v_x`` below ``least`` (m/s).
 
         Windows are formed from these by indexing; no ``(N, H, 7)`` array is ever stored.
         """
         rows = np.arange(H - 1, len(self) - horizon)
         if len(rows) == 0:
             return rows
-        slow = np.concatenate([[0], np.cumsum(np.abs(self.columns["v_x"]) < min_speed)])
+        v_x = self.columns["v_x"]
+        slow = np.concatenate([[0], np.cumsum((np.abs(v_x) < min_speed) | (v_x < least))])
         first, last = rows - H + 1, rows + horizon
         usable = (self.segment[first] == self.segment[last]) & (slow[last + 1] == slow[first])
         return np.asarray(rows[usable])
