@@ -17,6 +17,7 @@ from dynssm_ros.signals.estimation import MEASURED, estimated, noise_notes
 from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import V_Y_DEVIATION, Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
+from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, SENSORS, SPEED_SIGNALS, STATE_SIGNALS, SignalMap
 from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, frames_note, log_time_note
 from dynssm_ros.signals.table_clock import clock_of
@@ -59,7 +60,8 @@ def _extract(
     with open_log(path) as log:
         signal_map, lack = _with_commands_of(log, signal_map)
         streams, stamped, notes = read_streams(log, signal_map, drop_bad, progress)
-    notes = [*([note] if note else []), *notes, *lack]
+    streams, rests = _with_brakes_at_rest(streams, signal_map)
+    notes = [*([note] if note else []), *notes, *lack, *rests]
     if signal_map.velocities is not None:
         streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
         notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")
@@ -81,6 +83,20 @@ def _extract(
         notes=tuple(notes),
     )
     return resample(streams, rate, signal_map.max_gap, signal_map.commands, info)
+
+
+def _with_brakes_at_rest(streams: dict[str, Stream], signal_map: SignalMap) -> tuple[dict[str, Stream], list[str]]:
+    """The streams with brakes that are 0 while nobody brakes, and what the map has to say for a live node to do so."""
+    found, notes = dict(streams), []
+    for name in ("brake_feedback", "brake_command"):
+        limit = rest_value(streams[name].values) if name in streams else 0.0
+        if limit > 0:
+            found[name] = Stream(streams[name].stamps, streams[name].values - limit)
+            notes.append(
+                f"{name}: up to {limit:.4g} nobody brakes, and the throttle would not count; taken off (for the live node "
+                f"write offset: {signal_map.signals[name].offset - limit:.4g} in the signal map)"
+            )
+    return found, notes
 
 
 def _with_commands_of(log: Bag | Table, signal_map: SignalMap) -> tuple[SignalMap, list[str]]:

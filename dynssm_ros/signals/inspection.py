@@ -38,12 +38,17 @@ class Inspection:
         """Signals that every signal map needs and for which nothing was found."""
         required = required_signals(set_point_of(self.signals))
         needed = required[len(STATE_SIGNALS) :] if self.poses_alone else required
-        return tuple(name for name in needed if name not in self.signals)
+        return tuple(name for name in needed if name not in self.signals and (name != "v_y" or not self.estimates))
 
     @property
     def poses_alone(self) -> bool:
         """Whether velocities have to follow from poses."""
         return "v_x" not in self.signals and "x" in self.signals
+
+    @property
+    def estimates(self) -> bool:
+        """Whether ``v_y`` has to be estimated."""
+        return {"v_x", "omega"} <= set(self.signals) and "v_y" not in self.signals and not self.time
 
     def signal_map(self) -> str:
         """The suggested signal map as YAML; what is missing or uncertain stands there as a comment."""
@@ -53,6 +58,7 @@ class Inspection:
         lines = [f"# Suggested by `dynssm inspect` from {self.name}. Check {check} and scales before you use it.",
                  f"name: {name}", f"commands: {commands}", "max_gap: 0.25", "signals:"]  # fmt: skip
         lines[-1:-1] = [f"velocities: {{window: {_WINDOW}}}"] if self.poses_alone else []
+        lines[-1:-1] = ["estimation: {rear_axle: 0.0}  # m from the centre of gravity"] if self.estimates else []
         lines[-1:-1] = [f"time: {_flow(self.time.model_dump(exclude_none=True))}"] if self.time else []
         lines += [f"  # {each}: nothing found; give its {give}" for each in self.missing]
         for signal in SIGNALS:
@@ -65,6 +71,8 @@ class Inspection:
                 source["unit"] = found.unit
             if found.scale != 1.0:
                 source["scale"] = float(f"{found.scale:.4g}")
+            if found.offset:
+                source["offset"] = float(f"{found.offset:.4g}")
             lines += [f"  # {found.note}"] if found.note else []
             lines.append(f"  {signal}: {_flow(source)}")
         return "\n".join(lines) + "\n"

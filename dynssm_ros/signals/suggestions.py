@@ -16,6 +16,8 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.columns import heading
 from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, pose_fields
 from dynssm_ros.signals.decoding import LOG_TIME
+from dynssm_ros.signals.rest_value import rest_value
+from dynssm_ros.signals.sensor_topics import sensors
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals
 from dynssm_ros.signals.stamps import clock_notes, frames_note, log_time_note
 from dynssm_ros.vehicle.single_track import SetPoint
@@ -71,11 +73,12 @@ class Suggestion:
     scale: float = 1.0
     note: str = ""
     unit: str = "1"
+    offset: float = 0.0
 
     @property
     def values(self) -> Vector:
         """The signal at the topic's samples, shape ``(N,)``."""
-        return self.scale * UNITS[self.unit] * self.topic.values[self.field]
+        return self.scale * UNITS[self.unit] * self.topic.values[self.field] + self.offset
 
 
 def suggest(
@@ -157,6 +160,13 @@ def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Su
     moving = [topic for topic in odometries if _spread(topic.values[TWIST["v_x"]]) > 0]
     if not moving:
         poses = [topic for topic in topics.values() if topic.msgtype in POSES and _moves(topic)]
+        if not poses and (found := sensors(topics)):
+            lack = "" if "a_y" in found else "; it has no accelerometer, and v_y is that of a steady turn"
+            notes.append(
+                f"nothing measures v_y; it is estimated from {', '.join(found)} (estimation: give rear_axle, m from the "
+                f"centre of gravity){lack}"
+            )
+            return {signal: Suggestion(*place) for signal, place in found.items()}
         if not poses:
             notes.append(
                 "nothing tells where the car is or how fast; find a topic with v_x, v_y and omega, or with poses"
@@ -212,7 +222,8 @@ def _actuators(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:
                 ranked[kind].append((rank, _with_unit(Suggestion(topic, path), quantity)))
         for kind, candidates in ranked.items():
             if candidates:
-                found[f"{actuator}_{kind}"] = _scaled(actuator, max(candidates, key=lambda pair: pair[0])[1])
+                best = _scaled(actuator, max(candidates, key=lambda pair: pair[0])[1])
+                found[f"{actuator}_{kind}"] = _at_rest(best) if actuator == "brake" else best
         if f"{actuator}_feedback" not in found and f"{actuator}_command" in found and actuator != "brake":
             command = found[f"{actuator}_command"]
             note = "no feedback found: the command is taken for it"
@@ -273,6 +284,13 @@ def _scaled(actuator: str, suggestion: Suggestion) -> Suggestion:
         return replace(suggestion, scale=0.01, note="taken for percent")
     note = f"up to {largest:.4g} in the log, which is taken for full {actuator}"
     return replace(suggestion, scale=1.0 / largest, note=note)
+
+
+def _at_rest(brake: Suggestion) -> Suggestion:
+    """The brake without what its sensor shows while nobody brakes."""
+    limit = rest_value(brake.values)
+    note = f"up to {limit:.4g} nobody brakes: offset"
+    return replace(brake, offset=-limit, note=f"{brake.note}; {note}" if brake.note else note) if limit else brake
 
 
 def _scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], wheelbase: float | None) -> Suggestion:

@@ -1,0 +1,66 @@
+"""Gyro, accelerometers, wheel speeds and GNSS fixes among the topics of a log: what velocities are estimated from."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.signals.contents import TopicContent
+
+IMU, FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
+_OF_IMU = {"omega": "angular_velocity.z", "a_x": "linear_acceleration.x", "a_y": "linear_acceleration.y"}
+_OF_FIX = {"latitude": "latitude", "longitude": "longitude"}
+_SPEED = re.compile(r"wheel\w*speed|speed\w*wheel|vehicle_?speed|(^|[/._])(speed|velocity|linear\.x)$", re.IGNORECASE)
+_NO_SPEED = re.compile(
+    r"cmd|command|target|desired|set_?point|drive\.|motor|engine|rpm|angular|limit|covariance|wind|steer|gps|gnss",
+    re.IGNORECASE,
+)
+_WHEEL = re.compile(r"wheel|rear|front|left|right", re.IGNORECASE)
+
+Place = tuple[TopicContent, str]
+"""A topic and a field of it."""
+
+
+def sensors(topics: Mapping[str, TopicContent]) -> dict[str, Place]:
+    """Where ``v_x``, ``omega``, ``a_x``, ``a_y``, ``latitude`` and ``longitude`` may come from, as far as they change.
+
+    Nothing without both ``v_x`` and ``omega``.
+    """
+    found: dict[str, Place] = {}
+    for msgtype, fields in ((IMU, _OF_IMU), (FIX, _OF_FIX)):
+        fitting = [
+            one for one in topics.values() if one.msgtype == msgtype and _changes(one, next(iter(fields.values())))
+        ]
+        if fitting:
+            best = max(fitting, key=lambda one: one.count)
+            found |= {signal: (best, field) for signal, field in fields.items() if _changes(best, field)}
+    speeds = [
+        (one, field)
+        for one in topics.values()
+        for field in one.values
+        if one.msgtype not in (IMU, FIX) and _is_speed(one, field) and _changes(one, field)
+    ]
+    if speeds:
+        found["v_x"] = max(
+            speeds, key=lambda place: (bool(_WHEEL.search(f"{place[0].name}.{place[1]}")), place[0].count)
+        )
+    if "latitude" not in found or "longitude" not in found:
+        found = {name: place for name, place in found.items() if name not in _OF_FIX}
+    return found if {"v_x", "omega"} <= set(found) else {}
+
+
+def _is_speed(topic: TopicContent, field: str) -> bool:
+    name = f"{topic.name}.{field}"
+    named = (
+        _SPEED.search(field) or _SPEED.search(topic.name) or (_WHEEL.search(field) and "speed" in topic.name.lower())
+    )
+    return bool(named) and not _NO_SPEED.search(name) and not field.endswith((".y", ".z"))
+
+
+def _changes(topic: TopicContent, field: str) -> bool:
+    values: Vector = topic.values.get(field, np.empty(0))
+    known = values[np.isfinite(values)]
+    return len(known) > 1 and float(np.ptp(known)) > 0

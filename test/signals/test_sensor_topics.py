@@ -1,0 +1,71 @@
+"""What a car without odometry has, IMU, wheel speed and GNSS, is suggested for the estimator, and nothing else is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from dynssm_ros.signals import messages
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.inspection import inspect
+from dynssm_ros.signals.signal_map import load_signal_map
+
+START = 1_700_000_000_000_000_000
+
+
+def records(
+    typestore: Any, *, speed: str = "/wheel_speed", fixes: bool = True, accelerations: bool = True
+) -> list[Any]:
+    """20 s of a car that turns and accelerates."""
+    types, found = typestore.types, []
+    vector, nine = types["geometry_msgs/msg/Vector3"], np.zeros(9)
+    turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+    status = types["sensor_msgs/msg/NavSatStatus"](status=0, service=1)
+    for k in range(1000):
+        stamp, t = START + k * 20_000_000, k / 50
+        v_x, omega = 15 + 4 * np.sin(t / 3), 0.5 * np.sin(t)
+        head = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9), "imu")
+        forces = vector(x=4 / 3 * np.cos(t / 3), y=v_x * omega, z=9.8) if accelerations else vector(x=0.0, y=0.0, z=0.0)
+        imu = types["sensor_msgs/msg/Imu"](head, turn, nine, vector(x=0.0, y=0.0, z=omega), nine, forces, nine)
+        found.append(("/imu/data", "sensor_msgs/msg/Imu", stamp, imu))
+        found.append((speed, "std_msgs/msg/Float64", stamp, types["std_msgs/msg/Float64"](v_x)))
+        inputs = messages.joint_state(stamp, {"throttle": 0.5 * np.sin(t), "steering": 0.1 * np.sin(t)})
+        found.append((messages.FEEDBACK_TOPIC, messages.JOINT_STATE, stamp, inputs))
+        if fixes and k % 5 == 0:
+            fix = types["sensor_msgs/msg/NavSatFix"](head, status, 48.0 + 1e-4 * t, 11.0 + 1e-4 * t, 0.0, nine, 0)
+            found.append(("/gps/fix", "sensor_msgs/msg/NavSatFix", stamp, fix))
+    return found
+
+
+def test_the_estimator_is_suggested_and_the_map_extracts(make_bag: Any, typestore: Any, tmp_path: Path) -> None:
+    bag = make_bag(records(typestore))
+    found = inspect(bag)
+    assert found.missing == ()
+    fields = {name: (one.topic.name, one.field) for name, one in found.signals.items()}
+    assert fields["v_x"] == ("/wheel_speed", "data")
+    assert fields["omega"] == ("/imu/data", "angular_velocity.z")
+    assert fields["a_y"] == ("/imu/data", "linear_acceleration.y")
+    assert fields["latitude"] == ("/gps/fix", "latitude")
+    assert "v_y" not in fields
+    assert any(note.startswith("nothing measures v_y; it is estimated from") for note in found.notes)
+    (tmp_path / "map.yaml").write_text(found.signal_map(), encoding="utf-8")
+    assert yaml.safe_load(found.signal_map())["estimation"] == {"rear_axle": 0.0}
+    recording = extract([bag], load_signal_map(tmp_path / "map.yaml"), 50.0)
+    assert recording.has_pose
+    assert "v_y_std" in recording.columns
+
+
+def test_without_accelerometers_and_fixes_v_y_is_that_of_a_steady_turn(make_bag: Any, typestore: Any) -> None:
+    found = inspect(make_bag(records(typestore, fixes=False, accelerations=False, speed="/can/vehicle_speed")))
+    assert set(found.signals) == {"v_x", "omega", "throttle_feedback", "steering_feedback"}
+    assert any("it has no accelerometer" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("speed", ["/motor/speed", "/wind_speed", "/cmd/speed"])
+def test_other_speeds_are_not_taken(make_bag: Any, typestore: Any, speed: str) -> None:
+    found = inspect(make_bag(records(typestore, speed=speed)))
+    assert "v_x" not in found.signals
