@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +37,7 @@ Samples = tuple[int, dict[str, float]]
 
 MEASURED = ("v_x", "omega", *SENSORS, *POSE_SIGNALS)
 """Signals that the filter takes."""
+_BLOCK, _AHEAD = 30_000, 10_000  # moments that are smoothed at once, of 3 kB, and that they look ahead: 20 s or more
 _KEPT_NS = 1_000_000_000  # how late a sample may come
 _AXIS, _FLATTENING = 6_378_137.0, 1 / 298.257223563  # m, 1; WGS 84
 _MEDIAN_OF_NORMAL = 0.6745  # of absolute values, in standard deviations
@@ -97,20 +99,10 @@ def estimated(
     plane = _plane(used, settings)
     found: list[tuple[Stamps, Vector, Vector]] = []
     for stretch in _stretches(_merged(used), max_gap):
-        moments = list(_forward(motion, stretch, plane))
-        at = [k for k, (moment, (_, values)) in enumerate(zip(moments, stretch, strict=True))
-              if moment.is_ready and "omega" in values]  # fmt: skip
-        if not at:
-            continue
-        if both_sides:
-            x, P = smoothed(moments)
-        else:
-            x, P = np.stack([one.x for one in moments]), np.stack([one.P for one in moments])
-        turns, has_pose = (np.array([each(moments[k]) for k in at]) for each in (_turn, _has_pose))
-        states = np.stack([x[at, V_X], x[at, V_Y], turns - x[at, GYRO_BIAS]], axis=1)
-        variances = np.diagonal(P, axis1=1, axis2=2)[at]
-        poses = np.where(has_pose[:, None], x[at][:, [X, Y, THETA]], np.nan)
-        found.append((np.array([moments[k].stamp for k in at]), np.hstack([states, poses]), variances))
+        for block in _blocks(_forward(motion, stretch, plane), both_sides):
+            at = [k for k, one in enumerate(block.moments) if one.is_ready and one.has_turn]
+            if at:
+                found.append(_columns(block, at))
     if not found:
         raise RecordingError(f"{where}: no velocities: omega and v_x are nowhere known together")
     stamps, columns, variances = (np.concatenate(parts) for parts in zip(*found, strict=True))
@@ -119,12 +111,42 @@ def estimated(
     return Estimated(stamps, columns[:, :3], np.sqrt(known), columns[:, 3:], plane.origin if plane else None)
 
 
-def _turn(moment: Moment) -> float:
-    return moment.inputs[2]
+class _Block(NamedTuple):
+    """Moments in a row with states ``(N, 9)`` and covariances ``(N, 9, 9)``."""
+
+    moments: list[Moment]
+    x: Vector
+    P: Vector
 
 
-def _has_pose(moment: Moment) -> bool:
-    return moment.has_pose
+def _blocks(moments: Iterator[Moment], both_sides: bool) -> Iterator[_Block]:
+    """The moments so many at a time, each smoothed by itself and at least so many that follow, which bounds memory."""
+    held: list[Moment] = []
+    more = True
+    while more:
+        new = list(islice(moments, _BLOCK + _AHEAD - len(held)))
+        held += new
+        more = len(held) == _BLOCK + _AHEAD
+        count = _BLOCK if more else len(held)
+        if not count:
+            return
+        if both_sides:
+            x, P = smoothed(held)
+        else:
+            x, P = np.stack([one.x for one in held]), np.stack([one.P for one in held])
+        yield _Block(held[:count], x[:count], P[:count])
+        held = held[count:]
+
+
+def _columns(block: _Block, at: list[int]) -> tuple[Stamps, Vector, Vector]:
+    """Stamps, velocities and poses ``(M, 6)``, and variances ``(M, 9)`` of some moments of a block."""
+    moments, x = [block.moments[k] for k in at], block.x[at]
+    turns = np.array([one.inputs[2] for one in moments])
+    has_pose = np.array([one.has_pose for one in moments])
+    states = np.stack([x[:, V_X], x[:, V_Y], turns - x[:, GYRO_BIAS]], axis=1)
+    poses = np.where(has_pose[:, None], x[:, [X, Y, THETA]], np.nan)
+    stamps = np.array([one.stamp for one in moments])
+    return stamps, np.hstack([states, poses]), np.diagonal(block.P, axis1=1, axis2=2)[at]
 
 
 def _plane(streams: Mapping[str, tuple[Stamps, Vector]], settings: Estimation) -> Plane | None:

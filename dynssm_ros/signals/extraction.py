@@ -18,7 +18,7 @@ from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import V_Y_DEVIATION, Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
 from dynssm_ros.signals.rest_value import rest_value
-from dynssm_ros.signals.signal_map import POSE_SIGNALS, SENSORS, SPEED_SIGNALS, STATE_SIGNALS, SignalMap
+from dynssm_ros.signals.signal_map import POSE_SIGNALS, SENSORS, SPEED_SIGNALS, STATE_SIGNALS, SignalMap, yaw_of
 from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, frames_note, log_time_note
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import Table
@@ -118,8 +118,11 @@ def pose_velocities(streams: Mapping[str, Stream], window: float, where: str) ->
     """Streams of ``v_x``, ``v_y`` and ``omega`` from those of the pose, without delay.
 
     Raises:
-        RecordingError: fewer poses in a row than a window has.
+        RecordingError: fewer poses in a row than a window has, or none.
     """
+    lacking = [name for name in POSE_SIGNALS if name not in streams]
+    if lacking:
+        raise RecordingError(f"{where}: {', '.join(lacking)}: no good sample, needed for velocities from poses")
     x, y, theta = (streams[name] for name in POSE_SIGNALS)
     stamps = np.intersect1d(np.intersect1d(x.stamps, y.stamps), theta.stamps)  # dropped ones may differ
     columns = [one.values[np.searchsorted(one.stamps, stamps)] for one in (x, y, theta)]
@@ -282,18 +285,20 @@ def _table_streams(table: Table, signal_map: SignalMap, drop_bad: bool) -> dict[
             f"inspect` suggests it)"
         )
     active = signal_map.active_signals()
-    columns = table.read([source.column for source in active.values()])
+    columns = table.read([column for source in active.values() for column in source.columns])
     clock = clock_of(table, signal_map.time)
     streams = {}
     for name, source in active.items():
-        column = columns[source.column]
-        wrong = column.reason or ("" if drop_bad else column.bad)
-        if wrong:
-            hint = "" if column.reason else " (--drop-bad leaves such cells out)"
-            raise BagError(f"{table.path}: column '{source.column}' for {name}: {wrong}; expected numbers{hint}")
-        there = column.present & clock.known
+        parts = {heading: columns[heading] for heading in source.columns}
+        for heading, column in parts.items():
+            wrong = column.reason or ("" if drop_bad else column.bad)
+            if wrong:
+                hint = "" if column.reason else " (--drop-bad leaves such cells out)"
+                raise BagError(f"{table.path}: column '{heading}' for {name}: {wrong}; expected numbers{hint}")
+        there = np.logical_and.reduce([clock.known, *(column.present for column in parts.values())])
         stamps = clock.stamps[there] - round(source.delay * 1e9)
-        streams[name] = Stream(stamps, to_si(source)(column.values[there]))
+        values = [column.values[there] for column in parts.values()]
+        streams[name] = Stream(stamps, to_si(source)(yaw_of(*values) if len(values) == 4 else values[0]))
     return streams
 
 

@@ -74,6 +74,11 @@ class Estimation(StrictModel):
     heading_noise: float = Field(default=0.02, gt=0, description="of theta, standard deviation (rad)")
     fix_noise: float = Field(default=1.0, gt=0, description="of latitude and longitude, standard deviation (m)")
     ground_speed_noise: float = Field(default=0.1, gt=0, description="of v_east and v_north, standard deviation (m/s)")
+    position_at: tuple[float, float] = Field(
+        default=(0.0, 0.0),
+        description="where positions and velocities over ground are measured, ahead and left of the "
+        "centre of gravity (m)",
+    )
     origin: tuple[float, float] | None = Field(
         default=None, description="latitude and longitude (deg) where x and y are 0; null: the first fix"
     )
@@ -89,8 +94,9 @@ class Moment(NamedTuple):
     x: Vector  # state, (9,)
     P: Vector  # its covariance, (9, 9)
     inputs: tuple[float, float, float]  # newest a_x, a_y, omega; NaN where none came yet
+    has_turn: bool  # whether omega came at this instant
     has_pose: bool  # whether x, y and theta are those of the map
-    anchor: tuple[float, float] | None  # first position, before the heading is known (m)
+    anchor: complex | None  # first position, before the heading is known (m)
     F: Vector  # derivative of the state predicted by that of the moment before, (9, 9)
     before: tuple[Vector, Vector]  # the state predicted and its covariance, before the samples
     since: tuple[Vector, Vector]  # those of the moment before, by what the inputs since then say of them
@@ -117,6 +123,7 @@ class MotionFilter:
     def __init__(self, settings: Estimation, names: Sequence[str]) -> None:
         self.settings = settings
         self._measured = ("a_x" in names, "a_y" in names)
+        self._antenna = complex(*settings.position_at)
         self._position_noise = settings.fix_noise if "latitude" in names else settings.position_noise
         s = settings
         times = (_GYRO_BIAS_TIME, s.bias_time, s.bias_time)
@@ -129,7 +136,7 @@ class MotionFilter:
         x[SLIP] = s.slip
         deviations = [_UNKNOWN_SPEED, s.slip_deviation * _UNKNOWN_SPEED, *(bias for bias, _ in self._biases)]
         P = np.diag(np.square([*deviations, max(_SLIP_SHARE * s.slip, 1e-6), 1.0, 1.0, 1.0]))
-        first = Moment(stamp, x, P, (math.nan,) * 3, False, None, np.eye(_SIZE), (x, P), (x, P))
+        first = Moment(stamp, x, P, (math.nan,) * 3, False, False, None, np.eye(_SIZE), (x, P), (x, P))
         return self._corrected(first, values)
 
     def step(self, last: Moment, stamp: int, values: Mapping[str, float]) -> Moment:
@@ -223,7 +230,7 @@ class MotionFilter:
         """The moment after the samples of its instant."""
         s = self.settings
         a_x, a_y, omega = (values.get(name, old) for name, old in zip(INPUTS, at.inputs, strict=True))
-        at, had_pose = at._replace(inputs=(a_x, a_y, omega)), at.has_pose
+        at, had_pose = at._replace(inputs=(a_x, a_y, omega), has_turn="omega" in values), at.has_pose
         at = at if had_pose else self._placed(at, values)
         x, P = at.x, at.P
         if (speed := values.get("v_x")) is not None:
@@ -233,46 +240,52 @@ class MotionFilter:
                 x, P = _updated(x, P, _ROWS[V_Y], -x[V_Y], _AT_REST**2)
                 x, P = _updated(x, P, _ROWS[GYRO_BIAS], omega - x[GYRO_BIAS], _TURN_AT_REST**2)
         if had_pose:
-            x, P = self._located(x, P, values)
+            x, P = self._located(x, P, values, 0.0 if math.isnan(omega) else omega)
         return at._replace(x=x, P=(P + P.T) / 2)
 
     def _placed(self, at: Moment, values: Mapping[str, float]) -> Moment:
         """The moment with a pose of the map, as soon as samples say where it is and how it is turned."""
         if "x" not in values or "y" not in values:
             return at
-        here, x = (values["x"], values["y"]), at.x.copy()
-        noise = self._position_noise
+        here, x, noise = complex(values["x"], values["y"]), at.x.copy(), self._position_noise
         if "theta" in values:
-            x[X], x[Y], x[THETA], turned = *here, values["theta"], self.settings.heading_noise
+            x[THETA], turned = values["theta"], self.settings.heading_noise
         elif at.anchor is None:
-            x[X] = x[Y] = 0.0
+            x[_POSE] = 0.0
             return at._replace(x=x, anchor=here)
         else:
-            gone, seen = complex(x[X], x[Y]), complex(here[0] - at.anchor[0], here[1] - at.anchor[1])
+            gone = complex(x[X], x[Y]) + self._antenna * (cmath.exp(1j * x[THETA]) - 1)
+            seen = here - at.anchor
             if not at.is_ready or min(abs(gone), abs(seen)) < max(_LEAST_TRAVEL, _CLEAR * math.sqrt(2) * noise):
                 return at
             turned = math.sqrt(2) * noise / abs(seen) + 0.05
-            x[X], x[Y], x[THETA] = *here, x[THETA] + cmath.phase(seen / gone)
+            x[THETA] += cmath.phase(seen / gone)
+        centre = here - self._antenna * cmath.exp(1j * x[THETA])
+        x[X], x[Y] = centre.real, centre.imag
         P = at.P.copy()
         P[_POSE], P[:, _POSE] = 0.0, 0.0
         P[_POSE, _POSE] = np.diag([noise**2, noise**2, turned**2])
         return at._replace(x=x, P=P, has_pose=True, before=_with_pose(at.before, x, P))
 
-    def _located(self, x: Vector, P: Vector, values: Mapping[str, float]) -> tuple[Vector, Vector]:
-        """With poses, positions and velocities over ground, which are taken as they come."""
+    def _located(self, x: Vector, P: Vector, values: Mapping[str, float], omega: float) -> tuple[Vector, Vector]:
+        """With poses, positions and velocities over ground, which are taken as they come; ``omega`` is as measured."""
         s = self.settings
         for name, number in (("x", X), ("y", Y)):
             if name in values:
-                x, P = _updated(x, P, _ROWS[number], values[name] - x[number], self._position_noise**2)
+                lever, row = self._antenna * cmath.exp(1j * x[THETA]), _ROWS[number].copy()
+                ahead, row[THETA] = (lever.real, -lever.imag) if number == X else (lever.imag, lever.real)
+                x, P = _updated(x, P, row, values[name] - x[number] - ahead, self._position_noise**2)
         if "theta" in values:
             off = (values["theta"] - x[THETA] + math.pi) % (2 * math.pi) - math.pi
             x, P = _updated(x, P, _ROWS[THETA], off, s.heading_noise**2)
         for name, turn in (("v_east", 0.0), ("v_north", math.pi / 2)):
             if name in values:
                 c, sine = math.cos(x[THETA] - turn), math.sin(x[THETA] - turn)
+                there = complex(x[V_X], x[V_Y]) + 1j * (omega - x[GYRO_BIAS]) * self._antenna
                 row = np.zeros(_SIZE)
-                row[V_X], row[V_Y], row[THETA] = c, -sine, -x[V_X] * sine - x[V_Y] * c
-                x, P = _updated(x, P, row, values[name] - x[V_X] * c + x[V_Y] * sine, s.ground_speed_noise**2)
+                row[V_X], row[V_Y], row[THETA] = c, -sine, -there.real * sine - there.imag * c
+                off = values[name] - there.real * c + there.imag * sine
+                x, P = _updated(x, P, row, off, s.ground_speed_noise**2)
         return x, P
 
 

@@ -13,9 +13,11 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from dynssm_ros import configuration
+from dynssm_ros.arrays import Vector
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.signals.motion_filter import Estimation
 from dynssm_ros.vehicle.single_track import SetPoint
@@ -63,6 +65,7 @@ _NOT_UNIT = 0.1  # squared length of a quaternion: some drivers publish some tha
 _STEP = r"[A-Za-z_]\w*(?:\[[^\[\]().]+\])?"
 _PATH = rf"{_STEP}(?:\.{_STEP})*"
 _FIELD = re.compile(rf"^(?:yaw\((?P<yaw>{_PATH})\)|(?P<path>{_PATH}))\Z")
+_YAW_OF_COLUMNS = re.compile(r"^yaw\((?P<names>[^,]+(?:,[^,]+){3})\)\Z")
 _OUTSIDE_BRACKETS = r"(?![^\[]*\])"
 _PLUS, _TIMES = re.compile(rf"\s*\+\s*{_OUTSIDE_BRACKETS}"), re.compile(rf"\s*\*\s*{_OUTSIDE_BRACKETS}")
 
@@ -80,7 +83,11 @@ class TimeColumn(StrictModel):
 class Source(StrictModel):
     """Where one signal comes from, a field of a topic or a column; its value is ``scale * unit * curve(field) + offset``."""
 
-    column: str = Field(default="", description="heading of a table's column, instead of topic, type and field")
+    column: str = Field(
+        default="",
+        description="heading of a table's column, instead of topic, type and field; yaw(qx, qy, qz, qw) of a quaternion in "
+        "four of them",
+    )
     topic: str = Field(
         default="",
         pattern=r"^(?:/?(?:\w+/)*\w+)?$",
@@ -128,6 +135,12 @@ class Source(StrictModel):
     def factor(self) -> float:
         """Of a field, or of what its curve gives, to SI units."""
         return self.scale * UNITS[self.unit]
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Headings of the columns that are read: one, or the x, y, z and w of a quaternion."""
+        match = _YAW_OF_COLUMNS.match(self.column)
+        return tuple(name.strip() for name in match["names"].split(",")) if match else (self.column,)
 
     @property
     def recorded(self) -> str:
@@ -364,6 +377,12 @@ def _yaw(q: Any) -> float:
     if abs(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z - 1.0) > _NOT_UNIT:
         return math.nan
     return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
+
+
+def yaw_of(x: Vector, y: Vector, z: Vector, w: Vector) -> Vector:
+    """Yaw (rad) of quaternions, each ``(N,)``; NaN where the length is not near 1."""
+    yaw = np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+    return np.where(np.abs(w * w + x * x + y * y + z * z - 1.0) > _NOT_UNIT, np.nan, yaw)
 
 
 def _element(part: str) -> Callable[[Any], Any]:

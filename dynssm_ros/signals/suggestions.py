@@ -18,7 +18,7 @@ from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, po
 from dynssm_ros.signals.decoding import LOG_TIME
 from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.sensor_topics import sensors
-from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals
+from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals, yaw_of
 from dynssm_ros.signals.stamps import clock_notes, frames_note, log_time_note
 from dynssm_ros.vehicle.single_track import SetPoint
 
@@ -31,6 +31,10 @@ _MOTION = {
     "theta": (r"^(pose_)?(yaw|theta|heading|psi|gierwinkel)(_angle)?$|orientation_yaw$", r"^phi$"),
 }
 """Words for signals in headings, in the order in which they are tried."""
+_LEAVE = " (leave v_y out and write `estimation: {}` to have it estimated)"
+_QUATERNION = re.compile(
+    r"^(?P<name>(?:.*(?:orient|quat|rot|pose)\w*[._/ ]+|.*\bq_?|.*_q_?))x(?P<end>\W.*|)$", re.IGNORECASE
+)
 _NOT_MOTION = re.compile(
     r"wheel|(^|_)(rad|wind|soll)_|cmd|command|target|desired|setpoint|engine|motor|std|cov|sigma|acc|rpm|_ref|steer|lenk|error",
     re.IGNORECASE,
@@ -118,6 +122,8 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
             others = [name for name in fitting if name != best and not re.search(patterns[0], names[best])]
             if others:
                 found[signal] = replace(found[signal], note=f"or {', '.join(dict.fromkeys(others))}")
+    if "theta" not in found and (yaw := _yaw_of_columns(columns)):
+        found["theta"] = yaw
     if not {"x", "y", "theta"} <= set(found):
         found = {name: one for name, one in found.items() if name in STATE_SIGNALS}
     has_path = "x" in found and _spread(found["x"].values) + _spread(found["y"].values) > 0
@@ -128,13 +134,27 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
     elif not found:
         notes.append("no column tells where the car is or how fast; find v_x, v_y and omega, or x, y and theta")
     if "v_y" in found and _spread(found["v_y"].values) == 0:
-        notes.append(f"{found['v_y'].field}: v_y is constant, so that nothing is known of how the car slides")
+        notes.append(f"{found['v_y'].field}: v_y is constant, so that nothing is known of how the car slides{_LEAVE}")
     if "v_x" in found and float(np.nanmax(np.abs(found["v_x"].values), initial=0.0)) > _FASTEST:
         found["v_x"] = replace(found["v_x"], note="too fast for m/s: find its unit")
     for name in ("omega", "theta"):
         if name in found and found[name].unit == "1" and _spread(found[name].values) > _MOST[name]:
             found[name] = replace(found[name], note="large for rad: deg?")
     return found
+
+
+def _yaw_of_columns(columns: dict[str, TopicContent]) -> Suggestion | None:
+    """The yaw of a quaternion in four columns whose headings end in x, y, z and w alike, as ``qx`` or ``orientation.x``."""
+    for first, content in columns.items():
+        match = _QUATERNION.match(first)
+        names = [f"{match['name']}{axis}{match['end']}" for axis in "xyzw"] if match else []
+        parts = [columns[name].values[name] for name in names if name in columns and columns[name].values]
+        if len(parts) == 4 and len({len(one) for one in parts}) == 1:
+            field = f"yaw({', '.join(names)})"
+            yaw = yaw_of(*parts)
+            if np.isfinite(yaw).any():
+                return Suggestion(replace(content, name=field, values={field: yaw}, unit=""), field)
+    return None
 
 
 def _plain(name: str) -> str:
@@ -188,7 +208,7 @@ def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Su
         )
         return {signal: Suggestion(pose, path) for signal, path in pose_fields(pose.msgtype).items()}
     if _spread(best.values[TWIST["v_y"]]) == 0:
-        notes.append(f"{best.name}: v_y is constant, so that nothing is known of how the car slides")
+        notes.append(f"{best.name}: v_y is constant, so that nothing is known of how the car slides{_LEAVE}")
     fields = TWIST | pose_fields(ODOMETRY) if _moves(best) else TWIST
     return {signal: Suggestion(best, path) for signal, path in fields.items()}
 

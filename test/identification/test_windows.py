@@ -102,6 +102,18 @@ def test_noise_is_recovered_and_whitened() -> None:
     assert np.abs(np.corrcoef(white.T) - np.eye(white.shape[1])).max() < 0.5
 
 
+def test_an_estimated_v_y_has_no_less_noise_than_its_recording_states() -> None:
+    some = windows(AV21, (0.02, 0.03, 0.004), duration=20.0)
+    errors = IdentificationProblem(some, CarEstimate.of(AV21)).errors(CarEstimate.of(AV21))
+    stated = replace(some, data=replace(some.data, v_y_variance=0.2**2))
+    measured, estimated = (
+        np.sqrt(IdentificationProblem(one, CarEstimate.of(AV21)).noise(errors).v[:3]) for one in (some, stated)
+    )
+    assert measured[1] < 0.05
+    assert estimated[1] >= 0.2 * (1 - 1e-9)
+    assert estimated[2] == pytest.approx(measured[2], rel=0.3)
+
+
 def test_disturbances_on_the_way_are_told_from_noise_of_the_measurement() -> None:
     rng, W, K = np.random.default_rng(0), 1500, 6
     keep = np.broadcast_to(0.8 * np.eye(3), (W, K, 3, 3))

@@ -14,7 +14,8 @@ from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.replay import replay, replay_to_bag
 from dynssm_ros.signals.bags import open_bag
-from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.estimation import estimated
+from dynssm_ros.signals.extraction import extract, read_streams
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
 from dynssm_ros.vehicle import COEFFICIENTS
@@ -56,6 +57,21 @@ def test_from_poses_alone_it_predicts_what_it_does_from_velocities(small_model: 
     apart = np.sqrt(((both[:, 0] - both[:, 1]) ** 2).mean(axis=0))
     # these laps move in Euler steps, by the heading at the start of a step, so that v_y is another by half a step
     assert (apart[[0, 2]] < 0.1 * both[:, 0].std(axis=0)[[0, 2]]).all()
+
+
+def test_where_v_y_is_estimated_it_predicts_from_the_causal_estimate(small_model: Path, laps_bag: Path) -> None:
+    content = DEFAULT.with_commands(None).model_dump()
+    signals = {name: source for name, source in content["signals"].items() if name not in ("v_y", "x", "y", "theta")}
+    estimating = SignalMap.model_validate(content | {"signals": signals, "estimation": {"rear_axle": 0.033}})
+    predictor, rows = Predictor(OnnxModel(open_artifact(small_model)), estimating), []
+    with open_bag(laps_bag) as bag:
+        rows = [predictor.row[:3].copy() for answer in replay(bag, predictor) if isinstance(answer.outcome, Prediction)]
+        streams, _, _ = read_streams(bag, estimating)
+    assert estimating.estimation is not None
+    samples = {name: (one.stamps, one.values) for name, one in streams.items()}
+    batch = estimated(samples, estimating.estimation, estimating.max_gap_ns, both_sides=False).states
+    assert len(rows) == len(batch) - H + 1
+    np.testing.assert_allclose(rows, batch[H - 1 :], rtol=0, atol=1e-9)
 
 
 def test_the_new_bag_holds_predictions_parameters_and_on_request_the_inputs(

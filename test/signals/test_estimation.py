@@ -138,6 +138,49 @@ def test_fixes_give_position_and_heading_though_nothing_measures_the_heading(dri
     assert first == (drive.streams["latitude"][1][0], drive.streams["longitude"][1][0])
 
 
+def test_positions_and_velocities_of_an_antenna_that_is_elsewhere(drive: Drive) -> None:
+    ahead, left = 3.0, -1.0
+    x, y, theta = drive.pose.T
+    v_x, v_y, omega = drive.state.T
+    c, s = np.cos(theta), np.sin(theta)
+    u, v = v_x - omega * left, v_y + omega * ahead
+    seen = {
+        "x": x + c * ahead - s * left,
+        "y": y + s * ahead + c * left,
+        "v_east": c * u - s * v,
+        "v_north": s * u + c * v,
+    }
+    streams = without(drive, "latitude", "longitude") | {
+        name: (drive.stamps[::5], one[::5]) for name, one in seen.items()
+    }
+    errors = []
+    for at in ((ahead, left), (0.0, 0.0)):
+        found = estimated(streams, SETTINGS.model_copy(update={"position_at": at}), GAP)
+        known = np.isfinite(found.poses[:, 2])
+        error = found.poses[known] - drive.pose[np.searchsorted(drive.stamps, found.stamps[known])]
+        errors.append(
+            [*rms(error), rms(found.states[:, 1] - drive.state[np.searchsorted(drive.stamps, found.stamps), 1])]
+        )
+    right, wrong = np.array(errors)
+    assert (right < [0.1, 0.1, 0.01, 0.15]).all()
+    assert (right[[0, 1, 3]] < 0.5 * wrong[[0, 1, 3]]).all()
+
+
+def test_a_long_log_is_smoothed_in_blocks(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = estimated(drive.streams, SETTINGS, GAP)
+    monkeypatch.setattr("dynssm_ros.signals.estimation._BLOCK", 300)
+    apart = []
+    for ahead in (50, 500):  # 1.2 and 12 s; what is learned of the car later does not reach a block
+        monkeypatch.setattr("dynssm_ros.signals.estimation._AHEAD", ahead)
+        blocks = estimated(drive.streams, SETTINGS, GAP)
+        np.testing.assert_array_equal(blocks.stamps, whole.stamps)
+        apart.append(rms(blocks.states - whole.states) / rms(whole.deviations))
+    assert (apart[1] < 0.1).all()
+    assert (apart[1] < 0.3 * apart[0]).all()
+    causal = estimated(drive.streams, SETTINGS, GAP, both_sides=False)
+    np.testing.assert_array_equal(causal.stamps, whole.stamps)
+
+
 def test_live_it_is_what_it_is_forwards_over_a_log(drive: Drive) -> None:
     batch = estimated(drive.streams, SETTINGS, GAP, both_sides=False)
     live = LiveEstimation(live_map(*ALL, **SETTINGS.model_dump()))

@@ -84,7 +84,10 @@ def test_the_set_point_and_the_poses_of_an_f1tenth_car_are_suggested(f1tenth_bag
 def test_an_odometry_that_turns_is_taken(f1tenth_bag: Any) -> None:
     found = inspect(f1tenth_bag(turns=True))
     assert found.signals["omega"].topic.name == "/odom"
-    assert found.notes[0] == "/odom: v_y is constant, so that nothing is known of how the car slides"
+    assert found.notes[0] == (
+        "/odom: v_y is constant, so that nothing is known of how the car slides (leave v_y out and write `estimation: {}` to "
+        "have it estimated)"
+    )
 
 
 def test_where_there_is_a_throttle_the_set_point_is_told_alone(f1tenth_bag: Any) -> None:

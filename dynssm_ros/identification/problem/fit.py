@@ -155,9 +155,14 @@ class IdentificationProblem:
         return self.windows.errors_of(cars, context).reshape(len(cars), len(self.windows), -1)
 
     def noise(self, errors: Vector) -> Noise:
-        """The noise under which ``errors`` are most likely, whatever it was taken for before."""
+        """The noise under which ``errors`` are most likely, whatever it was taken for before.
+
+        That of an estimated ``v_y`` is no less than its recording states.
+        """
         least, largest = tuning.NOISE_SHARES
-        return fit_noise(self.spread, errors, largest * self._channels, least * self._channels)
+        floor = least * self._channels
+        floor[1] = max(floor[1], self.windows.data.v_y_variance)
+        return fit_noise(self.spread, errors, largest * self._channels, floor)
 
     def columns(self, car: CarEstimate, errors: Vector, free: Free, first: int = 0) -> Vector:
         """Derivatives of ``errors`` by the 18 nominal values and by ``free``, from the ``first`` on.

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.levels import Group, Levels
-from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows, rows_per_sample
+from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows, rows_per_sample, v_y_variance
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number, track_position
 from dynssm_ros.track.lines import ClosedLine
@@ -130,8 +130,9 @@ class RecordingSet:
         lines = self.lines if self.has_places else (None,) * len(self.names)
         parts = [lap_context(self._part(k), line) for k, line in enumerate(lines)]
         context = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} | {"t": self.clock}
-        samples = rows_per_sample(self.recording)
-        return RecordedRows(self.recording.matrix.T, context, self.recording.T_s, self.time, self.number, samples)
+        samples, variance = rows_per_sample(self.recording), v_y_variance(self.recording)
+        rows, T_s = self.recording.matrix.T, self.recording.T_s
+        return RecordedRows(rows, context, T_s, self.time, self.number, samples, variance)
 
     def _part(self, k: int, rows: Indices | None = None) -> Recording:
         """One of the recordings, or those of its rows that are among ``rows``."""

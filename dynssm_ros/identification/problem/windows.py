@@ -35,6 +35,7 @@ class RecordedRows:
         time: of each row since the first (s), shape ``(N,)``.
         number: of the recording that each row is of, shape ``(N,)``.
         rows_per_sample: of throttle and steering: that many rows show a sample before the next one comes.
+        v_y_variance: of ``v_y`` as stated by what estimated it ((m/s)^2); 0 where it is measured.
     """
 
     rows: Vector
@@ -43,6 +44,7 @@ class RecordedRows:
     time: Vector
     number: Indices
     rows_per_sample: tuple[int, int] = (1, 1)
+    v_y_variance: float = 0.0
 
     @property
     def on_one_lap(self) -> bool:
@@ -248,7 +250,13 @@ class SimulationWindows:
 def recorded_rows(recording: Recording, context: dict[str, Vector]) -> RecordedRows:
     """The rows of a single recording with other signals by name."""
     time, number = (recording.time - recording.time[0]) / 1e9, np.zeros(len(recording), dtype=np.intp)
-    return RecordedRows(recording.matrix.T, context, recording.T_s, time, number, rows_per_sample(recording))
+    samples, variance = rows_per_sample(recording), v_y_variance(recording)
+    return RecordedRows(recording.matrix.T, context, recording.T_s, time, number, samples, variance)
+
+
+def v_y_variance(recording: Recording) -> float:
+    """Of an estimated ``v_y`` ((m/s)^2), as the recording states it; 0 where it is measured."""
+    return recording.info.standard_deviations.get("v_y", 0.0) ** 2
 
 
 def rows_per_sample(recording: Recording) -> tuple[int, int]:
