@@ -48,6 +48,7 @@ _KEPT = 200  # messages, for that
 _REMEMBERED = 1000  # control steps that the percentiles are of
 _TOLERATED = 0.01  # share of plans that may be missing before it is called a warning
 _STANDING = 0.2  # of the vehicle's minimum speed, below which a car stands
+_REST = 1e-3  # m/s, below which any car stands: an exponential end of the braking never reaches 0
 _PUNCTUAL = 0.02  # of T_s by which odometry may be off for its difference to the one before to be that of a step
 _EARLY = 0.25  # of T_s that odometry may come before its time; what comes earlier is for a later step
 
@@ -182,7 +183,7 @@ class LiveController:
         self._acting: deque[tuple[int, Applied]] = deque(maxlen=_KEPT)  # commands by when they begin to act (ns)
         self._believed: deque[_Believed] = deque(maxlen=_KEPT)
         self._reckoned: _Believed | None = None  # while it brakes
-        self.brakes = Brakes(self.vehicle.sampling_time, _STANDING * self.vehicle.minimum_speed)
+        self.brakes = Brakes(self.vehicle.sampling_time, max(_STANDING * self.vehicle.minimum_speed, _REST))
         self._contract.forget()
         self._jumps = self._contract.jumps
         self._weights = np.zeros(len(SOURCES))
@@ -244,6 +245,8 @@ class LiveController:
             self.remote.forget()
         if since < 0 or self._last is None:
             self.laps, self._first = Laps(self._track), stamp
+        if self._last is None:  # what was asked before is not known; a car that rolls is asked for its speed
+            self._sent.extend([Applied(float(self.vehicle.inputs.coasting(seen.v_x)), 0.0)] * self._age)
         self._last = self._planned = stamp
         self.laps.passed((stamp - self._first) / 1e9, pose.x, pose.y, together)
         if self.laps.outside > LOST * self.laps.width:

@@ -54,6 +54,15 @@ def test_lateral_acceleration_is_speed_times_yaw_rate_to_either_side():
     }
 
 
+def test_a_speed_set_point_drives_by_its_distance_from_the_speed():
+    found = of(driving_regimes(rows([5.0, 5.0, 5.0, 5.0], 0.0, [4.5, 5.02, 5.5, 0.0]), "speed"), "throttle")
+    assert {regime.label: regime.member.tolist() for regime in found} == {
+        "braking": [True, False, False, True],
+        "coasting": [False, True, False, False],
+        "accelerating": [False, False, True, False],
+    }
+
+
 def test_bins_that_nothing_falls_into_are_left_out():
     found = of(driving_regimes(rows([1.0, 1.5, 4.5])), "speed")
     assert [(regime.label, regime.short) for regime in found] == [("1 to 2", "1–2"), ("4 to 5", "4–5")]

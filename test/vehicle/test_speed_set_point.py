@@ -74,6 +74,16 @@ def test_a_standing_car_is_held_by_the_resistance_until_the_set_point_overcomes_
         assert (car.motion(State(0.0, 0.0, 0.0), Applied(r, 0.0), THETA).a_x > 0) == drives
 
 
+def test_the_set_point_is_reached_forwards_standing_and_backwards() -> None:
+    """In steps that resolve the passage through standstill; what resists costs a few cm/s."""
+    car, state = CarModel(CAR.constants, 0.5, (), "rk4", 500, set_point="speed"), State(0.0, 0.0, 0.0)
+    for wanted in (3.0, 0.0, -1.5, 1.0):
+        for _ in range(4):
+            state = car.step(state, Applied(wanted, 0.0), THETA)[0]
+        assert state.v_x == pytest.approx(wanted, abs=(THETA.C_r0 + THETA.C_r2 * 9) / THETA.C_m2 + 1e-3)
+        assert state[1:] == (0.0, 0.0)
+
+
 def test_limits_of_the_car_follow_from_the_controller() -> None:
     limits, inputs = vehicle_limits(CAR), CAR.inputs
     most = THETA.C_m1 / CAR.constants.m
