@@ -62,6 +62,7 @@ _OTHER = re.compile(
 _RADIANS, _SHARE = 1.6, 1.5  # larger values are no road-wheel angle in rad, and no throttle between -1 and 1
 _AGREES = 0.5  # correlation with the curvature, from which on a scale is told
 _UNIT = (0.6, 1.7)  # wheelbase times curvature per unit, for a signal that is the road-wheel angle in rad already
+_POSES_HZ = 20.0  # of a localisation, from which on a window of 0.1 s has poses enough for velocities
 _TURN = 0.1  # rad, of a heading that changes
 _FASTEST = 110.0  # m/s
 _MOST = {"omega": 15.0, "theta": 60.0}  # range in rad/s, and in rad, from which on degrees are likelier
@@ -208,7 +209,13 @@ def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Su
         )
         return {signal: Suggestion(pose, path) for signal, path in pose_fields(pose.msgtype).items()}
     if _spread(best.values[TWIST["v_y"]]) == 0:
-        notes.append(f"{best.name}: v_y is constant, so that nothing is known of how the car slides{_LEAVE}")
+        told = f"{best.name}: v_y is constant, so that nothing is known of how the car slides"
+        localised = [topic for topic in turning if topic.msgtype != ODOMETRY and topic.rate >= _POSES_HZ]
+        if localised:
+            pose = max(localised, key=lambda topic: topic.count)
+            notes.append(f"{told}; velocities follow from the poses of {pose.name}")
+            return {signal: Suggestion(pose, path) for signal, path in pose_fields(pose.msgtype).items()}
+        notes.append(f"{told}{_LEAVE}")
     fields = TWIST | pose_fields(ODOMETRY) if _moves(best) else TWIST
     return {signal: Suggestion(best, path) for signal, path in fields.items()}
 

@@ -43,14 +43,14 @@ def f1tenth_bag(typestore: Any, make_bag: Any) -> Any:
     typestore.register({name: types[name] for name in TYPES if name not in typestore.types})
     made = typestore.types
 
-    def build(topic: str = "/drive", turns: bool = False, also: Any = None) -> Path:
+    def build(topic: str = "/drive", turns: bool = False, also: Any = None, poses_every: int = 1) -> Path:
         records = []
         for k, stamp in enumerate((START + np.round(1e9 * t)).astype(np.int64).tolist()):
             moved = messages.odometry(stamp, (x[k], y[k], theta[k]), (v_x[k], 0.0, omega[k] if turns else 0.0))
             pose = made["geometry_msgs/msg/PoseStamped"](moved.header, moved.pose.pose)
             asked = made[STAMPED](moved.header, made[DRIVE](delta[k], 0.0, v_set[k], 0.0, 0.0))
             records += [("/odom", messages.ODOMETRY, stamp, moved), (topic, STAMPED, stamp, asked)]
-            records += [("/pf/pose", "geometry_msgs/msg/PoseStamped", stamp, pose)]
+            records += [("/pf/pose", "geometry_msgs/msg/PoseStamped", stamp, pose)] if k % poses_every == 0 else []
             records += [] if also is None else [("/duty", messages.JOINT_STATE, stamp, also(stamp, k))]
         return Path(make_bag(records))
 
@@ -81,8 +81,16 @@ def test_the_set_point_and_the_poses_of_an_f1tenth_car_are_suggested(f1tenth_bag
     np.testing.assert_allclose(np.sort(np.unique(recording["r_fb"]))[[0, -1]], [1.5, 3.5])
 
 
-def test_an_odometry_that_turns_is_taken(f1tenth_bag: Any) -> None:
+def test_of_an_odometry_that_knows_no_side_slip_the_localisation_is_taken(f1tenth_bag: Any) -> None:
     found = inspect(f1tenth_bag(turns=True))
+    assert found.signals["x"].topic.name == "/pf/pose"
+    assert found.notes[0] == (
+        "/odom: v_y is constant, so that nothing is known of how the car slides; velocities follow from the poses of /pf/pose"
+    )
+
+
+def test_of_a_slow_localisation_velocities_are_not_made(f1tenth_bag: Any) -> None:
+    found = inspect(f1tenth_bag(turns=True, poses_every=4))
     assert found.signals["omega"].topic.name == "/odom"
     assert found.notes[0] == (
         "/odom: v_y is constant, so that nothing is known of how the car slides (leave v_y out and write `estimation: {}` to "
