@@ -30,6 +30,7 @@ _DATES = {
     "minutes": r"^(?P<minute>\d{1,3}):(?P<second>\d{1,2})[.,](?P<fraction>\d{1,9})$",
 }
 _ALIASES = {
+    "m/s²": "m/s^2", "m/s2": "m/s^2", "m/s/s": "m/s^2", "mps2": "m/s^2",
     "kmh": "km/h", "kph": "km/h", "kmph": "km/h", "mps": "m/s", "m/sec": "m/s", "kn": "kt", "knots": "kt",
     "°": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "°/s": "deg/s", "deg/sec": "deg/s",
     "dps": "deg/s", "degps": "deg/s", "radps": "rad/s", "rad/sec": "rad/s", "percent": "%", "pct": "%", "prozent": "%",

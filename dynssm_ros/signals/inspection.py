@@ -48,7 +48,7 @@ class Inspection:
     @property
     def estimates(self) -> bool:
         """Whether ``v_y`` has to be estimated."""
-        return {"v_x", "omega"} <= set(self.signals) and "v_y" not in self.signals and not self.time
+        return {"v_x", "omega"} <= set(self.signals) and "v_y" not in self.signals
 
     def signal_map(self) -> str:
         """The suggested signal map as YAML; what is missing or uncertain stands there as a comment."""

@@ -20,6 +20,15 @@ _NO_SPEED = re.compile(
 )
 _WHEEL = re.compile(r"wheel|rear|front|left|right", re.IGNORECASE)
 
+COLUMNS = {
+    "v_x": r"wheel\w*(speed|vel\w*)|(speed|vel\w*)_wheel",
+    "a_x": r"^(lin\w*_)?(a|acc|accel|acceleration)_?(x|long\w*)$|^long\w*_?(acc\w*|g)$|^g_?long\w*$",
+    "a_y": r"^(lin\w*_)?(a|acc|accel|acceleration)_?(y|lat|lateral)$|^lat(eral)?_?(acc\w*|g)$|^g_?lat\w*$",
+    "latitude": r"^(gps_|gnss_|fix_)?lat(itude)?$",
+    "longitude": r"^(gps_|gnss_|fix_)?(lon|lng|long|longitude)$",
+}
+"""Words in headings of tables, in lower case and apart by underscores."""
+
 Place = tuple[TopicContent, str]
 """A topic and a field of it."""
 

@@ -55,6 +55,7 @@ JUMP_NS = 500_000_000
 UNITS = {
     "m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kt": 1852 / 3600, "ft/s": 0.3048, "rad": 1.0, "deg": math.pi / 180,
     "rad/s": 1.0, "deg/s": math.pi / 180, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "%": 0.01, "1": 1.0,
+    "m/s^2": 1.0, "g": 9.80665,
 }  # fmt: skip
 """Units of fields and columns, and what one is in SI units."""
 TIME_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1, "days": 86_400_000_000_000}
@@ -248,6 +249,11 @@ class SignalMap(StrictModel):
             pair = [self.signals[name] for name in (one, other) if name in self.signals]
             if len(pair) == 1 or len({source.topic for source in pair}) > 1:
                 raise ValueError(f"signals: {one} and {other} come alone or apart; expected both from one topic")
+        turned = [name for name in ("latitude", "longitude") if name in self.signals and self.signals[name].unit != "1"]
+        if turned:
+            raise ValueError(
+                f"signals.{turned[0]}.unit: '{self.signals[turned[0]].unit}'; it is in degrees, expected none"
+            )
         if "latitude" in self.signals and "x" in self.signals:
             raise ValueError("signals.latitude: the position is x and y already; expected either")
 

@@ -17,7 +17,7 @@ from dynssm_ros.signals.columns import heading
 from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, pose_fields
 from dynssm_ros.signals.decoding import LOG_TIME
 from dynssm_ros.signals.rest_value import rest_value
-from dynssm_ros.signals.sensor_topics import sensors
+from dynssm_ros.signals.sensor_topics import COLUMNS, sensors
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals, yaw_of
 from dynssm_ros.signals.stamps import clock_notes, frames_note, log_time_note
 from dynssm_ros.vehicle.single_track import SetPoint
@@ -43,6 +43,7 @@ _QUANTITIES = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "x": "m", "y": "m",
 _FITTING = {
     "m/s": ("m/s", "km/h", "mph", "kt", "ft/s"), "rad/s": ("rad/s", "deg/s"), "m": ("m", "cm", "mm", "km", "ft"),
     "rad": ("rad", "deg"), "1": ("1", "%"),
+    "m/s^2": ("m/s^2", "g"),
 }  # fmt: skip
 _WORDS = {
     "steering": re.compile(r"steer|delta|servo|lenk", re.IGNORECASE),
@@ -132,6 +133,9 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
         lack = ", ".join(name for name in STATE_SIGNALS if name not in found)
         notes.append(f"no column is {lack}; velocities follow from the poses")
         found = {name: one for name, one in found.items() if name not in STATE_SIGNALS}
+    elif "v_y" not in found and (sensed := _sensor_columns(columns, found)):
+        found = {name: one for name, one in found.items() if name in STATE_SIGNALS} | sensed
+        notes.append(f"no column is v_y; it is estimated from {', '.join(found)} (estimation: give rear_axle, m)")
     elif not found:
         notes.append("no column tells where the car is or how fast; find v_x, v_y and omega, or x, y and theta")
     if "v_y" in found and _spread(found["v_y"].values) == 0:
@@ -142,6 +146,23 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
         if name in found and found[name].unit == "1" and _spread(found[name].values) > _MOST[name]:
             found[name] = replace(found[name], note="large for rad: deg?")
     return found
+
+
+def _sensor_columns(columns: dict[str, TopicContent], found: dict[str, Suggestion]) -> dict[str, Suggestion]:
+    """Accelerations, fixes and, where nothing else is the speed, a wheel's; nothing without both speed and yaw rate."""
+    sensed: dict[str, Suggestion] = {}
+    for signal, pattern in COLUMNS.items():
+        fitting = [
+            Suggestion(one, name)
+            for name, one in columns.items()
+            if one.values and re.search(pattern, _plain(heading(name).bare)) and _spread(one.values[name]) > 0
+        ]
+        if fitting and signal not in found:
+            quantity = {"v_x": "m/s", "a_x": "m/s^2", "a_y": "m/s^2"}.get(signal)
+            sensed[signal] = _with_unit(fitting[0], quantity) if quantity else fitting[0]
+    if not {"latitude", "longitude"} <= set(sensed):
+        sensed = {name: one for name, one in sensed.items() if name not in ("latitude", "longitude")}
+    return sensed if {"v_x", "omega"} <= {*found, *sensed} else {}
 
 
 def _yaw_of_columns(columns: dict[str, TopicContent]) -> Suggestion | None:

@@ -314,6 +314,10 @@ def test_v_y_comes_from_one_place() -> None:
     content["signals"]["v_y"] = content["signals"]["v_x"]
     with pytest.raises(ConfigurationError, match=r"v_y comes from signals\.v_y; expected either"):
         validate(SignalMap, content, "signal map")
+    content = live_map(*ALL).model_dump()
+    content["signals"]["latitude"]["unit"] = "deg"
+    with pytest.raises(ConfigurationError, match=r"signals\.latitude\.unit: 'deg'; it is in degrees, expected none"):
+        validate(SignalMap, content, "signal map")
     assert live_map("v_x", "omega", "a_y").estimation == Estimation()
     assert live_map("v_x", "omega", rear_axle=0.1).estimation == Estimation(rear_axle=0.1)
 

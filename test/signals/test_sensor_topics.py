@@ -69,3 +69,42 @@ def test_without_accelerometers_and_fixes_v_y_is_that_of_a_steady_turn(make_bag:
 def test_other_speeds_are_not_taken(make_bag: Any, typestore: Any, speed: str) -> None:
     found = inspect(make_bag(records(typestore, speed=speed)))
     assert "v_x" not in found.signals
+
+
+@pytest.mark.parametrize(
+    ("heads", "units", "expected"),
+    [
+        (("v_x", "yaw_rate", "ax", "ay", "lat", "lon"), (1, 1, 1, 1), {}),
+        (
+            (
+                "WheelSpeedRL [km/h]",
+                "GyroZ [deg/s]",
+                "G Long [g]",
+                "G Lat [g]",
+                "GPS Latitude [deg]",
+                "GPS Longitude [deg]",
+            ),
+            (3.6, np.degrees(1), 1 / 9.80665, 1 / 9.80665),
+            {"v_x": "km/h", "omega": "deg/s", "a_x": "g", "a_y": "g"},
+        ),
+    ],
+)
+def test_columns_of_a_data_logger_are_suggested(
+    tmp_path: Path, heads: tuple[str, ...], units: tuple[float, ...], expected: dict[str, str]
+) -> None:
+    t = np.arange(0.0, 20.0, 0.02)
+    v_x, omega = 15 + 4 * np.sin(t / 3), 0.5 * np.sin(t)
+    motion = np.stack([v_x, omega, 4 / 3 * np.cos(t / 3), v_x * omega], axis=1) * units
+    theta = 0.5 * (1 - np.cos(t))
+    fixes = 48 + np.cumsum(v_x * np.sin(theta)) * 0.02 / 111_200, 11 + np.cumsum(v_x * np.cos(theta)) * 0.02 / 74_600
+    columns = np.column_stack([t, motion, *fixes, 0.1 * np.sin(t), 0.5 + 0.1 * np.cos(t)])
+    head = ",".join(["time", *heads, "steering_angle", "throttle"])
+    np.savetxt(tmp_path / "log.csv", columns, delimiter=",", header=head, comments="", fmt="%.9f")
+    found = inspect(tmp_path / "log.csv")
+    assert found.missing == ()
+    assert {name: one.unit for name, one in found.signals.items() if one.unit != "1"} == expected
+    assert set(found.signals) >= {"v_x", "omega", "a_x", "a_y", "latitude", "longitude"}
+    (tmp_path / "map.yaml").write_text(found.signal_map(), encoding="utf-8")
+    recording = extract([tmp_path / "log.csv"], load_signal_map(tmp_path / "map.yaml"), 50.0)
+    np.testing.assert_allclose(recording["v_x"], 15 + 4 * np.sin(recording.time / 3e9), atol=0.2)
+    assert np.abs(recording["v_y"]).max() < 0.5
