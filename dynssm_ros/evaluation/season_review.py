@@ -180,7 +180,9 @@ def review_again(
         known = None
     if known is not None and known.key == key:
         return known
-    found = review(Recording.load(file), session, key, open_models(models, car.in_windows), car, stretch=stretch)
+    recording = Recording.load(file)
+    recording.require_set_point(car.inputs.set_point, f"vehicle {car.name}")
+    found = review(recording, session, key, open_models(models, car.in_windows), car, stretch=stretch)
     write_json(kept, found.model_dump(mode="json"))
     return found
 

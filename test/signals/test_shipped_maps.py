@@ -81,7 +81,7 @@ def test_a_bag_of_the_stack_is_extracted_with_its_map(store: Any, tmp_path: Path
     t = (recording.time - START) / 1e9
     source = signal_map.signals["steering_feedback"]
     np.testing.assert_allclose(recording["delta_fb"], source.scale * t + source.offset, atol=1e-4)
-    np.testing.assert_allclose(recording["v_x"], np.ones(len(t)) if name == "vesc" else t, atol=1e-4)
+    np.testing.assert_allclose(recording["v_x"], np.ones(len(t)) if name in ("vesc", "f1tenth") else t, atol=1e-4)
     assert recording.has_pose
     by = {"f1tenth": "header", "vesc": "log time", "autoware": "stamp"}[name]
     assert recording.info.stamped["steering_feedback"] == by
