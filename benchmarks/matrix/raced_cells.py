@@ -19,8 +19,9 @@ from benchmarks.matrix.scored_cells import CARS, NOISE_LEVELS, Training, simulat
 from dynssm_ros.control.settings import Objective
 from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.simulation.sensing import Sensing
+from dynssm_ros.track.centre_points import TrackError
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.track.tracks import Track, TrackError, load_track
+from dynssm_ros.track.tracks import Track, load_track
 from dynssm_ros.vehicle import load_vehicle
 
 TRACKS = (("club", 11), ("club", 12), ("club", 13), ("club_b", 14), ("club_b", 15), ("club_b", 16))

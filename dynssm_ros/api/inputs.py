@@ -63,10 +63,15 @@ def signal_map_of(signals: SignalMap | PathLike, commands: Commands | None = Non
 
 
 def track_of(track: Track | PathLike) -> Track:
-    """The track."""
+    """The track; a :class:`DataWarning` names what was mended of a file's points."""
     from dynssm_ros.track.tracks import Track, load_track
 
-    return track if isinstance(track, Track) else load_track(track)
+    if isinstance(track, Track):
+        return track
+    found = load_track(track)
+    for words in found.notes:
+        warnings.warn(f"track {found.name}: {words}", DataWarning, stacklevel=3)
+    return found
 
 
 def opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:

@@ -39,6 +39,7 @@ from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.limits import vehicle_limits
+from dynssm_ros.vehicle.single_track import standing_speed
 
 LAUNCH = 0.3, 0.7  # shares of the line's speed: below the first pursuit takes over, above the second it ends
 _LAUNCH_STYLE = Style(aggressiveness=0.7, variation=0.0)
@@ -47,8 +48,8 @@ _RECKONED_S = 10.0  # over which the car is reckoned on: until it stands, from a
 _KEPT = 200  # messages, for that
 _REMEMBERED = 1000  # control steps that the percentiles are of
 _TOLERATED = 0.01  # share of plans that may be missing before it is called a warning
-_STANDING = 0.2  # of the vehicle's minimum speed, below which a car stands
-_REST = 1e-3  # m/s, below which any car stands: an exponential end of the braking never reaches 0
+_STANDING = 0.2  # of the vehicle's minimum speed, below which a car stands, or half of the physics'
+# standing speed: an exponential end of the braking never reaches 0, and noise hides it
 _PUNCTUAL = 0.02  # of T_s by which odometry may be off for its difference to the one before to be that of a step
 _EARLY = 0.25  # of T_s that odometry may come before its time; what comes earlier is for a later step
 
@@ -183,7 +184,9 @@ class LiveController:
         self._acting: deque[tuple[int, Applied]] = deque(maxlen=_KEPT)  # commands by when they begin to act (ns)
         self._believed: deque[_Believed] = deque(maxlen=_KEPT)
         self._reckoned: _Believed | None = None  # while it brakes
-        self.brakes = Brakes(self.vehicle.sampling_time, max(_STANDING * self.vehicle.minimum_speed, _REST))
+        constants = self.vehicle.constants
+        stands = max(_STANDING * self.vehicle.minimum_speed, standing_speed(constants.l_f + constants.l_r) / 2)
+        self.brakes = Brakes(self.vehicle.sampling_time, stands)
         self._contract.forget()
         self._jumps = self._contract.jumps
         self._weights = np.zeros(len(SOURCES))

@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.track.centre_points import TrackError
 from dynssm_ros.track.lines import ClosedLine, Floats
 from dynssm_ros.track.racing_line import line_of
 from dynssm_ros.track.speed_profile import speed_profile
-from dynssm_ros.track.tracks import Track, TrackError
+from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.limits import Limits, vehicle_limits
 

@@ -133,6 +133,8 @@ class ControllerNode(ManagedNode):
             raise ConfigurationError(f"parameter horizon: {self._steps}; expected {_STEPS[0]} to {_STEPS[1]}, or 0")
         car = load_vehicle(self._vehicle)
         road = load_track(self._track).scaled(self._scale)
+        for words in road.notes:
+            self.get_logger().warning(f"track {road.name}: {words}")
         reference = load_reference(self._line, car, road, self._speed_scale)
         settings = Settings.of(car, self._objective, self._steps or None, self._offset_free, self._evidence)
         settings = replace(settings, deadline=car.sampling_time / self._rate)

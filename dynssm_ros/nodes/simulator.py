@@ -88,6 +88,8 @@ class SimulatorNode(Node):
             raise ConfigurationError(f"parameter seed: {self._seed}; expected at least 0")
         self._vehicle = load_vehicle(vehicle).with_effects(map(parse_effect, effects.split()))
         self._track = load_track(track).scaled(scale)
+        for words in self._track.notes:
+            self.get_logger().warning(f"track {self._track.name}: {words}")
         self._style = Style(aggressiveness, variation)
         self._sensors = self._make_sensors()
         self._commands = CommandHolder(self._vehicle, watchdog, lambda: self._pace.count * self._vehicle.sampling_time)

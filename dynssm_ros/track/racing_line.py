@@ -16,8 +16,9 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.track.centre_points import TrackError
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.track.tracks import Track, TrackError
+from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Vehicle
 
 LineKind = Literal["centre", "racing"]

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.errors import UserError
+from dynssm_ros.track.centre_points import TrackError, mended
 from dynssm_ros.track.layouts import LAYOUTS, closed_loop
 from dynssm_ros.track.lines import ClosedLine, Floats
 
@@ -20,10 +20,6 @@ CSV_COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 LARGEST = 1e9  # m, of a coordinate or width
 MIN_POINTS = 10
 MAX_FOLDED = 0.25  # share of the lap; 0.04 on the published ETHZ track
-
-
-class TrackError(UserError):
-    """A track file is missing or malformed, or what it describes is not a track."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +31,7 @@ class Track:
         centre: the centre line in driving order, ``N`` points.
         width_right: distance from the centre line to the right border at its points (m), ``(N,)``.
         width_left: likewise to the left border.
+        notes: what was mended of its points, in words.
 
     Raises:
         TrackError: too few points, repeated points, widths that are not positive, borders that cross.
@@ -44,6 +41,7 @@ class Track:
     centre: ClosedLine
     width_right: Vector
     width_left: Vector
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for side in ("width_right", "width_left"):
@@ -122,10 +120,12 @@ def load_track(name_or_path: str | Path) -> Track:
 
 
 def read_track(path: str | Path) -> Track:
-    """Reads ``x_m,y_m,w_tr_right_m,w_tr_left_m`` rows; a last row that repeats the first point is left out.
+    """Reads ``x_m,y_m,w_tr_right_m,w_tr_left_m`` rows of a closed track.
+
+    Points that repeat or overlap are left out, and coordinates that are rounded are smoothed; see :func:`mended`.
 
     Raises:
-        TrackError: unreadable, other columns, a value that is not a number, or no track.
+        TrackError: unreadable, other columns, a value that is not a number, an open road, or no track.
     """
     path = Path(path)
     try:
@@ -141,10 +141,9 @@ def read_track(path: str | Path) -> Track:
         elif line.strip():
             rows.append(_numbers(cells, f"{path}: line {number}"))
     table = np.array(rows).reshape(-1, len(CSV_COLUMNS))
-    if len(table) > 1 and np.array_equal(table[0, :2], table[-1, :2]):
-        table = table[:-1]
     try:
-        return Track(path.stem, ClosedLine(table[:, :2]), table[:, 2], table[:, 3])
+        table, notes = mended(table)
+        return Track(path.stem, ClosedLine(table[:, :2]), table[:, 2], table[:, 3], notes)
     except TrackError as error:
         raise TrackError(f"{path}: {error}") from error
 
