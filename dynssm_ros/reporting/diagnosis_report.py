@@ -173,11 +173,16 @@ def improvement_in_words(diagnosis: Diagnosis) -> list[str]:
     for c, channel in enumerate(STATE_SIGNALS):
         values = ", ".join(f"{text(float(values[at, c]))} {name}" for name, values in improvement.rmse.items())
         lines.append(
-            f"   {channel} ({UNITS[channel]}): {values}: {percent(float(improvement.reduction[at, c]))} less than as given, "
-            f"{percent(float(improvement.reduction_from(RECALIBRATED)[at, c]))} less than recalibrated "
-            f"(95 %: {percent(float(low[c]))} to {percent(float(high[c]))})"
+            f"   {channel} ({UNITS[channel]}): {values}: {_less(improvement.reduction[at, c])} than as given, "
+            f"{_less(improvement.reduction_from(RECALIBRATED)[at, c])} than recalibrated "
+            f"(95 %: {_less(low[c])} to {_less(high[c])})"
         )
     return lines
+
+
+def _less(share: float) -> str:
+    """How much of an error a reduction takes away, or adds."""
+    return f"{percent(abs(float(share)))} {'less' if share >= 0 else 'more'}"
 
 
 def diagnosis_report(diagnosis: Diagnosis) -> Report:

@@ -135,6 +135,17 @@ def test_words_say_cause_size_evidence_gain_and_what_to_do(lagging: Lagging) -> 
     assert left_in_words(found) == ""
 
 
+def test_an_error_that_grew_is_called_more_and_not_negatively_less(lagging: Lagging) -> None:
+    found = lagging[2]
+    ours = found.improvement.errors
+    doubled = replace(found.improvement, errors={**ours, EXTENDED: 2.0 * ours[GIVEN]})
+    lines = as_text(replace(found, improvement=doubled)).splitlines()
+    channels = [line for line in lines if line.startswith(tuple(f"   {channel} (" for channel in STATE_SIGNALS))]
+    assert len(channels) == 3
+    assert all(": 100 % more than as given, " in line for line in channels)
+    assert not any("-" in line.split("as given, ")[-1] for line in channels)
+
+
 def test_a_pattern_names_signals_and_the_place(improvement: Improvement) -> None:
     left = improvement.explained_variance[GIVEN][improvement.horizon]
     assert "lateral acceleration" in pattern_in_words(left)
