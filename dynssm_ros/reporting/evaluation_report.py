@@ -185,15 +185,7 @@ def markdown(evaluation: Evaluation) -> str:
 
 def _prose(evaluation: Evaluation) -> Prose:
     bars, coasting = percent(evaluation_figures.MAX_BAR), percent(COASTING)
-    return Prose(
-        "evaluation",
-        evaluation=evaluation,
-        cut=_CUT,
-        max_bar=bars,
-        coasting=coasting,
-        most_rows=interactive.MOST_ROWS,
-        longest_gap=interactive.LONGEST_GAP,
-    )
+    return Prose("evaluation", evaluation=evaluation, cut=_CUT, max_bar=bars, coasting=coasting)
 
 
 def _protocol(evaluation: Evaluation) -> dict[str, str]:

@@ -20,6 +20,7 @@ LONGEST_GAP = 1.0
 """Time (s) that is drawn of a gap: between two recordings may lie days."""
 _INPUT_COLOURS = (PALETTE[6], PALETTE[7], PALETTE[8])
 _TITLES = {"v_x": "v<sub>x</sub>", "v_y": "v<sub>y</sub>", "omega": "ω"}
+_HINT = f"Drag to zoom, double-click to go back, click a name to hide it. The first {MOST_ROWS:,} rows, gaps cut to {LONGEST_GAP:g} s."
 _HEIGHT = 720  # pixels
 
 
@@ -57,7 +58,8 @@ def predicted_and_measured(
         font={"family": "system-ui, sans-serif"},
     )  # fmt: skip
     config = {"displaylogo": False, "responsive": True}
-    return str(to_html(figure, config=config, include_plotlyjs=True, full_html=False, div_id="zoomed"))
+    drawn = str(to_html(figure, config=config, include_plotlyjs=True, full_html=False, div_id="zoomed"))
+    return f'<p class="caption">{_HINT}</p>{drawn}'
 
 
 def _draw(
