@@ -20,7 +20,10 @@ LONGEST_GAP = 1.0
 """Time (s) that is drawn of a gap: between two recordings may lie days."""
 _INPUT_COLOURS = (PALETTE[6], PALETTE[7], PALETTE[8])
 _TITLES = {"v_x": "v<sub>x</sub>", "v_y": "v<sub>y</sub>", "omega": "ω"}
-_HINT = f"Drag to zoom, double-click to go back, click a name to hide it. The first {MOST_ROWS:,} rows, gaps cut to {LONGEST_GAP:g} s."
+_HINT = (
+    "Drag to zoom, double-click to go back, click a name to hide it. "
+    f"The first {MOST_ROWS:,} rows, with gaps cut to {LONGEST_GAP:g} s."
+)
 _HEIGHT = 720  # pixels
 
 
