@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from dynssm_ros.api.inputs import Log, PathLike, centre_line, held_out, joined, opened, vehicle_of
-from dynssm_ros.api.settings import HOLDOUT, MIN_SPEED, CommandsSettings, keywords, setting
+from dynssm_ros.api.settings import HOLDOUT, MIN_SPEED, CommandsSettings, StrictSettings, keywords, setting
 from dynssm_ros.errors import DataWarning, RecordingError
 from dynssm_ros.extras import require
 from dynssm_ros.files import forced
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from dynssm_ros.identification.result.calibration import Calibration
 
 
-class CalibrateSettings(CommandsSettings):
+class CalibrateSettings(CommandsSettings, StrictSettings):
     """Settings of :func:`calibrate`."""
 
     horizon: float | None = setting(
@@ -74,7 +74,7 @@ def calibrate(
     from dynssm_ros.identification.result.calibration import calibrate
 
     car, s = vehicle_of(vehicle), settings
-    logs = opened(recordings, car)
+    logs = opened(recordings, car, strict=s.strict)
     left_out = held_out(logs, s.holdout, car)
     data = joined(logs, s.commands, left_out)
     line = None if s.track is None else centre_line(s.track, data)

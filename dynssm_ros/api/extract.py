@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from dynssm_ros.api.inputs import PathLike, signal_map_of
-from dynssm_ros.api.settings import CommandsSettings, keywords, setting
+from dynssm_ros.api.inputs import PathLike, signal_map_of, warn_of_findings
+from dynssm_ros.api.settings import CommandsSettings, StrictSettings, keywords, setting
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import SignalMap
 
 
-class ExtractSettings(CommandsSettings):
+class ExtractSettings(CommandsSettings, StrictSettings):
     """Settings of :func:`extract`."""
 
     rate: float = setting(50.0, "Rate of the uniform time grid (Hz).", ge=1.0, le=1000.0)
@@ -35,6 +35,11 @@ def extract(
         settings: all keywords as one object.
         on_progress: called with messages read.
 
+    Signals that cannot be right together are a :class:`~dynssm_ros.errors.DataWarning` each, and in ``info.findings``.
+
+    Raises:
+        RecordingError: they cannot, and ``strict`` is set.
+
     Example:
         >>> recording = extract("laps_bag", rate=50.0)  # doctest: +SKIP
         >>> recording["v_x"].mean()  # doctest: +SKIP
@@ -44,4 +49,6 @@ def extract(
 
     several = [bags] if isinstance(bags, (str, Path)) else list(bags)
     signal_map = signal_map_of(signals, settings.commands)
-    return extract(several, signal_map, settings.rate, drop_bad=settings.drop_bad, progress=on_progress)
+    recording = extract(several, signal_map, settings.rate, drop_bad=settings.drop_bad, progress=on_progress)
+    warn_of_findings(recording, strict=settings.strict)
+    return recording

@@ -8,8 +8,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dynssm_ros.errors import DataWarning, SettingError
+from dynssm_ros.errors import DataWarning, RecordingError, SettingError
 from dynssm_ros.runtime.plausibility import implausible_rows
+from dynssm_ros.signals.consistency import checked
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.signals.season import recording_files
 from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
@@ -74,8 +75,12 @@ def track_of(track: Track | PathLike) -> Track:
     return found
 
 
-def opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
-    """Recordings, all of a season's folder; a :class:`DataWarning` names what of them the car cannot have done."""
+def opened(logs: Log | Sequence[Log], car: Vehicle | None, *, strict: bool = False) -> list[Recording]:
+    """Recordings, all of a season's folder; a :class:`DataWarning` names what of them the car cannot have done.
+
+    Raises:
+        RecordingError: ``strict``, and their signals contradict each other.
+    """
     found = []
     for log in files(logs):
         recording = log if isinstance(log, Recording) else Recording.load(log)
@@ -84,8 +89,23 @@ def opened(logs: Log | Sequence[Log], car: Vehicle | None) -> list[Recording]:
         if car is not None and math.isclose(car.sampling_time, recording.T_s):  # else the command ends with that
             for words in implausible_rows(recording, car):
                 warnings.warn(f"{name_of(log)}: {words}", DataWarning, stacklevel=3)
+        recording = checked(recording, None if car is None else car.constants.l_f + car.constants.l_r)
+        warn_of_findings(recording, name_of(log), strict=strict)
         found.append(recording)
     return found
+
+
+def warn_of_findings(recording: Recording, name: str = "", *, strict: bool) -> None:
+    """A :class:`DataWarning` for each contradiction between the signals of a recording.
+
+    Raises:
+        RecordingError: ``strict``, and there is one.
+    """
+    for finding in recording.info.findings:
+        words = f"{name or name_of(recording)}: {finding.line}"
+        if strict:
+            raise RecordingError(words)
+        warnings.warn(words, DataWarning, stacklevel=4)
 
 
 def joined(

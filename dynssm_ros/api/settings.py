@@ -67,6 +67,12 @@ class CommandsSettings(VerbSettings):
     )
 
 
+class StrictSettings(VerbSettings):
+    """What becomes of signals that cannot be right together."""
+
+    strict: bool = setting(False, "Signals that contradict each other are errors instead of warnings.")
+
+
 class WorkerSettings(VerbSettings):
     """Where independent pieces of work are done."""
 

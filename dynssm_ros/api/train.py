@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dynssm_ros.api.calibrate import require_physics
 from dynssm_ros.api.inputs import Log, PathLike, files, held_out, joined, opened, vehicle_in_windows
-from dynssm_ros.api.settings import EPOCHS, HOLDOUT, CommandsSettings, keywords, setting
+from dynssm_ros.api.settings import EPOCHS, HOLDOUT, CommandsSettings, StrictSettings, keywords, setting
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
 from dynssm_ros.progress import NamedProgress
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from dynssm_ros.runtime.artifact import Artifact
 
 
-class TrainSettings(CommandsSettings):
+class TrainSettings(CommandsSettings, StrictSettings):
     """Settings of :func:`train`."""
 
     holdout: float | None = HOLDOUT
@@ -84,11 +84,11 @@ def train(
     config = model_config(model, seed=s.seed, epochs=s.epochs)
     checkpoint, car = folder.with_name(f"{folder.name}.checkpoint.pt"), vehicle_in_windows(vehicle)
     if s.memory is None:
-        logs = opened(recordings, car)
+        logs = opened(recordings, car, strict=s.strict)
         left_out = held_out(logs, s.holdout, car)
         data = joined(logs, s.commands, left_out)
     else:
-        paths, begins = zip(*_looked_at(recordings, car), strict=True)
+        paths, begins = zip(*_looked_at(recordings, car, s.strict), strict=True)
         left_out = held_out(begins, s.holdout, car)
         data = sampled(paths, s.memory, commands=s.commands, holdouts=[left_out[each] for each in begins])
     car = car.with_held_out(left_out)
@@ -121,7 +121,7 @@ def _in_brief(shares: Mapping[str, float]) -> float | dict[str, float]:
     return next(iter(shares.values())) if len(set(shares.values())) == 1 else dict(shares)
 
 
-def _looked_at(logs: Log | Sequence[Log], car: Vehicle) -> list[tuple[Path, str]]:
+def _looked_at(logs: Log | Sequence[Log], car: Vehicle, strict: bool) -> list[tuple[Path, str]]:
     """Files of recordings, each of which was looked at, see :func:`~dynssm_ros.api.inputs.opened`, and their beginnings."""
     found = []
     for log in files(logs):
@@ -129,5 +129,5 @@ def _looked_at(logs: Log | Sequence[Log], car: Vehicle) -> list[tuple[Path, str]
             raise ConfigurationError(
                 "memory: a recording that is not in a file takes its memory already; expected files"
             )
-        found += [(Path(log), one.beginning) for one in opened(log, car)]
+        found += [(Path(log), one.beginning) for one in opened(log, car, strict=strict)]
     return found

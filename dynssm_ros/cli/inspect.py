@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import console, progress_bar, say
+from dynssm_ros.cli.console import console, errors, progress_bar, say
 from dynssm_ros.cli.options import JsonOption
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
@@ -34,7 +35,7 @@ def inspect(
     json: JsonOption = None,
 ) -> None:
     """Show what is in a log: topics or columns, rates, gaps, clocks; suggest a signal map."""
-    from dynssm_ros.reporting.inspection_tables import inspection_json, season_table, topic_table
+    from dynssm_ros.reporting.inspection_tables import finding_table, inspection_json, season_table, topic_table
 
     if is_season(bag):
         if vehicle is not None or out is not None:
@@ -49,6 +50,10 @@ def inspect(
     console.print(topic_table(found).brief.rich())
     for note in found.notes:
         say(f"note: {note}")
+    if found.findings:
+        console.print(finding_table(found.findings).brief.rich())
+    for finding in found.findings:
+        errors.print(f"[yellow]warning:[/yellow] {escape(finding.line)}", soft_wrap=True, highlight=False)
     console.print(found.signal_map(), markup=False, soft_wrap=True, end="")
     if json is not None:
         write_json(json, inspection_json(found))

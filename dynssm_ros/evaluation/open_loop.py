@@ -147,6 +147,7 @@ class Evaluation:
             "starts": self.starts,
             "persistence_rmse": by_channel(self.persistence_rmse),
             "not_tests": self.not_tests,
+            "findings": [finding.model_dump() for finding in self.recording.info.findings],
         }
 
 

@@ -194,6 +194,8 @@ def _protocol(evaluation: Evaluation) -> dict[str, str]:
     lines = _prose(evaluation).protocol(
         sources=sources, rate=1 / recording.T_s, commands=commands, cores=os.cpu_count()
     )
+    found = "; ".join(finding.line for finding in recording.info.findings)
+    lines |= {"Signals that cannot be right": found} if found else {}
     return lines | {f"Model {name}": _origin(group) for name, group in evaluation.groups.items()}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 
 from dynssm_ros.reporting.evaluation_figures import MAX_POINTS, MEASURED, PALETTE, WIDTH, sheet, styled
-from dynssm_ros.reporting.inspection_tables import signal_table, topic_table
+from dynssm_ros.reporting.inspection_tables import finding_table, signal_table, topic_table
 from dynssm_ros.reporting.page import Report, Section
 from dynssm_ros.signals.inspection import Inspection
 
@@ -25,6 +25,9 @@ def inspection_report(found: Inspection) -> Report:
     told = "".join(f" {name}: {one.note}." for name, one in found.signals.items() if one.note)
     text = f"As written to signals.yaml. Names suggest it, so check each line.{missing}{told}"
     sections = [Section("Signal map", text, table=signal_table(found) if found.signals else None)]
+    if found.findings:
+        told = " ".join(f"{finding.line}." for finding in found.findings)
+        sections.insert(0, Section("What cannot be right", told, table=finding_table(found.findings)))
     if any(name in found.signals for names in _PANELS.values() for name in names):
         text = "Signs are seen best here: in a bend to the left omega and the steering are positive."
         sections.append(Section("Signals", text, signals_over_time(found)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from operator import attrgetter
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from dynssm_ros.evaluation.metrics import finite
 from dynssm_ros.reporting.tables import Column, Table
+from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.inspection import Inspection
 from dynssm_ros.signals.season import Season
 
@@ -59,6 +61,21 @@ def signal_table(found: Inspection) -> Table:
     )
 
 
+def finding_table(findings: Sequence[Finding]) -> Table:
+    """What cannot be right, how large it is, and what mends it."""
+    return Table.of(
+        findings,
+        (Column("finding", brief=True), lambda one: one.what),
+        (Column("size", brief=True), lambda one: one.size),
+        (Column("low"), lambda one: one.low),
+        (Column("high"), lambda one: one.high),
+        (Column("unit", brief=True), lambda one: one.unit),
+        (Column("expected", brief=True), lambda one: one.expected),
+        (Column("remedy", brief=True), lambda one: one.remedy),
+        caption="Low and high are the 95 % interval of the size.",
+    )
+
+
 def season_table(season: Season) -> Table:
     """All sessions, in the order of driving, those that could not be read last."""
     sessions = sorted(season.sessions.values(), key=lambda each: (bool(each.failure), each.start, each.place))
@@ -97,4 +114,5 @@ def inspection_json(found: Inspection) -> dict[str, Any]:
         },
         "missing": list(found.missing),
         "notes": list(found.notes),
+        "findings": [finding.model_dump() for finding in found.findings],
     }

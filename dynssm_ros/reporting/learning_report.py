@@ -77,7 +77,8 @@ def _data(out: Path, of: dict[str, list[StepRecord]]) -> Verdict:
     if not few:
         return Verdict("data", "ok", f"{told}; the checks found nothing", link)
     more = [f"and {len(few) - _NOTES} more"] if len(few) > _NOTES else []
-    return Verdict("data", "look", f"{told}. " + "; ".join([*few[:_NOTES], *more]), link)
+    wrong = any(Recording.load(each.outputs[0]).info.findings for each in of["extract"])
+    return Verdict("data", "wrong" if wrong else "look", f"{told}. " + "; ".join([*few[:_NOTES], *more]), link)
 
 
 def _length(files: Sequence[str]) -> str:

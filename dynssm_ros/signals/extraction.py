@@ -12,6 +12,7 @@ import numpy as np
 from dynssm_ros.errors import BagError, RecordingError
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.bags import Bag
+from dynssm_ros.signals.consistency import checked
 from dynssm_ros.signals.decoding import LOG_TIME, decoders, frames_told, header_stamp_ns, stamped_by, to_si
 from dynssm_ros.signals.estimation import MEASURED, estimated, noise_notes
 from dynssm_ros.signals.logs import open_log
@@ -82,7 +83,7 @@ def _extract(
         standard_deviations=deviations,
         notes=tuple(notes),
     )
-    return resample(streams, rate, signal_map.max_gap, signal_map.commands, info)
+    return checked(resample(streams, rate, signal_map.max_gap, signal_map.commands, info))
 
 
 def _with_brakes_at_rest(streams: dict[str, Stream], signal_map: SignalMap) -> tuple[dict[str, Stream], list[str]]:

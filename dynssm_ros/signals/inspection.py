@@ -4,21 +4,33 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import ValidationError
 
-from dynssm_ros.errors import BagError
+from dynssm_ros.errors import BagError, UserError
 from dynssm_ros.progress import Progress
+from dynssm_ros.signals.consistency import contradictions
 from dynssm_ros.signals.contents import TopicContent, contents_of_bag, contents_of_table
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.logs import open_log
-from dynssm_ros.signals.signal_map import SIGNALS, STATE_SIGNALS, TimeColumn, command_signals, required_signals
+from dynssm_ros.signals.signal_map import (
+    SIGNALS,
+    STATE_SIGNALS,
+    SignalMap,
+    TimeColumn,
+    command_signals,
+    required_signals,
+)
 from dynssm_ros.signals.suggestions import Suggestion, set_point_of, suggest
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import Table
 
+_FASTEST_HZ = 50.0  # at which a log is extracted to compare its signals
 _WINDOW = 0.1  # s, of poses from which velocities follow
 
 
@@ -32,6 +44,7 @@ class Inspection:
     signals: dict[str, Suggestion]  # suggested sources, by signal
     notes: tuple[str, ...]  # what to look at, in sentences
     time: TimeColumn | None = None  # of a table
+    findings: tuple[Finding, ...] = ()  # what cannot be right if the suggested signal map is
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -86,7 +99,8 @@ def _flow(content: dict[str, Any]) -> str:
 def inspect(path: str | Path, wheelbase: float | None = None, progress: Progress | None = None) -> Inspection:
     """Reads a log, a bag or a table, and says what is in it.
 
-    With the ``wheelbase`` of the car (m) the scale of a steering signal follows from the curvature it drives.
+    With the ``wheelbase`` of the car (m) the scale of a steering signal follows from the curvature it drives. Where the
+    suggested signal map is complete, the log is extracted with it, and its signals are compared with each other.
 
     Raises:
         BagError: unreadable, or without messages or a time column.
@@ -103,4 +117,18 @@ def inspect(path: str | Path, wheelbase: float | None = None, progress: Progress
         raise BagError(f"{path}: holds no messages; expected some")
     notes += [f"{name}: {one.reason}" for name, one in topics.items() if one.reason]
     signals = suggest(topics, wheelbase, notes, is_table=time is not None)
-    return Inspection(Path(path).name, (end - begin) / 1e9, topics, signals, tuple(notes), time)
+    found = Inspection(Path(path).name, (end - begin) / 1e9, topics, signals, tuple(notes), time)
+    return replace(found, findings=_contradictions(path, found, wheelbase))
+
+
+def _contradictions(path: str | Path, found: Inspection, wheelbase: float | None) -> tuple[Finding, ...]:
+    """Contradictions between the signals of a log by the suggested signal map; none where it cannot be extracted."""
+    if found.missing:
+        return ()
+    rate = found.signals["v_x" if "v_x" in found.signals else "x"].topic.rate
+    try:
+        signal_map = SignalMap.model_validate(yaml.safe_load(found.signal_map())).with_commands("none")
+        recording = extract([path], signal_map, min(max(rate, 1.0), _FASTEST_HZ), drop_bad=True)
+    except (UserError, ValidationError):
+        return ()
+    return contradictions(recording, wheelbase)

@@ -22,6 +22,7 @@ from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.configuration import StrictModel, describe
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.files import replacing, require_replaceable
+from dynssm_ros.signals.findings import Finding, merged
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, lookahead_commands
 from dynssm_ros.signals.recover import vast_table
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS, Commands
@@ -71,6 +72,7 @@ class RecordingInfo(StrictModel):
         default_factory=dict, description="of estimated velocities, root mean square over the rows (m/s, rad/s)"
     )
     notes: tuple[str, ...] = Field(default=(), description="what was recovered, dropped or bridged")
+    findings: tuple[Finding, ...] = Field(default=(), description="what of the signals cannot be right")
 
 
 @dataclass(frozen=True)
@@ -390,6 +392,7 @@ def concatenate(recordings: Sequence[Recording]) -> Recording:
         update={
             "source": tuple(s for r in recordings for s in r.info.source),
             "notes": tuple(n for r in recordings for n in r.info.notes),
+            "findings": merged([info.findings for info in infos]),
             "held": tuple(dict.fromkeys(name for r in recordings for name in r.info.held)),
             "held_periods": _largest([info.held_periods for info in infos]),
             "interpolated": _largest([info.interpolated for info in infos]),

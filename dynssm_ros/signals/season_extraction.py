@@ -158,7 +158,7 @@ def _extracted(task: tuple[Log, Path]) -> Session:
         "rows": len(recording),
         "seconds": round(recording.duration, 3),
         "segments": int(recording.segment[-1]) + 1,
-        "notes": recording.info.notes,
+        "notes": (*recording.info.notes, *(finding.line for finding in recording.info.findings)),
     }
     return about.model_copy(update=found)
 

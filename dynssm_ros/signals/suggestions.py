@@ -13,12 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.signals.actuation import SCALES, UNDERSTEER, believable, understeer
 from dynssm_ros.signals.columns import heading
 from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, pose_fields
 from dynssm_ros.signals.decoding import LOG_TIME
 from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.sensor_topics import COLUMNS, sensors
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals, yaw_of
+from dynssm_ros.signals.spans import BLOCKS
 from dynssm_ros.signals.stamps import clock_notes, frames_note, log_time_note
 from dynssm_ros.vehicle.single_track import SetPoint
 
@@ -62,7 +64,6 @@ _OTHER = re.compile(
 )
 _RADIANS, _SHARE = 1.6, 1.5  # larger values are no road-wheel angle in rad, and no throttle between -1 and 1
 _AGREES = 0.5  # correlation with the curvature, from which on a scale is told
-_UNIT = (0.6, 1.7)  # wheelbase times curvature per unit, for a signal that is the road-wheel angle in rad already
 _POSES_HZ = 20.0  # of a localisation, from which on a window of 0.1 s has poses enough for velocities
 _TURN = 0.1  # rad, of a heading that changes
 _FASTEST = 110.0  # m/s
@@ -344,22 +345,26 @@ def _at_rest(brake: Suggestion) -> Suggestion:
 def _scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], wheelbase: float | None) -> Suggestion:
     """The steering in rad at the road wheel, as far as the curvature that it drives tells."""
     suggestion = replace(suggestion, scale=1.0)
-    slope, values = _curvature_per_unit(suggestion, signals), suggestion.values
-    if slope is None:
+    seen, values = _curvature_per_unit(suggestion, signals), suggestion.values
+    if seen is None:
         large = float(np.nanmax(np.abs(values), initial=0.0)) > _RADIANS
         note = "too large for rad at the road wheel: find its scale" if large else suggestion.note
         return replace(suggestion, scale=1.0, note=note)
-    told = f"the curvature follows it with {slope:.4g} 1/m per unit"
+    slope, low, high = seen
+    told = f"the curvature follows it with {slope:.4g} 1/m per unit, understeer taken off"
     if wheelbase is None:
         return replace(suggestion, scale=1.0, note=f"{told}: the scale is about that times the wheelbase")
-    scale = slope * wheelbase
-    if _UNIT[0] < scale < _UNIT[1]:
+    if low * wheelbase < SCALES[1] and high * wheelbase > SCALES[0]:
         return replace(suggestion, scale=1.0)
-    return replace(suggestion, scale=scale, note=f"{told}; measure the scale at the wheel")
+    return replace(suggestion, scale=slope * wheelbase, note=f"{told}; measure the scale at the wheel")
 
 
-def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) -> float | None:
-    """Change of ``omega / v_x`` (1/m) per unit of the signal; ``None`` where they do not go together."""
+def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) -> tuple[float, float, float] | None:
+    """Change of ``omega / v_x`` (1/m) per unit of the signal in a slow car, and its least and largest value.
+
+    Understeer is fitted with it where speeds differ enough, else it is what cars have. ``None`` where the two do not go
+    together.
+    """
     if "v_x" not in signals or "omega" not in signals:
         return None
     at = suggestion.topic.time
@@ -371,7 +376,14 @@ def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) 
     curvature = omega[fast] / v_x[fast]
     if abs(np.corrcoef(values[fast], curvature)[0, 1]) < _AGREES:
         return None
-    return float(np.polyfit(values[fast], curvature, 1)[0])
+    slope = float(np.polyfit(values[fast], curvature, 1)[0])
+    sign, speed = float(np.sign(slope)), v_x[fast]
+    fit = understeer(sign * values[fast], curvature, speed, block=np.arange(len(speed)) * BLOCKS // len(speed))
+    if fit is not None and fit.share > _AGREES:
+        low, high = believable(fit, float(np.mean(speed**2)))
+        if 0 < low <= high:
+            return sign / float(fit.values[1]), *sorted((sign / low, sign / high))  # type: ignore[return-value]
+    return slope, *sorted(slope * (1.0 + share) for share in UNDERSTEER)  # type: ignore[return-value]
 
 
 def _stamps(signals: dict[str, Suggestion]) -> list[str]:

@@ -72,6 +72,8 @@ def test_the_signals_of_a_bag_come_out_as_they_went_in(make_bag: Any, drive: Any
         "interpolated": {},
         "standard_deviations": {},
         "notes": (),
+        "findings": (),
+        "set_point": "throttle",
     }
     t = seconds(recording)
     np.testing.assert_allclose(recording["x"], 10 * t, atol=1e-6)

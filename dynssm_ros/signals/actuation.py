@@ -1,0 +1,231 @@
+"""Whether steering and throttle can be those of the drive: time, sign, scale, offset, by what they cause.
+
+Steering is compared with curvature including understeer: ``delta = L k + K v^2 k`` (Gillespie, *Fundamentals of Vehicle
+Dynamics*, ch. 6), fitted together, on gentle driving where there is enough of it. Throttle is compared with acceleration.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.signals.findings import Finding, number
+from dynssm_ros.signals.motion import Checked, is_turning
+from dynssm_ros.signals.spans import BLOCKS, SIGMAS, Drive, Fitted, fitted, varies
+from dynssm_ros.signals.timing import acceleration
+
+_SPAN_S = 0.4
+"""Of steering and curvature that are compared (s)."""
+_GENTLE = 0.5
+"""Share of the 99th percentile of the lateral acceleration, up to which tyres count as linear."""
+UNDERSTEER = (-0.4, 4.0)
+"""Understeer ``K v^2`` over wheelbase that cars have: below -1 they are unstable, above 4 they push straight on."""
+_ENOUGH_SPANS = 40
+_LARGE_RAD = 1.6
+"""Larger values are no road-wheel angle in rad."""
+SCALES = (0.5, 2.0)
+"""Steering scales that are left alone: hidden gains of a steering, a wrong wheelbase and tyres at their limit are within."""
+_OFFSET_RAD = 0.04
+"""Straight-ahead steering that is left alone: servos are trimmed worse than that by nobody; banked roads need 0.02."""
+
+
+def steering_fit(drive: Drive) -> Fitted | None:
+    """``delta = offset + L k + K v^2 k`` as recorded: ``(offset, L, K)``; on gentle driving where there is enough."""
+    spans = drive.spans(_SPAN_S)
+    if len(spans) < _ENOUGH_SPANS or not varies(drive.steering):
+        return None
+    ahead = spans.mean(drive.velocity.real)
+    spans, ahead = spans.where(ahead > 0), ahead[ahead > 0]
+    if len(spans) < _ENOUGH_SPANS:
+        return None
+    curvature = spans.mean(drive.omega) / ahead
+    return understeer(spans.mean(drive.steering), curvature, ahead, block=spans.block)
+
+
+def understeer(steering: Vector, curvature: Vector, speed: Vector, *, block: Indices) -> Fitted | None:
+    """``delta = offset + L k + K v^2 k`` from steering (as recorded), curvature (1/m) and speed (m/s), each ``(n,)``.
+
+    ``block`` numbers neighbours. ``None`` where the rows do not determine it.
+    """
+    lateral = np.abs(curvature) * speed**2
+    gentle = lateral <= _GENTLE * np.percentile(lateral, 99)
+    if gentle.sum() < max(_ENOUGH_SPANS, 0.2 * len(lateral)):
+        gentle = np.ones(len(lateral), dtype=bool)
+    at, v = curvature[gentle], speed[gentle]
+    return fitted(np.stack([np.ones(len(at)), at, v**2 * at], axis=1), steering[gentle], block[gentle])
+
+
+def steering_sign(drive: Drive) -> tuple[int, Fitted | None]:
+    """Sign of the yaw rate against the steering, 0 where they do not go together, with their regression.
+
+    The way that the car drives mostly counts as forwards: the sign of v_x may be what is wrong.
+    """
+    spans = drive.spans(_SPAN_S)
+    if len(spans) < 8 or not is_turning(drive) or not varies(drive.steering):
+        return 0, None
+    ahead = spans.mean(drive.velocity.real)
+    ahead = ahead * (np.sign(np.median(ahead)) or 1.0)
+    spans, ahead = spans.where(ahead > 0), ahead[ahead > 0]
+    curvature = spans.mean(drive.omega) / ahead
+    fit = fitted(np.stack([np.ones(len(spans)), curvature], axis=1), spans.mean(drive.steering), spans.block)
+    if fit is None or fit.share < 0.4:
+        return 0, fit
+    low, high = fit.interval(1)
+    return (1 if low > 0 else -1 if high < 0 else 0), fit
+
+
+def check_steering(drive: Drive, wheelbase: float | None) -> Checked:
+    """Sign, scale and offset of the steering against curvature; the scale with the ``wheelbase`` (m) alone."""
+    sign, rough = steering_sign(drive)
+    found: list[Finding] = []
+    if sign < 0 and rough is not None:
+        slope, (low, high) = float(rough.values[1]), rough.interval(1)
+        found.append(
+            Finding(
+                what="steering_sign", told=f"delta_fb falls with the curvature, by {number(slope)} m", size=slope, low=low,
+                high=high, unit="m", expected="above 0: left is positive in both",
+                remedy="steering_feedback: scale: -1; or, if y points right, omega, v_y, y and theta: scale: -1",
+            )
+        )  # fmt: skip
+        drive = drive.changed(steering=-drive.steering)
+    fit = steering_fit(drive) if sign else None
+    scale = _scale(drive, fit, wheelbase)
+    if scale is not None:
+        return [*found, scale], drive.changed(steering=drive.steering * scale.size)
+    if fit is not None and fit.share > 0.4:
+        found += _offset(drive, fit)
+    return found, drive
+
+
+def _scale(drive: Drive, fit: Fitted | None, wheelbase: float | None) -> Finding | None:
+    """What to multiply the steering with, if that is not about 1."""
+    largest = float(np.percentile(np.abs(drive.steering), 99))
+    if fit is not None and wheelbase is not None and fit.share > 0.4:
+        square = float(np.mean(drive.speed[drive.speed >= drive.least_speed] ** 2))
+        low, high = believable(fit, square)
+        if 0 < low <= high and (wheelbase / high > SCALES[1] or wheelbase / low < SCALES[0]):
+            scale = wheelbase / float(fit.values[1])
+            told = f"wheelbase over delta_fb per curvature is {number(scale)}, understeer taken off"
+            return Finding(
+                what="steering_scale", told=told, size=scale, low=wheelbase / high, high=wheelbase / low,
+                expected=f"1 ({SCALES[0]:g} to {SCALES[1]:g})", remedy=_scale_remedy(scale),
+            )  # fmt: skip
+        return None
+    if largest > _LARGE_RAD:
+        return Finding(
+            what="steering_range", told=f"delta_fb is up to {number(largest)}", size=math.pi / 180, low=0.0,
+            high=_LARGE_RAD / largest, unit="1", expected=f"below {_LARGE_RAD:g} rad at the road wheel",
+            remedy="steering_feedback: unit: deg, or scale: 1 over the ratio of the steering",
+        )  # fmt: skip
+    return None
+
+
+def believable(fit: Fitted, square: float) -> tuple[float, float]:
+    """The interval of ``L`` as far as cars go: at the mean ``square`` of the speed understeer is ``UNDERSTEER`` of it.
+
+    Their sum at that speed is known best. Empty, the first larger than the second, where the fit is that of no car.
+    """
+    low, high = fit.interval(1)
+    total = float(fit.values[1] + fit.values[2] * square)
+    ends = [total / (1.0 + share) for share in UNDERSTEER]
+    if not min(ends) <= float(fit.values[1]) <= max(ends):
+        return math.inf, -math.inf
+    return max(low, min(ends)), min(high, max(ends))
+
+
+def _scale_remedy(scale: float) -> str:
+    if abs(scale * 180 / math.pi - 1.0) < 0.35:
+        return f"steering_feedback: unit: deg (factor 0.0175), or scale: {number(scale)}"
+    if 1 / 25 < scale < 1 / 8:
+        return f"steering_feedback: scale: {number(scale)} (steering wheel, ratio {1 / scale:.3g})"
+    return f"steering_feedback: scale: {number(scale)}"
+
+
+def _offset(drive: Drive, fit: Fitted) -> list[Finding]:
+    """Steering at which the car goes straight, if that is not about 0; told where it turned to both sides."""
+    offset, (low, high) = float(fit.values[0]), fit.interval(0)
+    right, left = np.percentile(drive.omega[drive.speed >= drive.least_speed], [10.0, 90.0])
+    if (low < _OFFSET_RAD and high > -_OFFSET_RAD) or not right < 0.0 < left:
+        return []
+    return [
+        Finding(
+            what="steering_offset", told=f"the car goes straight at delta_fb = {number(offset)} rad", size=offset, low=low,
+            high=high, unit="rad", expected=f"0 (within {_OFFSET_RAD:g} rad)",
+            remedy=f"steering_feedback: offset: {number(-offset)}",
+        )
+    ]  # fmt: skip
+
+
+def check_throttle(drive: Drive) -> list[Finding]:
+    """Range and sign of the throttle, and whether it is ever used."""
+    r, largest = drive.throttle, float(np.percentile(np.abs(drive.throttle), 99.5))
+    a = acceleration(drive)
+    known = np.isfinite(a)
+    if not known.any() or largest == 0:
+        return []
+    if largest > 1.5:
+        return [_throttle_range(drive, known, largest)]
+    if largest < 0.03:
+        return [
+            Finding(
+                what="throttle_scale", told=f"r_fb is at most {number(largest)}", size=largest, low=largest, high=largest,
+                expected="a fraction whose full throttle is 1", remedy="throttle_feedback: scale: so that full is 1",
+            )
+        ]  # fmt: skip
+    return _throttle_sign(drive, a, known) or _never_used(r[known], a[known])
+
+
+def _throttle_range(drive: Drive, known: Vector, largest: float) -> Finding:
+    """A throttle beyond 1: a speed set-point, or a percentage."""
+    speed, r = drive.velocity.real[known], drive.throttle[known]
+    block = np.arange(len(r)) * BLOCKS // len(r)
+    fit = fitted(np.stack([np.ones(len(r)), speed], axis=1), r, block)
+    if fit is not None and fit.share > 0.5 and abs(float(fit.values[1]) - 1.0) < 0.3:
+        low, high = fit.interval(1)
+        return Finding(
+            what="throttle_setpoint", told=f"r_fb follows v_x with {number(float(fit.values[1]))} per m/s, up to "
+            f"{number(largest)}: a speed set-point", size=float(fit.values[1]), low=low, high=high,
+            expected="a throttle between -1 and 1", 
+            remedy="map it as speed_feedback, for a vehicle with inputs.set_point: speed, or find the throttle",
+        )  # fmt: skip
+    unit = "unit: '%'" if 20.0 < largest <= 105.0 else f"scale: {number(1 / largest)} or what is full"
+    return Finding(
+        what="throttle_range", told=f"r_fb is up to {number(largest)}", size=largest, low=largest, high=largest,
+        expected="a fraction between -1 and 1", remedy=f"throttle_feedback: {unit}",
+    )  # fmt: skip
+
+
+def _never_used(r: Vector, a: Vector) -> list[Finding]:
+    """A throttle that is never positive although the car accelerates as hard as it brakes."""
+    rest = float(r.max())
+    if rest > 0 or not float(np.percentile(a, 95)) > 0.2 * float(np.abs(np.percentile(a, 5))):
+        return []
+    remedy = f"brake_feedback rests at {number(-rest)}, not 0: offset: {number(rest)}, or a curve with a dead band"
+    return [
+        Finding(
+            what="throttle_never_used", told=f"r_fb is at most {number(rest)} although the car accelerates", size=-rest,
+            low=-rest, high=-rest, expected="above 0 where the car accelerates",
+            remedy=remedy if rest < 0 else "throttle_feedback: map what drives the car",
+        )
+    ]  # fmt: skip
+
+
+def _throttle_sign(drive: Drive, a: Vector, known: Vector) -> list[Finding]:
+    v_x = drive.velocity.real[known]
+    block = np.arange(len(v_x)) * BLOCKS // len(v_x)
+    design = np.stack([drive.throttle[known], np.ones(len(v_x)), v_x, v_x**2], axis=1)
+    fit = fitted(design, a[known], block)
+    if fit is None or fit.share < 0.4:
+        return []
+    slope, (low, high) = float(fit.values[0]), fit.interval()
+    if high >= 0 or abs(slope) < 2 * SIGMAS * float(fit.std[0]):
+        return []
+    return [
+        Finding(
+            what="throttle_sign", told=f"the car decelerates by {number(-slope)} m/s^2 per r_fb", size=slope, low=low,
+            high=high, unit="m/s^2", expected="above 0: throttle accelerates",
+            remedy="throttle_feedback: scale: -1; or it is the brake, or a set-point",
+        )
+    ]  # fmt: skip

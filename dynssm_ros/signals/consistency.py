@@ -1,0 +1,107 @@
+"""Whether the signals of a recording can be right together, by kinematics and physics, with intervals.
+
+Each check compares signals, tells what contradicts, and hands on the drive with that mended, so that one fault is one
+finding. The live check of messages is :mod:`dynssm_ros.runtime.consistency`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from dynssm_ros.signals.actuation import check_steering, check_throttle, steering_sign
+from dynssm_ros.signals.findings import Finding
+from dynssm_ros.signals.liveness import check_liveness
+from dynssm_ros.signals.motion import check_direction, check_path_speed, check_side_slip, check_turning
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.spans import Drive
+from dynssm_ros.signals.timing import check_times
+
+_LEAST_S = 10.0
+"""Seconds of a recording, below which nothing is said."""
+_MOST_ROWS, _STRETCHES = 30_000, 8
+"""Rows that are compared, 10 min at 50 Hz, and in how many stretches they lie in a longer recording."""
+
+
+def checked(recording: Recording, wheelbase: float | None = None) -> Recording:
+    """The recording with what :func:`contradictions` finds in it."""
+    info = recording.info.model_copy(update={"findings": contradictions(recording, wheelbase)})
+    return replace(recording, info=info)
+
+
+def contradictions(recording: Recording, wheelbase: float | None = None) -> tuple[Finding, ...]:
+    """What of a recording cannot be right.
+
+    Args:
+        recording: of one car.
+        wheelbase: of the car (m), with which the scale of the steering is known.
+
+    Returns:
+        A finding for each fault, those first that others depend on; empty where nothing contradicts.
+    """
+    if recording.duration < _LEAST_S:
+        return ()
+    drive = Drive.of(_parts(recording))
+    found = check_liveness(drive)
+    dead = {each.what for each in found}
+    if not drive.speed.max() > 0:
+        return tuple(found)
+    more, drive = check_times(drive)
+    found += more
+    moves = drive.position is not None and "pose_constant" not in dead and bool(np.ptp(np.abs(drive.position)) > 0)
+    alternative = None
+    if moves:
+        more, drive, alternative = _poses(drive, "omega_constant" not in dead)
+        found += more
+    elif float(np.mean(drive.velocity.real[drive.speed >= drive.least_speed] > 0)) < 0.1:
+        found.append(_backwards(drive))
+        drive = drive.changed(velocity=-drive.velocity.conj())
+    if "omega_constant" not in dead:
+        more, drive = check_steering(drive, wheelbase)
+        if alternative is not None and not _is_scaled(check_steering(alternative(drive), wheelbase)[0]):
+            more = [each for each in more if each.what != "steering_scale"]
+        found += more
+    return (*found, *(check_throttle(drive) if recording.info.set_point == "throttle" else ()))
+
+
+def _parts(recording: Recording) -> Recording:
+    """Stretches of a long recording, evenly spread: what contradicts does so everywhere."""
+    if len(recording) <= _MOST_ROWS:
+        return recording
+    each = _MOST_ROWS // _STRETCHES
+    starts = np.linspace(0, len(recording) - each, _STRETCHES).astype(np.intp)
+    return recording.select((starts[:, None] + np.arange(each)).ravel())
+
+
+def _poses(drive: Drive, turns: bool) -> tuple[list[Finding], Drive, Callable[[Drive], Drive] | None]:
+    """Poses against velocities; where the speed of either is wrong and nothing tells which, also the other possibility."""
+    given = drive
+    found, drive = check_path_speed(drive)
+    alternative: Callable[[Drive], Drive] | None = None
+    if found and drive.velocity is not given.velocity and "unit" not in found[0].remedy:
+        ratio = found[0].size
+
+        def alternative(drive: Drive) -> Drive:
+            return drive.changed(velocity=drive.velocity / ratio)
+
+    if turns:
+        more, drive = check_turning(drive, steering_sign(drive)[0])
+        found += more
+    for check in (check_direction, check_side_slip):
+        more, drive = check(drive)
+        found += more
+    return found, drive, alternative
+
+
+def _is_scaled(found: list[Finding]) -> bool:
+    return any(each.what == "steering_scale" for each in found)
+
+
+def _backwards(drive: Drive) -> Finding:
+    share = float(np.mean(drive.velocity.real[drive.speed >= drive.least_speed] < 0))
+    return Finding(
+        what="v_x_sign", told=f"v_x is negative in {100 * share:.0f} % of the drive", size=share, low=share, high=share,
+        expected="a car that drives forwards", remedy="v_x: scale: -1",
+    )  # fmt: skip

@@ -1,0 +1,132 @@
+"""Signals that do not live: constant where the car moves, clipped, or in coarse steps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.signals.findings import Finding, number
+from dynssm_ros.signals.spans import Drive, varies
+
+_TURNS_RAD_S, _BOTH_WAYS = 0.02, 0.3
+"""Rate of turning that shows (rad/s); share of the largest that it has to both sides."""
+_SWING, _SWINGS = 0.3, 4
+"""Change of the speed, as a share of the largest, and how often it goes up and down by that."""
+_CLIPPED_SHARE, _CLIPPED_S = 0.01, 0.2
+"""Share of rows at the very largest value, and the time at a stretch, that no sensor shows that is not clipped."""
+_STEP = 0.3
+"""Step of a signal in units of its standard deviation, from which on it is coarse."""
+
+
+def check_liveness(drive: Drive) -> list[Finding]:
+    """Constants, clipping and coarse steps."""
+    found = [*_constants(drive)]
+    dead = {each.what.removesuffix("_constant") for each in found}
+    for name, values in (("v_x", drive.velocity.real), ("v_y", drive.velocity.imag), ("omega", drive.omega)):
+        if name not in dead and varies(values):
+            found += _clipped(name, values, drive) or _coarse(name, values)
+    return found
+
+
+def _constants(drive: Drive) -> list[Finding]:
+    moving = drive.speed >= drive.least_speed
+    turn = _turn_rate(drive)
+    turns = float(np.sqrt(np.mean(turn[moving] ** 2))) if moving.any() else 0.0
+    found = []
+    if turns > _TURNS_RAD_S and drive.speed.max(initial=0.0) > 0:
+        for name, values, what in (("omega", drive.omega, "turns"), ("v_y", drive.velocity.imag, "turns")):
+            if np.ptp(values) == 0:
+                found.append(_constant(name, float(values[0]), what, turns))
+        low, high = np.percentile(turn[moving], [5.0, 95.0])
+        if np.ptp(drive.steering) == 0 and min(-low, high) > _BOTH_WAYS * max(-low, high):
+            found.append(_constant("steering", float(drive.steering[0]), "turns to both sides", turns))
+    swings = _swings(drive)
+    if swings >= _SWINGS and np.ptp(drive.throttle) == 0:
+        found.append(_constant("throttle", float(drive.throttle[0]), f"gains and loses speed {swings} times", swings))
+    if drive.position is not None and drive.speed.min(initial=1.0) > 0 and np.ptp(np.abs(drive.position)) == 0:
+        found.append(_constant("pose", 0.0, "drives", float(drive.speed.mean())))
+    return found
+
+
+_REMEDIES = {
+    "omega": "take omega from a gyro, or give `velocities:` with the pose",
+    "v_y": "nothing measures it: give `velocities:` with the pose, or leave v_y out for the estimator",
+    "steering": "steering_feedback: map the measured or commanded angle",
+    "throttle": "throttle_feedback: map what drives the car",
+    "pose": "leave x, y, theta out, or map the localisation",
+}
+
+
+def _constant(name: str, value: float, though: str, size: float) -> Finding:
+    told = f"{name} is {number(value)} throughout although the car {though}"
+    return Finding(
+        what=f"{name}_constant", told=told, size=size, low=size, high=size, expected="a signal that lives",
+        remedy=_REMEDIES[name],
+    )  # fmt: skip
+
+
+def _turn_rate(drive: Drive) -> Vector:
+    """Rate of turning by the heading, the yaw rate where there is none, or the steering (rad/s), ``(N,)``."""
+    if drive.theta is not None and np.ptp(drive.theta) > 0:
+        step = max(1, round(0.2 / drive.T_s))
+        found = np.zeros(len(drive))
+        same = drive.segment[step:] == drive.segment[:-step]
+        found[step:] = np.where(same, (drive.theta[step:] - drive.theta[:-step]) / (step * drive.T_s), 0.0)
+        return found
+    return drive.omega if np.ptp(drive.omega) > 0 else drive.steering
+
+
+def _swings(drive: Drive) -> int:
+    """How often the speed goes up or down by a share of its largest."""
+    speed = drive.speed[:: max(1, round(0.2 / drive.T_s))]
+    least, count, way = _SWING * float(np.percentile(drive.speed, 99)), 0, 0
+    low = high = float(speed[0]) if len(speed) else 0.0
+    for value in speed.tolist():
+        low, high = min(low, value), max(high, value)
+        if way <= 0 and value - low > least:
+            count, way, high = count + 1, 1, value
+        elif way >= 0 and high - value > least:
+            count, way, low = count + 1, -1, value
+    return count
+
+
+def _clipped(name: str, values: Vector, drive: Drive) -> list[Finding]:
+    """A signal that stays at its largest value."""
+    for end in (float(values.max()), float(values.min())):
+        at = (values == end) & (np.abs(values) > 0.5 * np.abs(values).max())
+        stays = _longest_run(at) * drive.T_s
+        if at.mean() > _CLIPPED_SHARE and stays >= _CLIPPED_S and _runs(at) > 1:
+            told = f"{name} is exactly {number(end)} in {100 * at.mean():.2g} % of the rows, up to {stays:.2g} s at a stretch"
+            return [
+                Finding(
+                    what=f"{name}_clipped", told=told, size=end, low=end, high=end, expected="no such limit",
+                    remedy="a sensor with a larger range, or leave those rows out",
+                )
+            ]  # fmt: skip
+    return []
+
+
+def _runs(at: Vector) -> int:
+    return int((np.diff(at.astype(int), prepend=0) > 0).sum())
+
+
+def _longest_run(at: Vector) -> int:
+    edges = np.flatnonzero(np.diff(at.astype(int), prepend=0, append=0))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
+def _coarse(name: str, values: Vector) -> list[Finding]:
+    """A signal that knows few values."""
+    kinds, counts = np.unique(values, return_counts=True)
+    common = kinds[counts >= 3]
+    if counts[counts >= 3].sum() < 0.5 * len(values) or len(common) < 2:
+        return []
+    step, spread = float(np.median(np.diff(common))), float(values.std())
+    if step < _STEP * spread:
+        return []
+    return [
+        Finding(
+            what=f"{name}_coarse", told=f"{name} comes in steps of {number(step)}", size=step, low=step, high=step,
+            expected=f"steps below {number(_STEP * spread)}", remedy="find the field that is not rounded",
+        )
+    ]  # fmt: skip

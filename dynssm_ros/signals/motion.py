@@ -1,0 +1,314 @@
+"""Whether poses move as the velocities say: scale, sign, frame and time, by kinematics alone.
+
+Three rates of turning are compared in pairs: that of the heading, of the measured yaw rate, and of the course, which is the
+direction in which the position moves. Which of them is wrong the other two tell.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.signals.findings import Finding, number
+from dynssm_ros.signals.spans import SIGMAS, Drive, Fitted, Spans, fitted
+
+Checked = tuple[list[Finding], Drive]
+"""What was found, and the drive with that mended."""
+_COURSE_S = (0.8, 0.4, 0.2, 0.1)
+"""Lengths of spans over which positions move (s); the longest is taken in which a car hardly turns."""
+_HARDLY_RAD = 0.5
+"""Change of the course over a span in which its chord is as long as its arc within 1 %."""
+_TURN_S = 1.0
+"""Length of spans over which the car turns (s)."""
+SPEED_TOLERANCE, YAW_TOLERANCE = 0.06, 0.12
+"""Relative deviations that healthy logs show: tyre radii and drifting localisation, scale of gyros."""
+_ANGLE_TOLERANCE_RAD = 0.2
+"""Turn between pose and velocity that a mounting or a heading that settles may have."""
+_OPPOSITE = (-2.0, -0.5)
+"""Ratio of two lateral velocities whose signs differ; others belong to a v_y that says too little to judge."""
+_RELATED = 0.5
+"""Explained share, from which on two signals count as related."""
+_TURNING_RAD_S = 0.02
+"""Root mean square yaw rate, below which nothing is said of turning."""
+_SCATTER, _ALIGNED, _CLEARER = 0.02, 0.15, 4.0
+"""Circular variance of the angle between path and velocity: up to which it is constant, up to which a frame may explain it,
+and how many times less than in the other frame it must be."""
+
+_UNITS = {
+    "km/h": 1 / 3.6, "mph": 0.44704, "kt": 1852 / 3600, "ft/s": 0.3048, "deg": math.pi / 180, "deg/s": math.pi / 180,
+    "cm": 0.01, "mm": 0.001, "km": 1000.0,
+}  # fmt: skip
+_UNIT_WITHIN = 0.03
+"""Relative deviation of a factor from that of a unit that is named."""
+
+
+def unit_of(factor: float, *names: str) -> str:
+    """The unit whose factor to SI a factor is, if one is; else empty."""
+    return next((name for name in names if abs(factor / _UNITS[name] - 1.0) < _UNIT_WITHIN), "")
+
+
+def in_unit(factor: float, *names: str) -> str:
+    """What to write for a factor: the unit if it is that of one, else the scale."""
+    unit = unit_of(factor, *names)
+    return f"unit: {unit}" if unit else f"scale: {number(factor)}"
+
+
+def course_spans(drive: Drive) -> Spans:
+    """Spans over which the course is nearly constant, where the position moves at all."""
+    assert drive.position is not None
+    best: tuple[float, Spans] | None = None
+    for seconds in _COURSE_S:
+        spans = drive.spans(seconds)
+        moved = spans.change(drive.position)
+        spans, moved = spans.where(np.abs(moved) > 0), moved[np.abs(moved) > 0]
+        if len(spans) < 2:
+            continue
+        turn = np.abs(np.angle(moved[1:] * moved[:-1].conj()))[np.diff(spans.start) == spans.end[0] - spans.start[0]]
+        most = float(np.percentile(turn, 80)) if len(turn) else math.inf
+        if most < _HARDLY_RAD:
+            return spans
+        if best is None or most < best[0]:
+            best = most, spans
+    return best[1] if best else drive.spans(_COURSE_S[-1])
+
+
+def check_path_speed(drive: Drive) -> Checked:
+    """Path speed of the positions over the magnitude of the velocity."""
+    spans = course_spans(drive)
+    way, moved = spans.integral(drive.speed), np.abs(spans.change(drive.position))
+    fit = _ratio(moved, way, spans)
+    if fit is None or _is_one(fit, SPEED_TOLERANCE):
+        return [], drive
+    ratio, (low, high) = float(fit.values[0]), fit.interval()
+    unit = unit_of(ratio, "km/h", "mph", "kt", "ft/s")
+    told = f"path speed of x, y over hypot(v_x, v_y) is {number(ratio)}"
+    of_pose = in_unit(1.0 / ratio, "cm", "mm", "km")
+    remedy = f"v_x, v_y: unit: {unit}" if unit else f"v_x, v_y: scale: {number(ratio)}, or x, y: {of_pose}"
+    found = Finding(
+        what="pose_speed", told=told, size=ratio, low=low, high=high, expected="1", remedy=remedy,
+    )  # fmt: skip
+    if unit_of(1.0 / ratio, "cm", "mm", "km"):
+        return [found], drive.changed(position=drive.position / ratio)  # type: ignore[operator]
+    return [found], drive.changed(velocity=drive.velocity * ratio)
+
+
+def _is_one(fit: Fitted, tolerance: float, value: float = 1.0) -> bool:
+    """Whether a factor may be 1 within its interval and a tolerance."""
+    low, high = fit.interval()
+    return low < value + tolerance and high > value - tolerance
+
+
+class _Turning(NamedTuple):
+    """How the heading turns against yaw rate and course."""
+
+    heading_by_omega: Fitted | None
+    course_by_omega: Fitted | None
+    course_by_heading: Fitted | None
+
+
+def _turning(drive: Drive) -> _Turning:
+    assert drive.theta is not None
+    assert drive.position is not None
+    spans = drive.spans(_TURN_S)
+    heading = _ratio(spans.change(drive.theta), spans.integral(drive.omega), spans)
+    along = course_spans(drive)
+    if len(along) < 2:
+        return _Turning(heading, None, None)
+    moved = along.change(drive.position)
+    next_to = np.flatnonzero(along.start[1:] == along.end[:-1])
+    course = np.angle(moved[next_to + 1] * moved[next_to].conj())
+    half = (along.end[0] - along.start[0]) // 2
+    between = Spans(drive, along.start[next_to] + half, along.start[next_to + 1] + half)
+    return _Turning(
+        heading,
+        _ratio(course, between.integral(drive.omega), between),
+        _ratio(course, between.change(drive.theta), between),
+    )
+
+
+def _ratio(values: Vector, of: Vector, spans: Spans) -> Fitted | None:
+    """``values`` over ``of``; ``None`` where they do not go together.
+
+    Noise in ``of`` makes the ratio too small, by the explained share at most: the deviation counts that.
+    """
+    found = fitted(of[:, None], values, spans.block) if len(spans) else None
+    if found is None or found.share < _RELATED:
+        return None
+    return Fitted(found.values, found.std + np.abs(found.values) * (1.0 / found.share - 1.0) / SIGMAS, found.share)
+
+
+def is_turning(drive: Drive) -> bool:
+    """Whether the car turns enough that signs and scales of turning show."""
+    driving = drive.speed >= drive.least_speed
+    return bool(driving.any()) and float(np.sqrt(np.mean(drive.omega[driving] ** 2))) > _TURNING_RAD_S
+
+
+def check_turning(drive: Drive, steering_sign: int) -> Checked:
+    """Heading against yaw rate against course: signs and scales.
+
+    ``steering_sign`` is that of the yaw rate against the steering, 0 if not known: it breaks ties.
+    """
+    turning = _turning(drive)
+    found, drive = _turning_scales(turning, drive)
+    signs = [0 if fit is None else int(np.sign(fit.values[0])) for fit in turning]
+    heading, course, both = signs
+    if heading == 0 and course != 0 and both != 0:
+        heading = course * both
+    if course == 0 and heading != 0 and both != 0:
+        course = heading * both
+    if heading < 0 and course < 0:
+        if steering_sign <= 0:
+            return [*found, _sign(turning.heading_by_omega or turning.course_by_omega, "omega_sign", "omega")], (
+                drive.changed(omega=-drive.omega)
+            )
+        return [*found, _sign(turning.heading_by_omega or turning.course_by_omega, "pose_mirrored", "pose")], (
+            drive.changed(theta=-drive.theta, position=drive.position.conj())  # type: ignore[operator,union-attr]
+        )
+    if heading < 0:
+        return [*found, _sign(turning.heading_by_omega, "theta_sign", "theta")], drive.changed(theta=-drive.theta)  # type: ignore[operator]
+    if course < 0:
+        return [*found, _sign(turning.course_by_omega, "path_mirrored", "path")], (
+            drive.changed(position=drive.position.conj())  # type: ignore[union-attr]
+        )
+    return found, drive
+
+
+_SIGNS = {
+    "omega": ("omega over the turning of theta and of the path", "omega: scale: -1"),
+    "theta": (
+        "d theta/dt over omega",
+        "theta: scale: -1 (with x east and y north a compass heading is also turned: offset: 1.571)",
+    ),
+    "path": ("turning of the path over omega", "y: scale: -1, or x and y exchanged"),
+    "pose": (
+        "turning of theta and of the path over omega",
+        "theta: scale: -1 and y: scale: -1 (north-east-down to x forward, y left); or omega: scale: -1 with the steering's",
+    ),
+}
+
+
+def _sign(fit: Fitted | None, what: str, which: str) -> Finding:
+    assert fit is not None
+    told, remedy = _SIGNS[which]
+    low, high = fit.interval()
+    value = float(fit.values[0])
+    return Finding(
+        what=what, told=f"{told} is {number(value)}", size=value, low=low, high=high, expected="1", remedy=remedy
+    )
+
+
+def _turning_scales(turning: _Turning, drive: Drive) -> Checked:
+    """A scale of omega or theta that the course contradicts."""
+    heading, course, both = turning
+    if heading is None or _is_one(_positive(heading), YAW_TOLERANCE):
+        return [], drive
+    ratio = abs(float(heading.values[0]))
+    theta_is_right = both is not None and _is_one(_positive(both), 2 * YAW_TOLERANCE)
+    omega_is_right = course is not None and _is_one(_positive(course), 2 * YAW_TOLERANCE)
+    low, high = sorted(map(abs, heading.interval()))
+    told = f"d theta/dt over omega is {number(ratio)}"
+    if omega_is_right and not theta_is_right:
+        remedy = f"theta: {in_unit(1.0 / ratio, 'deg')}"
+        found = Finding(what="theta_scale", told=told, size=ratio, low=low, high=high, expected="1", remedy=remedy)
+        return [found], drive.changed(theta=drive.theta / ratio)  # type: ignore[operator]
+    remedy = f"omega: {in_unit(ratio, 'deg/s')}"
+    found = Finding(what="omega_scale", told=told, size=ratio, low=low, high=high, expected="1", remedy=remedy)
+    return [found], drive.changed(omega=drive.omega * ratio)
+
+
+def _positive(fit: Fitted) -> Fitted:
+    return Fitted(np.abs(fit.values), fit.std, fit.share)
+
+
+def check_direction(drive: Drive) -> Checked:
+    """Direction in which the position moves, against heading and velocity."""
+    assert drive.theta is not None
+    assert drive.position is not None
+    spans = course_spans(drive)
+    moved = spans.change(drive.position)
+    if len(spans) < 8:
+        return [], drive
+    middle = drive.theta[spans.start] + spans.change(drive.theta) / 2
+    course, body = moved / np.abs(moved), _unit(spans.mean(drive.velocity))
+    heading = np.exp(1j * middle)
+    error = course * (heading * body).conj()
+    mean = complex(error.mean())
+    scatter, scatter_in_map = 1.0 - abs(mean), 1.0 - abs(complex((course * body.conj()).mean()))
+    if scatter < max(_SCATTER, scatter_in_map / _CLEARER):
+        return _turned(mean, error, spans, drive)
+    if scatter_in_map < _ALIGNED and scatter_in_map < scatter / _CLEARER:
+        low, high = _mean_interval(np.cos(np.angle(error)), spans)
+        found = Finding(
+            what="twist_in_map_frame",
+            told=f"v_x, v_y point along the path without theta; with it the cosine of their angle is {number(abs(mean))}",
+            size=abs(mean), low=low, high=high, expected="1",
+            remedy="v_x, v_y in the frame of the car: turn them by -theta in the odometry, or `velocities:` from the poses",
+        )  # fmt: skip
+        return [found], drive.changed(velocity=drive.velocity * np.exp(-1j * drive.theta))
+    return [], drive
+
+
+def _turned(mean: complex, error: Vector, spans: Spans, drive: Drive) -> Checked:
+    """A constant angle between the path and where the car goes by its heading and velocity."""
+    angle = float(np.angle(mean))
+    low, high = _mean_interval(np.angle(error * np.exp(-1j * angle)) + angle, spans)
+    if low < _ANGLE_TOLERANCE_RAD and high > -_ANGLE_TOLERANCE_RAD:
+        return [], drive
+    told = f"the path points {number(angle)} rad beside theta and the velocity"
+    ahead = float(np.mean(drive.velocity.real[drive.speed >= drive.least_speed] > 0))
+    if abs(angle) > math.pi - _ANGLE_TOLERANCE_RAD and ahead < 0.5:
+        found = Finding(
+            what="v_x_sign", told=told, size=angle, low=low, high=high, unit="rad", expected="0",
+            remedy="v_x: scale: -1 (or theta: offset: 3.142, if the car drove backwards)",
+        )  # fmt: skip
+        return [found], drive.changed(velocity=-drive.velocity.conj())
+    found = Finding(
+        what="theta_offset", told=told, size=angle, low=low, high=high, unit="rad", expected="0",
+        remedy=f"theta: offset: {number(angle)}",
+    )  # fmt: skip
+    return [found], drive.changed(theta=drive.theta + angle)  # type: ignore[operator]
+
+
+def _unit(values: Vector) -> Vector:
+    return values / np.maximum(np.abs(values), 1e-12)
+
+
+def _mean_interval(values: Vector, spans: Spans) -> tuple[float, float]:
+    """The 95 % interval of a mean, by blocks."""
+    means = np.array([values[spans.block == number].mean() for number in np.unique(spans.block)])
+    half = SIGMAS * float(means.std(ddof=1)) / math.sqrt(len(means)) if len(means) > 1 else math.inf
+    return float(values.mean()) - half, float(values.mean()) + half
+
+
+def check_side_slip(drive: Drive) -> Checked:
+    """Lateral velocity of the position in the car's frame against v_y: sign and scale.
+
+    A point beside the centre of gravity adds a multiple of omega, a turned sensor one of v_x; both are left free.
+    """
+    assert drive.theta is not None
+    assert drive.position is not None
+    spans = course_spans(drive)
+    if len(spans) < 8:
+        return [], drive
+    turned = np.exp(1j * drive.theta)
+    back = np.exp(-1j * (drive.theta[spans.start] + spans.change(drive.theta) / 2))
+
+    def across(velocity: Any) -> Vector:
+        return np.asarray((spans.integral(turned * velocity) * back).imag / spans.seconds)
+
+    moved = (spans.change(drive.position) * back).imag / spans.seconds - across(drive.velocity.real)
+    terms = [across(1j * each) for each in (drive.velocity.imag, drive.omega, drive.velocity.real)]
+    fit = fitted(np.stack(terms, axis=1), moved, spans.block)
+    if fit is None or fit.share < _RELATED:
+        return [], drive
+    slope, (low, high) = float(fit.values[0]), fit.interval()
+    if high < 0.0 and _OPPOSITE[0] < slope < _OPPOSITE[1]:
+        found = Finding(
+            what="v_y_sign", told=f"lateral velocity of x, y over v_y is {number(slope)}", size=slope, low=low, high=high,
+            expected="1", remedy="v_y: scale: -1",
+        )  # fmt: skip
+        return [found], drive.changed(velocity=drive.velocity.conj())
+    return [], drive

@@ -1,0 +1,272 @@
+"""What cannot be right is found with its size, one finding a fault; what is right has none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dynssm_ros.api import extract
+from dynssm_ros.api.inputs import opened
+from dynssm_ros.arrays import Vector
+from dynssm_ros.errors import DataWarning, RecordingError
+from dynssm_ros.signals.consistency import checked, contradictions
+from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
+from dynssm_ros.signals.spans import fitted
+from dynssm_ros.signals.standard import recording_to_bag
+
+T_S, WHEELBASE, UNDERSTEER, REAR_SLIP = 0.05, 2.6, 0.004, 0.01
+DEGREE = 180.0 / np.pi
+Changed = Callable[[Recording], Recording]
+
+
+def driven(seconds: float = 60.0, noise: float = 0.01, speed: float = 15.0, seed: int = 0) -> Recording:
+    """A car that understeers, ``delta = L k + K v^2 k``, on bends that do not repeat; it accelerates and brakes."""
+    t = np.arange(round(seconds / T_S)) * T_S
+    rng = np.random.default_rng(seed)
+    periods, phases = np.array([4.1, 6.7, 11.3, 19.0]), rng.uniform(0, 2 * np.pi, 4)
+    waves = np.sin(2 * np.pi * t[:, None] / periods + phases)
+    acceleration = 0.3 * speed * (waves[:, 1] + waves[:, 2]) / 2
+    v_x = speed + np.cumsum(acceleration) * T_S
+    curvature = 3.0 / speed**2 * (waves[:, 0] + waves[:, 3]) / 2
+    omega, v_y = v_x * curvature, (1.2 - REAR_SLIP * v_x**2) * v_x * curvature
+    theta = np.cumsum(omega) * T_S
+    path = np.cumsum((v_x + 1j * v_y) * np.exp(1j * theta)) * T_S
+    r = np.roll((acceleration + 0.01 * speed) / (0.3 * speed), -2)
+    delta = np.roll(WHEELBASE * curvature + UNDERSTEER * v_x**2 * curvature, -2)
+    measured = np.stack([v_x, v_y, omega]) + noise * rng.standard_normal((3, len(t))) * np.array([[5.0], [1.0], [1.0]])
+    columns = dict(zip(("v_x", "v_y", "omega"), measured, strict=True))
+    columns |= {
+        "r_fb": r,
+        "delta_fb": delta,
+        "r_cmd": 0 * r,
+        "delta_cmd": 0 * r,
+        "x": path.real,
+        "y": path.imag,
+        "theta": theta,
+    }
+    time = np.round(1.7e18 + t * 1e9).astype(np.int64)
+    info = RecordingInfo(sampling_time=T_S, commands="none", source=("drive",))
+    return Recording(info, time, np.zeros(len(t), np.int32), columns)
+
+
+def times(**factors: float) -> Changed:
+    """Multiplies columns."""
+    return lambda drive: with_columns(drive, **{name: factor * drive[name] for name, factor in factors.items()})
+
+
+def early(seconds: float, *names: str) -> Changed:
+    """Columns that come some seconds early."""
+
+    def change(drive: Recording) -> Recording:
+        moved = drive.select(slice(0, len(drive) - 240))
+        rows = 120 + round(seconds / T_S)
+        columns = {
+            name: values[rows:][: len(moved)] if name in names else values[120:][: len(moved)]
+            for name, values in drive.columns.items()
+        }
+        return replace(moved, columns=columns)
+
+    return change
+
+
+def with_columns(drive: Recording, **columns: Vector) -> Recording:
+    """With other columns."""
+    return replace(drive, columns=drive.columns | columns)
+
+
+def constant(name: str, value: float = 0.0) -> Changed:
+    """A column that does not live."""
+    return lambda drive: with_columns(drive, **{name: np.full(len(drive), value)})
+
+
+def in_the_map(drive: Recording) -> Recording:
+    """The velocity in the map's frame."""
+    velocity = (drive["v_x"] + 1j * drive["v_y"]) * np.exp(1j * drive["theta"])
+    return with_columns(drive, v_x=velocity.real, v_y=velocity.imag)
+
+
+def resting(rest: float) -> Changed:
+    """A brake sensor that is never 0, so that the throttle is never used."""
+    return lambda drive: with_columns(drive, r_fb=-(rest + (1 - rest) * np.maximum(-drive["r_fb"], 0)))
+
+
+def without_pose(drive: Recording) -> Recording:
+    """Without x, y and theta."""
+    return replace(drive, columns={name: drive[name] for name in drive.columns if name not in ("x", "y", "theta")})
+
+
+def turned(angle: float) -> Changed:
+    """A heading that is off."""
+    return lambda drive: with_columns(drive, theta=drive["theta"] + angle)
+
+
+def compass(drive: Recording) -> Recording:
+    """A heading that counts clockwise from north."""
+    return with_columns(drive, theta=np.pi / 2 - drive["theta"])
+
+
+def set_point(drive: Recording) -> Recording:
+    """A speed set-point where the throttle is expected."""
+    return with_columns(drive, r_fb=np.roll(drive["v_x"], -4) + 0.4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("speed", [3.0, 15.0, 30.0])
+def test_a_healthy_drive_has_no_finding(seed: int, speed: float) -> None:
+    assert contradictions(driven(speed=speed, seed=seed), WHEELBASE) == ()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda drive: drive, without_pose, times(delta_fb=1.4), early(0.2, "x", "y", "theta"), early(-0.2, "delta_fb")],
+)
+def test_what_healthy_logs_show_has_no_finding(change: Changed) -> None:
+    assert contradictions(change(driven()), WHEELBASE) == ()
+
+
+@pytest.mark.parametrize(
+    ("what", "size", "change"),
+    [
+        ("pose_speed", 0.5, times(x=0.5, y=0.5)),
+        ("pose_speed", 1 / 3.6, times(v_x=3.6, v_y=3.6)),
+        ("pose_speed", 0.8, times(v_x=1.25, v_y=1.25)),
+        ("pose_speed", 1000.0, times(x=1e3, y=1e3)),
+        ("omega_scale", 1 / DEGREE, times(omega=DEGREE)),
+        ("omega_scale", 0.5, times(omega=2.0)),
+        ("omega_scale", 1.25, times(omega=0.8)),
+        ("theta_scale", DEGREE, times(theta=DEGREE)),
+        ("theta_scale", 0.7, times(theta=0.7)),
+        ("theta_scale", 2.0, times(theta=2.0)),
+        ("omega_sign", -1.0, times(omega=-1)),
+        ("theta_sign", -1.0, times(theta=-1)),
+        ("path_mirrored", -1.0, times(y=-1)),
+        ("pose_mirrored", -1.0, times(y=-1, theta=-1)),
+        ("v_y_sign", -1.0, times(v_y=-1)),
+        ("v_x_sign", np.pi, times(v_x=-1)),
+        ("theta_offset", 0.5, turned(-0.5)),
+        ("theta_offset", np.pi / 2, turned(-np.pi / 2)),
+        ("theta_offset", -1.2, turned(1.2)),
+        ("steering_scale", 1 / DEGREE, times(delta_fb=DEGREE)),
+        ("steering_scale", 1 / 14.5, times(delta_fb=14.5)),
+        ("steering_scale", 4.0, times(delta_fb=0.25)),
+        ("steering_time", 3.0, early(3.0, "delta_fb")),
+        ("steering_time", -1.5, early(-1.5, "delta_fb")),
+        ("steering_time", 1.0, early(1.0, "delta_fb")),
+        ("throttle_time", 2.0, early(2.0, "r_fb")),
+        ("throttle_time", -4.0, early(-4.0, "r_fb")),
+        ("throttle_time", 5.0, early(5.0, "r_fb")),
+        ("inputs_time", 3.0, early(3.0, "r_fb", "delta_fb")),
+        ("pose_time", -2.0, early(2.0, "x", "y", "theta")),
+        ("pose_time", 1.0, early(-1.0, "x", "y", "theta")),
+        ("twist_time", 2.0, early(2.0, "v_x", "v_y", "omega")),
+        ("steering_offset", 0.1, lambda drive: with_columns(drive, delta_fb=drive["delta_fb"] + 0.1)),
+        ("throttle_never_used", 0.0075, resting(0.0075)),
+        ("throttle_never_used", 0.02, resting(0.02)),
+        ("throttle_never_used", 0.05, resting(0.05)),
+    ],
+)
+def test_a_fault_is_found_with_its_size(what: str, size: float, change: Changed) -> None:
+    (found,) = contradictions(change(driven()), WHEELBASE)
+    assert found.what == what
+    margin = 0.15 if what.endswith("_time") else 0.1 * abs(size)
+    assert min(abs(found.size - size), abs(abs(found.size) - abs(size)) if abs(size) == np.pi else np.inf) < margin
+    assert found.low <= found.size <= found.high
+
+
+@pytest.mark.parametrize(
+    ("what", "change"),
+    [
+        ("twist_in_map_frame", in_the_map),
+        ("steering_sign", times(delta_fb=-1)),
+        ("steering_sign", times(y=-1, theta=-1, v_y=-1, omega=-1)),
+        ("steering_sign", lambda drive: without_pose(times(omega=-1)(drive))),
+        ("throttle_sign", times(r_fb=-1)),
+        ("throttle_range", times(r_fb=100)),
+        ("throttle_scale", times(r_fb=0.01)),
+        ("throttle_setpoint", set_point),
+        ("omega_constant", constant("omega")),
+        ("v_y_constant", constant("v_y")),
+        ("steering_constant", constant("delta_fb", 0.1)),
+        ("throttle_constant", constant("r_fb")),
+        ("v_x_sign", lambda drive: without_pose(times(v_x=-1)(drive))),
+    ],
+)
+def test_a_fault_without_a_size_is_named(what: str, change: Changed) -> None:
+    found = contradictions(change(driven()), WHEELBASE)
+    assert [each.what for each in found] == [what]
+
+
+def test_a_compass_heading_is_a_sign_and_an_offset() -> None:
+    found = {each.what: each.size for each in contradictions(compass(driven()))}
+    assert list(found) == ["theta_sign", "theta_offset"]
+    assert found["theta_offset"] == pytest.approx(np.pi / 2, abs=0.02)
+
+
+def test_half_the_path_speed_and_a_heading_that_turns_against_omega_are_two_findings() -> None:
+    found = {each.what: each.size for each in contradictions(times(x=0.5, y=0.5, theta=-1)(driven()), WHEELBASE)}
+    assert set(found) <= {"pose_speed", "omega_sign", "theta_sign"}
+    assert found["pose_speed"] == pytest.approx(0.5, abs=0.005)
+
+
+def test_the_scale_of_steering_is_right_where_the_car_understeers_much() -> None:
+    """At 30 m/s the car needs two and a half times the steering of one that does not understeer."""
+    t = np.arange(1200) * T_S
+    v_x, curvature = 30 + 8 * np.sin(2 * np.pi * t / 40), 0.006 * np.sin(2 * np.pi * t / 12)
+    delta = 2.4 * curvature + 0.004 * v_x**2 * curvature
+    bends = without_pose(
+        with_columns(driven(60.0), v_x=v_x, v_y=0.02 * v_x * curvature, omega=v_x * curvature, delta_fb=delta)
+    )
+    bends = with_columns(bends, r_fb=0.3 + 0.2 * np.cos(2 * np.pi * t / 40))
+    assert contradictions(bends, 2.4) == ()
+    (found,) = contradictions(times(delta_fb=DEGREE)(bends), 2.4)
+    assert found.size == pytest.approx(1 / DEGREE, rel=0.1)
+
+
+def test_signals_clip_and_come_in_steps() -> None:
+    drive = driven()
+    limit = float(np.percentile(drive["omega"], 85))
+    assert "omega_clipped" in [
+        each.what for each in contradictions(with_columns(drive, omega=np.minimum(drive["omega"], limit)))
+    ]
+    coarse = with_columns(drive, v_x=np.round(drive["v_x"] / 2) * 2)
+    assert [each.size for each in contradictions(coarse) if each.what == "v_x_coarse"] == [2.0]
+
+
+def test_a_steering_that_is_held_says_nothing_of_curvature() -> None:
+    rng = np.random.default_rng(0)
+    curvature = 0.03 + 0.01 * rng.standard_normal(400)
+    held = np.where(np.arange(400) < 40, -0.02, 0.3) + 1e-15 * rng.standard_normal(400)  # as means over spans come out
+    assert fitted(np.stack([np.ones(400), curvature], axis=1), held, np.arange(400) // 17) is None
+
+
+def test_a_small_lateral_velocity_that_follows_the_yaw_rate_is_not_judged() -> None:
+    drive = driven(noise=0.0)
+    assert contradictions(with_columns(drive, v_y=0.002 * drive["omega"] * drive["v_x"]), WHEELBASE) == ()
+
+
+def test_short_recordings_and_standing_cars_have_no_finding() -> None:
+    drive = driven()
+    assert contradictions(drive.select(slice(0, 100))) == ()
+    assert contradictions(times(v_x=0, v_y=0, omega=0)(without_pose(drive))) == ()
+
+
+def test_findings_are_kept_shown_and_errors_if_asked() -> None:
+    wrong = checked(times(delta_fb=-1)(driven()))
+    assert [each.what for each in concatenate([wrong, wrong]).info.findings] == ["steering_sign"]
+    with pytest.warns(DataWarning, match=r"drive: steering_sign: delta_fb falls .*expected above 0.*scale: -1"):
+        opened([wrong], None)
+    with pytest.raises(RecordingError, match="steering_sign"):
+        opened([wrong], None, strict=True)
+
+
+def test_a_bag_is_checked_when_it_is_extracted(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    recording_to_bag(early(3.0, "delta_fb")(driven()), tmp_path / "bag")
+    with pytest.warns(DataWarning, match="steering_time"):
+        found = extract(tmp_path / "bag", "default", rate=1 / T_S, commands="none")
+    found.save(tmp_path / "r.parquet")
+    assert [each.what for each in Recording.load(tmp_path / "r.parquet").info.findings] == ["steering_time"]
+    with pytest.raises(RecordingError, match=r"steering_time.*3\.0"):
+        extract(tmp_path / "bag", "default", rate=1 / T_S, commands="none", strict=True)
