@@ -19,11 +19,11 @@ SHIFTS = ("S_hf", "S_vf", "S_hr", "S_vr")
 
 @pytest.fixture(params=["orca", "av21"])
 def vehicle(request: pytest.FixtureRequest) -> Vehicle:
-    return load_vehicle(request.param)
+    return reversing(load_vehicle(request.param), False)
 
 
-def reversing(vehicle: Vehicle) -> Vehicle:
-    return vehicle.model_copy(update={"constants": vehicle.constants.model_copy(update={"reverse": True})})
+def reversing(vehicle: Vehicle, reverse: bool = True) -> Vehicle:
+    return vehicle.model_copy(update={"constants": vehicle.constants.model_copy(update={"reverse": reverse})})
 
 
 def theta_of(vehicle: Vehicle, **changes: float) -> Coefficients:
