@@ -89,8 +89,9 @@ def opened(logs: Log | Sequence[Log], car: Vehicle | None, *, strict: bool = Fal
         if car is not None and math.isclose(car.sampling_time, recording.T_s):  # else the command ends with that
             for words in implausible_rows(recording, car):
                 warnings.warn(f"{name_of(log)}: {words}", DataWarning, stacklevel=3)
-        recording = checked(recording, None if car is None else car.constants.l_f + car.constants.l_r)
-        warn_of_findings(recording, name_of(log), strict=strict)
+        if car is None or math.isclose(car.sampling_time, recording.T_s):
+            recording = checked(recording, None if car is None else car.constants.l_f + car.constants.l_r)
+            warn_of_findings(recording, name_of(log), strict=strict)
         found.append(recording)
     return found
 
