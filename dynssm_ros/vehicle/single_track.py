@@ -254,7 +254,8 @@ def drive(xp: Any, q: Motion) -> None:
     else:
         drives = gain * (q.r + abs(q.r)) / 2
         q.F_d = drives + q.direction * (gain * (q.r - abs(q.r)) / 2)
-    held = (abs(drives + C_r0) - abs(drives - C_r0)) / 2  # of the drive, as far as the resistance reaches
+    reached = (abs(drives + C_r0) - abs(drives - C_r0)) / 2  # of the drive, as far as the resistance reaches
+    held = drives + (abs(drives) > C_r0) * (reached - drives)  # exactly all of it where it does
     q.F_rx = q.F_d - (q.direction * C_r0 + standing * held) - q.theta.C_r2 * q.v_x * speed
 
 
