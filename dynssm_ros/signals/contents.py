@@ -18,7 +18,7 @@ from dynssm_ros.signals.bags import Bag
 from dynssm_ros.signals.columns import Column, known_unit
 from dynssm_ros.signals.decoding import LOG_TIME, frames_told, header_stamp_ns, stamped_by
 from dynssm_ros.signals.signal_map import compile_field
-from dynssm_ros.signals.stamps import Lateness
+from dynssm_ros.signals.stamps import Lateness, possible
 from dynssm_ros.signals.table_clock import Clock
 from dynssm_ros.signals.tables import Table
 
@@ -100,7 +100,7 @@ def contents_of_bag(bag: Bag, progress: Progress | None) -> tuple[dict[str, Topi
             1.0 / max(float(np.median(apart)), 1e-9) if len(apart) else math.nan,
             float(apart.max()) if len(apart) else 0.0,
             np.array([time - begin for time, _ in sampled[topic]]) / 1e9,
-            {path: np.array([values.get(path, math.nan) for _, values in sampled[topic]]) for path in paths},
+            {path: _possible(np.array([values.get(path, math.nan) for _, values in sampled[topic]])) for path in paths},
             reason=reasons.get(topic, ""),
             stamped=stamped[topic],
             late=Lateness(*np.array(late[topic]).reshape(-1, 2).T),
@@ -136,11 +136,16 @@ def _column_content(name: str, unit: str, column: Column, clock: Clock, begin: i
         1.0 / max(float(np.median(apart)), 1e-9) if len(apart) else math.nan,
         float(apart.max()) if len(apart) else 0.0,
         (clock.stamps[there[::step]] - begin) / 1e9,
-        {} if column.reason or column.is_time else {name: values[::step]},
+        {} if column.reason or column.is_time else {name: _possible(values[::step])},
         known_unit(unit) or unit,
         column.reason or column.bad,
         limits,
     )
+
+
+def _possible(values: Vector) -> Vector:
+    """NaN where a value is none that a signal can have."""
+    return np.where(possible(values), values, math.nan)
 
 
 def _numbers(message: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, float]]:

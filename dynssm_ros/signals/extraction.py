@@ -299,7 +299,8 @@ def _table_streams(table: Table, signal_map: SignalMap, drop_bad: bool) -> dict[
         there = np.logical_and.reduce([clock.known, *(column.present for column in parts.values())])
         stamps = clock.stamps[there] - round(source.delay * 1e9)
         values = [column.values[there] for column in parts.values()]
-        streams[name] = Stream(stamps, to_si(source)(yaw_of(*values) if len(values) == 4 else values[0]))
+        with np.errstate(invalid="ignore", over="ignore"):  # what comes of infinities is left out later
+            streams[name] = Stream(stamps, to_si(source)(yaw_of(*values) if len(values) == 4 else values[0]))
     return streams
 
 

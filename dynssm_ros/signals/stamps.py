@@ -15,6 +15,7 @@ from dynssm_ros.errors import BagError
 from dynssm_ros.signals.resampling import Stamps, Stream
 from dynssm_ros.signals.signal_map import JUMP_NS
 
+_LARGEST = 1e12  # in any unit; coordinates of maps in mm are 1e10
 _SEVERAL = 0.1  # of the steps go back, from which on several publishers are likelier than a fault
 _APART = 0.2  # s by which clocks may be apart; what is measured late is rarely later than that
 _DRIFT = 0.1  # s by which clocks may come apart over a log
@@ -28,8 +29,13 @@ class Lateness(NamedTuple):
     late: Vector
 
 
+def possible(values: Vector) -> npt.NDArray[np.bool_]:
+    """Whether each value is finite, and of a size that a signal can have."""
+    return np.isfinite(values) & (np.abs(values) <= _LARGEST)
+
+
 def clean(stream: Stream, where: str, drop_bad: bool, jump: int = JUMP_NS) -> tuple[Stream, str]:
-    """Checks a stream for values that are not finite and for stamps that repeat, run backwards or are far ahead.
+    """Checks a stream for values that no signal has and for stamps that repeat, run backwards or are far ahead.
 
     Of stamps more than ``jump`` ns apart those count that most samples agree with, so that a few far ahead cost no others.
 
@@ -40,13 +46,14 @@ def clean(stream: Stream, where: str, drop_bad: bool, jump: int = JUMP_NS) -> tu
         BagError: a bad sample and ``drop_bad`` is off; names the first.
     """
     stamps, values = stream.stamps, stream.values
-    finite = np.isfinite(values)
+    finite = possible(values)
     believed = finite.copy()
     believed[finite] = _in_line(stamps[finite], jump)
     oldest = np.iinfo(np.int64).min
     newest = np.maximum.accumulate(np.concatenate([[oldest], np.where(believed, stamps, oldest)]))[:-1]
     kinds = {
-        "not finite": ~finite,
+        "not finite": ~np.isfinite(values),
+        "larger than any signal": np.isfinite(values) & ~finite,
         "with a repeated stamp": finite & (stamps == newest),
         "with a stamp that runs backwards": finite & (stamps < newest),
         "with a stamp far ahead of those that follow": finite & ~believed & (stamps > newest),

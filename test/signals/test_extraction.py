@@ -264,7 +264,7 @@ def test_an_empty_bag_is_told(make_bag: Any) -> None:
 def bad_odometry(kind: str, k: int = 50) -> Any:
     """The odometry message number ``k`` of the drive, spoilt."""
     t, stamp = k / 100, START + k * SECOND // 100
-    v_x = {"nan": np.nan, "inf": np.inf}.get(kind, 10 + t)
+    v_x = {"nan": np.nan, "inf": np.inf, "vast": 1e13}.get(kind, 10 + t)
     stamp += {"repeated": -SECOND // 100, "backwards": -SECOND // 5}.get(kind, 0)
     return messages.odometry(stamp, (10 * t, 1.0, 0.3), (v_x, 0.1 * t, -0.2 * t))
 
@@ -274,6 +274,7 @@ def bad_odometry(kind: str, k: int = 50) -> Any:
     [
         ("nan", "v_x: sample 50 at 1700000000.623 s, value nan, is not finite (1 such)"),
         ("inf", "v_x: sample 50 at 1700000000.623 s, value inf, is not finite (1 such)"),
+        ("vast", "v_x: sample 50 at 1700000000.623 s, value 1e+13, is larger than any signal (1 such)"),
         ("repeated", "v_x: sample 50 at 1700000000.613 s, value 10.5, is with a repeated stamp (1 such)"),
         ("backwards", "v_x: sample 50 at 1700000000.423 s, value 10.5, is with a stamp that runs backwards (1 such)"),
     ],
@@ -285,7 +286,7 @@ def test_bad_samples_are_refused_or_left_out(make_bag: Any, drive: Any, kind: st
     assert "--drop-bad leaves such samples out" in message
     recording = extract([bag], DEFAULT, 25.0, drop_bad=True)
     assert_linear(recording)
-    affected = ["v_x"] if kind in ("nan", "inf") else ["v_x", "v_y", "omega", "x", "y", "theta"]
+    affected = ["v_x"] if kind in ("nan", "inf", "vast") else ["v_x", "v_y", "omega", "x", "y", "theta"]
     assert [note.split(":")[0] for note in recording.info.notes] == affected
     assert "dropped 1 samples" in recording.info.notes[0]
 

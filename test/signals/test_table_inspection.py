@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from dynssm_ros.errors import BagError
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inspection import Inspection, inspect
 from dynssm_ros.signals.recording import Recording
@@ -162,3 +163,21 @@ def test_a_fast_speed_and_large_angles_without_units_are_asked_about(tmp_path: P
     assert any(note.startswith(told) for note in inspect(still).notes)
     assert "# too fast for m/s: find its unit\n  v_x: {column: speed}" in text
     assert "# large for rad: deg?\n  omega: {column: yaw_rate}" in text
+
+
+def test_what_no_signal_can_be_disturbs_no_suggestion(tmp_path: Path) -> None:
+    """Infinities and values near the end of what a number can hold, as some loggers write for an empty cell."""
+    columns = {"time": T, "vx": V_X, "vy": V_Y, "yaw rate": OMEGA, "steering": DELTA, "throttle": 0.4 + 0.1 * np.sin(T)}
+    odd = {name: values.copy() for name, values in columns.items()}
+    for name in set(odd) - {"time"}:
+        odd[name][[3, 40, 41]] = np.inf, 1.7e308, -1e200
+    found = []
+    for name, each in (("good", columns), ("odd", odd)):
+        pq.write_table(pa.table(each), tmp_path / f"{name}.parquet")
+        found.append(inspect(tmp_path / f"{name}.parquet", WHEELBASE))
+    good, spoilt = ({name: (one.field, one.scale) for name, one in each.signals.items()} for each in found)
+    assert len(good) == 5
+    assert spoilt == good
+    with pytest.raises(BagError, match=r"is larger than any signal|is not finite"):
+        extract([tmp_path / "odd.parquet"], suggested(found[1]), 50.0)
+    assert len(extract([tmp_path / "odd.parquet"], suggested(found[1]), 50.0, drop_bad=True)) > 950
