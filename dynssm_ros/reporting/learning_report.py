@@ -73,18 +73,19 @@ def _data(out: Path, of: dict[str, list[StepRecord]]) -> Verdict:
         return Verdict("data", "wrong", failure + (signals if of["extract"] else ""), link)
     lines = [line for name in ("inspect", "extract", "calibrate") for each in of[name] for line in each.notes]
     few = list(dict.fromkeys(line.split(": ", 1)[1] for line in lines))
-    told = _length([each.outputs[0] for each in of["extract"]])
+    told, contradictory = _recorded([each.outputs[0] for each in of["extract"]])
     if not few:
         return Verdict("data", "ok", f"{told}; the checks found nothing", link)
     more = [f"and {len(few) - _NOTES} more"] if len(few) > _NOTES else []
-    wrong = any(Recording.load(each.outputs[0]).info.findings for each in of["extract"])
-    return Verdict("data", "wrong" if wrong else "look", f"{told}. " + "; ".join([*few[:_NOTES], *more]), link)
+    return Verdict("data", "wrong" if contradictory else "look", f"{told}. " + "; ".join([*few[:_NOTES], *more]), link)
 
 
-def _length(files: Sequence[str]) -> str:
+def _recorded(files: Sequence[str]) -> tuple[str, bool]:
+    """How much was recorded, in words, and whether signals contradict each other somewhere."""
     recordings = list(map(Recording.load, files))
     seconds = sum(each.duration for each in recordings)
-    return f"{len(recordings)} recording{'s' * (len(recordings) > 1)}, {seconds:.0f} s"
+    words = f"{len(recordings)} recording{'s' * (len(recordings) > 1)}, {seconds:.0f} s"
+    return words, any(each.info.findings for each in recordings)
 
 
 def _car(out: Path, of: dict[str, list[StepRecord]]) -> Verdict:

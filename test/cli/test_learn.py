@@ -17,6 +17,7 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.reporting.page import Report, Section, figures_of
 
+RECORDED = "dynssm_ros.reporting.learning_report._recorded"
 STATES = {"v_x": 0.1, "v_y": 0.1, "omega": 0.1}
 RESULTS: dict[str, dict[str, object]] = {
     "inspect": {},
@@ -63,7 +64,7 @@ def _written(verb: str, options: dict[str, str]) -> list[Path]:
 @pytest.fixture
 def commands(monkeypatch: pytest.MonkeyPatch) -> Commands:
     """Commands that recordings need not be read for."""
-    monkeypatch.setattr("dynssm_ros.reporting.learning_report._length", lambda files: "1 recording, 10 s")
+    monkeypatch.setattr(RECORDED, lambda files: ("1 recording, 10 s", False))
     made = Commands()
     monkeypatch.setattr(sys.modules["dynssm_ros.api.learn"], "_in_a_process", made)
     return made
@@ -116,6 +117,15 @@ def test_a_failed_step_ends_it_and_is_told_first(commands: Commands, log: Path, 
     commands.status = {}
     api.learn(log, "orca", out)
     assert commands.verbs[3:] == WAY[2:]
+
+
+def test_signals_that_contradict_each_other_are_wrong(
+    commands: Commands, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(RECORDED, lambda files: ("1 recording, 10 s", True))
+    commands.lines = {"extract": ["warning: run: steering_sign: the other way round"]}
+    api.learn(log, "orca", tmp_path / "out")
+    assert lines(tmp_path / "out")["data"] == "wrong"
 
 
 @pytest.mark.parametrize(

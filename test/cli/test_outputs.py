@@ -101,7 +101,10 @@ INSIDE = {
     "diagnose": ["diagnose", "--reference", "laps.parquet", "--suspect", "R", "--vehicle", "orca"],
     "season": ["season", "R", "--vehicle", "orca"],
     "race": ["race", "--vehicle", "orca", "--track", "oval", "--model", "R"],
-}  # R: a folder or file that the command reads; simulate reads files alone
+    "vehicle": ["vehicle", "new", "--like", "R/car.yaml", "--mass", "3", "--front-mass", "1", "--wheelbase", "0.3"],
+}  # R: a folder or file that the command reads
+OF_FILES = ("simulate", "vehicle")  # which read no folder
+WITHOUT_JSON = ("learn", "vehicle")
 
 
 @pytest.mark.parametrize("command", sorted(command.callback.__name__ for command in app.registered_commands))
@@ -109,16 +112,14 @@ def test_no_output_of_any_command_lies_inside_its_inputs(
     command: str, dynssm: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    read = Path("R/car.yaml") if command == "simulate" else Path("R")
+    read = Path("R/car.yaml") if command in OF_FILES else Path("R")
     Path("R/inner").mkdir(parents=True)
     Path("link").symlink_to("R/inner", target_is_directory=True)
     (read / "old" if read.is_dir() else read).touch()
     before = sorted(tmp_path.rglob("*"))
-    outputs = (
-        [read] if command == "simulate" else [Path("R"), Path("R/new"), Path("R/inner/deep/new"), Path("link/new")]
-    )
+    outputs = [read] if command in OF_FILES else [Path("R"), Path("R/new"), Path("R/inner/deep/new"), Path("link/new")]
     for output in outputs:
-        for option in ("--out", "--json") if command != "learn" else ("--out",):
+        for option in ("--out", "--json") if command not in WITHOUT_JSON else ("--out",):
             ways = {"--out": "elsewhere"} | {option: str(output)}
             status, _, err = dynssm(*INSIDE[command], *(word for pair in ways.items() for word in pair))
             assert status == 1
