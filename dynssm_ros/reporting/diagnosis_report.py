@@ -15,8 +15,9 @@ from dynssm_ros.identification.result.residuals import ExplainedVariance
 from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC
 from dynssm_ros.reporting import diagnosis_figures
 from dynssm_ros.reporting.evaluation_figures import UNITS
-from dynssm_ros.reporting.page import Prose, Report, Section
+from dynssm_ros.reporting.page import Prose, Report, Section, data_verdicts
 from dynssm_ros.reporting.tables import Column, ColumnOf, Table, percent, text
+from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS
 from dynssm_ros.vehicle.effects import EFFECTS
@@ -31,6 +32,8 @@ _FEW = 4  # parameters of a curve that are shown one by one
 def as_text(diagnosis: Diagnosis) -> str:
     """The result for a terminal: cause, size, evidence, improvement, what to do, what is left."""
     lines = [headline(diagnosis)]
+    for found in _findings(diagnosis):
+        lines += textwrap.wrap(f"Signals that cannot be right: {found.line}.", _WIDTH)
     for number, cause in enumerate(diagnosis.found, 1):
         share = f"{'small, ' if cause.small else ''}{percent(cause.heldout_improvement)} of the error on held-out laps"
         lines += ["", f"{number}. {cause.effect}{_where(cause)}: {size_in_words(cause)}; {share}"]
@@ -44,6 +47,10 @@ def as_text(diagnosis: Diagnosis) -> str:
     ):
         lines += textwrap.wrap(words, _WIDTH)
     return "\n".join(lines)
+
+
+def _findings(diagnosis: Diagnosis) -> tuple[Finding, ...]:
+    return diagnosis.recordings.recording.info.findings
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -193,6 +200,7 @@ def diagnosis_report(diagnosis: Diagnosis) -> Report:
         tuple(_sections(diagnosis)),
         diagnosis.protocol,
         _causes(diagnosis) if diagnosis.found else None,
+        verdicts=data_verdicts(_findings(diagnosis)),
     )
 
 

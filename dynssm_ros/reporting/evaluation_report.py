@@ -16,7 +16,7 @@ from dynssm_ros.evaluation.regimes import COASTING, QUANTITIES, Regime
 from dynssm_ros.evaluation.rollout import branches
 from dynssm_ros.evaluation.score import Group, Score
 from dynssm_ros.reporting import evaluation_figures, interactive, track_figures
-from dynssm_ros.reporting.page import Prose, Report, Section
+from dynssm_ros.reporting.page import Prose, Report, Section, data_verdicts
 from dynssm_ros.reporting.tables import Column, Table, percent, text
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lap_position import track_position
@@ -167,12 +167,14 @@ def open_loop_report(evaluation: Evaluation) -> Report:
         sections=list(_sections(evaluation)),
         protocol=_protocol(evaluation),
         table=summary_table(evaluation),
+        verdicts=data_verdicts(evaluation.recording.info.findings),
     )
 
 
 def markdown(evaluation: Evaluation) -> str:
     """``results.md``: the same head and tables as the report."""
-    head = "".join(f"- {name}: {value}\n" for name, value in _protocol(evaluation).items())
+    wrong = [("Signals that cannot be right", each.line) for each in evaluation.recording.info.findings]
+    head = "".join(f"- {name}: {value}\n" for name, value in (*wrong, *_protocol(evaluation).items()))
     title = f"# Open-loop evaluation on {evaluation.name}"
     tables: list[tuple[str, Table | None]] = [
         *((f"RMSE by {quantity}", regime_table(evaluation, key)) for key, quantity in QUANTITIES.items()),
@@ -194,8 +196,6 @@ def _protocol(evaluation: Evaluation) -> dict[str, str]:
     lines = _prose(evaluation).protocol(
         sources=sources, rate=1 / recording.T_s, commands=commands, cores=os.cpu_count()
     )
-    found = "; ".join(finding.line for finding in recording.info.findings)
-    lines |= {"Signals that cannot be right": found} if found else {}
     return lines | {f"Model {name}": _origin(group) for name, group in evaluation.groups.items()}
 
 

@@ -26,6 +26,7 @@ from matplotlib.figure import Figure
 from dynssm_ros import __version__
 from dynssm_ros.files import replacing
 from dynssm_ros.reporting.tables import Table
+from dynssm_ros.signals.findings import Finding
 
 State = Literal["ok", "look", "wrong"]
 RASTER_DPI = 160  # of the rasterised parts of a figure
@@ -54,6 +55,11 @@ class Verdict:
     state: State
     text: str
     link: str = ""
+
+
+def data_verdicts(findings: Sequence[Finding]) -> tuple[Verdict, ...]:
+    """A line on the signals that contradict each other; none if none do."""
+    return (Verdict("data", "wrong", "; ".join(finding.line for finding in findings)),) if findings else ()
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from dynssm_ros.reporting.diagnosis_report import (
     pattern_in_words,
     size_in_words,
 )
+from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.simulation.laps import simulate
@@ -133,6 +134,21 @@ def test_words_say_cause_size_evidence_gain_and_what_to_do(lagging: Lagging) -> 
         assert f"   {channel} (" in words
     assert max(len(line) for line in words.splitlines() if line.startswith("   What")) <= 113
     assert left_in_words(found) == ""
+
+
+def test_signals_that_contradict_each_other_are_told_before_the_causes(lagging: Lagging) -> None:
+    found = lagging[2]
+    wrong = Finding(
+        what="v_y_sign", told="v_y over the path's is -1.00", size=-1.0, low=-1.1, high=-0.9, expected="1",
+        remedy="v_y: scale: -1",
+    )  # fmt: skip
+    together = found.recordings.recording
+    info = together.info.model_copy(update={"findings": (wrong,)})
+    spoilt = replace(found, recordings=replace(found.recordings, recording=replace(together, info=info)))
+    assert " ".join(as_text(spoilt).splitlines()[1:3]) == f"Signals that cannot be right: {wrong.line}."
+    assert [each.state for each in diagnosis_report(spoilt).verdicts] == ["wrong"]
+    assert diagnosis_report(found).verdicts == ()
+    assert [each["what"] for each in spoilt.to_json("")["findings"]] == ["v_y_sign"]
 
 
 def test_an_error_that_grew_is_called_more_and_not_negatively_less(lagging: Lagging) -> None:

@@ -27,6 +27,7 @@ from dynssm_ros.reporting.page import Report, Section, svg_uri
 from dynssm_ros.reporting.tables import Column, Table
 from dynssm_ros.runtime.baselines import Persistence, SingleTrack
 from dynssm_ros.runtime.contract import WindowPrediction
+from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.track.lines import ClosedLine
@@ -270,3 +271,17 @@ def test_a_small_report_needs_only_title_summary_and_sections(tmp_path):
 def test_the_same_figure_gives_the_same_image():
     samples = {"m": np.arange(1.0, 50)}
     assert svg_uri(latency_histogram(samples)) == svg_uri(latency_histogram(samples))
+
+
+def test_signals_that_contradict_each_other_come_first(evaluation):
+    wrong = Finding(
+        what="steering_sign", told="omega over curvature is -1.00", size=-1.0, low=-1.1, high=-0.9, expected="1",
+        remedy="steering_feedback: scale: -1",
+    )  # fmt: skip
+    info = evaluation.recording.info.model_copy(update={"findings": (wrong,)})
+    spoilt = replace(evaluation, recording=replace(evaluation.recording, info=info))
+    (said,) = open_loop_report(spoilt).verdicts
+    assert (said.name, said.state, said.text) == ("data", "wrong", wrong.line)
+    assert f"- Signals that cannot be right: {wrong.line}" in markdown(spoilt)
+    assert open_loop_report(evaluation).verdicts == ()
+    assert "cannot be right" not in markdown(evaluation)

@@ -170,6 +170,7 @@ class Diagnosis:
                 }
                 for formula in self.formulas
             ],
+            "findings": [finding.model_dump() for finding in self.recordings.recording.info.findings],
             "notes": list(self.notes),
             "vehicle": vehicle_path,
         }
