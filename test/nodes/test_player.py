@@ -105,7 +105,10 @@ def test_a_predictor_that_is_held_up_for_two_seconds_and_listens_reliably_loses_
     reliable = {f"qos_overrides.{topic}.subscription.reliability": "reliable" for topic in topics}
     run = run_live(small_model, laps_bag, 0.02, rate=4.0, held_up=(6.0, 14.0), parameters=reliable)
     assert len(run.predicted) + len(run.missing()) == 1001 - 4
-    assert run.lost == 0
+    refused = {name: int(count) for name, count in run.diagnostics[-1][2].items() if name.startswith("refused: ")}
+    assert len(run.predicted) + sum(refused.values()) == 1001, "each is answered, or refused by name"
+    assert {name for name, count in refused.items() if count} == {"refused: skipped", "refused: filling"}
+    assert refused["refused: filling"] <= 4 + 4, "the first window, and at most one anew as topics are heard again"
     assert run.passed_over > 350, "of 8 s at 50 Hz"
     assert run.predicted.keys() & set(sorted(run.sent)[-100:]), "and it answers again"
 
