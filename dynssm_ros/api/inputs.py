@@ -90,7 +90,7 @@ def opened(logs: Log | Sequence[Log], car: Vehicle | None, *, strict: bool = Fal
             for words in implausible_rows(recording, car):
                 warnings.warn(f"{name_of(log)}: {words}", DataWarning, stacklevel=3)
         if car is None or math.isclose(car.sampling_time, recording.T_s):
-            recording = checked(recording, None if car is None else car.constants.l_f + car.constants.l_r)
+            recording = checked(recording, None if car is None else car.constants.wheelbase)
             warn_of_findings(recording, name_of(log), strict=strict)
         found.append(recording)
     return found

@@ -28,5 +28,4 @@ def inspect(
     """
     from dynssm_ros.signals.inspection import inspect
 
-    car = None if vehicle is None else vehicle_of(vehicle).constants
-    return inspect(bag, None if car is None else car.l_f + car.l_r, on_progress)
+    return inspect(bag, None if vehicle is None else vehicle_of(vehicle).constants.wheelbase, on_progress)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from dynssm_ros.files import write_json
@@ -25,6 +26,11 @@ _LINE_EVERY_S, _SHOWN_EVERY_S = 10.0, 0.1
 def say(words: str) -> None:
     """Prints words as they are; the terminal breaks the line."""
     console.print(words, markup=False, soft_wrap=True)
+
+
+def warn(words: str) -> None:
+    """Prints a warning as a line on stderr."""
+    errors.print(f"[yellow]warning:[/yellow] {escape(words)}", soft_wrap=True, highlight=False)
 
 
 def write_results(content: dict[str, Any], out: Path, also: Path | None) -> None:

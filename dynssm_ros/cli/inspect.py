@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from dynssm_ros import api
-from dynssm_ros.cli.console import console, errors, progress_bar, say
+from dynssm_ros.cli.console import console, progress_bar, say, warn
 from dynssm_ros.cli.options import JsonOption
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.extras import require
@@ -53,7 +52,7 @@ def inspect(
     if found.findings:
         console.print(finding_table(found.findings).brief.rich())
     for finding in found.findings:
-        errors.print(f"[yellow]warning:[/yellow] {escape(finding.line)}", soft_wrap=True, highlight=False)
+        warn(finding.line)
     console.print(found.signal_map(), markup=False, soft_wrap=True, end="")
     if json is not None:
         write_json(json, inspection_json(found))

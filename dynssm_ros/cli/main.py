@@ -16,7 +16,7 @@ from rich.markup import escape
 
 from dynssm_ros import __version__
 from dynssm_ros.cli.calibrate import calibrate
-from dynssm_ros.cli.console import errors
+from dynssm_ros.cli.console import errors, warn
 from dynssm_ros.cli.diagnose import diagnose
 from dynssm_ros.cli.evaluate import evaluate
 from dynssm_ros.cli.extract import extract
@@ -146,7 +146,7 @@ def _warning_in_lines() -> Iterator[None]:
 
         def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
             if issubclass(category, DataWarning):
-                errors.print(f"[yellow]warning:[/yellow] {escape(str(message))}", soft_wrap=True, highlight=False)
+                warn(str(message))
             else:
                 others(message, category, *where, **more)
 

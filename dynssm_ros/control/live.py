@@ -184,8 +184,7 @@ class LiveController:
         self._acting: deque[tuple[int, Applied]] = deque(maxlen=_KEPT)  # commands by when they begin to act (ns)
         self._believed: deque[_Believed] = deque(maxlen=_KEPT)
         self._reckoned: _Believed | None = None  # while it brakes
-        constants = self.vehicle.constants
-        stands = max(_STANDING * self.vehicle.minimum_speed, standing_speed(constants.l_f + constants.l_r) / 2)
+        stands = max(_STANDING * self.vehicle.minimum_speed, standing_speed(self.vehicle.constants.wheelbase) / 2)
         self.brakes = Brakes(self.vehicle.sampling_time, stands)
         self._contract.forget()
         self._jumps = self._contract.jumps

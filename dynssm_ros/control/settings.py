@@ -43,7 +43,7 @@ class Scale:
         Raises:
             UserError: the car cannot drive, brake or corner.
         """
-        wheelbase = vehicle.constants.l_f + vehicle.constants.l_r
+        wheelbase = vehicle.constants.wheelbase
         return cls(wheelbase, math.sqrt(wheelbase / float(np.min(vehicle_limits(vehicle).lateral))))
 
 

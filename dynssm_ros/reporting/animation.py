@@ -71,7 +71,7 @@ def _cars(races: Sequence[Race], axes: Axes, changed: Mask) -> list[Show]:
     if changed.any() and not changed.all():
         x, y = np.where(changed[:, None], track.centre.position(track.centre.s), np.nan).T
         axes.plot(x, y, color=MEASURED, alpha=0.2, lw=8, solid_capstyle="butt", label="the car is another here")
-    wheelbase = course.vehicle.constants.l_f + course.vehicle.constants.l_r
+    wheelbase = course.vehicle.constants.wheelbase
     size = max(_LENGTH * wheelbase, _SMALLEST * float(np.max(extent)))
     cars = [_car(race, axes, size, style) for race, style in race_lines(races)]
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")

@@ -102,8 +102,7 @@ class ModelCard(StrictModel):
     @property
     def least(self) -> float:
         """``v_x`` (m/s) below which nothing that was learned speaks: a car that stands or reverses, unless trained on."""
-        constants = self.vehicle.constants
-        stands = float(standing_speed(constants.l_f + constants.l_r))
+        stands = float(standing_speed(self.vehicle.constants.wheelbase))
         return stands if self.slowest is None else min(self.slowest, stands)
 
     @property

@@ -66,7 +66,7 @@ def ranges(vehicle: Vehicle) -> dict[str, Range]:
     except UserError:
         return {}
     inputs, constants = vehicle.inputs, vehicle.constants
-    wheelbase = constants.l_f + constants.l_r
+    wheelbase = constants.wheelbase
     grip = float(max(limits.lateral.max(), limits.brake.max(), limits.drive.max()))
     radius = wheelbase / math.tan(min(max(map(abs, inputs.steering)), 1.2))
     top, yaw = _BEYOND * limits.top_speed, _SPIN * math.sqrt(grip / radius)
@@ -116,7 +116,7 @@ def _driven_backwards(recording: Recording, vehicle: Vehicle) -> str | None:
     if vehicle.inputs.set_point == "speed":
         return None
     ahead = np.append(v_x[_BACKWARDS:], np.full(min(_BACKWARDS, len(v_x)), np.inf))
-    faster = (v_x < -standing_speed(constants.l_f + constants.l_r)) & (ahead < v_x)
+    faster = (v_x < -standing_speed(constants.wheelbase)) & (ahead < v_x)
     faster &= (r > _PUSHES) | ((r < -_PUSHES) & (not constants.reverse))
     if faster.sum() < _FEWEST_BACKWARDS:
         return None
@@ -149,8 +149,7 @@ def _place(recording: Recording, row: int) -> str:
 
 
 def _consistency(vehicle: Vehicle) -> Consistency:
-    constants = vehicle.constants
-    return Consistency(constants.l_f + constants.l_r, vehicle.minimum_speed)
+    return Consistency(vehicle.constants.wheelbase, vehicle.minimum_speed)
 
 
 class Plausibility:

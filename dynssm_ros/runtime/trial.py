@@ -24,7 +24,6 @@ from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.plausibility import Plausibility
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
-from dynssm_ros.vehicle import Vehicle
 
 _MASS, _WHEELBASE = 0.25, 0.1  # relative differences of one car from day to day
 _PREDICTING_S = 0.5  # for the windows that are compared
@@ -62,8 +61,8 @@ def require_same_use(model: OnnxModel, present: ModelCard) -> None:
             f"{path}: trained with commands '{model.commands}', but the node runs with '{present.commands}'; restart it "
             "with this model"
         )
-    m, wheelbase = card.vehicle.constants.m, _wheelbase(card.vehicle)
-    own = present.vehicle.constants.m, _wheelbase(present.vehicle)
+    m, wheelbase = card.vehicle.constants.m, card.vehicle.constants.wheelbase
+    own = present.vehicle.constants.m, present.vehicle.constants.wheelbase
     for what, value, expected, tolerance in (
         ("T_s = {:g} s", card.sampling_time, present.sampling_time, 1e-6),
         ("m = {:g} kg", m, own[0], _MASS),
@@ -74,10 +73,6 @@ def require_same_use(model: OnnxModel, present: ModelCard) -> None:
                 f"{path}: {what.format(value)} is another car's, of vehicle {card.vehicle.name}; the node runs with "
                 f"{expected:g}; restart it with this model"
             )
-
-
-def _wheelbase(vehicle: Vehicle) -> float:
-    return vehicle.constants.l_f + vehicle.constants.l_r
 
 
 def judge(model: OnnxModel, present: ModelCard, rows: Vector) -> bool:

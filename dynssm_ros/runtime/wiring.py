@@ -65,7 +65,7 @@ class Wiring:
         self._last: int | None = None
         self._found: deque[str] = deque(maxlen=_CONFIRMED)
         constants, unchanged = vehicle.constants, _scaled((), 1.0)
-        self._wheelbase = wheelbase = constants.l_f + constants.l_r
+        self._wheelbase = wheelbase = constants.wheelbase
         suspicions = [("", unchanged, 1.0), *((words, factors, 1.0) for words, factors in _CHANGES.items())]
         for factor in _WHEELBASES:
             words = f"the wheelbase is not {wheelbase:.3g} m, but about {factor * wheelbase:.2g} m"

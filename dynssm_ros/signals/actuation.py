@@ -13,7 +13,7 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.signals.findings import Finding, number
 from dynssm_ros.signals.motion import Checked, is_turning
-from dynssm_ros.signals.spans import BLOCKS, SIGMAS, Drive, Fitted, fitted, varies
+from dynssm_ros.signals.spans import SIGMAS, Drive, Fitted, blocks, fitted, varies
 from dynssm_ros.signals.timing import acceleration
 
 _SPAN_S = 0.4
@@ -180,8 +180,7 @@ def check_throttle(drive: Drive) -> list[Finding]:
 def _throttle_range(drive: Drive, known: Vector, largest: float) -> Finding:
     """A throttle beyond 1: a speed set-point, or a percentage."""
     speed, r = drive.velocity.real[known], drive.throttle[known]
-    block = np.arange(len(r)) * BLOCKS // len(r)
-    fit = fitted(np.stack([np.ones(len(r)), speed], axis=1), r, block)
+    fit = fitted(np.stack([np.ones(len(r)), speed], axis=1), r, blocks(len(r)))
     if fit is not None and fit.share > 0.5 and abs(float(fit.values[1]) - 1.0) < 0.3:
         low, high = fit.interval(1)
         return Finding(
@@ -214,9 +213,8 @@ def _never_used(r: Vector, a: Vector) -> list[Finding]:
 
 def _throttle_sign(drive: Drive, a: Vector, known: Vector) -> list[Finding]:
     v_x = drive.velocity.real[known]
-    block = np.arange(len(v_x)) * BLOCKS // len(v_x)
     design = np.stack([drive.throttle[known], np.ones(len(v_x)), v_x, v_x**2], axis=1)
-    fit = fitted(design, a[known], block)
+    fit = fitted(design, a[known], blocks(len(v_x)))
     if fit is None or fit.share < 0.4:
         return []
     slope, (low, high) = float(fit.values[0]), fit.interval()

@@ -143,6 +143,12 @@ def _column_content(name: str, unit: str, column: Column, clock: Clock, begin: i
     )
 
 
+def spread(values: Vector) -> float:
+    """Largest less least of the finite values; 0 of none."""
+    known = values[np.isfinite(values)]
+    return float(np.ptp(known)) if len(known) else 0.0
+
+
 def _possible(values: Vector) -> Vector:
     """NaN where a value is none that a signal can have."""
     return np.where(possible(values), values, math.nan)

@@ -32,6 +32,8 @@ def extract(
     rate: float,
     drop_bad: bool = False,
     progress: Progress | None = None,
+    *,
+    wheelbase: float | None = None,
 ) -> Recording:
     """Reads logs and brings their signals onto a uniform grid.
 
@@ -41,6 +43,7 @@ def extract(
         rate: of the grid (Hz).
         drop_bad: leave out samples that are not finite or whose stamps repeat or run backwards, instead of raising.
         progress: told of each message.
+        wheelbase: of the car (m), with which the scale of the steering is checked too.
 
     Raises:
         BagError: unreadable, topics or columns missing or of another type, bad samples.
@@ -51,7 +54,7 @@ def extract(
     if 0 < len(lacking) < len(recordings):  # commands of some logs alone cannot be joined
         none, note = signal_map.with_commands("none"), f"no commands in {', '.join(lacking)}; commands: none"
         recordings = [_extract(path, none, rate, drop_bad, progress, note) for path in bags]
-    return concatenate(recordings)
+    return concatenate([checked(one, wheelbase) for one in recordings])
 
 
 def _extract(
@@ -83,7 +86,7 @@ def _extract(
         standard_deviations=deviations,
         notes=tuple(notes),
     )
-    return checked(resample(streams, rate, signal_map.max_gap, signal_map.commands, info))
+    return resample(streams, rate, signal_map.max_gap, signal_map.commands, info)
 
 
 def _with_brakes_at_rest(streams: dict[str, Stream], signal_map: SignalMap) -> tuple[dict[str, Stream], list[str]]:

@@ -13,7 +13,6 @@ from pydantic import ValidationError
 
 from dynssm_ros.errors import BagError, UserError
 from dynssm_ros.progress import Progress
-from dynssm_ros.signals.consistency import contradictions
 from dynssm_ros.signals.contents import TopicContent, contents_of_bag, contents_of_table
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.findings import Finding
@@ -25,8 +24,9 @@ from dynssm_ros.signals.signal_map import (
     TimeColumn,
     command_signals,
     required_signals,
+    set_point_of,
 )
-from dynssm_ros.signals.suggestions import Suggestion, set_point_of, suggest
+from dynssm_ros.signals.suggestions import Suggestion, suggest
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import Table
 
@@ -128,7 +128,7 @@ def _contradictions(path: str | Path, found: Inspection, wheelbase: float | None
     rate = found.signals["v_x" if "v_x" in found.signals else "x"].topic.rate
     try:
         signal_map = SignalMap.model_validate(yaml.safe_load(found.signal_map())).with_commands("none")
-        recording = extract([path], signal_map, min(max(rate, 1.0), _FASTEST_HZ), drop_bad=True)
+        rate = min(max(rate, 1.0), _FASTEST_HZ)
+        return extract([path], signal_map, rate, drop_bad=True, wheelbase=wheelbase).info.findings
     except (UserError, ValidationError):
         return ()
-    return contradictions(recording, wheelbase)

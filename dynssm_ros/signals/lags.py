@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.arrays import Indices, Mask, Vector
-from dynssm_ros.signals.spans import BLOCKS, Drive
+from dynssm_ros.signals.spans import BLOCKS, Drive, blocks
 
 LONGEST_LAG_S = 10.0
 _STEP_S = 0.1
@@ -66,7 +66,7 @@ def lag_of(
     lags = np.arange(-most, most + 1)
     seconds = np.asarray(lags * (step * drive.T_s), np.float64)
     usable = np.flatnonzero(np.isfinite(response[rows]))
-    block = np.minimum(np.arange(len(rows)) * BLOCKS // max(len(rows), 1), BLOCKS - 1)
+    block = blocks(len(rows))
     terms = known.shape[1] + signal.shape[1] + 1
     grams = np.zeros((len(lags), BLOCKS, terms, terms))
     counts = np.zeros(len(lags))

@@ -13,6 +13,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.findings import Finding, number
+from dynssm_ros.signals.signal_map import UNITS
 from dynssm_ros.signals.spans import SIGMAS, Drive, Fitted, Spans, fitted
 
 Checked = tuple[list[Finding], Drive]
@@ -37,17 +38,13 @@ _SCATTER, _ALIGNED, _CLEARER = 0.02, 0.15, 4.0
 """Circular variance of the angle between path and velocity: up to which it is constant, up to which a frame may explain it,
 and how many times less than in the other frame it must be."""
 
-_UNITS = {
-    "km/h": 1 / 3.6, "mph": 0.44704, "kt": 1852 / 3600, "ft/s": 0.3048, "deg": math.pi / 180, "deg/s": math.pi / 180,
-    "cm": 0.01, "mm": 0.001, "km": 1000.0,
-}  # fmt: skip
 _UNIT_WITHIN = 0.03
 """Relative deviation of a factor from that of a unit that is named."""
 
 
 def unit_of(factor: float, *names: str) -> str:
     """The unit whose factor to SI a factor is, if one is; else empty."""
-    return next((name for name in names if abs(factor / _UNITS[name] - 1.0) < _UNIT_WITHIN), "")
+    return next((name for name in names if abs(factor / UNITS[name] - 1.0) < _UNIT_WITHIN), "")
 
 
 def in_unit(factor: float, *names: str) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from typing import TypeVar
 
 import numpy as np
 
-from dynssm_ros.arrays import Vector
-from dynssm_ros.signals.contents import TopicContent
+from dynssm_ros.signals.contents import TopicContent, spread
 
 IMU, FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
 _OF_IMU = {"omega": "angular_velocity.z", "a_x": "linear_acceleration.x", "a_y": "linear_acceleration.y"}
@@ -29,6 +29,7 @@ COLUMNS = {
 }
 """Words in headings of tables, in lower case and apart by underscores."""
 
+T = TypeVar("T")
 Place = tuple[TopicContent, str]
 """A topic and a field of it."""
 
@@ -56,9 +57,16 @@ def sensors(topics: Mapping[str, TopicContent]) -> dict[str, Place]:
         found["v_x"] = max(
             speeds, key=lambda place: (bool(_WHEEL.search(f"{place[0].name}.{place[1]}")), place[0].count)
         )
-    if "latitude" not in found or "longitude" not in found:
-        found = {name: place for name, place in found.items() if name not in _OF_FIX}
-    return found if {"v_x", "omega"} <= set(found) else {}
+    return of_use(found)
+
+
+def of_use(sensed: Mapping[str, T], known: Collection[str] = ()) -> dict[str, T]:
+    """What of the ``sensed`` signals an estimate can use beside those that are ``known``: fixes only with both angles,
+    and nothing without ``v_x`` and ``omega``.
+    """
+    has_fix = set(_OF_FIX) <= set(sensed)
+    kept = {name: one for name, one in sensed.items() if has_fix or name not in _OF_FIX}
+    return kept if {"v_x", "omega"} <= {*known, *kept} else {}
 
 
 def _is_speed(topic: TopicContent, field: str) -> bool:
@@ -70,6 +78,4 @@ def _is_speed(topic: TopicContent, field: str) -> bool:
 
 
 def _changes(topic: TopicContent, field: str) -> bool:
-    values: Vector = topic.values.get(field, np.empty(0))
-    known = values[np.isfinite(values)]
-    return len(known) > 1 and float(np.ptp(known)) > 0
+    return spread(topic.values.get(field, np.empty(0))) > 0

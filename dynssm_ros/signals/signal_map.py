@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from itertools import groupby, pairwise
 from operator import attrgetter
 from pathlib import Path
@@ -260,7 +260,7 @@ class SignalMap(StrictModel):
     @property
     def set_point(self) -> SetPoint:
         """What the first input is: a throttle, or the set-point of a speed controller."""
-        return "speed" if any(name in self.signals for name in SPEED_SIGNALS) else "throttle"
+        return set_point_of(self.signals)
 
     @property
     def required(self) -> tuple[str, ...]:
@@ -313,6 +313,11 @@ class SignalMap(StrictModel):
         skipped: tuple[str, ...] = () if self.commands == "topics" else (*self.command_signals, "brake_command")
         skipped += () if self.estimation is not None else SENSORS
         return {name: source for name, source in self.signals.items() if name not in skipped}
+
+
+def set_point_of(signals: Collection[str]) -> SetPoint:
+    """What the first input of these signals is."""
+    return "speed" if any(name in signals for name in SPEED_SIGNALS) else "throttle"
 
 
 def required_signals(set_point: SetPoint) -> tuple[str, ...]:

@@ -140,7 +140,12 @@ class Spans:
     @property
     def block(self) -> Indices:
         """Number of the block of neighbours that each belongs to."""
-        return np.arange(len(self)) * BLOCKS // max(len(self), 1)
+        return blocks(len(self))
+
+
+def blocks(count: int) -> Indices:
+    """Number of the block of neighbours that each of ``count`` rows, in the order of time, belongs to, ``(count,)``."""
+    return np.arange(count) * BLOCKS // max(count, 1)
 
 
 @dataclass(frozen=True)

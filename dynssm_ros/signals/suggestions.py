@@ -7,7 +7,6 @@ are seen.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,14 +14,13 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.actuation import SCALES, UNDERSTEER, believable, understeer
 from dynssm_ros.signals.columns import heading
-from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, pose_fields
+from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, pose_fields, spread
 from dynssm_ros.signals.decoding import LOG_TIME
 from dynssm_ros.signals.rest_value import rest_value
-from dynssm_ros.signals.sensor_topics import COLUMNS, sensors
-from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals, yaw_of
-from dynssm_ros.signals.spans import BLOCKS
+from dynssm_ros.signals.sensor_topics import COLUMNS, of_use, sensors
+from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals, set_point_of, yaw_of
+from dynssm_ros.signals.spans import blocks
 from dynssm_ros.signals.stamps import clock_notes, frames_note, log_time_note
-from dynssm_ros.vehicle.single_track import SetPoint
 
 _MOTION = {
     "v_y": (r"(^|_)(v|vel|velocity|linear)_?(y|lat\w*)$|^v?_?lat\w*_(vel\w*|speed)$|^vlat|quergeschw",),
@@ -120,7 +118,7 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
             and _may_be(columns[name], signal)
         ]
         if fitting:
-            best = max(fitting, key=lambda name: (_spread(columns[name].values[name]) > 0, -fitting.index(name)))
+            best = max(fitting, key=lambda name: (spread(columns[name].values[name]) > 0, -fitting.index(name)))
             found[signal] = _with_unit(Suggestion(columns[best], best), _QUANTITIES[signal])
             others = [name for name in fitting if name != best and not re.search(patterns[0], names[best])]
             if others:
@@ -129,7 +127,7 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
         found["theta"] = yaw
     if not {"x", "y", "theta"} <= set(found):
         found = {name: one for name, one in found.items() if name in STATE_SIGNALS}
-    has_path = "x" in found and _spread(found["x"].values) + _spread(found["y"].values) > 0
+    has_path = "x" in found and spread(found["x"].values) + spread(found["y"].values) > 0
     if not set(STATE_SIGNALS) <= set(found) and has_path:
         lack = ", ".join(name for name in STATE_SIGNALS if name not in found)
         notes.append(f"no column is {lack}; velocities follow from the poses")
@@ -139,12 +137,12 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
         notes.append(f"no column is v_y; it is estimated from {', '.join(found)} (estimation: give rear_axle, m)")
     elif not found:
         notes.append("no column tells where the car is or how fast; find v_x, v_y and omega, or x, y and theta")
-    if "v_y" in found and _spread(found["v_y"].values) == 0:
+    if "v_y" in found and spread(found["v_y"].values) == 0:
         notes.append(f"{found['v_y'].field}: v_y is constant, so that nothing is known of how the car slides{_LEAVE}")
     if "v_x" in found and float(np.nanmax(np.abs(found["v_x"].values), initial=0.0)) > _FASTEST:
         found["v_x"] = replace(found["v_x"], note="too fast for m/s: find its unit")
     for name in ("omega", "theta"):
-        if name in found and found[name].unit == "1" and _spread(found[name].values) > _MOST[name]:
+        if name in found and found[name].unit == "1" and spread(found[name].values) > _MOST[name]:
             found[name] = replace(found[name], note="large for rad: deg?")
     return found
 
@@ -156,14 +154,12 @@ def _sensor_columns(columns: dict[str, TopicContent], found: dict[str, Suggestio
         fitting = [
             Suggestion(one, name)
             for name, one in columns.items()
-            if one.values and re.search(pattern, _plain(heading(name).bare)) and _spread(one.values[name]) > 0
+            if one.values and re.search(pattern, _plain(heading(name).bare)) and spread(one.values[name]) > 0
         ]
         if fitting and signal not in found:
             quantity = {"v_x": "m/s", "a_x": "m/s^2", "a_y": "m/s^2"}.get(signal)
             sensed[signal] = _with_unit(fitting[0], quantity) if quantity else fitting[0]
-    if not {"latitude", "longitude"} <= set(sensed):
-        sensed = {name: one for name, one in sensed.items() if name not in ("latitude", "longitude")}
-    return sensed if {"v_x", "omega"} <= {*found, *sensed} else {}
+    return of_use(sensed, found)
 
 
 def _yaw_of_columns(columns: dict[str, TopicContent]) -> Suggestion | None:
@@ -200,7 +196,7 @@ def _with_unit(suggestion: Suggestion, quantity: str) -> Suggestion:
 def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Suggestion]:
     """The odometry that moves most often, if there is one."""
     odometries = [topic for topic in topics.values() if topic.msgtype == ODOMETRY and topic.values]
-    moving = [topic for topic in odometries if _spread(topic.values[TWIST["v_x"]]) > 0]
+    moving = [topic for topic in odometries if spread(topic.values[TWIST["v_x"]]) > 0]
     if not moving:
         poses = [topic for topic in topics.values() if topic.msgtype in POSES and _moves(topic)]
         if not poses and (found := sensors(topics)):
@@ -223,14 +219,14 @@ def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Su
         notes.append(f"several odometries move: {', '.join(topic.name for topic in moving)}; taken is {best.name}")
     omega = best.values[TWIST["omega"]]
     turning = [topic for topic in topics.values() if topic.msgtype in POSES and _moves(topic) and _turns(topic)]
-    if _spread(omega) == 0 and turning:
+    if spread(omega) == 0 and turning:
         pose = max(turning, key=lambda topic: (topic is not best, topic.count))
         notes.append(
             f"{best.name}: omega is constant {float(omega[0]):g} while the car turns; velocities follow from the poses of "
             f"{pose.name}"
         )
         return {signal: Suggestion(pose, path) for signal, path in pose_fields(pose.msgtype).items()}
-    if _spread(best.values[TWIST["v_y"]]) == 0:
+    if spread(best.values[TWIST["v_y"]]) == 0:
         told = f"{best.name}: v_y is constant, so that nothing is known of how the car slides"
         localised = [topic for topic in turning if topic.msgtype != ODOMETRY and topic.rate >= _POSES_HZ]
         if localised:
@@ -244,11 +240,11 @@ def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Su
 
 def _moves(topic: TopicContent) -> bool:
     fields = pose_fields(topic.msgtype)
-    return any(_spread(topic.values[fields[name]]) > 0 for name in ("x", "y") if fields[name] in topic.values)
+    return any(spread(topic.values[fields[name]]) > 0 for name in ("x", "y") if fields[name] in topic.values)
 
 
 def _turns(topic: TopicContent) -> bool:
-    return _spread(topic.values.get(pose_fields(topic.msgtype)["theta"], np.empty(0))) > _TURN
+    return spread(topic.values.get(pose_fields(topic.msgtype)["theta"], np.empty(0))) > _TURN
 
 
 def _actuators(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:
@@ -292,7 +288,7 @@ def _speed_set_points(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:
                 kind = "command" if _COMMAND.search(name) else "feedback"
                 found[kind].append(_with_unit(Suggestion(topic, path), "m/s"))
     best = {
-        kind: max(some, key=lambda one: (_spread(one.values), one.topic.count)) for kind, some in found.items() if some
+        kind: max(some, key=lambda one: (spread(one.values), one.topic.count)) for kind, some in found.items() if some
     }
     if "feedback" not in best and "command" in best:
         return {"speed_feedback": best["command"]}
@@ -316,11 +312,6 @@ def _with_set_point(
     notes.append(f"{words}; take a vehicle with inputs.set_point: speed, such as f1tenth")
     without = {name: each for name, each in found.items() if not name.startswith(("throttle", "brake"))}
     return without | {name: replace(each, note="a set-point") for name, each in asked.items()}
-
-
-def set_point_of(signals: Iterable[str]) -> SetPoint:
-    """What the first input of these signals is."""
-    return "speed" if "speed_feedback" in set(signals) else "throttle"
 
 
 def _scaled(actuator: str, suggestion: Suggestion) -> Suggestion:
@@ -371,14 +362,14 @@ def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) 
     values = suggestion.values
     v_x, omega = (np.interp(at, signals[name].topic.time, signals[name].values) for name in ("v_x", "omega"))
     fast = (v_x > _DRIVING * v_x.max(initial=0.0)) & np.isfinite(values) & (v_x > 0)
-    if fast.sum() < 3 or _spread(values[fast]) == 0 or _spread(omega[fast]) == 0:
+    if fast.sum() < 3 or spread(values[fast]) == 0 or spread(omega[fast]) == 0:
         return None
     curvature = omega[fast] / v_x[fast]
     if abs(np.corrcoef(values[fast], curvature)[0, 1]) < _AGREES:
         return None
     slope = float(np.polyfit(values[fast], curvature, 1)[0])
     sign, speed = float(np.sign(slope)), v_x[fast]
-    fit = understeer(sign * values[fast], curvature, speed, block=np.arange(len(speed)) * BLOCKS // len(speed))
+    fit = understeer(sign * values[fast], curvature, speed, block=blocks(len(speed)))
     if fit is not None and fit.share > _AGREES:
         low, high = believable(fit, float(np.mean(speed**2)))
         if 0 < low <= high:
@@ -395,8 +386,3 @@ def _stamps(signals: dict[str, Suggestion]) -> list[str]:
     if first is not None:
         found += clock_notes({name: one.late for name, one in used.items()}, first.topic.name)
     return found
-
-
-def _spread(values: Vector) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.ptp(known)) if len(known) else 0.0

@@ -19,6 +19,7 @@ _EXPECTED_S = (-0.2, 0.5)
 """Lags of a response that cars and their sensors have: smoothing looks 0.1 s ahead, actuators and filters take 0.3 s."""
 _POSE_EXPECTED_S = (-0.4, 0.4)
 """Likewise of poses behind velocities: filters of either are up to 0.3 s late."""
+_POSE_EXPECTED = f"within {_POSE_EXPECTED_S[1]:g} s"
 _WIDEST_S = 1.0
 """Widest interval of a lag that is told: wider ones belong to drives that repeat or hardly change."""
 _CLEARLY, _EXPLAINED = 0.5, 0.4
@@ -166,12 +167,12 @@ def _way(lag: float) -> str:
 
 def _twist_finding(pose: Lag) -> Finding:
     told = f"poses and inputs go together best when v_x, v_y, omega are moved {number(abs(pose.value))} s {_way(pose.value)}"
-    return _lag_finding("twist_time", told, pose, "within 0.4 s", "correct the stamps of v_x, v_y, omega")
+    return _lag_finding("twist_time", told, pose, _POSE_EXPECTED, "correct the stamps of v_x, v_y, omega")
 
 
 def _pose_finding(pose: Lag) -> Finding:
     told = f"poses and velocities go together best when the poses are moved {number(abs(pose.value))} s {_way(-pose.value)}"
-    return _lag_finding("pose_time", told, pose, "within 0.4 s", "correct the stamps of x, y, theta")
+    return _lag_finding("pose_time", told, pose, _POSE_EXPECTED, "correct the stamps of x, y, theta")
 
 
 def _lag_finding(what: str, told: str, lag: Lag, expected: str, remedy: str) -> Finding:

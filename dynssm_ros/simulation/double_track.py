@@ -43,7 +43,7 @@ class DoubleTrack(StageEffect):
     @classmethod
     def of(cls, car: VehicleConstants) -> DoubleTrack:
         """What is plausible for a car of which only the axles are known: neutral roll stiffness, as the static loads."""
-        wheelbase = car.l_f + car.l_r
+        wheelbase = car.wheelbase
         return cls(width=TRACK_WIDTH * wheelbase, roll_front=car.l_r / wheelbase)
 
     def wheel_loads(self, q: Motion, F_y: Array) -> Wheels:

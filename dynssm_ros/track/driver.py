@@ -77,7 +77,7 @@ class Driver:
     def _steering(self, pose: Pose, state: State, s: float, offset: float) -> float:
         """Pure pursuit of the rear axle; its sideslip counts, so that a car at the limit still meets the line."""
         car = self._vehicle.constants
-        T_s, wheelbase = self._vehicle.sampling_time, car.l_f + car.l_r
+        T_s, wheelbase = self._vehicle.sampling_time, car.wheelbase
         x, y = pose.x - car.l_r * math.cos(pose.theta), pose.y - car.l_r * math.sin(pose.theta)
         v_x = max(state.v_x, 1e-3)
         lag = car.m * v_x / self._stiffness  # of the sideslip behind the steering
@@ -98,7 +98,7 @@ class Driver:
         slowed = 1 - self._slower * (1 + self._slowing(time)) / 2
         tighter = math.sqrt(max(1 - float(self.line.curvature(ahead)) * offset, 0.1))
         error = slowed * tighter * self.speed(ahead) - state.v_x
-        cornering = car.m * state.v_x * state.omega * math.sin(previous.delta) * car.l_r / (car.l_f + car.l_r)
+        cornering = car.m * state.v_x * state.omega * math.sin(previous.delta) * car.l_r / car.wheelbase
         force = car.m * error / horizon + th.C_r0 + th.C_r2 * state.v_x**2 + cornering
         if self._vehicle.inputs.set_point == "speed":
             return float(state.v_x) + speed_error_for(th, force)

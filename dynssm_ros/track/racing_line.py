@@ -38,7 +38,7 @@ def border_margin(vehicle: Vehicle, track: Track) -> float:
     """What to keep between the line and the borders (m): half the car, and room for the driver's error."""
     car = vehicle.constants
     narrowest = float(np.min(track.width_left + track.width_right))
-    return CAR_WIDTH * (car.l_f + car.l_r) / 2 + SAFETY * narrowest
+    return CAR_WIDTH * car.wheelbase / 2 + SAFETY * narrowest
 
 
 def line_of(kind: LineKind, vehicle: Vehicle, track: Track) -> ClosedLine:

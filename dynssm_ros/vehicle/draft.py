@@ -81,6 +81,11 @@ class MeasuredCar:
     steering: float | None = None  # largest angle of the road wheels (rad); None: that of the known car
     sampling_time: float | None = None  # s; None: that of the known car
 
+    @property
+    def l_f(self) -> float:
+        """Centre of gravity to front axle (m)."""
+        return self.wheelbase * (1 - self.front_mass / self.mass)
+
 
 def drafted(like: Vehicle, name: str, car: MeasuredCar, tyre: Tyre | None = None) -> Vehicle:
     """The car ``name``, of the kind of ``like``; with ``tyre`` that kind of tyres on both axles.
@@ -89,8 +94,7 @@ def drafted(like: Vehicle, name: str, car: MeasuredCar, tyre: Tyre | None = None
         ConfigurationError: no car is like that.
     """
     old = like.constants
-    length = car.wheelbase / (old.l_f + old.l_r)
-    l_f = car.wheelbase * (1 - car.front_mass / car.mass)
+    length = car.wheelbase / old.wheelbase
     load = car.mass * GRAVITY / 2
     height = old.h_cg * length if car.height is None else car.height
     steering = like.inputs.steering if car.steering is None else (-car.steering, car.steering)
@@ -105,8 +109,8 @@ def drafted(like: Vehicle, name: str, car: MeasuredCar, tyre: Tyre | None = None
         "name": name,
         "description": f"a guess from {like.name}, scaled to its mass and wheelbase",
         "constants": {
-            "m": _rounded(car.mass, 6), "m_std": _rounded(_WEIGHED * car.mass), "l_f": _rounded(l_f),
-            "l_r": _rounded(car.wheelbase - l_f), "h_cg": _rounded(height), "F_z0": _rounded(load),
+            "m": _rounded(car.mass, 6), "m_std": _rounded(_WEIGHED * car.mass), "l_f": _rounded(car.l_f),
+            "l_r": _rounded(car.wheelbase - car.l_f), "h_cg": _rounded(height), "F_z0": _rounded(load),
             "load_transfer": height > 0,
         },
         "sampling_time": car.sampling_time or like.sampling_time,
@@ -154,8 +158,7 @@ def as_commented_file(vehicle: Vehicle, head: Iterable[str]) -> str:
 def _scaled(like: Vehicle, car: MeasuredCar, length: float, load: float) -> dict[str, float]:
     """Coefficients of the known car for another mass and size."""
     old = like.constants
-    l_f = car.wheelbase * (1 - car.front_mass / car.mass)
-    mass, axles = car.mass / old.m, l_f * (car.wheelbase - l_f) / (old.l_f * old.l_r)
+    mass, axles = car.mass / old.m, car.l_f * (car.wheelbase - car.l_f) / (old.l_f * old.l_r)
     factors = {"D": load / old.F_z0, "S_v": load / old.F_z0, "C_r2": length**2, "I_z": mass * axles}
     factors |= dict.fromkeys(("C_m1", "C_m2", "C_r0"), mass)
     values = {key: like.coefficients[key].nominal * factors.get(_kind(key), 1.0) for key in COEFFICIENTS}

@@ -25,7 +25,7 @@ class PlausibleRange(NamedTuple):
 
 def of_constants(car: VehicleConstants) -> Iterator[str]:
     """What is wrong with mass and geometry, in one line each: field, value, what was expected."""
-    wheelbase = car.l_f + car.l_r
+    wheelbase = car.wheelbase
     for name in ("l_f", "l_r"):
         value = getattr(car, name)
         yield from _outside(f"constants.{name}", value, PlausibleRange(0.01, 6.0, "m", _length(value)))

@@ -94,6 +94,11 @@ class VehicleConstants(StrictModel):
         "false: it only brakes",
     )
 
+    @property
+    def wheelbase(self) -> float:
+        """Distance of the axles (m)."""
+        return self.l_f + self.l_r
+
 
 @dataclass
 class Motion:

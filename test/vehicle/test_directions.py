@@ -31,7 +31,7 @@ def theta_of(vehicle: Vehicle, **changes: float) -> Coefficients:
 
 
 def standing(vehicle: Vehicle) -> float:
-    return float(standing_speed(vehicle.constants.l_f + vehicle.constants.l_r))
+    return float(standing_speed(vehicle.constants.wheelbase))
 
 
 def motion(vehicle: Vehicle, state: Any, applied: Any, theta: Coefficients | None = None, xp: Any = np) -> Motion:

@@ -55,7 +55,7 @@ class OdometryLeverArm(MeasurementEffect):
     @classmethod
     def least(cls, constants: VehicleConstants) -> float:
         """How well anybody knows where the centre of gravity is."""
-        return _CENTRE_KNOWN * (constants.l_f + constants.l_r)
+        return _CENTRE_KNOWN * constants.wheelbase
 
     def changed(self, xp: Any, state: State, effect_states: Mapping[str, Array], way: float) -> State:
         v_x, v_y, omega = state
