@@ -21,12 +21,12 @@ from dynssm_ros.control.live import LiveController
 from dynssm_ros.control.reference import load_reference
 from dynssm_ros.control.settings import Objective, Settings
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.nodes.commands import COMMAND_TYPES, commands_as
 from dynssm_ros.nodes.executor import failures
 from dynssm_ros.nodes.managed import ManagedNode
 from dynssm_ros.nodes.rivals import WatchedOutput
 from dynssm_ros.nodes.support import (
     NEWEST_QOS,
-    actuators,
     choose,
     describe,
     diagnostics,
@@ -75,7 +75,8 @@ class ControllerNode(ManagedNode):
         self._refused = -math.inf, Refusal.MISSING  # of odometry, the last one and when it came (s)
         self._answered = -math.inf  # when a rival was answered (s)
 
-        self._command = WatchedOutput(self, JointState, COMMAND_TOPIC, self._on_rival)
+        kind, self._as_message = commands_as(self._command_type, self._driver.vehicle)
+        self._command = WatchedOutput(self, kind, COMMAND_TOPIC, self._on_rival)
         self._publish_command = self._command.publish
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
         # when several messages wait, the executor serves subscriptions in this order
@@ -122,6 +123,13 @@ class ControllerNode(ManagedNode):
             describe(
                 self, "child_frame_id", "", "Frame of the odometry's twist; empty: as it comes first.", read_only=True
             ),
+        )
+        self._command_type: str = choose(
+            self,
+            "command_type",
+            "sensor_msgs/msg/JointState",
+            COMMAND_TYPES,
+            "Type of the commands that are published.",
         )
         self._max_age: float = describe(
             self, "max_age", 0.5, "Age to which the predictor's coefficients are held (s).", (0.01, 10.0), read_only=True
@@ -194,7 +202,7 @@ class ControllerNode(ManagedNode):
 
     def _send(self, acts: int, command: Applied) -> None:
         """Publishes a command that acts from an instant on (ns)."""
-        self._publish_command(actuators(acts, command, self._driver.vehicle.inputs.set_point))
+        self._publish_command(self._as_message(acts, command))
 
     def _watch(self) -> None:
         """Brakes while there is no good odometry, and looks for others who command."""
