@@ -7,7 +7,8 @@ kill costs the task under way. Variables of all groups:
 - ``page``: folder of the pages and their figures; that of the run if not given.
 - ``data``: folder of measured logs and tracks; ``DYNSSM_DATA`` if not given.
 
-Of ``paper``: ``test`` (``NAME=R.parquet``, several apart by commas: recordings to predict after training on the whole log),
+Of ``paper``: ``test`` (``NAME=R.parquet``, several apart by commas: recordings to predict after training on the whole log of
+the car that has their sampling time),
 ``quick=1`` (a few epochs, one seed: tries everything out), ``plan`` (another plan than ``plan.yaml``), ``results`` (file of
 the first page). Of ``hidden_causes``: ``seed`` (of the first case), ``count`` (of cases), ``healthy=1`` (nothing is hidden in
 any), ``cars`` (those of some truths alone, apart by commas); after a change of the engine ``doit forget`` has cases diagnosed
@@ -50,6 +51,7 @@ from dynssm_ros import __version__
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
 from dynssm_ros.runtime.artifact import CARD
+from dynssm_ros.signals.recording import Recording
 
 GROUP = get_var("group", "")
 OUT = Path(get_var("out", f"out/{GROUP}"))
@@ -96,7 +98,8 @@ class Paper:
     def __init__(self) -> None:
         given = given_recordings(get_var("test", ""))
         path = get_var("plan", "")
-        plan = load_plan(Path(path) if path else None).with_tests(given)
+        times = {name: Recording.load(recording).T_s for name, recording in given.items()}
+        plan = load_plan(Path(path) if path else None).with_tests(times)
         self.quick = bool(get_var("quick", ""))
         self.plan: Plan = plan.shortened() if self.quick else plan
         self.steps = steps_of(self.plan, Path(DATA) if DATA else None, given)

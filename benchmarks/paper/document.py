@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from benchmarks.page import render, save_figure
 from benchmarks.paper import figures, tables
-from benchmarks.paper.plan import Plan
+from benchmarks.paper.plan import MID_RANGE, Plan
+from benchmarks.paper.reference import suspects
 from benchmarks.paper.results import Comparison, Results
 from benchmarks.paper.stale import signed
 from benchmarks.paper.summary import EXACT, summary
@@ -74,10 +75,31 @@ def markdown(results: Results, pictures: Mapping[str, str]) -> str:
         pictures={"rates": ""} | dict(pictures),
         plan=results.plan,
         rates=tables.rate_table(results).markdown() if any(results.rates.values()) else "",
+        horizons={_CARS[car.reference].lower(): f"{car.horizon:g} s" for car in results.plan.cars.values()},
+        mid_range=MID_RANGE,
         results=results,
+        suspects=[*suspects(results.reference), *_below_persistence(results)],
         shipped={name: model.base for name, model in models.items() if model.base and model.base not in models},
         short=summary(results),
     )
+
+
+def _below_persistence(results: Results) -> Iterator[str]:
+    """Errors of the paper's model that are above those of persistence on recordings of a full-size car that the user gave."""
+    paper = results.reference["open_loop"]["real"]["DynSSM"]["rmse"]
+    for comparison in (each for each in _comparable(results, "real") if each.study.given):
+        for test in comparison.tests:
+            least = comparison.test(test)["persistence_rmse"]
+            worse = [
+                f"{channel} ({least[channel]:.3g}, {paper[channel]:.3g})"
+                for channel in paper
+                if paper[channel] > least[channel]
+            ]
+            if worse:
+                yield (
+                    f"DynSSM, full-size car: on {test} ({comparison.label}) predicting that nothing changes has lower errors "
+                    f"than the paper's model in {', '.join(worse)}"
+                )
 
 
 def _car(results: Results, data: str, title: str, pictures: Mapping[str, str]) -> dict[str, Any]:
@@ -108,7 +130,10 @@ def _lacking(results: Results, data: str) -> Iterator[dict[str, str]]:
     for comparison in (each for each in results.comparisons if each.car.reference == data):
         words = "measured in part" if comparison.tests else "not measured"
         if not comparison.planned:
-            yield {"label": comparison.label, "words": f"{words}, no recording was given with `test=NAME=R.parquet`"}
+            given = f". {comparison.study.given.rstrip('.')}" if comparison.study.given else ""
+            yield {
+                "label": comparison.label, "words": f"{words}, no recording was given with `test=NAME=R.parquet`{given}"
+            }  # fmt: skip
         elif comparison.reasons:
             yield {"label": comparison.label, "words": f"{words}; {'; '.join(dict.fromkeys(comparison.reasons))}"}
 

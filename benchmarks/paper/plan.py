@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,12 +22,16 @@ from dynssm_ros.runtime.registry import UNTRAINED
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.track.racing_line import LineKind
+from dynssm_ros.vehicle import load_vehicle
 from dynssm_ros.vehicle.parameters import EffectEntry
 
 Quantity = Literal["time", "speed", "yaw_rate", "lateral_acceleration"]
 MID_RANGE = "mid_range"
-FIXED = (TRUE, MID_RANGE, *UNTRAINED)
-"""Models of a race that need no training: the plant's own, the middle of the bounds, and those on the calibrated car."""
+AS_THEY_ARE = (*UNTRAINED, MID_RANGE)
+"""Models that need no training: those on the calibrated car, and the single-track model with the middle of the bounds."""
+FIXED = (TRUE, *AS_THEY_ARE)
+"""The same of a race, with the plant's own."""
+_SAME_TIME = 1e-3  # share by which sampling times may differ
 
 
 def _of_the_repository(vehicle: str) -> str:
@@ -100,7 +105,8 @@ class Split(StrictModel):
     car: str
     train: Part
     test: dict[str, Part] = Field(
-        default_factory=dict, description="by the name to show; empty: the recordings that the user gives"
+        default_factory=dict,
+        description="by the name to show; empty: those recordings that the user gives which have the car's sampling time",
     )
 
 
@@ -113,6 +119,7 @@ class Car(StrictModel):
     )
     min_speed: float = Field(ge=0)  # rows that are slower are not calibrated on (m/s)
     reference: Literal["real", "sim", "other"]  # which of the paper's data sets is comparable, if any
+    horizon: float = Field(gt=0)  # of rollouts (s); for the paper's cars the paper's
     full: str  # the model that ships; models named after it, with an underscore and more, are its ablations
     paper: str | None = None  # the paper's model; its ablations are named likewise
     ddm: str
@@ -135,6 +142,7 @@ class Study(StrictModel):
 
     title: str
     text: str  # what is asked, in a sentence or two
+    given: str = Field(default="", description="of splits whose tests the user gives: what to give, and how to get it")
     remark: Annotated[str, AfterValidator(_no_results)] = Field(
         default="", description="what its authors make of the outcome in words, with the date"
     )
@@ -219,7 +227,7 @@ class Plan(StrictModel):
             _check(f"cars.{name}.coefficients", [car.coefficients], self.studies)
         for name, study in self.studies.items():
             _check(f"studies.{name}.splits", study.splits, self.splits)
-            _check(f"studies.{name}.models", study.models, [*UNTRAINED, *self.models])
+            _check(f"studies.{name}.models", study.models, [*AS_THEY_ARE, *self.models])
             if len({self.splits[split].car for split in study.splits}) > 1:
                 raise ValueError(f"studies.{name}.splits: of several cars; expected the same")
             tests = self.tests(study)
@@ -264,6 +272,10 @@ class Plan(StrictModel):
     def car(self, study: Study) -> Car:
         return self.cars[self.splits[study.splits[0]].car]
 
+    def nominal(self, car: Car) -> str:
+        """The vehicle whose bounds :data:`MID_RANGE` is the middle of: that of the paper's model, if there is one."""
+        return (self.models[car.paper].vehicle if car.paper else None) or car.vehicle
+
     def seeds(self, study: Study, model: str) -> range:
         limit = self.models[model].seeds
         return range(study.seeds if limit is None else min(limit, study.seeds))
@@ -271,21 +283,36 @@ class Plan(StrictModel):
     def tests(self, study: Study) -> tuple[str, ...]:
         return tuple(test for split in study.splits for test in self.splits[split].test)
 
-    def with_tests(self, recordings: Iterable[str]) -> Plan:
-        """The plan in which the splits without test parts have these recordings, which the user gives.
+    def with_tests(self, recordings: Mapping[str, float]) -> Plan:
+        """The plan in which the splits without test parts have the recordings that the user gives.
+
+        Args:
+            recordings: sampling times (s) by name; a split has those of its car's sampling time.
 
         Raises:
-            ConfigurationError: the plan has a recording of that name.
+            ConfigurationError: the plan has a recording of that name, or no such split has a car of that sampling time.
         """
-        given = {name: Part(recording=name) for name in recordings}
-        for name in given:
-            if name in {*self.logs, *self.drives}:
-                raise ConfigurationError(f"--test {name}: the plan has a recording of that name; expected another one")
-        splits = {
-            name: split if split.test else split.model_copy(update={"test": given})
-            for name, split in self.splits.items()
-        }
+        open_splits = {name: split for name, split in self.splits.items() if not split.test}
+        times = {name: load_vehicle(self.cars[split.car].vehicle).sampling_time for name, split in open_splits.items()}
+        splits = dict(self.splits)
+        for recording, T_s in recordings.items():
+            if recording in {*self.logs, *self.drives}:
+                raise ConfigurationError(
+                    f"test={recording}: the plan has a recording of that name; expected another one"
+                )
+            fitting = [name for name, of_car in times.items() if math.isclose(T_s, of_car, rel_tol=_SAME_TIME)]
+            if not fitting:
+                expected = " or ".join(f"{each:g} s" for each in dict.fromkeys(times.values()))
+                raise ConfigurationError(f"test={recording}: sampling time {T_s:g} s; expected {expected}")
+            for name in fitting:
+                test = splits[name].test | {recording: Part(recording=recording)}
+                splits[name] = splits[name].model_copy(update={"test": test})
         return self.model_copy(update={"splits": splits})
+
+    def home(self, name: str) -> str:
+        """The first split with the car and the training part of split ``name``: its trainings serve both."""
+        split = self.splits[name]
+        return next(n for n, each in self.splits.items() if (each.car, each.train) == (split.car, split.train))
 
     def shortened(self) -> Plan:
         """The plan that tries everything out: few epochs and seeds, short drives, one split of each study."""

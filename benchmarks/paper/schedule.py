@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.paper.plan import FIXED, Plan, Race, Split, Sweep
+from benchmarks.paper.plan import AS_THEY_ARE, FIXED, Car, Plan, Race, Split, Sweep
 from benchmarks.paper.racing import DriveLaps
 from benchmarks.paper.steps import (
     Calibrate,
@@ -19,7 +19,6 @@ from benchmarks.paper.steps import (
     Train,
     recording_key,
 )
-from dynssm_ros.runtime.registry import UNTRAINED
 from dynssm_ros.signals.signal_map import Commands
 
 
@@ -33,7 +32,10 @@ def steps_of(plan: Plan, data: Path | None, given: Mapping[str, Path]) -> list[S
     sites = [Site(plan, *each) for each in wanted]
     recordings = dict.fromkeys(name for site in sites for name in site.recordings)
     steps: list[Step] = [_recording_step(plan, name, data, given) for name in recordings]
-    steps += [step for site in sites for step in site.steps()]
+    made: dict[str, Step] = {}
+    for step in (step for site in sites for step in site.steps()):
+        made.setdefault(step.key, step)  # what splits share is made once
+    steps += made.values()
     trained: dict[str, list[str]] = {}
     for step in steps:
         if isinstance(step, Train):
@@ -86,6 +88,15 @@ class Site:
         return f"{self.name}.{self.commands}"
 
     @property
+    def home(self) -> str:
+        """Under which name its trainings lie."""
+        return f"{self.plan.home(self.name)}.{self.commands}"
+
+    @property
+    def car(self) -> Car:
+        return self.plan.cars[self.split.car]
+
+    @property
     def split(self) -> Split:
         return self.plan.splits[self.name]
 
@@ -100,18 +111,18 @@ class Site:
     @property
     def vehicle(self) -> str:
         """Where the car lies that is calibrated on the training part."""
-        return f"vehicles/{self}.yaml"
+        return f"vehicles/{self.home}.yaml"
 
     @property
     def scores(self) -> str:
         return f"scores/{self}.json"
 
     def model(self, name: str, seed: int) -> str:
-        return f"models/{self}/{name}.{seed}"
+        return f"models/{self.home}/{name}.{seed}"
 
     def rate(self, sweep: Sweep, rate: float, seed: int) -> str:
         """Where the training of a sweep with a learning rate and a seed lies."""
-        return f"rates/{self}/{sweep.model}.{rate:g}.{seed}"
+        return f"rates/{self.home}/{sweep.model}.{rate:g}.{seed}"
 
     @property
     def models(self) -> dict[str, range]:
@@ -120,7 +131,7 @@ class Site:
         for study in self.plan.studies.values():
             if self.name in study.splits and study.commands == self.commands:
                 for name in study.models:
-                    seeds = range(0) if name in UNTRAINED else self.plan.seeds(study, name)
+                    seeds = range(0) if name in AS_THEY_ARE else self.plan.seeds(study, name)
                     wanted[name] = max(wanted.get(name, seeds), seeds, key=len)
         return wanted
 
@@ -128,7 +139,7 @@ class Site:
         """All but those that make the recordings."""
         yield Calibrate(
             key=self.vehicle, title=f"calibrate on {self.shown}", needs=(recording_key(self.split.train.recording),),
-            car=self.plan.cars[self.split.car], part=self.split.train, commands=self.commands,
+            car=self.car, part=self.split.train, commands=self.commands,
         )  # fmt: skip
         models = self.models
         for name, seeds in models.items():
@@ -138,8 +149,9 @@ class Site:
         tested = dict.fromkeys(recording_key(part.recording) for part in self.split.test.values())
         yield Evaluate(
             key=self.scores, title=f"evaluate on {self.shown}", needs=(*tested, self.vehicle),
-            uses=tuple(trained), vehicle=self.vehicle, untrained=tuple(name for name in models if name in UNTRAINED),
-            trained=trained, tests=self.split.test, commands=self.commands, stride=self.plan.stride,
+            uses=tuple(trained), vehicle=self.vehicle, untrained=tuple(name for name in models if name in AS_THEY_ARE),
+            nominal=self.plan.nominal(self.car), trained=trained, tests=self.split.test, commands=self.commands,
+            horizon=self.car.horizon, stride=self.plan.stride,
         )  # fmt: skip
 
     def _training(self, name: str, seed: int, others: Mapping[str, range]) -> Train:

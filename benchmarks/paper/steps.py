@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from benchmarks.paper.parts import cut
-from benchmarks.paper.plan import Car, Drive, Log, Part
+from benchmarks.paper.plan import MID_RANGE, Car, Drive, Log, Part
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.metrics import by_channel, latency_us
@@ -25,6 +25,7 @@ from dynssm_ros.evaluation.open_loop import Evaluation, evaluate
 from dynssm_ros.files import digest, write_json
 from dynssm_ros.identification.result.calibration import calibrate
 from dynssm_ros.learning.models.base import ModelConfig
+from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.registry import UNTRAINED, load_model
 from dynssm_ros.signals.extraction import extract
@@ -211,24 +212,40 @@ class Evaluate(Step):
 
     vehicle: str  # key of the calibrated car
     untrained: tuple[str, ...]  # names of models without training
+    nominal: str  # vehicle whose bounds the model mid_range is the middle of
     trained: Mapping[str, str]  # names by the keys of their steps
     tests: Mapping[str, Part]  # parts to predict, by the names to show
     commands: Commands  # the command protocol
-    stride: int  # rollouts start at every ``stride``-th row
+    horizon: float  # of rollouts (s)
+    stride: int  # they start at every ``stride``-th row
 
     def recipe(self) -> dict[str, Any]:
         tests = {name: part.model_dump(mode="json") for name, part in self.tests.items()}
-        return {"models": [*self.untrained, *self.trained], "tests": tests, "stride": self.stride}
+        recipe = {
+            "models": [*self.untrained, *self.trained],
+            "tests": tests,
+            "horizon": self.horizon,
+            "stride": self.stride,
+        }
+        if MID_RANGE in self.untrained:
+            recipe["nominal"] = load_vehicle(self.nominal).model_dump(mode="json")
+        return recipe
 
     def make(self, root: Path, there: frozenset[str]) -> None:
         vehicle = load_vehicle(root / self.vehicle)
-        models = {name: load_model(name, vehicle) for name in self.untrained}
+        models = {name: self._untrained(name, vehicle) for name in self.untrained}
         models |= {key: load_model(root / key) for key in self.trained if key in there}
         tests = {}
         for name, part in self.tests.items():
             recording = _load(root, part, self.commands)
-            tests[name] = self._scores(evaluate(recording, models, name=name, stride=self.stride, calls=1))
+            scored = evaluate(recording, models, name=name, horizon_s=self.horizon, stride=self.stride, calls=1)
+            tests[name] = self._scores(scored)
         write_json(root / self.key, {"tests": tests})
+
+    def _untrained(self, name: str, calibrated: Vehicle) -> WindowModel:
+        if name == MID_RANGE:
+            return SingleTrack(load_vehicle(self.nominal).unmeasured())
+        return load_model(name, calibrated)
 
     def _scores(self, evaluation: Evaluation) -> dict[str, Any]:
         by_model: dict[str, list[dict[str, Any]]] = {}

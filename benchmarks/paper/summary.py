@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.paper.plan import AS_THEY_ARE
 from benchmarks.paper.results import Comparison, Results
 from dynssm_ros.reporting.tables import Column, Table, Value
-from dynssm_ros.runtime.registry import UNTRAINED
 
 _WITHOUT_A_NETWORK = ("ridge", "rls", "gp", "on_track")
 _ALIKE = 0.02  # errors that differ by less are called equal
@@ -46,7 +46,7 @@ def _simple(comparison: Comparison, results: Results) -> list[str]:
     """Its models without a network."""
     models = results.plan.models
     closed = [m for m in comparison.compared if m in models and results.plan.configured(m).kind in _WITHOUT_A_NETWORK]
-    return [*(m for m in comparison.compared if m in UNTRAINED), *closed]
+    return [*(m for m in comparison.compared if m in AS_THEY_ARE), *closed]
 
 
 def _published(comparison: Comparison, results: Results) -> list[str]:

@@ -7,16 +7,22 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from benchmarks.paper.plan import MID_RANGE
 from benchmarks.paper.results import Comparison, Entry, Results, by_name
 from dynssm_ros.evaluation.coefficients import coefficient_unit
 from dynssm_ros.evaluation.spread import SeedSpread, spreads
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.tables import Column, Table, Value, text
+from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENTS
 
 TITLES = {"v_x": "v_x", "v_y": "v_y", "omega": "ω"}
-_PHYSICS_ONLY = "single_track"
+_PHYSICS_ONLY = {
+    MID_RANGE: "physics only, θ_0 in the middle of the bounds",
+    SingleTrack.name: "physics only, calibrated",
+}
+_THEIR_PHYSICS_ONLY = "single_track"  # in the reference; its coefficients are nominal, not calibrated
 _ERRORS = ("ADE", "FDE")
 
 
@@ -88,9 +94,11 @@ def error_table(comparison: Comparison) -> Table:
     ]
     rows_scored = sum(comparison.test(test)["rows"] for test in comparison.tests)
     together = " on all tests together" if len(comparison.tests) > 1 else ""
+    horizon = " or ".join(dict.fromkeys(f"{comparison.test(test)['horizon_s']:g} s" for test in comparison.tests))
     return Table(
-        columns, rows, f"Errors{together}: {rows_scored:,} one-step predictions of each model. {_seeds(comparison)}"
-    )
+        columns, rows, f"Errors{together}: {rows_scored:,} one-step predictions of each model, rollouts over {horizon}. "
+        f"{_seeds(comparison)}"
+    )  # fmt: skip
 
 
 def relative_table(comparison: Comparison) -> Table:
@@ -114,13 +122,15 @@ def ablation_table(comparison: Comparison, results: Results, base: str) -> Table
     columns = [Column("variant")]
     for column in shown:
         columns += [column, *([Column(f"{column.title}, the paper's", column.unit)] if paper else [])]
-    variants = {_PHYSICS_ONLY: _PHYSICS_ONLY} if _PHYSICS_ONLY in comparison.models else {}
+    variants = {model: model for model in comparison.those(*_PHYSICS_ONLY)}
     variants |= comparison.ablations(base) | {"full": base}
-    names = {_PHYSICS_ONLY: "physics only, calibrated", "full": "full model"} | comparison.variants(base)
+    names = _PHYSICS_ONLY | {"full": "full model"} | comparison.variants(base)
     rows: list[list[Value]] = []
     for lacking, model in variants.items():
-        theirs = paper.get(lacking)
-        cost = results.costs.get(model)
+        theirs = (
+            None if lacking == SingleTrack.name else paper.get(_THEIR_PHYSICS_ONLY if lacking == MID_RANGE else lacking)
+        )
+        cost = results.costs.get(SingleTrack.name if model == MID_RANGE else model)
         own: list[Value] = list(comparison.rmse(model))
         own += [cost["parameters"], cost["flops"], cost["latency_us"]["p50"]] if cost else [None] * 3
         published = [*by_name(theirs["rmse"]), *_cost(theirs)] if theirs else [None] * 6

@@ -19,14 +19,14 @@ from dynssm_ros.vehicle import COEFFICIENTS
 STATE_SIGNALS = ("v_x", "v_y", "omega")
 SPLITS = {"slow": "slow to fast", "right": "right to left", "straight": "straight to corner"}
 MODELS = (
-    "persistence", "single_track", "ddm_av21", "dynssm_av21_paper", "dynssm_av21", "dynssm_av21_no_innovation",
+    "persistence", "mid_range", "single_track", "ddm_av21", "dynssm_av21_paper", "dynssm_av21", "dynssm_av21_no_innovation",
     "dynssm_av21_no_online",
 )  # fmt: skip
 LEVELS = {
-    "persistence": 1.0, "single_track": 0.8, "ddm_av21": 0.6, "dynssm_av21_paper": 0.4, "dynssm_av21": 0.3,
+    "persistence": 1.0, "mid_range": 0.9, "single_track": 0.8, "ddm_av21": 0.6, "dynssm_av21_paper": 0.4, "dynssm_av21": 0.3,
     "dynssm_av21_no_innovation": 0.5, "dynssm_av21_no_online": 0.31,
 }  # fmt: skip
-UNTRAINED = ("persistence", "single_track")
+UNTRAINED = ("persistence", "mid_range", "single_track")
 
 
 def entry(rmse, seed=None, ade=0.1, coverage=None, theta=None):
@@ -159,7 +159,14 @@ def test_ablations_are_told_from_the_paper_s_configuration(make, scores):
     }  # fmt: skip
     assert comparison.ablations("dynssm_av21_paper") == {"no_ssm": "dynssm_av21_paper_no_ssm"}
     assert comparison.bases == ("dynssm_av21_paper", "dynssm_av21")
-    assert comparison.compared == ("persistence", "single_track", "ddm_av21", "dynssm_av21_paper", "dynssm_av21")
+    assert comparison.compared == (
+        "persistence",
+        "mid_range",
+        "single_track",
+        "ddm_av21",
+        "dynssm_av21_paper",
+        "dynssm_av21",
+    )
     table = tables.ablation_table(comparison, results, "dynssm_av21_paper")
     assert cells(table, "w/o SSM encoder")[:2] == ["0.450 ± 0.000", "0.0286"]
     assert cells(table, "w/o SSM encoder")[7:12:2] == ["79,500", "139,800", "2,000"]
@@ -191,7 +198,8 @@ def test_the_paper_s_numbers_stand_beside_and_are_never_the_best(make):
     best = {(row[0].text, k) for row in table.cells for k, cell in enumerate(row) if cell.best}
     assert best == {("full model", 1), ("full model", 2), ("full model", 3)}
     theirs = tables.ablation_table(results.comparisons[0], results, "dynssm_av21_paper")
-    assert cells(theirs, "physics only, calibrated")[:2] == ["0.800", "0.0350"]
+    assert cells(theirs, "physics only, calibrated")[:2] == ["0.800", "–"]
+    assert cells(theirs, "physics only, θ_0 in the middle of the bounds")[:2] == ["0.900", "0.0350"]
     published = tables.published_table(results.comparisons, results.reference["open_loop"]["real"])
     assert cells(published, "FTHD, the paper's")[1:4] == ["0.0270", "0.938", "0.0338"]
     assert not any(cell.best for row in published.cells for cell in row)
@@ -278,7 +286,7 @@ def test_the_document_has_every_section_and_shows_its_figures(make, tmp_path):
     assert re.findall(r"^#+ (.+)$", text, flags=re.M) == [
         "Results", "In short", "How it was measured", "Full-size car",
         "Against the published models", "Unseen driving, commands `lookahead`",
-        "Coefficients", "Stated uncertainty", "Cost",
+        "Coefficients", "Stated uncertainty", "Suspect figures of the paper", "Cost",
     ]  # fmt: skip
     shown = set(re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text))
     assert shown == {"results_persistence.png", "results_ablations_unseen_dynssm_av21.png"}
@@ -305,7 +313,25 @@ def test_a_study_of_given_recordings_asks_for_them(make):
     plan = load_plan()
     plan = plan.model_copy(update={"studies": {"track": plan.studies["track"]}})
     text = document.markdown(make(plan=plan, scores={}), {})
-    assert "*another track, lookahead*: not measured, no recording was given with `test=NAME=R.parquet`." in text
+    assert (
+        "*another track, lookahead*: not measured, no recording was given with `test=NAME=R.parquet`. The paper's"
+        in text
+    )
+    assert 'ARGS="test=LVMS=lvms.parquet"' in text
+
+
+def test_persistence_with_lower_errors_than_the_paper_s_model_is_a_suspect_figure(make, scores):
+    plan = load_plan().with_tests({"LVMS": 0.04})
+    study = plan.studies["track"].model_copy(update={"models": ("persistence",)})
+    plan = plan.model_copy(update={"studies": {"track": study}})
+    found = score("LVMS", {"persistence": [entry(0.01)]})
+    found["tests"]["LVMS"]["persistence_rmse"] = {"v_x": 0.05, "v_y": 0.007, "omega": 0.009}
+    text = document.markdown(make(plan=plan, scores={"scores/whole.lookahead.json": found}), {})
+    assert (
+        "- DynSSM, full-size car: on LVMS (another track, lookahead) predicting that nothing changes has lower errors than "
+        "the paper's model in v_y (0.007, 0.019)." in text
+    )
+    assert "predicting that nothing changes" not in document.markdown(make(), {})
 
 
 def test_quick_runs_say_so(make):

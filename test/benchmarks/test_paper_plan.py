@@ -12,12 +12,15 @@ import yaml
 import benchmarks.rivals
 from benchmarks.paper.parts import cut, quantity
 from benchmarks.paper.plan import Part, Range, Study, load_plan
-from benchmarks.paper.reference import load_reference
+from benchmarks.paper.published import published_drive
+from benchmarks.paper.reference import load_reference, suspects
 from benchmarks.paper.results import by_name
 from dynssm_ros.configuration import config_root
-from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.errors import ConfigurationError, RecordingError
+from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
+from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import COEFFICIENTS
 
 T_s = 0.04
@@ -109,12 +112,36 @@ def test_quantities_are_means_over_a_second_and_stop_at_gaps():
 
 
 def test_given_recordings_are_the_tests_of_splits_without(plan):
-    given = plan.with_tests(["vegas"])
-    assert given.splits["whole"].test == {"vegas": Part(recording="vegas")}
+    given = plan.with_tests({"vegas": 0.04, "mobil": 0.02, "again": 0.04})
+    assert given.splits["whole"].test == {name: Part(recording=name) for name in ("vegas", "again")}
+    assert given.splits["ethz_given"].test == {"mobil": Part(recording="mobil")}
     assert given.splits["lap_1"] == plan.splits["lap_1"]
-    assert plan.with_tests([]).splits["whole"].test == {}
-    with pytest.raises(ConfigurationError, match="--test putnam: the plan has a recording of that name"):
-        plan.with_tests(["putnam"])
+    assert plan.with_tests({}).splits["whole"].test == {}
+    with pytest.raises(ConfigurationError, match="test=putnam: the plan has a recording of that name"):
+        plan.with_tests({"putnam": 0.04})
+    with pytest.raises(ConfigurationError, match=r"test=slow: sampling time 0.1 s; expected 0.02 s or 0.04 s"):
+        plan.with_tests({"slow": 0.1})
+
+
+def test_splits_with_the_same_training_share_it(plan):
+    assert plan.home("ethz_given") == "ethz"
+    assert {name: plan.home(name) for name in ("lap_1", "whole", "slow")} == {n: n for n in ("lap_1", "whole", "slow")}
+
+
+def test_the_papers_cars_are_scored_over_its_horizons(plan):
+    horizons = {car.reference: car.horizon for car in plan.cars.values()}
+    assert {data: horizons[data] for data in ("real", "sim")} == {"real": 0.6, "sim": 0.3}  # caption of tab:open_loop
+
+
+def test_figures_of_the_paper_that_contradict_each_other_are_listed():
+    reference = load_reference()
+    assert suspects(reference) == [
+        "DDM, small car: the FDE, 0.0016 m, is below the ADE, 0.00759 m",
+        "FTHD, small car: the RMSE of omega, 0.483, is above its maximum, 0.289",
+    ]
+    planted = copy.deepcopy(reference)
+    planted["open_loop"]["real"]["DynSSM"]["rmse"]["v_x"] = 1.0
+    assert "DynSSM, full-size car: the RMSE of v_x, 1, is above its maximum, 0.927" in suspects(planted)
 
 
 def test_a_quick_plan_is_shorter_in_everything(plan):
@@ -226,3 +253,40 @@ def test_the_papers_model_has_the_papers_size(name, vehicle, data):
 def test_an_unreadable_plan_is_named():
     with pytest.raises(ConfigurationError, match=r"nowhere.yaml: cannot be read"):
         load_plan(Path("nowhere.yaml"))
+
+
+def test_a_published_drive_is_the_recording_that_its_bag_is(orca_bag):
+    """``ethz_pure_pursuit.npz`` and its bag are the same data."""
+    recording = published_drive(orca_bag.with_suffix(".npz"))
+    of_bag = extract([orca_bag], load_signal_map("default"), 50.0)
+    assert recording.info.commands == of_bag.info.commands
+    assert recording.T_s == of_bag.T_s
+    for name in of_bag.columns:
+        np.testing.assert_allclose(recording[name], of_bag[name], atol=1e-12, err_msg=name)
+
+
+def test_another_file_is_no_published_drive(tmp_path):
+    np.savez(
+        tmp_path / "a.npz",
+        time=np.arange(3.0),
+        states=np.zeros((6, 3)),
+        dstates=np.zeros((7, 3)),
+        inputs=np.zeros((2, 2)),
+    )
+    with pytest.raises(RecordingError, match=r"dstates of shape \(7, 3\); expected \(8, 3\) for 3 times"):
+        published_drive(tmp_path / "a.npz")
+    with pytest.raises(RecordingError, match="expected arrays time, states, dstates, inputs"):
+        published_drive(tmp_path / "nowhere.npz")
+
+
+def test_a_published_csv_is_the_recording_that_its_bag_is(putnam):
+    """The bag of Putnam Park was made from the CSV; stamps of its reports are 5 and 7 ms off."""
+    signals = load_signal_map(str(REPOSITORY / "benchmarks" / "paper" / "deep_dynamics_csv.yaml"))
+    of_csv = extract([putnam.with_suffix(".csv")], signals, 25.0)
+    of_bag = extract([putnam], load_signal_map("av21"), 25.0)
+    first = np.searchsorted(of_csv.time, of_bag.time[0] - 1000)  # the bag's reports begin later; stamps in ns
+    later = of_csv.select(slice(first, first + len(of_bag)))
+    assert len(of_bag) > 11_890
+    np.testing.assert_allclose(later.time, of_bag.time, atol=1000)
+    for name, error in {"v_x": 1e-6, "v_y": 1e-6, "omega": 1e-6, "r_fb": 0.01, "delta_fb": 1e-3}.items():
+        assert np.quantile(np.abs(later[name] - of_bag[name]), 0.99) < error, name

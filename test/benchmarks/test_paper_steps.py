@@ -26,8 +26,8 @@ SMALL = {
     },
     "cars": {
         "orca": {
-            "vehicle": "orca", "start": "mid_range", "min_speed": 0.0, "reference": "sim", "full": "dynssm_orca",
-            "ddm": "ddm_orca", "fthd": "fthd_orca", "coefficients": "track",
+            "vehicle": "orca", "start": "mid_range", "min_speed": 0.0, "reference": "sim", "horizon": 0.1,
+            "full": "dynssm_orca", "ddm": "ddm_orca", "fthd": "fthd_orca", "coefficients": "track",
         },
     },
     "splits": {
@@ -82,7 +82,7 @@ def small_run(plan, tmp_path_factory):
 def quick_run(plan, tmp_path_factory):
     """The split that is there, with models that take no epochs: its folder, and results."""
     study = plan.studies["track"].model_copy(
-        update={"models": ("persistence", "single_track", "ridge_orca"), "seeds": 1}
+        update={"models": ("persistence", "mid_range", "single_track", "ridge_orca"), "seeds": 1}
     )
     small = plan.model_copy(update={"studies": {"track": study}})
     root = tmp_path_factory.mktemp("quick_run")
@@ -100,7 +100,7 @@ def by_key(steps):
 def test_each_step_of_the_shipped_plan_is_there_once_with_what_it_builds_on():
     plan = load_plan()
     for given in ({}, {"vegas": "vegas.parquet"}):
-        steps = steps_of(plan.with_tests(given), None, given)
+        steps = steps_of(plan.with_tests(dict.fromkeys(given, 0.04)), None, given)
         keys = [step.key for step in steps]
         assert len(set(keys)) == len(keys)
         assert all({*step.needs, *step.uses} <= set(keys) for step in steps)
@@ -108,6 +108,24 @@ def test_each_step_of_the_shipped_plan_is_there_once_with_what_it_builds_on():
             f"recordings/{name}.parquet" for name in given
         }
         assert ("scores/whole.lookahead.json" in keys) == bool(given)
+
+
+def test_a_given_drive_is_predicted_by_the_trainings_that_are_there_anyway():
+    given = {"mobil": "mobil.parquet"}
+    plan = load_plan()
+    steps = by_key(steps_of(plan.with_tests({"mobil": 0.02}), None, given))
+    ours, theirs = (steps[f"scores/{split}.topics.json"] for split in ("ethz", "ethz_given"))
+    assert set(theirs.trained) <= set(ours.trained)
+    assert theirs.vehicle == ours.vehicle
+    without = {step.key for step in steps_of(plan, None, {})}
+    assert set(steps) - without == {"recordings/mobil.parquet", "scores/ethz_given.topics.json"}
+
+
+def test_rollouts_are_as_long_as_the_car_s_horizon(plan):
+    steps = by_key(steps_of(load_plan(), None, {}))
+    assert steps["scores/ethz.topics.json"].recipe()["horizon"] == 0.3
+    assert steps["scores/lap_2.lookahead.json"].recipe()["horizon"] == 0.6
+    assert steps["scores/lap_2.lookahead.json"].nominal == "av21_paper"
 
 
 def test_every_training_of_a_split_is_evaluated():
@@ -209,6 +227,7 @@ def test_calibration_starts_mid_range_and_finds_the_simulated_car(quick_run):
     vehicle, truth = load_vehicle(root / "vehicles/club.topics.yaml"), load_vehicle("orca")
     assert vehicle.coefficients["B_f"].nominal == pytest.approx(truth.coefficients["B_f"].nominal, rel=1e-3)
     assert results.comparisons[0].rmse("single_track")[0].mean < 1e-6
+    assert results.comparisons[0].rmse("mid_range")[0].mean > 1e-3
 
 
 def test_a_test_part_is_scored_and_nothing_else(quick_run):
@@ -217,6 +236,7 @@ def test_a_test_part_is_scored_and_nothing_else(quick_run):
     recording = Recording.load(root / "recordings/club.parquet")
     late = int(((recording.time - recording.time[0]) / 1e9 >= 6.0).sum())
     assert track.test("late")["rows"] == late - 15  # windows of 15 rows and the row to predict
+    assert track.test("late")["horizon_s"] == 0.1
 
 
 def test_fine_tuning_goes_on_from_the_model_that_the_split_has_anyway(plan, tmp_path):
