@@ -13,10 +13,12 @@ import numpy as np
 import torch
 
 from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.learning.models.base import OnlineConfig, TrainableModel, steps_of
 from dynssm_ros.learning.models.physics import PhysicsConfig
-from dynssm_ros.learning.online import FittedLayer, LayerDrive, LeftOut, OnlineFeatures, fit_layer
+from dynssm_ros.learning.online import FittedLayer, LayerDrive, LeftOut, fit_layer
 from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.runtime.features import FeatureLayout, LayerFeatures
 from dynssm_ros.runtime.online import OnlineLayer, Seen
 from dynssm_ros.runtime.rollout import RolloutCorrection, path_errors, roll_out
 from dynssm_ros.signals.recording import Recording
@@ -26,6 +28,7 @@ from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 NETWORK_GAIN_WANTED = 0.03
 """A network that takes away less of the online layer's error is left out of it. On the development cells of
 the generalisation matrix, gains of 1 to 2 % on left-out laps did not carry over to another track."""
+_FEWEST_ROWS = 3  # of a window
 _STRETCHES = 4  # of the laps, for a layer without a network
 _STARTS = 400  # rollouts in a part, at most
 
@@ -41,9 +44,30 @@ class LayerBase(NamedTuple):
     H: int  # rows of the model's window
     config: OnlineConfig
 
-    def features(self, network: bool) -> OnlineFeatures:
-        """What the layer sees, with a network's prediction or without."""
-        return OnlineFeatures(self.config, self.vehicle, self.physics, self.normalisation, self.H, network=network)
+    def features(self, network: bool) -> LayerFeatures:
+        """What the layer sees, with a network's prediction or without.
+
+        Raises:
+            ConfigurationError: the window has too few rows.
+        """
+        config, scale, most = self.config, self.normalisation, self.H - 1
+        if most < _FEWEST_ROWS - 1:
+            raise ConfigurationError(
+                f"online: a window of {self.H} rows; expected at least {_FEWEST_ROWS} to see how it changes"
+            )
+        errors = steps_of(config.error_average, self.vehicle.sampling_time)
+        layout = FeatureLayout(
+            min(config.lags, most),
+            min(config.other_lags, most),
+            min(config.input_lags, most),
+            min(errors, most),
+            network,
+        )
+        integrator, substeps = self.physics.stepping(self.vehicle)
+        return LayerFeatures(
+            layout, self.vehicle, mean=np.array(scale.input_mean), std=np.array(scale.input_std),
+            increment_scale=np.array(scale.increment_scale), integrator=integrator, substeps=substeps,
+        )  # fmt: skip
 
     @property
     def path_steps(self) -> int:
@@ -55,7 +79,7 @@ class LayerBase(NamedTuple):
         rows: Indices = recording.window_ends(self.H, self.path_steps, self.vehicle.minimum_speed)
         return rows[:: max(1, len(rows) // _STARTS)]
 
-    def fitted(self, features: OnlineFeatures, parts: list[Part]) -> FittedLayer:
+    def fitted(self, features: LayerFeatures, parts: list[Part]) -> FittedLayer:
         """The layer, its prior fitted to ``parts``."""
         drives = [_drive(features, model, part, self) for model, part in parts]
         return fit_layer(drives, features, self.normalisation, self.config)
@@ -63,7 +87,7 @@ class LayerBase(NamedTuple):
 
 def earned_layer(
     base: LayerBase, model: TrainableModel, laps: Recording, left_out: list[Part]
-) -> tuple[OnlineFeatures, OnlineLayer, float | None]:
+) -> tuple[LayerFeatures, OnlineLayer, float | None]:
     """The online layer, with the network if that earns its place.
 
     The gain of a network is the share of the error that it takes away: the mean of one step and path, or of the path
@@ -87,7 +111,7 @@ def earned_layer(
     return (together, with_network.layer, gain) if gain >= NETWORK_GAIN_WANTED else (alone, layer, gain)
 
 
-def _errors(base: LayerBase, features: OnlineFeatures, fitted: FittedLayer, parts: list[Part]) -> Vector:
+def _errors(base: LayerBase, features: LayerFeatures, fitted: FittedLayer, parts: list[Part]) -> Vector:
     """Geometric mean of the one-step errors, and mean distance of the path, on parts that are not known, ``(2,)``."""
     distances = [
         _path_error(base, features, left_out, model, recording)
@@ -96,7 +120,7 @@ def _errors(base: LayerBase, features: OnlineFeatures, fitted: FittedLayer, part
     return np.array([fitted.error, np.nanmean(np.concatenate(distances))])
 
 
-def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording, base: LayerBase) -> LayerDrive:
+def _drive(features: LayerFeatures, model: TrainableModel, recording: Recording, base: LayerBase) -> LayerDrive:
     """What the layer sees of the windows of a recording, with what ``model`` predicts from them."""
     ends = recording.window_ends(base.H, min_speed=base.vehicle.minimum_speed)
     see = partial(_seen, features, model.eval())
@@ -104,15 +128,17 @@ def _drive(features: OnlineFeatures, model: TrainableModel, recording: Recording
     return LayerDrive(lambda block: see(recording.windows(ends[block], base.H)), recording, ends, starts)
 
 
-@torch.no_grad()
-def _seen(features: OnlineFeatures, model: TrainableModel, windows: Vector) -> Seen:
-    """What the layer sees of windows ``(N, H, 7)``."""
-    window = torch.tensor(windows, dtype=torch.float32)
-    return Seen(*(each.double().numpy() for each in features(window, model(window))))
+def _seen(features: LayerFeatures, model: TrainableModel, windows: Vector) -> Seen:
+    """What the layer sees of windows ``(N, H, 7)``; the network is asked only if its prediction is among it."""
+    if not features.layout.network:
+        return features.seen(windows)
+    with torch.no_grad():
+        increment: Vector = model(torch.tensor(windows, dtype=torch.float32)).increment.double().numpy()
+    return features.seen(windows, increment)
 
 
 def _path_error(
-    base: LayerBase, features: OnlineFeatures, left_out: LeftOut, model: TrainableModel, recording: Recording
+    base: LayerBase, features: LayerFeatures, left_out: LeftOut, model: TrainableModel, recording: Recording
 ) -> Vector:
     """Mean distance (m) of predicted from measured paths, for each of some starts; NaN for what diverges."""
     H, steps, starts = base.H, base.path_steps, base.starts(recording)

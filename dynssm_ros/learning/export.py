@@ -26,7 +26,6 @@ from dynssm_ros.files import checksum, replacing
 from dynssm_ros.learning.losses import Output
 from dynssm_ros.learning.models.base import TrainableModel
 from dynssm_ros.learning.models.registry import build_model, parse_model_config
-from dynssm_ros.learning.online import OnlineFeatures
 from dynssm_ros.learning.stages import Trained
 from dynssm_ros.runtime.artifact import (
     CARD,
@@ -50,19 +49,15 @@ _GRU_INITIAL_STATE = 5  # among the inputs of ONNX's GRU
 class _Deployed(nn.Module):
     """The outputs that are deployed, as a flat tuple."""
 
-    def __init__(self, model: TrainableModel, features: OnlineFeatures | None) -> None:
+    def __init__(self, model: TrainableModel) -> None:
         super().__init__()
         self.model = copy.deepcopy(model).eval().for_deployment()
-        self.features = features
 
     def named(self, window: Tensor) -> dict[str, Tensor]:
         """The outputs by name."""
         output: Output = self.model(window)
         named = {name: getattr(output, name) for name in ("increment", "theta", "physics")}
-        named = {name: value for name, value in named.items() if value is not None}
-        if self.features is not None:
-            named["features"], named["nominal_physics"] = self.features(window, output)
-        return named
+        return {name: value for name, value in named.items() if value is not None}
 
     def forward(self, window: Tensor) -> tuple[Tensor, ...]:
         return tuple(self.named(window).values())
@@ -91,11 +86,13 @@ def save_artifact(
     with replacing(out, may_hold=(ONLINE, LOSSES)) as folder:
         folder.mkdir()
         write_tensors(folder / WEIGHTS, {name: value.numpy(force=True) for name, value in model.state_dict().items()})
-        export_onnx(model, sample, folder / ONNX, trained.features)
+        metrics = _metrics(trained)
+        if trained.deploys_network:
+            export_onnx(model, sample, folder / ONNX)
+            scale = np.array(trained.normalisation.state_scale)
+            metrics["onnx_difference"] = check_export(model, sample, folder / ONNX, scale)
         if trained.online is not None:
             save_layer(trained.online, folder / ONLINE)
-        difference = check_export(model, sample, folder / ONNX, np.array(trained.normalisation.state_scale))
-        metrics = _metrics(trained) | {"onnx_difference": difference}
         if trained.start is not None:
             metrics["start"] = _metrics(trained.start)
         (folder / METRICS).write_text(json.dumps(metrics, indent=1), encoding="utf-8")
@@ -113,10 +110,11 @@ def save_artifact(
             substeps=substeps,
             normalisation=trained.normalisation,
             slowest=_slowest(trained),
-            covariance=tuple(value**2 for value in trained.validation_rmse),
+            network=trained.deploys_network,
+            covariance=_covariance(trained),
             online=None if trained.online is None else trained.online.card,
             parameters=sum(p.numel() for p in model.parameters()),
-            flops=count_flops(model, trained.H),
+            flops=count_flops(model, trained.H) if trained.deploys_network else 0,
             training={
                 "recordings": list(trained.recording.info.source),
                 "seed": config.training.seed,
@@ -129,6 +127,15 @@ def save_artifact(
         if picture is not None and trained.history:
             picture(trained, folder / LOSSES)
     return open_artifact(out)
+
+
+def _covariance(trained: Trained) -> tuple[float, float, float]:
+    """One-step error variances of what is deployed: on validation data, without a network the physics' on the laps."""
+    if trained.deploys_network or trained.online is None:
+        v_x, v_y, omega = (value**2 for value in trained.validation_rmse)
+    else:
+        v_x, v_y, omega = (trained.online.physics * trained.online.scale**2).tolist()
+    return v_x, v_y, omega
 
 
 def _metrics(trained: Trained) -> dict[str, Any]:
@@ -153,9 +160,9 @@ def check_replaceable(out: Path) -> None:
         raise ArtifactError(f"{out}: exists and is not a model folder; not replaced")
 
 
-def export_onnx(model: TrainableModel, sample: Tensor, file: Path, features: OnlineFeatures | None = None) -> None:
+def export_onnx(model: TrainableModel, sample: Tensor, file: Path) -> None:
     """Writes the deployed graph: input ``window`` (N, H, 7), outputs ``increment``, and what else it has."""
-    deployed = _Deployed(model, features)
+    deployed = _Deployed(model)
     with torch.no_grad():
         names = list(deployed.named(sample[:1]))
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)

@@ -1,30 +1,20 @@
-"""The online layer's features as a torch module, and its prior from training laps.
-
-The features of a channel are linear in what it may learn: the physics' increments, the network's, what was measured lately,
-how the inputs change, where the car is. All are in units that make one the usual size.
-"""
+"""The online layer's prior from training laps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor, nn
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.errors import ConfigurationError, RecordingError
-from dynssm_ros.learning.losses import Output
-from dynssm_ros.learning.models.base import OnlineConfig, scale_buffers, steps_of
-from dynssm_ros.learning.models.physics import PhysicsConfig, PhysicsLayer
+from dynssm_ros.errors import RecordingError
+from dynssm_ros.learning.models.base import OnlineConfig
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
-from dynssm_ros.runtime.online import CHANNELS, MEAN_ERROR, Along, Learned, OnlineLayer, OnlineLayerCard, Seen
+from dynssm_ros.runtime.features import LayerFeatures
+from dynssm_ros.runtime.online import CHANNELS, Along, Learned, OnlineLayer, OnlineLayerCard, Seen
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.signals.signal_map import STATE_SIGNALS
-from dynssm_ros.vehicle import Vehicle
 
 _BLOCK = 4096  # rows that are worked on at once
 _PRIOR_ROWS = (10.0, 40.0, 160.0)
@@ -33,92 +23,6 @@ _RIDGE = 1e-4  # of a feature's mean square: draws weights that the laps leave o
 _SMALLEST = 1e-12  # of a mean square
 _LARGEST_CHANGE = 1.0  # standard deviation of a weight of which the laps say nothing
 _LEAST_NOISE = 1e-4  # variance, in squared s_delta: no car is known better than to a hundredth of an increment
-
-
-class OnlineFeatures(nn.Module):
-    """Maps raw windows and a model's output to features ``(B, 3, n)``, in the order of :attr:`names`."""
-
-    mean: Tensor
-    std: Tensor
-    increment_scale: Tensor
-    input_scale: Tensor
-    nominal: Tensor
-    one: Tensor
-    places: Tensor
-
-    def __init__(
-        self,
-        config: OnlineConfig,
-        vehicle: Vehicle,
-        physics: PhysicsConfig,
-        scale: Normalisation,
-        H: int,
-        *,
-        network: bool,
-    ) -> None:
-        super().__init__()
-        if H < 3:
-            raise ConfigurationError(f"online: a window of {H} rows; expected at least 3 to see how it changes")
-        self.physics = PhysicsLayer(vehicle, physics)
-        self.register_buffer("nominal", physics.theta_0(vehicle))
-        scale_buffers(self, scale)
-        self.register_buffer("input_scale", 0.1 * self.std[3:5])  # what an input changes in a step, about
-        self.network = network
-        self.lags = min(config.lags, H - 1)
-        self.other_lags = min(config.other_lags, H - 1)
-        self.input_lags = min(config.input_lags, H - 1)
-        self.errors = min(steps_of(config.error_average, vehicle.sampling_time), H - 1)
-        self.recent = max(self.lags, self.other_lags)
-        self.names = self._names()
-        self.register_buffer("one", torch.ones(1, 1))
-        self.register_buffer("places", self._places())
-
-    def _names(self) -> tuple[str, ...]:
-        lags, others = range(self.lags), range(self.other_lags)
-        changes = [f"change of {name}, {k} steps ago" for k in range(self.input_lags) for name in ("r", "delta")]
-        return (
-            "physics", "physics, next channel", "physics, channel after",
-            *(["network"] if self.network else []),
-            *(f"increment, {k + 1} steps ago" for k in lags),
-            *(f"increment of the {which}, {k + 1} steps ago" for k in others for which in ("next", "one after")),
-            *changes, *STATE_SIGNALS, "r_fb", "delta_fb", MEAN_ERROR, "one",
-        )  # fmt: skip
-
-    def forward(self, window: Tensor, output: Output) -> tuple[Tensor, Tensor]:
-        """Windows ``(B, H, 7)`` to features ``(B, 3, n)`` and the physics' increments ``(B, 3)`` (m/s, m/s, rad/s)."""
-        increments = (window[:, 1:, :CHANNELS] - window[:, :-1, :CHANNELS]) / self.increment_scale
-        over = self.physics.over(window, self.nominal, self.errors + 1) if output.nominal is None else output.nominal
-        over = over[:, -self.errors - 1 :]
-        mean_error = increments[:, -self.errors :].mean(1) - (over[:, :-1].mean(1)) / self.increment_scale
-        inputs = window[:, -self.input_lags - 1 :, 3:7]
-        applied = inputs[..., :2] + inputs[..., 2:]
-        changes = (applied[:, 1:] - applied[:, :-1]) / self.input_scale
-        level = (window[:, -1, :5] - self.mean[:5]) / self.std[:5]
-        physics = over[:, -1]
-        parts = [physics / self.increment_scale, increments[:, -self.recent :].flatten(1), changes.flatten(1), level]
-        parts += [mean_error, *([output.increment / self.increment_scale] if self.network else [])]
-        found = torch.cat([*parts, self.one.expand(window.shape[0], -1)], -1)
-        return found[:, self.places], physics
-
-    def _places(self) -> Tensor:
-        """Where the features of each channel stand among those of all, ``(3, n)``."""
-        names = ("physics", "increments", "changes", "level", "error", "network", "one")
-        sizes = (CHANNELS, CHANNELS * self.recent, 2 * self.input_lags, 5, CHANNELS, CHANNELS * self.network)
-        at = dict(zip(names, accumulate(sizes, initial=0), strict=True))
-        rows = []
-        for c in range(CHANNELS):
-            following = [(c + k) % CHANNELS for k in range(CHANNELS)]  # the channel itself, the next, the one after
-            back = [at["increments"] + CHANNELS * (self.recent - 1 - k) for k in range(self.recent)]
-            rows.append([
-                *(at["physics"] + k for k in following),
-                *([at["network"] + c] if self.network else []),
-                *(back[k] + c for k in range(self.lags)),
-                *(back[k] + which for k in range(self.other_lags) for which in following[1:]),
-                *(at["changes"] + 2 * (self.input_lags - 1 - k) + u for k in range(self.input_lags) for u in range(2)),
-                *(at["level"] + k for k in range(5)),
-                at["error"] + c, at["one"],
-            ])  # fmt: skip
-        return torch.tensor(rows)
 
 
 class LayerDrive(NamedTuple):
@@ -160,7 +64,7 @@ class FittedLayer(NamedTuple):
 
 
 def fit_layer(
-    parts: list[LayerDrive], features: OnlineFeatures, scale: Normalisation, config: OnlineConfig
+    parts: list[LayerDrive], features: LayerFeatures, scale: Normalisation, config: OnlineConfig
 ) -> FittedLayer:
     """The layer with its prior, judged on parts of the laps that the prior was fitted without.
 
@@ -181,13 +85,16 @@ def fit_layer(
     moments = [_moments(part, s_delta) for part in parts]
     others = [[*moments[:k], *moments[k + 1 :]] if len(parts) > 1 else moments for k in range(len(parts))]
 
-    vehicle, stepping = features.physics.vehicle, features.physics.stepping
+    vehicle, stepping = features.vehicle, features.stepping
     nothing = BlockErrors(np.ones(CHANNELS), np.ones(CHANNELS))
     estimator = CoefficientEstimator(vehicle, s_delta, nothing, *stepping, spread=config.spread)
     usual = estimator.usual_errors((part.ends, part.measured) for part in parts)
 
     def layer(prior: _Prior, rows: float, spread: dict[str, float]) -> OnlineLayer:
-        card = OnlineLayerCard(features=features.names, memory=config.memory, prior_rows=rows, spread=spread)
+        card = OnlineLayerCard(
+            features=features.names, error_rows=features.layout.errors, memory=config.memory, prior_rows=rows,
+            spread=spread,
+        )  # fmt: skip
         precision = rows * prior.gram / prior.noise[:, None, None] + np.eye(len(features.names)) / _LARGEST_CHANGE**2
         covariance = np.linalg.inv(precision).astype(np.float64)
         return OnlineLayer(

@@ -16,7 +16,6 @@ from dynssm_ros.learning.dataset import normalisation, split_ends, split_windows
 from dynssm_ros.learning.earned_layer import LayerBase, earned_layer
 from dynssm_ros.learning.models.base import ModelConfig, TrainableModel
 from dynssm_ros.learning.models.registry import build_model
-from dynssm_ros.learning.online import OnlineFeatures
 from dynssm_ros.learning.optimisation import (
     History,
     Optimisation,
@@ -27,6 +26,7 @@ from dynssm_ros.learning.optimisation import (
 )
 from dynssm_ros.progress import NamedProgress
 from dynssm_ros.runtime.artifact import Normalisation
+from dynssm_ros.runtime.features import LayerFeatures
 from dynssm_ros.runtime.online import OnlineLayer
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
@@ -57,7 +57,7 @@ class Trained:
     resumed_from: int = 0  # epochs that were already done, of all stages together
     restarts: int = 0  # times that it began anew, out of a plateau
     start: Trained | None = None  # the model that fine-tuning started from
-    features: OnlineFeatures | None = None  # what the online layer sees; None without one, as the next
+    features: LayerFeatures | None = None  # what the online layer sees; None without one, as the next
     online: OnlineLayer | None = None
     network_gain: float | None = None
     """Share of the online layer's error on left-out parts that the network takes away; ``None`` without either."""
@@ -72,6 +72,11 @@ class Trained:
             f"{self.unexplained:.3g} of that of predicting the mean change; expected less than 1 (a smaller learning_rate, "
             f"another seed or more data may help)"
         )
+
+    @property
+    def deploys_network(self) -> bool:
+        """Whether a network acts: there is no online layer, or the network has earned its place in it."""
+        return self.features is None or self.features.layout.network
 
     @property
     def H(self) -> int:

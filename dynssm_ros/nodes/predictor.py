@@ -165,7 +165,7 @@ class PredictorNode(ManagedNode):
         if rows is not None:
             try_model(pathlib.Path(path), files, self._predictor.model.card, rows)
         artifact = parse_artifact(pathlib.Path(path), files)
-        if rows is None:
+        if rows is None and artifact.card.network:
             try_graph(artifact.onnx, artifact.graph, artifact.card.window, len(WINDOW_COLUMNS))
         return OnnxModel(artifact)
 

@@ -1,5 +1,7 @@
 """The model folder: ``model.yaml``, ``weights.safetensors``, ``model.onnx``, ``metrics.json``, ``online.safetensors``.
 
+A model whose network does not act beside its online layer has no ``model.onnx``: it is the calibrated physics and the layer.
+
 It is self-contained - architecture, vehicle with bounds, normalisation, sampling time and the checksums of the other
 files are in ``model.yaml`` - and nothing in it is ever unpickled. Whatever is wrong with a folder is found when it is
 opened, not when the car drives.
@@ -31,7 +33,7 @@ from dynssm_ros.vehicle.integrators import Integrator
 from dynssm_ros.vehicle.parameters import Vehicle
 from dynssm_ros.vehicle.single_track import standing_speed
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 2: models without a network have no graph; features are no outputs of it
 CARD, WEIGHTS, ONNX, METRICS = "model.yaml", "weights.safetensors", "model.onnx", "metrics.json"
 ONLINE = "online.safetensors"
 _LARGEST = {CARD: 1 << 20, METRICS: 10 << 20, ONLINE: 10 << 20, WEIGHTS: 100 << 20, ONNX: 100 << 20}
@@ -79,7 +81,13 @@ class ModelCard(StrictModel):
     slowest: float | None = Field(
         default=None, description="least v_x that it was trained on (m/s), negative backwards; null: not noted"
     )
-    covariance: tuple[Variance, Variance, Variance] = Field(description="one-step error variances on validation data")
+    covariance: tuple[Variance, Variance, Variance] = Field(
+        description="one-step error variances on validation data; without a network on the training laps"
+    )
+    network: bool = Field(
+        default=True,
+        description="whether a network acts; false: the physics and the online layer alone, without a graph",
+    )
     online: OnlineLayerCard | None = Field(default=None, description="the online layer, if it has one")
     parameters: int = Field(ge=0, description="weights that training finds")
     flops: int = Field(ge=0, description="floating-point operations per prediction")
@@ -89,6 +97,8 @@ class ModelCard(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> ModelCard:
+        if not self.network and (self.online is None or self.online.error_rows is None):
+            raise ValueError("network: false goes with an online layer that has error_rows; expected one")
         if self.columns != WINDOW_COLUMNS:
             raise ValueError(f"columns {self.columns} are not {WINDOW_COLUMNS}")
         if not math.isclose(self.sampling_time, self.vehicle.sampling_time):
@@ -108,7 +118,7 @@ class ModelCard(StrictModel):
     @property
     def files(self) -> tuple[str, ...]:
         """The folder's other files."""
-        return (WEIGHTS, ONNX, METRICS, *([ONLINE] if self.online else []))
+        return (WEIGHTS, *([ONNX] if self.network else []), METRICS, *([ONLINE] if self.online else []))
 
 
 @dataclass(frozen=True)
@@ -118,7 +128,7 @@ class Artifact:
     Attributes:
         path: of the folder.
         card: its ``model.yaml``.
-        graph: content of its ``model.onnx``, as it was checked.
+        graph: content of its ``model.onnx``, as it was checked; empty without a network.
         prior: content of its ``online.safetensors``; empty without an online layer.
     """
 
@@ -197,7 +207,7 @@ def parse_artifact(path: Path, files: Mapping[str, bytes]) -> Artifact:
     for name, weight in weights.items():
         if not np.isfinite(weight).all():
             raise ArtifactError(f"{path / WEIGHTS}: weight {name} holds NaN or infinity")
-    return Artifact(path, card, files[ONNX], files[ONLINE] if card.online else b"")
+    return Artifact(path, card, files[ONNX] if card.network else b"", files[ONLINE] if card.online else b"")
 
 
 def _read(file: Path, root: str) -> bytes:

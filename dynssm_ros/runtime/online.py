@@ -9,7 +9,7 @@ This is recursive least squares that forgets towards the prior. It learns in the
 Beside the layer, the physics' coefficients are followed (:mod:`dynssm_ros.runtime.coefficients`). They are published, and do
 not enter the prediction: the layer takes the same errors off, and more of them.
 
-The features are stateless and computed by the model's graph. What is learned is one small :class:`OnlineState`, in numpy.
+The features are stateless (:mod:`dynssm_ros.runtime.features`). What is learned is one small :class:`OnlineState`.
 """
 
 from __future__ import annotations
@@ -51,6 +51,11 @@ class OnlineLayerCard(StrictModel):
     """What ``model.yaml`` says of the online layer."""
 
     features: tuple[str, ...] = Field(min_length=1, description="names of the features of a channel, in order")
+    error_rows: int | None = Field(
+        default=None,
+        ge=1,
+        description="rows over which the physics' error is averaged; null: the graph computes the features (0.4 and before)",
+    )
     memory: float = Field(gt=0, description="time constant with which weights return to the prior (s)")
     prior_rows: float = Field(gt=0, description="rows of driving that the prior is worth")
     spread: dict[str, float] = Field(

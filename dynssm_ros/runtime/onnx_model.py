@@ -1,4 +1,4 @@
-"""Trained models, run by ONNX Runtime."""
+"""Trained models: the network run by ONNX Runtime, what the online layer sees of a window, the physics where it is alone."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dynssm_ros.arrays import Mask, Vector
 from dynssm_ros.runtime.artifact import ONLINE, Artifact, ModelCard
 from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.contract import WindowPrediction
+from dynssm_ros.runtime.features import LayerFeatures
 from dynssm_ros.runtime.graph import Graph
 from dynssm_ros.runtime.online import Seen
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
@@ -19,7 +20,8 @@ from dynssm_ros.signals.signal_map import Commands
 class OnnxModel:
     """A trained model.
 
-    Its graph computes the increment ``s_{t+1} - s_t`` in single precision; it is added to the state in double.
+    Its graph computes the increment ``s_{t+1} - s_t`` in single precision; it is added to the state in double. A model
+    without a network has no graph and predicts the calibrated physics, for its online layer to correct.
 
     Raises:
         ArtifactError: ONNX Runtime refuses the graph, or it is not one of such a model.
@@ -36,12 +38,17 @@ class OnnxModel:
         self.vehicle = card.vehicle
         self.parameters = card.parameters
         self.flops = card.flops
-        self._validated = np.array([card.covariance])
+        self._validated, self._nominal = np.array([card.covariance]), card.vehicle.nominal[None]
         self.online = artifact.online_layer()
         self.prior = card.checksums.get(ONLINE, "")
         """Names the prior of its online layer, for what was learned from it; empty without one."""
         self._physics = SingleTrack(card.vehicle, card.integrator, card.substeps)
-        self._scale = np.array(card.normalisation.increment_scale)
+        scales = card.normalisation
+        self._scale = np.array(scales.increment_scale)
+        self._least = card.least
+        self._features: LayerFeatures | None = None
+        if self.online is not None:
+            self._features = LayerFeatures.of(self.online, np.array(scales.input_mean), np.array(scales.input_std))
         self._open()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -53,7 +60,9 @@ class OnnxModel:
         self._open()
 
     def _open(self) -> None:
-        self._graph = Graph(self.artifact.onnx, self.artifact.graph, self.H, len(WINDOW_COLUMNS))
+        self._graph: Graph | None = None
+        if self.card.network:
+            self._graph = Graph(self.artifact.onnx, self.artifact.graph, self.H, len(WINDOW_COLUMNS))
 
     @property
     def origin(self) -> str:
@@ -72,20 +81,35 @@ class OnnxModel:
         A car that stands or reverses, unless that was trained on, is the physics' alone. That is not validated: the
         variance is at least that of an increment.
         """
-        by_name = self._graph.run(windows)
+        said = self._of_physics(windows) if self._graph is None else self._of_graph(self._graph, windows)
+        alone = windows[:, -1, 0] < self._least
+        return self._with_physics(said, windows, alone) if alone.any() else said
+
+    def _of_graph(self, graph: Graph, windows: Vector) -> WindowPrediction:
+        """What the network says, and what the online layer sees."""
+        by_name = graph.run(windows)
         now, theta, physics = windows[:, -1, :3], by_name.get("theta"), by_name.get("physics")
-        variance = by_name.get("variance")
-        said = WindowPrediction(
-            now + by_name["increment"],
+        variance, increment = by_name.get("variance"), by_name["increment"]
+        seen: Seen | None = None
+        if self._features is not None:
+            seen = self._features.seen(windows, increment)
+        elif self.online is not None:
+            seen = Seen(by_name["features"].astype(np.float64), by_name["nominal_physics"].astype(np.float64))
+        return WindowPrediction(
+            now + increment,
             None if theta is None else theta.astype(np.float64),
             None if physics is None else now + physics,
             self._validated.repeat(len(windows), axis=0) if variance is None else variance.astype(np.float64),
-            None
-            if self.online is None
-            else Seen(by_name["features"].astype(np.float64), by_name["nominal_physics"].astype(np.float64)),
+            seen,
         )
-        alone = windows[:, -1, 0] < self.card.least
-        return self._with_physics(said, windows, alone) if alone.any() else said
+
+    def _of_physics(self, windows: Vector) -> WindowPrediction:
+        """What the calibrated physics says, and what the online layer sees."""
+        assert self._features is not None
+        seen, count = self._features.seen(windows), len(windows)
+        following = windows[:, -1, :3] + seen.physics
+        variance, theta = self._validated.repeat(count, axis=0), self._nominal.repeat(count, axis=0)
+        return WindowPrediction(following, theta, following.copy(), variance, seen)
 
     def _with_physics(self, said: WindowPrediction, windows: Vector, alone: Mask) -> WindowPrediction:
         """What was said, and what the nominal physics says of the windows ``alone``."""

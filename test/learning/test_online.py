@@ -1,22 +1,26 @@
 """The online layer from training to prediction: exact cars stay exact, live equals evaluation, changed cars are learned."""
 
+import json
 import os
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
+import yaml
 
-from dynssm_ros.errors import ArtifactError
+from dynssm_ros.errors import ArtifactError, ConfigurationError
 from dynssm_ros.evaluation import metrics
 from dynssm_ros.evaluation.metrics import drive_through, predict_rows
 from dynssm_ros.evaluation.open_loop import evaluate
+from dynssm_ros.files import checksum
+from dynssm_ros.learning.earned_layer import LayerBase
 from dynssm_ros.learning.export import save_artifact
-from dynssm_ros.learning.losses import Output
-from dynssm_ros.learning.online import OnlineFeatures
 from dynssm_ros.learning.stages import train
+from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.contract import without_online
 from dynssm_ros.runtime.onnx_model import OnnxModel
@@ -90,6 +94,54 @@ def test_a_network_that_earns_nothing_is_left_out_of_the_layer(noisy_laps, orca,
     trained = train(noisy_laps, make_config(online={"folds": 2}), orca, tmp_path / "c.pt")
     assert trained.network_gain < 0.03
     assert "network" not in trained.features.names
+    artifact = save_artifact(trained, tmp_path / "model")
+    assert not artifact.card.network
+    assert not artifact.onnx.exists()
+    assert artifact.card.flops == 0
+    assert "onnx_difference" not in json.loads((tmp_path / "model/metrics.json").read_text())
+    rows = noisy_laps.window_ends(trained.H, 1, orca.minimum_speed)
+    model, windows = OnnxModel(artifact), noisy_laps.windows(rows, trained.H)
+    said, physics = model.predict(windows), SingleTrack(model.vehicle).predict(windows)
+    np.testing.assert_allclose(said.state, physics.state, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(said.theta, physics.theta)
+    errors = physics.state - noisy_laps.states(rows + 1)
+    np.testing.assert_allclose(said.variance[0], np.mean(errors**2, axis=0), rtol=0.05)
+    card = yaml.safe_load((tmp_path / "model/model.yaml").read_text())
+    (tmp_path / "model/model.yaml").write_text(yaml.safe_dump(card | {"online": None}))
+    with pytest.raises(ArtifactError, match="network: false goes with an online layer"):
+        open_artifact(tmp_path / "model")
+
+
+def test_a_layer_whose_features_the_graph_computes_is_read_as_before(noisy_laps, orca, make_config, tmp_path: Path):
+    """Model folders of version 0.4 and before."""
+    trained = train(noisy_laps, make_config(kind="rls", history=0.3), orca, tmp_path / "c.pt")
+    folder = save_artifact(trained, tmp_path / "model").path
+    n = len(trained.features.names)
+    weights = np.random.default_rng(0).standard_normal((trained.H * 7, 3 * n)).astype(np.float32)
+    constants = {"weights": weights, "rows": np.array([-1, trained.H * 7]), "each": np.array([-1, 3, n])}
+    nodes = [
+        onnx.helper.make_node("Reshape", ["window", "rows"], ["flat"]),
+        onnx.helper.make_node("MatMul", ["flat", "weights"], ["found"]),
+        onnx.helper.make_node("Reshape", ["found", "each"], ["features"]),
+        onnx.helper.make_node("ReduceMean", ["features"], ["increment"], axes=[2], keepdims=0),
+        onnx.helper.make_node("Identity", ["increment"], ["nominal_physics"]),
+    ]
+    shapes = {"increment": ["N", 3], "features": ["N", 3, n], "nominal_physics": ["N", 3]}
+    graph = onnx.helper.make_graph(
+        nodes, "old", [onnx.helper.make_tensor_value_info("window", onnx.TensorProto.FLOAT, ["N", trained.H, 7])],
+        [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape) for name, shape in shapes.items()],
+        [onnx.numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )  # fmt: skip
+    old = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    onnx.save(old, folder / "model.onnx")
+    card = yaml.safe_load((folder / "model.yaml").read_text())
+    del card["network"], card["online"]["error_rows"]
+    card |= {"format_version": 1, "checksums": card["checksums"] | {"model.onnx": checksum(folder / "model.onnx")}}
+    (folder / "model.yaml").write_text(yaml.safe_dump(card))
+    model, windows = OnnxModel(open_artifact(folder)), noisy_laps.windows(np.arange(100, 107), trained.H)
+    said, expected = model.predict(windows), (windows.reshape(7, -1) @ weights).reshape(7, 3, n)
+    np.testing.assert_allclose(said.seen.features, expected, atol=1e-4)
+    np.testing.assert_allclose(said.state, windows[:, -1, :3] + expected.mean(axis=2), atol=1e-4)
 
 
 def test_a_networks_increment_is_an_expert_of_its_own(noisy_laps, orca, make_config, tmp_path: Path, monkeypatch):
@@ -257,8 +309,6 @@ def test_a_damaged_layer_is_found_when_the_folder_is_opened(noisy_laps, orca, ma
     trained = train(noisy_laps, make_config(kind="rls", history=0.3), orca, tmp_path / "c.pt")
     artifact = save_artifact(trained, tmp_path / "model")
     (artifact.path / "online.safetensors").unlink()
-    from dynssm_ros.runtime.artifact import open_artifact
-
     with pytest.raises(ArtifactError, match=r"incomplete model folder, online\.safetensors is missing"):
         open_artifact(artifact.path)
 
@@ -267,7 +317,10 @@ def test_features_fit_into_a_short_window(orca, noisy_model):
     from dynssm_ros.learning.models.base import OnlineConfig
     from dynssm_ros.learning.models.physics import PhysicsConfig
 
-    features = OnlineFeatures(OnlineConfig(), orca, PhysicsConfig(), noisy_model.card.normalisation, 5, network=False)
-    seen, physics = features(torch.rand(7, 5, 7) + 1.0, Output(torch.zeros(7, 3), None, None, None, None))
+    base = LayerBase(orca, PhysicsConfig(), noisy_model.card.normalisation, 5, OnlineConfig())
+    features = base.features(False)
+    seen, physics = features.seen(np.random.default_rng(0).random((7, 5, 7)) + 1.0)
     assert seen.shape == (7, 3, len(features.names))
     assert physics.shape == (7, 3)
+    with pytest.raises(ConfigurationError, match="a window of 2 rows; expected at least 3"):
+        base._replace(H=2).features(False)
