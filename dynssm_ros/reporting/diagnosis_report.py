@@ -148,7 +148,8 @@ def size_in_words(cause: Cause) -> str:
         if name in cause.on_bound:
             spread = " or farther from neutral (at its bound)"
         else:
-            spread = f" ± {cause.std[name]:.2g}" if name in cause.std else " (assumed)"
+            otherwise = " (read off single steps)" if name in EFFECTS[cause.effect].READ_OFF else " (assumed)"
+            spread = f" ± {cause.std[name]:.2g}" if name in cause.std else otherwise
         parts.append(f"{name} = {value:.4g}{spread}{unit}")
     return ", ".join(parts)
 

@@ -19,7 +19,7 @@ from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.signal_map import POSE_SIGNALS
 from dynssm_ros.signals.standard import write_standard_bag
-from dynssm_ros.simulation.plant import PlantKind, make_plant
+from dynssm_ros.simulation.plant import START_TIME, PlantKind, make_plant
 from dynssm_ros.track.driver import Driver, Style
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.track.tracks import Track
@@ -27,7 +27,6 @@ from dynssm_ros.vehicle import Applied, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.limits import vehicle_limits
 
-START_TIME = 1_000_000_000_000_000_000  # ns: the stamp of the first sample; a fixed one, so that runs repeat
 DEFAULT_STYLE = Style()
 
 

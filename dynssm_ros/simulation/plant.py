@@ -13,13 +13,14 @@ from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.integrators import Integrator
-from dynssm_ros.vehicle.kinematics import SCALAR, Pose, world_velocity
+from dynssm_ros.vehicle.kinematics import SCALAR, Pose, time_of_day, world_velocity
 from dynssm_ros.vehicle.single_track import Motion, StageEffect
 
 PlantKind = str
 """Name of a plant, see :data:`PLANTS`."""
 
 RK4_STEP = 1e-3  # s, at most
+START_TIME = 1_000_000_000_000_000_000  # ns: the stamp of a drive's first sample; a fixed one, so that runs repeat
 
 
 class Plant(Protocol):
@@ -62,8 +63,8 @@ class _Odometer(StageEffect):
 class SingleTrackPlant:
     """The single-track car. The input of a step acts on that step.
 
-    Effects may read from the context ``t`` (s), ``s``, ``lap_length`` (m) and ``bend``, held over a step, and ``x, y,
-    theta`` (m, m, rad). Those that change what is measured leave the motion as it is.
+    Effects may read from the context ``t`` and ``clock`` (s), ``s``, ``lap_length`` (m) and ``bend``, held over a step, and
+    ``x, y, theta`` (m, m, rad). Those that change what is measured leave the motion as it is.
 
     Args:
         vehicle: the car with its effects.
@@ -139,7 +140,8 @@ class SingleTrackPlant:
 
     def _context(self, s: float) -> dict[str, float]:
         place = {"s": s} if self._line is None else self._line.place(s)
-        return {"t": self._steps * self._vehicle.sampling_time, **place}
+        t = self._steps * self._vehicle.sampling_time
+        return {"t": t, "clock": time_of_day(START_TIME) + t, **place}
 
     def _seen(self) -> State:
         """The present state as the sensors see it."""

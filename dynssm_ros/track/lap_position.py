@@ -8,6 +8,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.lines import ClosedLine
 from dynssm_ros.vehicle.effects import CONTEXT_UNITS
+from dynssm_ros.vehicle.kinematics import time_of_day
 
 _POINTS = 200  # of the path over the diagonal of the driven area
 _NEAR = 0.03  # of that diagonal: passing a place at most this far away is coming back to it
@@ -39,10 +40,11 @@ def track_position(line: ClosedLine, recording: Recording) -> Vector:
 def lap_context(recording: Recording, line: ClosedLine | None) -> dict[str, Vector]:
     """What effects may read of each row, ``(N,)``: the signals of ``CONTEXT_UNITS`` that ``recording`` has, and the place.
 
-    ``t`` (s) counts from the first row, ``s`` (m, in ``[0, lap_length)``) along ``line``.
+    ``t`` (s) counts from the first row, ``clock`` (s) from midnight UTC, ``s`` (m, in ``[0, lap_length)``) along ``line``.
     """
     known = {name: recording[name] for name in CONTEXT_UNITS if name in recording.columns}
-    context = {"t": (recording.time - recording.time[0]) / 1e9} | known
+    clock = time_of_day(recording.time)
+    context = {"t": (recording.time - recording.time[0]) / 1e9, "clock": clock} | known
     if line is None or "s" in context:
         return context
     s = track_position(line, recording)

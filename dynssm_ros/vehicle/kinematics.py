@@ -21,6 +21,14 @@ PATH_HORIZON_S = 0.6
 """How far a controller looks ahead with a model, about: paths are predicted, judged and scored over so long."""
 
 
+_DAY_NS = 86_400_000_000_000
+
+
+def time_of_day(stamp: Any) -> Any:
+    """Seconds since midnight UTC of stamps (ns since 1970, whole numbers)."""
+    return stamp % _DAY_NS / 1e9
+
+
 class Pose(NamedTuple):
     """Position (m) and heading (rad, counter-clockwise, not wrapped) of the centre of gravity in the odometry frame."""
 

@@ -11,12 +11,13 @@ import pytest
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.external import drive_by_commands
 from dynssm_ros.simulation.laps import simulate
-from dynssm_ros.simulation.plant import PlantKind, Pose, make_plant
+from dynssm_ros.simulation.plant import START_TIME, PlantKind, Pose, make_plant
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 from dynssm_ros.vehicle.effects.measurement import MeasurementEffect, OdometryDelay
+from dynssm_ros.vehicle.kinematics import time_of_day
 
 AV21, COURSE = load_vehicle("av21"), load_track("road_course")
 LINE, STEPS, WARM = load_track("club").centre.scaled(70.0), 25, 8
@@ -45,6 +46,7 @@ def driven(vehicle: Vehicle, kind: PlantKind) -> tuple[np.ndarray, np.ndarray, l
         signals.append(
             {
                 "t": k * vehicle.sampling_time,
+                "clock": time_of_day(START_TIME) + k * vehicle.sampling_time,
                 "s": s,
                 "lap_length": LINE.length,
                 "bend": float(LINE.bend(s)),
@@ -120,7 +122,8 @@ def test_late_odometry_is_the_true_motion_of_then(kind: PlantKind, late: float, 
 def test_a_signal_that_the_simulation_does_not_have_is_one_clear_line() -> None:
     rolling = AV21.with_effect("road_bank", {"roll_gain": 1.0})
     expected = (
-        r"simulation: effect road_bank needs the signal roll \(rad\), which .* \(t, s, lap_length, bend, x, y, theta\)$"
+        r"simulation: effect road_bank needs the signal roll \(rad\), which .* "
+        r"\(t, clock, s, lap_length, bend, x, y, theta\)$"
     )
     with pytest.raises(ConfigurationError, match=expected):
         simulate(rolling, COURSE, duration=1.0)

@@ -92,7 +92,8 @@ def test_effects_may_read_time_from_the_first_row_and_what_else_was_recorded() -
     time = np.array([7, 8, 9, 30, 31], dtype=np.int64) * 40_000_000
     info = RecordingInfo(sampling_time=0.04, commands="none")
     found = lap_context(Recording(info, time, np.array([0, 0, 0, 1, 1], dtype=np.int32), columns), None)
-    assert set(found) == {"t", "x", "y", "theta", "s"}
+    assert set(found) == {"t", "clock", "x", "y", "theta", "s"}
+    np.testing.assert_allclose(found["clock"], [0.28, 0.32, 0.36, 1.2, 1.24])
     np.testing.assert_allclose(found["t"], np.array([0, 1, 2, 23, 24]) * 0.04)
     np.testing.assert_array_equal(found["theta"], np.arange(5) + 90.0)
 

@@ -25,7 +25,14 @@ def samples(n: int = 12) -> list[np.ndarray]:
     state = np.stack([v_x, random.uniform(-0.1, 0.1, n) * v_x, random.uniform(-0.5, 0.5, n)])
     inputs = np.stack([random.uniform(-1, 1, n), random.uniform(-0.3, 0.3, n)])
     theta = AV21.lower[:, None] + random.uniform(size=(len(COEFFICIENTS), n)) * (AV21.upper - AV21.lower)[:, None]
-    context = {"t": (0, 300), "s": (0, 4000), "lap_length": (900, 1100), "theta": (-4, 4), "roll": (-0.1, 0.1)}
+    context = {
+        "t": (0, 300),
+        "clock": (6400, 6700),
+        "s": (0, 4000),
+        "lap_length": (900, 1100),
+        "theta": (-4, 4),
+        "roll": (-0.1, 0.1),
+    }
     signals = np.stack([random.uniform(*context.get(name, (-1, 1)), n) for name in CONTEXT_UNITS])
     return [state, inputs, theta, signals]
 

@@ -28,7 +28,10 @@ VEHICLE = load_vehicle("av21_paper")
 CONSTANTS = VEHICLE.constants
 THETA = Coefficients(*VEHICLE.nominal)
 STATE, APPLIED = State(30.0, 0.4, 0.2), Applied(0.4, 0.05)
-CONTEXT = {"t": 60.0, "s": 1900.0, "lap_length": 4000.0, "bend": 0.6, "x": 5.0, "y": -3.0, "theta": 1.1, "roll": 0.03}
+CONTEXT = {
+    "t": 60.0, "clock": 6460.3, "s": 1900.0, "lap_length": 4000.0, "bend": 0.6, "x": 5.0, "y": -3.0, "theta": 1.1,
+    "roll": 0.03,
+}  # fmt: skip
 
 
 def act(*effects: Effect, effect_states: dict[str, Array] | None = None) -> Motion:
@@ -195,7 +198,8 @@ def test_the_library_is_complete() -> None:
         "mass", "yaw_inertia", "front_grip", "rear_grip", "downforce", "load_transfer", "tire_relaxation",
         "combined_slip", "road_bank", "road_grade", "crosswind", "grip_drift", "grip_patch", "locked_differential",
         "load_sensitivity", "grip", "steering_curve", "throttle_dead_band", "power_limit", "front_drive",
-        "odometry_lever_arm", "odometry_misalignment", "odometry_delay", "yaw_rate_bias", "yaw_rate_lag",
+        "odometry_lever_arm", "odometry_misalignment", "odometry_delay", "odometry_correction", "yaw_rate_bias",
+        "yaw_rate_lag",
     }  # fmt: skip
 
 

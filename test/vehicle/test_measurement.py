@@ -19,6 +19,7 @@ from dynssm_ros.vehicle.single_track import Motion
 AV21 = load_vehicle("av21")
 CONSTANTS, THETA = AV21.constants, Coefficients(*AV21.nominal)
 STATE, APPLIED = State(30.0, 0.4, 0.2), Applied(0.4, 0.05)
+CONTEXT = {"clock": 6460.3}
 SENSORS = sorted(name for name, effect in EFFECTS.items() if issubclass(effect, MeasurementEffect))
 
 
@@ -80,7 +81,7 @@ def test_a_model_steps_what_is_measured_of_the_true_motion(
 ) -> None:
     effects = (build_effect("drag", {"coefficient": 0.3}), build_effect(name, acting(name)))
     plant, model = (CarModel(CONSTANTS, 0.04, effects, integrator, 2, measured=of) for of in (False, True))
-    effect_states = plant.settled(STATE, Applied(0.1, 0.02), THETA)
+    effect_states = plant.settled(STATE, Applied(0.1, 0.02), THETA, context=CONTEXT)
     true, carried = plant.step(STATE, APPLIED, THETA, effect_states)
     found, beside = model.step(model.measured_state(STATE, effect_states), APPLIED, THETA, effect_states)
     np.testing.assert_allclose(found, model.measured_state(true, carried), rtol=1e-13)
@@ -90,7 +91,7 @@ def test_a_model_steps_what_is_measured_of_the_true_motion(
 @pytest.mark.parametrize("name", SENSORS)
 def test_what_happens_does_not_depend_on_the_sensors(name: str, acting: Callable[..., dict[str, float]]) -> None:
     sensor = (build_effect(name, acting(name)),)
-    true, _ = CarModel(CONSTANTS, 0.04, sensor, measured=False).step(STATE, APPLIED, THETA)
+    true, _ = CarModel(CONSTANTS, 0.04, sensor, measured=False).step(STATE, APPLIED, THETA, context=CONTEXT)
     assert true == CarModel(CONSTANTS, 0.04).step(STATE, APPLIED, THETA)[0]
 
 
@@ -184,3 +185,20 @@ def test_delayed_inputs_keep_their_swing() -> None:
     swing = 2 * np.mean(acted[2000:] * wave)
     assert abs(swing) == pytest.approx(0.1, rel=0.01)
     assert -np.angle(swing) - np.pi / 2 == pytest.approx(w * 0.06, rel=0.02)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+def test_an_estimate_that_is_set_right_steps_once_a_period_and_drifts_back(integrator: Integrator) -> None:
+    values = {"v_x": 0.3, "v_y": -0.2, "omega": 0.05, "period": 0.5, "phase": 0.3}
+    car = CarModel(CONSTANTS, 0.04, (build_effect("odometry_correction", values),), integrator, 2)
+    sizes = np.array([values["v_x"], values["v_y"], values["omega"]])
+    plain = np.array(CarModel(CONSTANTS, 0.04, (), integrator, 2).increment(STATE, APPLIED, THETA)[0])
+    off = []
+    for clock in 6460.0 + 0.04 * np.arange(50):
+        context = {"clock": float(clock)}
+        seen = car.measured_state(STATE, car.settled(STATE, APPLIED, THETA, context=context))
+        off.append(np.array(car.increment(seen, APPLIED, THETA, context=context)[0]) - plain)
+    steps = [k for k, each in enumerate(off) if abs(each[0]) > 0.1]
+    assert np.diff(steps).tolist() in ([12, 13, 12], [13, 12, 13], [12, 13], [13, 12], [12, 12, 13], [13, 13, 12])
+    for k, each in enumerate(off):
+        np.testing.assert_allclose(each, (float(k in steps) - 0.04 / 0.5) * sizes, rtol=0, atol=1e-9)

@@ -20,6 +20,7 @@ from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.effects.step_errors import StepErrors
 from dynssm_ros.vehicle.integrators import Integrator
 from dynssm_ros.vehicle.single_track import settling_rate
 
@@ -245,6 +246,15 @@ class SimulationWindows:
         return CarModel(
             fleet.constants, self.data.T_s, fleet.effects, self.integrator, self.substeps, set_point=fleet.set_point
         )
+
+
+def step_errors(windows: SimulationWindows, car: CarEstimate) -> StepErrors:
+    """Errors of single steps of a car from the rows that simulations pass, each from the measured row."""
+    rows = np.unique(windows.starts[:, None] + np.arange(windows.steps))
+    single = replace(windows, starts=rows, steps=1, every=1, filtered=False)
+    data = windows.data
+    context = {name: values[rows] for name, values in data.context.items()}
+    return StepErrors(data.rows[:, rows], context, -single.errors(car)[:, 0], data.number[rows], data.T_s)
 
 
 def recorded_rows(recording: Recording, context: dict[str, Vector]) -> RecordedRows:

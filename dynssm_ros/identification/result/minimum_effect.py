@@ -62,7 +62,7 @@ class _Size:
     def __init__(self, candidate: Candidate, at: Values, fitted: int) -> None:
         self.effect, self._parameter, about = candidate.effect, candidate.amplitudes[0], candidate.about
         self._about = about[self._parameter]
-        self._form = {name: about[name].neutral for name in candidate.shapes} | at
+        self._form = {name: about[name].neutral for name in candidate.shapes} | dict(candidate.held) | at
         bound = self._about.upper if self._about.direction > 0 else self._about.lower
         self._most = abs(bound - self._about.neutral)
         self.size = min(tuning.FIRST_SIZE * unit(self.effect, self._parameter), self._most)

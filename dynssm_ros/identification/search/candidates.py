@@ -18,8 +18,10 @@ from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate, Values
 from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, unit
 from dynssm_ros.identification.problem.levels import ONE_RECORDING, Levels
+from dynssm_ros.identification.problem.windows import step_errors
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
 from dynssm_ros.vehicle.effects.base import LAP, Parameter, section
+from dynssm_ros.vehicle.effects.step_errors import StepErrors
 
 _MIDDLE, _SMALL = tuning.SIZE_GRID[1], tuning.SIZE_GRID[3]
 
@@ -32,11 +34,13 @@ class Candidate:
         effect: its name.
         parameters: to be fitted together.
         only_in: numbers of the recordings in which it acts; empty: in all.
+        held: parameters that were read off the errors of single steps, with their values; no fit moves them.
     """
 
     effect: str
     parameters: tuple[str, ...]
     only_in: tuple[int, ...] = ()
+    held: tuple[tuple[str, float], ...] = ()
 
     @property
     def about(self) -> Mapping[str, Parameter]:
@@ -68,6 +72,11 @@ class Candidate:
         """For a fit."""
         return tuple((self.effect, p) for p in self.parameters)
 
+    @property
+    def cost(self) -> int:
+        """How many parameters it has to pay for."""
+        return len(self.parameters) + len(self.held)
+
 
 @dataclass(frozen=True)
 class ScoredCandidate:
@@ -94,6 +103,7 @@ def candidates(
     """
     found, left = [], {}
     have = set(problem.windows.data.context)
+    steps: StepErrors | None = None
     for name, effect in EFFECTS.items():
         if name in excluded:
             continue
@@ -107,7 +117,14 @@ def candidates(
         usable = [v for v in effect.variants() if set(effect.signals(v)) <= have]
         if set(LAP) <= have:
             usable = [v for v in usable if v not in effect.OPEN_ROAD]
-        tried = [Candidate(name, variant, group) for group in ((), *levels.groups) for variant in usable]
+        held: dict[str, float] | None = {}
+        if effect.READ_OFF and usable:
+            steps = steps or step_errors(problem.windows, car)
+            held = effect.read_off(steps)
+        if held is None:
+            continue  # nothing asks for it
+        at = tuple(held.items())
+        tried = [Candidate(name, variant, group, at) for group in ((), *levels.groups) for variant in usable]
         found += [one for one in tried if levels.has_one_road(one.only_in) or not one.by_place]
         if not usable:
             left[name] = f"the recording has no {', '.join(s for s in effect.signals() if s not in have)}"
@@ -222,7 +239,8 @@ class ScoreTest:
         for candidate in found:
             tried = [candidate.about[p].tried for p in candidate.shapes]
             scored = (
-                self._try(candidate, dict(zip(candidate.shapes, shape, strict=True))) for shape in product(*tried)
+                self._try(candidate, dict(candidate.held) | dict(zip(candidate.shapes, shape, strict=True)))
+                for shape in product(*tried)
             )
             best = max(filter(None, scored), key=lambda one: one.improvement, default=None)
             if best is not None:

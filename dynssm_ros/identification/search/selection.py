@@ -277,10 +277,15 @@ class Search:
         """The candidates of another problem's fit, fitted here."""
         if start is None or not start.free:
             return []
-        effects = dict.fromkeys(effect for effect, _ in start.free)
+        values = {effect: start.car.effects[effect] for effect, _ in start.free}
         chosen = [
-            Candidate(name, tuple(p for effect, p in start.free if effect == name), start.car.only_in.get(name, ()))
-            for name in effects
+            Candidate(
+                name,
+                tuple(p for effect, p in start.free if effect == name),
+                start.car.only_in.get(name, ()),
+                tuple((p, values[name][p]) for p in EFFECTS[name].READ_OFF),
+            )
+            for name in values
         ]
         self._fits[frozenset(chosen)] = self._problem.fit(start.car, start.free)
         self._temper(tuple(chosen))
@@ -312,7 +317,7 @@ class Search:
             self._fits = {frozenset(): self._problem.refit(self.base), frozenset(chosen): self._problem.refit(fit)}
 
     def _expected_delta_bic(self, scored: ScoredCandidate) -> float:
-        return float(scored.improvement / self._problem.tempering - self._price * len(scored.candidate.parameters))
+        return float(scored.improvement / self._problem.tempering - self._price * scored.candidate.cost)
 
     def _refined(self, fit: Fit, starts: Sequence[CandidateStart]) -> list[Refined]:
         if starts:
@@ -323,7 +328,7 @@ class Search:
     def _judge(self, without: Fit, fit: Fit, candidate: Candidate) -> Refined:
         own = self._problem.inflation(fit, len(fit.free) - len(without.free))
         improvement = (without.objective - fit.objective) * min(1.0, self._problem.tempering / own)
-        delta = improvement - self._price * (len(fit.free) - len(without.free))
+        delta = improvement - self._price * candidate.cost
         return Refined(candidate, fit, improvement, delta)
 
     def _against(self, chosen: tuple[Candidate, ...], one: Candidate) -> Refined:

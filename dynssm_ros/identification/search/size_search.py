@@ -57,7 +57,7 @@ class SizeSearch:
             for car, errors in zip(cars, some.errors_of(cars), strict=True)
         ]
         best, objective = cars[int(np.argmin(reached))], min(reached)
-        promised, paid = scored.improvement / self.tempering, self.price * len(candidate.parameters)
+        promised, paid = scored.improvement / self.tempering, self.price * candidate.cost
         if promised > paid and near.objective - objective < tuning.KEPT_PROMISE * promised:
             fit = some.fit(self._sized(scored, 0.0), free, near, rounds=tuning.TRIAL_ROUNDS, rough=True)
             if fit.objective < objective:

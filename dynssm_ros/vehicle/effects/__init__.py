@@ -74,7 +74,8 @@ for _effect in (
     tyres.RearGrip, loads.Downforce, loads.LoadSensitivity, loads.LoadTransfer, tyres.TireRelaxation,
     tyres.CombinedSlip, environment.RoadBank, environment.RoadGrade, environment.Crosswind, tyres.GripDrift,
     tyres.GripPatch, drivetrain.FrontDrive, drivetrain.LockedDifferential, measurement.OdometryLeverArm,
-    measurement.OdometryMisalignment, measurement.OdometryDelay, measurement.YawRateBias, measurement.YawRateLag,
+    measurement.OdometryMisalignment, measurement.OdometryDelay, measurement.OdometryCorrection, measurement.YawRateBias,
+    measurement.YawRateLag,
 ):  # fmt: skip
     register_effect(_effect)
 

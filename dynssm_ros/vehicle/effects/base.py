@@ -16,6 +16,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.vehicle.effects.step_errors import StepErrors
 from dynssm_ros.vehicle.single_track import (
     Applied,
     Array,
@@ -28,12 +29,12 @@ from dynssm_ros.vehicle.single_track import (
 )
 
 CONTEXT_UNITS: dict[str, str] = {
-    "t": "s", "s": "m", "lap_length": "m", "bend": "1", "x": "m", "y": "m", "theta": "rad", "roll": "rad",
+    "t": "s", "clock": "s", "s": "m", "lap_length": "m", "bend": "1", "x": "m", "y": "m", "theta": "rad", "roll": "rad",
 }  # fmt: skip
-"""The signals beside state and inputs that effects may read: time since the start of the drive or recording, position
-along the track's centre line (which may count on over the laps), the length of a lap, and how sharply the line bends there
-(from -1 to the right to 1 to the left, its sharpest places), pose, measured roll of the car (positive with the left side
-up)."""
+"""The signals beside state and inputs that effects may read: time since the start of the drive or recording, time of the
+day (UTC) by the stamps, position along the track's centre line (which may count on over the laps), the length of a lap, and
+how sharply the line bends there (from -1 to the right to 1 to the left, its sharpest places), pose, measured roll of the car
+(positive with the left side up)."""
 
 PLACE = ("s", "lap_length", "bend")
 LAP = PLACE[:2]
@@ -104,6 +105,8 @@ class Effect(StageEffect):
     DIRECTIONS: ClassVar[tuple[float, ...]] = ()
     """To which sides of neutral it is met in a car that can be driven; empty: those that its bounds admit."""
     LEAST: ClassVar[float] = 0.0  # how far it is off neutral in any car
+    READ_OFF: ClassVar[tuple[str, ...]] = ()
+    """Parameters that :meth:`read_off` finds in the errors of single steps, and no fit moves: when the effect acts."""
 
     @classmethod
     def variants(cls) -> tuple[tuple[str, ...], ...]:
@@ -153,6 +156,11 @@ class Effect(StageEffect):
     def least(cls, constants: VehicleConstants) -> float:
         """How far it must be off neutral to be a cause in a car of these constants; less is in any car."""
         return cls.LEAST
+
+    @classmethod
+    def read_off(cls, steps: StepErrors) -> dict[str, float] | None:
+        """Values of ``READ_OFF``; ``None``: nothing in these errors asks for the effect, so that it is not tried."""
+        return {}
 
     @property
     def parameters(self) -> dict[str, Array]:

@@ -6,11 +6,15 @@ states and predicts measured states goes measured -> true -> step -> measured, i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dynssm_ros.vehicle.effects.base import Effect, Parameter, lagged
+import numpy as np
+
+from dynssm_ros.vehicle.effects.base import Effect, Parameter, lagged, like
+from dynssm_ros.vehicle.effects.step_errors import StepErrors, recurring_step
 from dynssm_ros.vehicle.single_track import Array, Motion, State, VehicleConstants, at_least
 
 _CENTRE_KNOWN = 0.02  # of the wheelbase
@@ -156,3 +160,59 @@ class YawRateLag(MeasurementEffect):
 
     def changed(self, xp: Any, state: State, effect_states: Mapping[str, Array], way: float) -> State:
         return state._replace(omega=state.omega - way * effect_states.get(self.EFFECT_STATES[0], 0.0))
+
+
+@dataclass(frozen=True)
+class OdometryCorrection(MeasurementEffect):
+    """An estimate that drifts and is set right by a step of ``(v_x, v_y, omega)`` once a ``period``.
+
+    ``z = s + (v_x, v_y, omega) (1/2 - u)``, with ``u`` from 0 to 1 the part of the period that has passed since the last
+    step. Steps are at ``clock = (n + phase) period``. Its state is the clock, so that a step falls where it does however the
+    motion is integrated. Exact for steps of one sign and size; those of random sign are for the online layer.
+    """
+
+    NAME = "odometry_correction"
+    SUMMARY = "The estimate of the odometry drifts and is set right by a step, again and again after the same time."
+    ADVICE = "Find the sensor of that period and let the filter take it in smoothly, with its true delay and noise."
+    MANOEUVRE = "straight and steady driving for a minute"
+    PARAMETERS = {
+        "v_y": Parameter("m/s", -1.0, 1.0, 0.0, context=("clock",)),
+        "v_x": Parameter("m/s", -1.0, 1.0, 0.0, context=("clock",)),
+        "omega": Parameter("rad/s", -0.5, 0.5, 0.0, context=("clock",)),
+        "period": Parameter("s", 0.02, 60.0, 1.0, shape=True),
+        "phase": Parameter("1", 0.0, 1.0, 0.0, shape=True),
+    }
+    VARIANTS = (("v_y",), ("v_x",), ("omega",), ("v_x", "v_y"), ("v_x", "v_y", "omega"))
+    READ_OFF = ("period", "phase")
+    TYPICAL = (0.03, 0.2)
+    EFFECT_STATES = ("odometry_correction.clock",)
+    v_y: Array = 0.0
+    v_x: Array = 0.0
+    omega: Array = 0.0
+    period: Array = 1.0
+    phase: Array = 0.0
+
+    @classmethod
+    def read_off(cls, steps: StepErrors) -> dict[str, float] | None:
+        """The period and phase at which errors of one sign recur."""
+        found = recurring_step(steps)
+        return None if found is None else {"period": found.period, "phase": found.phase}
+
+    @classmethod
+    def drawn(cls, amount: float, rng: np.random.Generator) -> dict[str, float]:
+        """A step of that size in v_y at a rate as filters and receivers have it, at a random instant."""
+        side, period = float(rng.choice([-1.0, 1.0])), float(rng.choice([0.5, 1.0, 2.0]))
+        return {"v_y": side * amount, "period": period, "phase": float(rng.uniform())}
+
+    def accelerations(self, xp: Any, q: Motion) -> None:
+        (name,) = self.EFFECT_STATES
+        if name not in q.effect_states:
+            q.effect_states[name] = like(q, self.read(q, "clock"))
+        q.effect_state_rates[name] = like(q, 1.0)
+
+    def changed(self, xp: Any, state: State, effect_states: Mapping[str, Array], way: float) -> State:
+        angle = (
+            2.0 * math.pi * (effect_states.get(self.EFFECT_STATES[0], 0.0 * state.v_x) / self.period - self.phase - 0.5)
+        )
+        off = -way * xp.arctan2(xp.sin(angle), xp.cos(angle)) / (2.0 * math.pi)
+        return State(state.v_x + off * self.v_x, state.v_y + off * self.v_y, state.omega + off * self.omega)

@@ -1,0 +1,152 @@
+"""What errors of single steps tell of an effect before it is fitted: when it acts.
+
+Some effects act at instants that no gradient finds: a correction of the estimate, a gear that changes. Their period, phase or
+thresholds are read off the errors of one step; only the sizes are then fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from dynssm_ros.arrays import Indices, Vector
+
+_MOST = 4.0  # standard deviations that one error counts for, at most: what recurs is told from what is large once
+_LEVEL_ROWS = 7  # whose median is the level that an error is compared with
+_CHANCE = 6.5  # standard deviations: with a million periods and phases tried, noise exceeds it in one drive of 10,000
+_REPEATS = 12  # of the longest period, at least
+_LONGEST_S = 5.0  # period that is looked for
+_FEWEST_ROWS = 4  # of the shortest period
+_HARMONICS = 12  # of a period that are summed up, at most
+_FINER = 8  # times finer than its resolution a spectrum is looked at
+_TRIED = 6  # rates of which the errors are folded
+_SMOOTH = 401  # of its bins, over which the level of the noise is averaged
+_OFFSETS = 4  # places within a row at which an instant is tried
+_ONE_INSTANT = 0.3  # of what recurs within a period, that is at a single instant if it is a step
+_ALIKE = 0.97  # of the best, from which on a rounder period is taken
+
+
+class StepErrors(NamedTuple):
+    """Errors of ``N`` single steps from measured rows, ``T_s`` apart where nothing is missing.
+
+    Attributes:
+        rows: from which the steps were made, shape ``(7, N)``, in order of time.
+        context: other signals there, each of shape ``(N,)``; has ``clock``.
+        errors: measured minus predicted states after the step (m/s, m/s, rad/s), shape ``(N, 3)``.
+        number: of the recording of each, shape ``(N,)``.
+        T_s: length of a step (s).
+    """
+
+    rows: Vector
+    context: Mapping[str, Vector]
+    errors: Vector
+    number: Indices
+    T_s: float
+
+    @property
+    def jumps(self) -> Vector:
+        """How far each error is off the level of those around it, in standard deviations, shape ``(N, 3)``; bounded."""
+        side = _LEVEL_ROWS // 2
+        around = np.pad(self.errors, ((side, side), (0, 0)), mode="edge")
+        level = np.median(np.lib.stride_tricks.sliding_window_view(around, _LEVEL_ROWS, axis=0), axis=2)
+        off = self.errors - level
+        spread = 1.4826 * np.median(np.abs(off), axis=0)
+        return np.asarray(np.clip(off / np.maximum(spread, 1e-12), -_MOST, _MOST))
+
+
+class Recurring(NamedTuple):
+    """A step that recurs."""
+
+    period: float  # s
+    phase: float  # instant of the clock at which it happens, in periods, from 0 to 1
+    sure: float  # standard deviations beyond chance
+
+
+def recurring_step(steps: StepErrors) -> Recurring | None:
+    """The period and instant at which errors of the same sign come again and again; ``None`` if none do beyond chance.
+
+    A spectrum whose harmonics are added up tells where to look, and folding the errors over the clock how sure it is.
+    """
+    clock, jumps = steps.context["clock"], steps.jumps
+    whole = steps.number == np.argmax(np.bincount(steps.number))
+    found: list[Recurring] = []
+    for values in jumps.T:
+        if not np.ptp(values) > 0.0:
+            continue
+        length = float(np.ptp(clock[whole]))
+        for rate in _likely_rates(clock[whole], values[whole], steps.T_s):
+            best = _folded(clock, values, 1.0 / rate, steps.T_s)
+            for reach in (1.0, 1.0 / _FINER):  # of what the spectrum resolves, and then finer
+                near = 1.0 / best.period + reach / length * np.linspace(-1.0, 1.0, 2 * _FINER + 1)
+                tried = [_folded(clock, values, 1.0 / one, steps.T_s) for one in near if one > 0.0]
+                best = max(tried, key=lambda one: one.sure)
+            found.append(_rounded(best, clock, values, steps.T_s))
+    surest = max(found, key=lambda one: one.sure, default=None)
+    return surest if surest is not None and surest.sure > _CHANCE else None
+
+
+def _likely_rates(clock: Vector, values: Vector, T_s: float) -> list[float]:
+    """The rates (1/s) whose harmonics stand out most from the noise around them."""
+    row = np.round((clock - clock.min()) / T_s).astype(np.intp)
+    count = int(row.max()) + 1
+    longest = min(_LONGEST_S, count * T_s / _REPEATS)
+    if longest <= _FEWEST_ROWS * T_s:
+        return []
+    series = np.zeros(count)
+    series[row] = values
+    size = 1 << int(np.ceil(np.log2(_FINER * count)))
+    power = np.abs(np.fft.rfft(series, size)) ** 2
+    level = np.convolve(np.pad(power, _SMOOTH // 2, mode="edge"), np.full(_SMOOTH, 1.0 / _SMOOTH), mode="valid")
+    power = power / np.maximum(level, 1e-300)
+    df = 1.0 / (size * T_s)
+    first, last = int(np.ceil(1.0 / (longest * df))), int(1.0 / (_FEWEST_ROWS * T_s * df))
+    at = np.arange(first, last + 1)
+    total, harmonics = np.zeros(len(at)), np.zeros(len(at))
+    for k in range(1, _HARMONICS + 1):
+        there = k * at < len(power)
+        total[there] += power[k * at[there]]
+        harmonics += there
+    beyond = (total - harmonics) / np.sqrt(harmonics)
+    rates = []
+    for _ in range(_TRIED):
+        top = int(np.argmax(beyond))
+        rates.append(float(at[top] * df))
+        beyond[max(0, top - 2 * _FINER) : top + 2 * _FINER + 1] = -np.inf
+    return rates
+
+
+def _folded(clock: Vector, values: Vector, period: float, T_s: float) -> Recurring:
+    """At which instant of a period the values are most alike, and how far beyond chance."""
+    bins = max(1, round(period / T_s))
+    share = np.mod(clock / period, 1.0)
+    fine = np.minimum((share * bins * _OFFSETS).astype(np.intp), bins * _OFFSETS - 1)
+    count, total = (np.bincount(fine, w, minlength=bins * _OFFSETS) for w in (None, values))
+    rows, sums = (sum(np.roll(each, -k) for k in range(_OFFSETS)) for each in (count, total))
+    z = (sums - rows * values.mean()) / (np.sqrt(np.maximum(rows, 1)) * max(float(values.std()), 1e-12))
+    z = np.where(rows >= _REPEATS // 2, z, 0.0)
+    largest = float(np.abs(z).max())
+    recurs = float((z**2).sum()) / _OFFSETS - bins  # beyond noise
+    if largest**2 < _ONE_INSTANT * recurs:
+        return Recurring(period, 0.0, 0.0)
+    alike = np.flatnonzero(np.abs(z) > _ALIKE * largest)
+    begins = alike[(alike - alike[0]) < _OFFSETS] if alike[-1] - alike[0] < _OFFSETS else _wrapped(alike, len(z))
+    middle = float(np.mean(begins)) / _OFFSETS  # the window of one row from here on has the rows before the instant
+    return Recurring(period, float(np.mod((middle + 1.0) / bins, 1.0)), largest)
+
+
+def _wrapped(places: Indices, size: int) -> Indices:
+    """Those of ``places`` on a circle of ``size`` that are within a row of the first, counted on beyond its end."""
+    off = np.mod(places - places[-1] + size // 2, size) - size // 2
+    return np.asarray(places[-1] + off[np.abs(off) < _OFFSETS])
+
+
+def _rounded(best: Recurring, clock: Vector, values: Vector, T_s: float) -> Recurring:
+    """The same with the roundest period that explains as much: sensors and filters work at round rates."""
+    for digits in (1, 2, 3, 4):
+        period = float(f"{best.period:.{digits}g}")
+        tried = _folded(clock, values, period, T_s)
+        if tried.sure >= _ALIKE * best.sure:
+            return tried
+    return best

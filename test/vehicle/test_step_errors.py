@@ -1,0 +1,52 @@
+"""What errors of single steps tell: when something recurs, and that noise does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dynssm_ros.vehicle.effects.step_errors import StepErrors, recurring_step
+
+
+def steps(errors: np.ndarray, T_s: float, begin: float = 6400.0) -> StepErrors:
+    clock = begin + T_s * np.arange(len(errors))
+    return StepErrors(np.zeros((7, len(errors))), {"clock": clock}, errors, np.zeros(len(errors), dtype=np.intp), T_s)
+
+
+def noise(N: int, seed: int) -> np.ndarray:
+    """Errors of steps between states with white noise."""
+    return np.diff(np.random.default_rng(seed).standard_normal((N + 1, 3)), axis=0)
+
+
+@pytest.mark.parametrize(("period", "T_s"), [(1.0, 0.04), (0.2, 0.02), (0.734, 0.02), (2.0, 0.04)])
+@pytest.mark.parametrize("channel", [0, 2])
+def test_a_planted_step_is_found_in_its_row(period: float, T_s: float, channel: int) -> None:
+    errors, instant = noise(4000, 3), 0.37
+    clock = 6400.0 + T_s * np.arange(len(errors))
+    passed = np.floor((clock + T_s) / period - instant) - np.floor(clock / period - instant)
+    errors[passed > 0, channel] -= 2.0
+    found = recurring_step(steps(errors, T_s))
+    assert found is not None
+    assert found.period == pytest.approx(period, rel=1e-4)
+    foretold = np.floor((clock + T_s) / found.period - found.phase) - np.floor(clock / found.period - found.phase)
+    assert np.mean((foretold > 0) & (passed > 0)) > 0.85 * np.mean(
+        passed > 0
+    )  # where rows do not fall in with the period
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+def test_noise_has_no_step_that_recurs(heavy: bool) -> None:
+    rng = np.random.default_rng(0)
+    for seed in range(5):
+        errors = noise(3000, seed) * (np.exp(rng.standard_normal((3000, 1))) if heavy else 1.0)
+        assert recurring_step(steps(errors, 0.04)) is None
+
+
+def test_a_smooth_wave_is_no_step() -> None:
+    wave = 2.0 * np.sin(2 * np.pi * 1.0 * 0.04 * np.arange(4000))[:, None]
+    assert recurring_step(steps(noise(4000, 1) + wave, 0.04)) is None
+
+
+def test_what_is_too_short_or_constant_tells_nothing() -> None:
+    assert recurring_step(steps(noise(40, 1), 0.04)) is None
+    assert recurring_step(steps(np.zeros((3000, 3)), 0.04)) is None
