@@ -41,7 +41,8 @@ def diagnose(
 ) -> None:
     """Find out what the simulation gets wrong about measured laps, and why; write the vehicle file that has it."""
     require("diagnose", "train", "report")
-    from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report
+    from dynssm_ros.reporting.diagnosis_report import diagnosis_report
+    from dynssm_ros.reporting.diagnosis_words import as_text
 
     if not (given := [*(recordings or ()), *(reference or ())]):
         raise ConfigurationError("no recording given; expected R.parquet or --reference R.parquet")

@@ -90,6 +90,7 @@ WEAK_LOG_RATIO = 3.0  # of likelihoods: no strong evidence yet (Kass and Raftery
 TEMPERING_CHANGE = 0.1  # of the logarithm of the inflation, from which the data are weighed anew
 SMALL_SHARE = 0.06  # of each channel's squared error on left-out parts, below which a cause is small [test_diagnose]
 NEGLIGIBLE_SHARE = 0.01  # of an error: too little to count for or against a car [test_diagnose, test_formula]
+NOTICEABLE_SHARE = 0.05  # of a channel's error on held-out laps, from which a coefficient is off [test_recalibration]
 MOVED_TOGETHER = float(stats.chi2.isf(2.0 * stats.norm.sf(SURE_STD), 18))  # SURE_STD of 18 values [test_diagnose]
 NOTED_CHANGE = 0.1  # of an effect's size between two ways to hold inputs, that a note is worth
 
@@ -102,6 +103,7 @@ CLUSTERED_INFLATION = 4.5  # noise reached 1.1 there, and 3.9 where it was corre
 FORMULA_SPAN_S = 0.12  # of a missing acceleration: shorter is noise, longer the car answers [test_outside_the_library]
 FORMULA_BESIDE_S = 0.1  # before and after, whose mean are the signals [test_outside_the_library]
 FORMULA_DEGREE, FORMULA_TERMS = 3, 3  # signals in a product, products in a formula [test_formula]
+CURVE_KNOTS = 8  # of a curve over one signal, which a formula has to beat [test_formula]
 
 # Minimum detectable effects
 DETECTION_WINDOWS = 100  # which stand for all [time]

@@ -114,8 +114,12 @@ def _diagnosis(out: Path, of: dict[str, list[StepRecord]]) -> Verdict:
         for cause in found["causes"]
     )
     state, words = {
-        "effects": ("look", f"the simulation lacks {causes}; the model's car has it"),
-        "none": ("ok", "the simulation is right within the noise, once its nominal values are recalibrated"),
+        "cause": ("look", f"the simulation lacks {causes}; the model's car has it"),
+        "healthy": ("ok", "the simulation is right within the noise"),
+        "recalibrate": (
+            "look",
+            f"off in the calibrated car: {', '.join(found['moved'])}; the model's car is recalibrated",
+        ),
         "unexplained": ("look", "something is systematically wrong that no effect of the library explains"),
     }[found["verdict"]]
     return Verdict("diagnosis", state, words, link)  # type: ignore[arg-type]

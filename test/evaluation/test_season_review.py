@@ -45,7 +45,7 @@ def a_review(
         key="", car=car, track="club", session=f"run_{k}", start=f"2026-06-{k + 1:02d}T10:00:00+00:00", seconds=60.0,
         accuracy={"dynssm": Accuracy(ade=ade, rmse=none), "single_track": Accuracy(ade=simple, rmse=none)},
         stretches=(Stretch(start="", coefficients=coefficients),),
-        verdict="effects" if cause else "none",
+        verdict="cause" if cause else "healthy",
         causes=(Found(effect=cause, values={"factor": 0.9}, std={}, improvement=0.5),) if cause else (),
     )  # fmt: skip
 

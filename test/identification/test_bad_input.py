@@ -11,7 +11,7 @@ import yaml
 
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.identification.problem.recordings import _cut
-from dynssm_ros.identification.result.diagnose import _check_signals, _hidden, _not_live, diagnose
+from dynssm_ros.identification.result.diagnose import _check_signals, _not_judged, _not_live, diagnose
 from dynssm_ros.identification.result.diagnosis import Diagnosis
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
@@ -93,12 +93,13 @@ def test_too_little_to_hold_out_is_refused(lagging: Lagging) -> None:
 
 def test_an_effect_that_needs_a_constant_says_which(lagging: Lagging) -> None:
     _, vehicle, found = lagging
-    assert not any(note.startswith("load_sensitivity cannot be judged") for note in found.notes)
+    assert "load_sensitivity" not in [one.effect for one in found.not_judged]
     flat = vehicle.model_copy(update={"constants": vehicle.constants.model_copy(update={"load_transfer": False})})
     others = set(EFFECTS) - {"load_sensitivity", "drag"}
     limited = diagnose(lagging[0], flat, integrator="euler", exclude=others)
-    (note,) = [note for note in limited.notes if note.startswith("load_sensitivity cannot be judged")]
-    assert "load_transfer false; expected axle loads that change" in note
+    (told,) = [one for one in limited.not_judged if one.effect == "load_sensitivity"]
+    assert "load_transfer false; expected axle loads that change" in told.why
+    assert told.manoeuvre == ""
 
 
 def test_an_extended_car_that_no_live_window_can_serve_says_so() -> None:
@@ -109,8 +110,7 @@ def test_an_extended_car_that_no_live_window_can_serve_says_so() -> None:
 
 
 def test_what_cannot_be_noticed_is_listed_with_the_driving_that_shows_it() -> None:
-    assert list(_hidden({"steering_lag": 0.1, "drag": 1.9})) == []
-    (note,) = _hidden({"steering_lag": np.inf, "drag": 2.1, "mass": 0.1})
-    assert note.startswith("no excitation: steering_lag, drag would not be noticed at any possible size")
-    for effect in ("steering_lag", "drag"):
-        assert EFFECTS[effect].MANOEUVRE in note
+    assert list(_not_judged({}, {"steering_lag": 0.1, "drag": 1.9})) == []
+    told = list(_not_judged({"grip_patch": "no place"}, {"steering_lag": np.inf, "drag": 2.1, "mass": 0.1}))
+    assert [one.effect for one in told] == ["grip_patch", "steering_lag", "drag"]
+    assert [one.manoeuvre for one in told] == ["", EFFECTS["steering_lag"].MANOEUVRE, EFFECTS["drag"].MANOEUVRE]

@@ -76,3 +76,14 @@ def test_of_time_there_is_a_trend_at_most() -> None:
     drifting[:, 1] = data.acceleration[:, 1] + 1e-6 * t**3
     cubic = _formula(data._replace(acceleration=drifting), 1)
     assert cubic is None or not any("t^" in name for name in cubic.terms)
+
+
+def test_products_that_stand_for_a_curve_over_one_signal_are_no_formula() -> None:
+    data = missing(6)
+    kinked = data.acceleration.copy()
+    throttle = data.signals[:, 3]
+    kinked[:, 0] += 3.0 * (np.abs(throttle) > 0.5) * np.sign(throttle)  # a dead band: no polynomial
+    found = _formula(data._replace(acceleration=kinked), 0)
+    assert found is not None
+    assert found.curve_share > found.share > 0.1
+    assert not found.holds

@@ -14,7 +14,8 @@ from benchmarks.hidden_causes.cases import Case, record
 from dynssm_ros.arrays import Vector
 from dynssm_ros.identification.result.diagnose import diagnose
 from dynssm_ros.identification.result.diagnosis import Diagnosis
-from dynssm_ros.reporting.diagnosis_report import as_text, diagnosis_report
+from dynssm_ros.reporting.diagnosis_report import diagnosis_report
+from dynssm_ros.reporting.diagnosis_words import as_text
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.simulation.plant import Rk4Plant, register_plant
 from dynssm_ros.track.tracks import load_track

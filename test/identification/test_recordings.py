@@ -15,7 +15,7 @@ from dynssm_ros.identification.problem.recordings import RecordingSet, driven_al
 from dynssm_ros.identification.problem.windows import SimulationWindows, fit_windows
 from dynssm_ros.identification.result.diagnose import diagnose
 from dynssm_ros.identification.tuning import BLOCK_S
-from dynssm_ros.reporting.diagnosis_report import as_text
+from dynssm_ros.reporting.diagnosis_words import as_text
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.tracks import load_track

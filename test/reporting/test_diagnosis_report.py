@@ -10,7 +10,7 @@ import pytest
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.fit import IdentificationProblem
 from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows
-from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Diagnosis
+from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Diagnosis, NotJudged
 from dynssm_ros.identification.result.improvement import Improvement, measure_improvement
 from dynssm_ros.identification.result.minimum_effect import minimum_detectable
 from dynssm_ros.identification.search.candidates import Candidate
@@ -21,14 +21,8 @@ from dynssm_ros.reporting.diagnosis_figures import (
     improvement_by_horizon,
     simulated_and_measured,
 )
-from dynssm_ros.reporting.diagnosis_report import (
-    as_text,
-    diagnosis_report,
-    left_in_words,
-    moved_in_words,
-    pattern_in_words,
-    size_in_words,
-)
+from dynssm_ros.reporting.diagnosis_report import diagnosis_report
+from dynssm_ros.reporting.diagnosis_words import as_text, left_in_words, moved_in_words, pattern_in_words, size_in_words
 from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
@@ -117,16 +111,16 @@ def test_words_say_cause_size_evidence_gain_and_what_to_do(lagging: Lagging) -> 
     found = lagging[2]
     (cause,) = found.causes
     words = as_text(found)
-    assert words.startswith("The simulation lacks: steering_lag.")
-    assert f"steering_lag: {size_in_words(cause)}" in words
+    assert words.startswith("cause: The simulation lacks: steering_lag.")
+    assert f"steering_lag: {size_in_words(cause)}" in " ".join(words.split())
     assert (
         "Evidence: on parts of the drive that were left out the logarithm of the predictive likelihood is better"
         in words
     )
-    assert moved_in_words(found) == []
+    assert moved_in_words(replace(found, moved={})) == []
     (sentence,) = moved_in_words(replace(found, moved={"D_f": -4.0}))
     assert sentence.startswith("Recalibrated: the front tyres' peak force (D_f) is ")
-    assert sentence.endswith(": 4 of its standard deviations.")
+    assert sentence.endswith(": 4.0 of its standard deviations.")
     stuck = replace(cause, on_bound=("time_constant",))
     assert size_in_words(stuck).endswith(" or farther from neutral (at its bound) s")
     assert "Error on held-out laps 0.52 s ahead:" in words
@@ -134,6 +128,24 @@ def test_words_say_cause_size_evidence_gain_and_what_to_do(lagging: Lagging) -> 
         assert f"   {channel} (" in words
     assert max(len(line) for line in words.splitlines() if line.startswith("   What")) <= 113
     assert left_in_words(found) == ""
+
+
+def test_findings_are_told_the_largest_first_but_what_persistence_does_as_well_before(lagging: Lagging) -> None:
+    found = lagging[2]
+    shares = [one.explains for one in found.conclusions]
+    assert shares == sorted(shares, reverse=True)
+    ours = found.improvement.errors
+    spoilt = {name: errors + np.array([0.0, 50.0, 0.0]) for name, errors in ours.items()}
+    lost = replace(found, improvement=replace(found.improvement, errors=spoilt))
+    assert next((one.kind, one.subject) for one in lost.conclusions) == ("no_better", "v_y")
+    assert (
+        as_text(lost).splitlines()[1].startswith("1. The steering explains nothing of v_y: 0.52 s ahead it errs by 50")
+    )
+    blind = replace(found, not_judged=(NotJudged("mass", "weighed", ""), NotJudged("drag", "unseen", "coasting down")))
+    assert as_text(blind).endswith(
+        "Cannot be judged on these laps:\n   mass: weighed\n   drag: what would show it is coasting down"
+    )
+    assert [section.title for section in diagnosis_report(blind).sections][-1] == "What cannot be judged"
 
 
 def test_signals_that_contradict_each_other_are_told_before_the_causes(lagging: Lagging) -> None:
@@ -146,8 +158,10 @@ def test_signals_that_contradict_each_other_are_told_before_the_causes(lagging: 
     info = together.info.model_copy(update={"findings": (wrong,)})
     spoilt = replace(found, recordings=replace(found.recordings, recording=replace(together, info=info)))
     assert " ".join(as_text(spoilt).splitlines()[1:3]) == f"Signals that cannot be right: {wrong.line}."
-    assert [each.state for each in diagnosis_report(spoilt).verdicts] == ["wrong"]
-    assert diagnosis_report(found).verdicts == ()
+    first, *rest = diagnosis_report(spoilt).verdicts
+    assert (first.name, first.state) == ("data", "wrong")
+    assert diagnosis_report(found).verdicts == tuple(rest)
+    assert ("cause", "look") in [(each.name, each.state) for each in rest]
     assert [each["what"] for each in spoilt.to_json("")["findings"]] == ["v_y_sign"]
 
 

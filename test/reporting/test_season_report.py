@@ -24,7 +24,7 @@ def a_review(k: int, car: str = "orca", D_r: float = 0.17) -> Review:
     errors = {"dynssm": Accuracy(ade=0.01 + 0.001 * k, rmse=(0.0, 0.0, 0.0))}
     return Review(
         key="", car=car, track="club", session=f"run_{k}", start=f"2026-06-{k + 1:02d}T10:00:00+00:00", seconds=600.0,
-        accuracy=errors, stretches=(Stretch(start="", coefficients=coefficients),) * 2, verdict="effects",
+        accuracy=errors, stretches=(Stretch(start="", coefficients=coefficients),) * 2, verdict="cause",
         causes=(Found(effect="drag", values={"factor": 1.4}, std={}, improvement=0.3),),
     )  # fmt: skip
 

@@ -241,7 +241,7 @@ class IdentificationProblem:
                 jacobian = np.concatenate([nominal, self.columns(car, errors, free, n)], axis=2) if free else nominal
             else:
                 jacobian, stale = self.columns(car, errors, free), False
-            H, g = self._normal(errors, noise.whiten(jacobian), p, noise)
+            H, g = self.normal(errors, noise.whiten(jacobian), p, noise)
             before, promised, kept = best, 0.0, 0.0
             for damping in tuning.DAMPING:
                 step = _step(H + damping * np.diag(np.diag(H)), g, lower - p, upper - p)
@@ -296,12 +296,12 @@ class IdentificationProblem:
         out = []
         for car, errors in zip(cars, self.errors_of(cars), strict=True):
             p = position(car, near.free)
-            H, g = self._normal(errors, near.white_jacobian, p, near.noise)
+            H, g = self.normal(errors, near.white_jacobian, p, near.noise)
             lower, upper = limits(car, near.free)
             out.append(with_values(car, near.free, p + _step(H, g, lower - p, upper - p)))
         return out
 
-    def _normal(self, errors: Vector, white_jacobian: Vector, p: Vector, noise: Noise) -> tuple[Vector, Vector]:
+    def normal(self, errors: Vector, white_jacobian: Vector, p: Vector, noise: Noise) -> tuple[Vector, Vector]:
         """Second and first derivatives of half the objective, as Gauss and Newton approximate them."""
         weighed, J, _ = noise.robust(errors, white_jacobian)
         known, weight = self.prior_precision(p), self.tempering**-0.5

@@ -17,10 +17,11 @@ from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, pe
 from dynssm_ros.identification.problem.levels import Levels
 from dynssm_ros.identification.problem.recordings import CrossValidation, RecordingSet, driven_alike
 from dynssm_ros.identification.problem.windows import SimulationWindows, fit_windows, held_out_windows, steps_of
-from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis
+from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis, NotJudged
 from dynssm_ros.identification.result.formula import Formula, formulas
 from dynssm_ros.identification.result.gate import Gated, Without, gated
 from dynssm_ros.identification.result.minimum_effect import minimum_detectable
+from dynssm_ros.identification.result.recalibration import MOVABLE, Recalibration, hidden_candidates, recalibration
 from dynssm_ros.identification.search.candidates import Candidate
 from dynssm_ros.identification.search.integrator import SearchResult, search_causes
 from dynssm_ros.identification.search.selection import Refined, Selection
@@ -29,11 +30,10 @@ from dynssm_ros.progress import OnProgress
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lines import ClosedLine
-from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
+from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, require_context
 from dynssm_ros.vehicle.integrators import Integrator
 
-_NAMES = (*COEFFICIENTS, "m")  # of what is recalibrated
 _HELD = {"zero": "held", "first": "a line from sample to sample"}
 
 
@@ -93,8 +93,12 @@ def diagnose(
 def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle, on_progress: OnProgress) -> Diagnosis:
     """What passed the gate, with the car to write and what limits the diagnosis."""
     problem, windows, selection, fit = found.problem, found.problem.windows, gate.selection, gate.selection.fit
-    terms = _formulas(windows, fit.car, at.left_out, at.notes, on_progress) if gate.left.is_there else ()
     sizes = minimum_detectable(problem, fit, found.search.found)
+    off = recalibration(problem, fit, at.car, gate.improvement)
+    if off is not None:
+        tried = found.search.found, found.search.responses
+        hiding = hidden_candidates(problem, fit, at.car, *tried)
+        off = replace(off, candidates=tuple(one for one in hiding if np.isfinite(sizes.get(one.effect, np.inf))))
     covariance = problem.covariance(fit)
     live, known = _as_held(problem, fit, covariance, at.car)
     suspects = at.recordings.levels.suspects
@@ -107,11 +111,11 @@ def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle
         _cause(one, rest, selection, at.recordings, std)
         for one, rest in zip(selection.chosen, gate.without, strict=True)
     ]
+    has_no_name = gate.left.is_there and all(cause.small for cause in causes)
+    terms = _formulas(windows, fit.car, at.left_out, at.notes, on_progress) if has_no_name else ()
     notes = (
         *at.notes,
-        *(f"{name} cannot be judged: {why}" for name, why in found.impossible.items()),
         *_steps_otherwise(vehicle, windows, fit.car, live),
-        *_hidden(sizes),
         *_passed_once(at.left_out, selection.candidates),
         *_not_confirmed(selection.unconfirmed),
         *_moved_together(fit.car),
@@ -120,7 +124,7 @@ def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle
     )
     return Diagnosis(
         tuple(sorted(causes, key=lambda cause: cause.small)),
-        _moved(fit.car),
+        _moved(fit.car, off),
         extended,
         gate.improvement,
         gate.left.systematic,
@@ -133,6 +137,8 @@ def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle
         windows,
         at.recordings,
         terms,
+        off,
+        tuple(_not_judged(found.impossible, sizes)),
     )
 
 
@@ -167,9 +173,11 @@ def _driven_alike(at: _Prepared) -> Levels:
     return replace(levels, groups=tried)
 
 
-def _moved(car: CarEstimate) -> dict[str, float]:
+def _moved(car: CarEstimate, off: Recalibration | None = None) -> dict[str, float]:
     """See :attr:`Diagnosis.moved`."""
-    return {name: float(by) for name, by in zip(_NAMES, car.moved, strict=True) if abs(by) > tuning.SURE_STD}
+    named = {one.name for one in off.coefficients} if off is not None else set()
+    each = zip(MOVABLE, car.moved, strict=True)
+    return {name: float(by) for name, by in each if abs(by) > tuning.SURE_STD or name in named}
 
 
 def _passed_once(left_out: CrossValidation, chosen: Iterable[Candidate]) -> Iterator[str]:
@@ -202,7 +210,7 @@ def _moved_together(car: CarEstimate) -> Iterator[str]:
     shares = car.moved * (car.prior_precision @ car.moved)
     squared = float(shares.sum())
     if not _moved(car) and squared > tuning.MOVED_TOGETHER:
-        most = [_NAMES[k] for k in np.argsort(-shares)[:4] if shares[k] > 0.0]
+        most = [MOVABLE[k] for k in np.argsort(-shares)[:4] if shares[k] > 0.0]
         yield (
             f"together the coefficients moved by {np.sqrt(squared):.0f} standard deviations, though none by more than "
             f"{tuning.SURE_STD:g} alone: "
@@ -329,21 +337,17 @@ def _steps_otherwise(
         )
         samples = " and ".join(f"{n * windows.data.T_s:g}" for n in dict.fromkeys(windows.data.rows_per_sample))
         yield (
-            "the car answers to the inputs half a sample earlier than if they were held, so that they are taken for lines "
-            f"from sample to sample ({samples} s apart); a live prediction cannot, and errs by that: record them faster, or "
-            "take the commands. The vehicle file is fitted to inputs that are held" + "".join(differ)
+            f"inputs are taken for lines between samples {samples} s apart, as the data ask for; live they are held, and "
+            "vehicle.yaml is fitted to that. Record them faster, or take the commands" + "".join(differ)
         )
 
 
-def _hidden(sizes: Mapping[str, float]) -> Iterator[str]:
-    """What these laps cannot show at any size that is possible, and how to drive so that they do."""
-    hidden = [effect for effect, size in sizes.items() if size > EFFECTS[effect].magnitude().span]
-    if hidden:
-        yield (
-            f"no excitation: {', '.join(hidden)} would not be noticed at any possible size, because these laps hardly show "
-            "it or the nominal values are known too badly; what would show it: "
-            + "; ".join(dict.fromkeys(EFFECTS[effect].MANOEUVRE for effect in hidden))
-        )
+def _not_judged(impossible: Mapping[str, str], sizes: Mapping[str, float]) -> Iterator[NotJudged]:
+    """What cannot be tried, and what these laps cannot show at any size that is possible."""
+    yield from (NotJudged(effect, why, "") for effect, why in impossible.items())
+    for effect, size in sizes.items():
+        if size > EFFECTS[effect].magnitude().span:
+            yield NotJudged(effect, "would not be noticed at any possible size", EFFECTS[effect].MANOEUVRE)
 
 
 def _not_live(vehicle: Vehicle) -> Iterator[str]:

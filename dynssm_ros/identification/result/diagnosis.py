@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from dynssm_ros.identification.problem.recordings import RecordingSet
 from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.identification.result.formula import Formula
 from dynssm_ros.identification.result.improvement import Improvement
+from dynssm_ros.identification.result.recalibration import Recalibration
 from dynssm_ros.identification.result.residuals import ClusteredResiduals, ExplainedVariance
 from dynssm_ros.identification.search.confirmation import Confirmation
 from dynssm_ros.identification.search.selection import Selection
@@ -23,7 +24,8 @@ from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 
-Verdict = Literal["effects", "none", "unexplained"]
+Verdict = Literal["cause", "unexplained", "recalibrate", "healthy"]
+ConclusionKind = Literal["no_better", "cause", "recalibration", "unexplained", "small"]
 
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
@@ -70,6 +72,25 @@ class Cause:
         return little and not self.confirmation.rests_on_known
 
 
+class Conclusion(NamedTuple):
+    """One finding of a diagnosis, to be told in a sentence."""
+
+    kind: ConclusionKind
+    subject: str
+    """The channel that is predicted no better than by persistence, or the effect; empty: the car as a whole."""
+    explains: float
+    """Share of the error on held-out laps that it takes away, as a mean of the channels, or that is left."""
+
+
+class NotJudged(NamedTuple):
+    """An effect that these recordings do not tell."""
+
+    effect: str
+    why: str
+    manoeuvre: str
+    """What would show it; empty where no drive of this car does."""
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """What the simulation gets wrong, and why.
@@ -77,7 +98,7 @@ class Diagnosis:
     Attributes:
         found: the causes and then the small effects, the strongest of each first.
         moved: coefficients, and ``m``, that are now more than three of the stated standard deviations off what the vehicle
-            file has; by name, how many.
+            file has, or that :attr:`recalibration` names; by name, how many.
         vehicle: the vehicle with effects and refitted nominal values.
         improvement: on the held-out rows.
         left: what is systematic in the errors of the extended car, on the rows of the fit.
@@ -90,7 +111,9 @@ class Diagnosis:
         protocol: how it was obtained, by name.
         windows: of the fit.
         recordings: what was diagnosed.
-        formulas: terms that the extended car lacks, where it leaves errors that are no noise.
+        formulas: terms that the extended car lacks, where it leaves errors that are no noise and no cause is named.
+        recalibration: what is off in the vehicle file beside the causes; ``None``: nothing that is noticed on held-out laps.
+        not_judged: effects that these recordings do not tell.
     """
 
     found: tuple[Cause, ...]
@@ -107,13 +130,53 @@ class Diagnosis:
     windows: SimulationWindows
     recordings: RecordingSet
     formulas: tuple[Formula, ...] = ()
+    recalibration: Recalibration | None = None
+    not_judged: tuple[NotJudged, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
-        """``effects``: causes are named; ``none``: right within noise; ``unexplained``: wrong, and nothing says why."""
+        """The first that holds of what needs most to be mended.
+
+        ``cause``: causes are named; ``unexplained``: errors are left that have no name; ``recalibrate``: coefficients of the
+        file are off, and nothing else; ``healthy``: right within the noise, as the file has it.
+        """
         if self.causes:
-            return "effects"
-        return "unexplained" if self.left.is_there or self.clustered.is_there else "none"
+            return "cause"
+        if self.is_left or self.no_better:
+            return "unexplained"
+        return "recalibrate" if self.moved else "healthy"
+
+    @property
+    def is_left(self) -> bool:
+        """Whether the extended car leaves errors that are no noise."""
+        return self.left.is_there or self.clustered.is_there
+
+    @property
+    def no_better(self) -> tuple[str, ...]:
+        """Channels that the extended car predicts hardly better than persistence, or worse, at the horizon."""
+        improvement = self.improvement
+        error, still = improvement.rmse[EXTENDED][improvement.horizon], improvement.persistence[improvement.horizon]
+        return tuple(
+            channel
+            for channel, ours, none in zip(STATE_SIGNALS, error, still, strict=True)
+            if ours > (1.0 - tuning.NOTICEABLE_SHARE) * none
+        )
+
+    @property
+    def conclusions(self) -> tuple[Conclusion, ...]:
+        """The findings: what is no better than persistence first, then the rest, that which explains most error first."""
+        found = [
+            Conclusion("small" if cause.small else "cause", cause.effect, cause.heldout_improvement)
+            for cause in self.found
+        ]
+        if self.moved:
+            explains = 0.0 if self.recalibration is None else self.recalibration.explains
+            found.append(Conclusion("recalibration", "", explains))
+        if self.is_left:
+            share = float(self.left.share.mean()) if self.left.is_there else 0.0
+            found.append(Conclusion("unexplained", "", float(1.0 - np.sqrt(1.0 - share))))
+        found.sort(key=lambda one: -one.explains)
+        return (*(Conclusion("no_better", channel, 0.0) for channel in self.no_better), *found)
 
     @property
     def causes(self) -> tuple[Cause, ...]:
@@ -160,6 +223,9 @@ class Diagnosis:
                 name: {"from": was, "to": now, "standard_deviations": self.moved[name]}
                 for name, (was, now) in self.recalibrated.items()
             },
+            "recalibration": None if self.recalibration is None else _recalibration_to_json(self),
+            "conclusions": [one._asdict() for one in self.conclusions],
+            "not_judged": [one._asdict() for one in self.not_judged],
             "formulas": [
                 {
                     "channel": formula.channel,
@@ -174,6 +240,35 @@ class Diagnosis:
             "notes": list(self.notes),
             "vehicle": vehicle_path,
         }
+
+
+def _recalibration_to_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    found = diagnosis.recalibration
+    assert found is not None
+    return {
+        "reduction": by_channel(found.share),
+        "interval_95": _intervals(found.interval),
+        "coefficients": [
+            {
+                "name": one.name,
+                "from": one.given,
+                "to": one.value,
+                "std": one.std,
+                "standard_deviations": one.deviations,
+                "reduction": by_channel(one.share),
+                "alternatives": list(one.alike),
+            }
+            for one in found.coefficients
+        ],
+        "candidates": [
+            {
+                "effect": one.effect,
+                "parameters": one.values,
+                "minimum_detectable": diagnosis.minimum_detectable.get(one.effect),
+            }
+            for one in found.candidates
+        ],
+    }
 
 
 def _cause_to_json(cause: Cause) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 Where a car leaves errors that no effect of the library explains, the acceleration that it lacks is regressed on products of
 signals, a few at a time (Brunton, Proctor and Kutz 2016; of a model's discrepancy: Kaheman et al. 2019). Terms are chosen one
-by one by orthogonal matching pursuit (Pati, Rezaiifar and Krishnaprasad 1993), by scikit-learn (extra ``formula``).
+by one by orthogonal matching pursuit (Pati, Rezaiifar and Krishnaprasad 1993), by scikit-learn (extra ``formula``). A
+formula that takes no more than a smooth curve over one signal does is none: its products stand for the curve.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ class Formula:
         share: of the squared error of parts that were left out, that it takes.
         improvement: by part, what it takes of the squared error there, in units of its variance, ``(U,)``.
         std: standard error of the sum of :attr:`improvement`, from stretches of a simulation of the fit.
+        curve_share: the same as :attr:`share` of the best smooth curve over one signal.
     """
 
     channel: str
@@ -41,14 +43,14 @@ class Formula:
     share: float
     improvement: Vector
     std: float
+    curve_share: float
 
     @property
     def holds(self) -> bool:
-        """Whether it carries over to what it was not fitted to: surely, and more than by the parts' standard error."""
+        """Whether it carries over to what it was not fitted to: surely, and more than a curve over one signal."""
         total = float(self.improvement.sum())
-        return (
-            total > max(tuning.SURE_STD * self.std, standard_error(self.improvement))
-            and self.share > tuning.NEGLIGIBLE_SHARE
+        return total > max(tuning.SURE_STD * self.std, standard_error(self.improvement)) and self.share > max(
+            tuning.NEGLIGIBLE_SHARE, self.curve_share
         )
 
 
@@ -135,7 +137,23 @@ def _formula(missing: _Missing, channel: int) -> Formula | None:
         float(improvement.sum() / (y**2).sum()),
         improvement,
         standard_error(sums_by(missing.block, better_by[best])),
+        max(_curve_share(signal, y, missing.fold) for signal in missing.signals.T),
     )
+
+
+def _curve_share(signal: Vector, y: Vector, fold: Indices) -> float:
+    """Share of the squared ``y`` ``(M,)`` of parts left out that a piecewise linear curve over a ``signal`` takes."""
+    knots = np.unique(np.quantile(signal, np.linspace(0.0, 1.0, tuning.CURVE_KNOTS)))
+    if len(knots) < 2:
+        return 0.0
+    at = np.clip(np.interp(signal, knots, np.arange(len(knots))), 0.0, len(knots) - 1.0)
+    hats = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(len(knots))))
+    left = np.empty_like(y)
+    for part in np.unique(fold):
+        rest = fold != part
+        H = hats[rest].T @ hats[rest] + np.eye(len(knots))  # as if each knot had one row more, at zero
+        left[~rest] = y[~rest] - hats[~rest] @ np.linalg.solve(H, hats[rest].T @ y[rest])
+    return 1.0 - float((left**2).sum() / (y**2).sum())
 
 
 def _fitted(X: Vector, y: Vector, order: Sequence[int]) -> Vector:

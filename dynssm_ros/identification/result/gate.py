@@ -13,7 +13,7 @@ from dynssm_ros.identification.problem.fit import IdentificationProblem
 from dynssm_ros.identification.problem.noise import weights
 from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED
-from dynssm_ros.identification.result.improvement import Improvement, measure_improvement
+from dynssm_ros.identification.result.improvement import Improvement, mean_reduction, measure_improvement
 from dynssm_ros.identification.result.residuals import Left, clustered, explained_variance
 from dynssm_ros.identification.search.integrator import SearchResult
 from dynssm_ros.identification.search.selection import Search, Selection
@@ -83,11 +83,7 @@ def gated(found: SearchResult, given: CarEstimate, windows: SimulationWindows, s
 def _without_each(selection: Selection, search: Search, windows: SimulationWindows, steps: int) -> tuple[Without, ...]:
     fits = [selection.fit, *(search.leave_out(selection, one) for one in selection.chosen)]
     with_all, *without = (windows.errors(fit.car)[:, steps - 1] for fit in fits)
-    squared = (with_all**2).mean(axis=0)
-    return tuple(
-        Without(errors, float(1.0 - np.sqrt((squared / np.maximum((errors**2).mean(axis=0), 1e-300)).mean())))
-        for errors in without
-    )
+    return tuple(Without(errors, mean_reduction(errors, with_all)) for errors in without)
 
 
 def _left(problem: IdentificationProblem, selection: Selection) -> Left:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dynssm_ros.arrays import Vector, sums_by
+from dynssm_ros.arrays import Indices, Vector, sums_by
 from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.windows import SimulationWindows
@@ -64,10 +64,14 @@ class Improvement:
 
     def interval_from(self, name: str) -> Vector:
         """95 % interval of :meth:`reduction_from` by a bootstrap over blocks in time, shape ``(2, n, 3)``."""
-        before, after = (sums_by(self.windows.block, self.errors[car] ** 2) for car in (name, list(self.errors)[-1]))
-        drawn = np.random.default_rng(0).integers(0, len(before), (tuning.DRAWS, len(before)))
-        ratios = np.sqrt(after[drawn].sum(axis=1) / np.maximum(before[drawn].sum(axis=1), 1e-300))
-        return np.asarray(1.0 - np.quantile(ratios, [0.975, 0.025], axis=0))
+        return reduction_interval(self.errors[name], self.errors[list(self.errors)[-1]], self.windows.block)
+
+    @cached_property
+    def persistence(self) -> Vector:
+        """Root mean square of the measured changes, ``(n, 3)``: what a prediction errs by that nothing changes."""
+        ahead = np.round(self.horizons / self.windows.data.T_s).astype(int)
+        now = self.windows.data.rows[:3, self.windows.starts].T[:, None]
+        return np.asarray(np.sqrt(((self.windows.target[:, ahead - 1] - now) ** 2).mean(axis=0)))
 
     def systematic_gone(self, name: str) -> Vector:
         """Share of the systematic squared error of a car that is gone with the last; NaN where there was next to none.
@@ -77,6 +81,27 @@ class Improvement:
         shares = [np.stack([s.share for s in self.explained_variance[car]]) for car in (name, list(self.errors)[-1])]
         before, after = shares[0] * self.rmse[name] ** 2, shares[1] * self.rmse[list(self.errors)[-1]] ** 2
         return np.where(shares[0] > tuning.NEGLIGIBLE_SHARE, 1.0 - after / np.maximum(before, 1e-300), np.nan)
+
+
+def reduction_interval(before: Vector, after: Vector, block: Indices) -> Vector:
+    """95 % interval of the share of the RMSE that is gone, by a bootstrap over blocks in time, shape ``(2, ..., 3)``.
+
+    Args:
+        before: errors of windows, ``(W, ..., 3)``.
+        after: errors of the same windows with what takes them away.
+        block: number of the block in time of each window, shape ``(W,)``.
+    """
+    sums = [sums_by(block, errors**2) for errors in (before, after)]
+    drawn = np.random.default_rng(0).integers(0, len(sums[0]), (tuning.DRAWS, len(sums[0])))
+    squared = [each[drawn].sum(axis=1) for each in sums]
+    ratios = np.sqrt(squared[1] / np.maximum(squared[0], 1e-300))
+    return np.asarray(1.0 - np.quantile(ratios, [0.975, 0.025], axis=0))
+
+
+def mean_reduction(before: Vector, after: Vector) -> float:
+    """Share of the RMSE that is gone, as a mean of the channels; errors of the same windows, each ``(W, 3)``."""
+    left = (after**2).mean(axis=0) / np.maximum((before**2).mean(axis=0), 1e-300)
+    return float(1.0 - np.sqrt(left.mean()))
 
 
 def measure_improvement(windows: SimulationWindows, cars: Mapping[str, CarEstimate], steps: int) -> Improvement:

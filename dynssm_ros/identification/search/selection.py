@@ -160,7 +160,8 @@ class Search:
         on_progress("recalibrating the nominal car")
         self.base = problem.temper(problem.recalibrated(car))
         self._tempering = problem.tempering
-        self._responses = Responses(problem, self.base.car, self.base.errors)
+        self.responses = Responses(problem, self.base.car, self.base.errors)
+        """Of the library, beside the recalibrated car."""
         self.tried: dict[str, float] = {}
         self._forget()
 
@@ -248,7 +249,7 @@ class Search:
         """Where to fit the most promising candidates beside ``before`` from, by a score test and in several sizes."""
         taken = {c.effect for c in before}
         self._report("trying all effects" + (f" beside {', '.join(taken)}" if taken else ""))
-        score_test = ScoreTest(self._problem, fit, self._responses)
+        score_test = ScoreTest(self._problem, fit, self.responses)
         scored = list(score_test.try_all([c for c in self.found if c.effect not in taken]))
         best: dict[str, ScoredCandidate] = {}
         for each in sorted(scored, key=self._expected_delta_bic, reverse=True):
