@@ -11,7 +11,7 @@ from dynssm_ros.identification.result.diagnosis import RECALIBRATED, Cause, Conc
 from dynssm_ros.identification.result.formula import Formula
 from dynssm_ros.identification.result.recalibration import CoefficientShift
 from dynssm_ros.identification.result.residuals import ExplainedVariance
-from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC
+from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC, SURE_STD
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.page import Prose
 from dynssm_ros.reporting.tables import percent, text
@@ -204,6 +204,8 @@ def moved_in_words(diagnosis: Diagnosis) -> list[str]:
     """What recalibration moved farther than the vehicle file allows for."""
     sentences, words = [], Prose("diagnosis").words["coefficients"]
     for name, (was, now) in diagnosis.recalibrated.items():
+        if abs(diagnosis.moved[name]) <= SURE_STD:
+            continue  # told by its part in the error
         unit = "kg" if name == "m" else COEFFICIENT_UNITS[name]
         value = text(now) if unit == "1" else f"{text(now)} {unit}"
         what = f"{words[name]} ({name})" if name in words else name
