@@ -9,6 +9,7 @@ import io
 import os
 import pickle
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -351,6 +352,26 @@ def orca() -> Any:
     from dynssm_ros.vehicle import load_vehicle
 
     return load_vehicle("orca")
+
+
+@pytest.fixture(scope="session")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The compiled loops: those of the environment, or built here; without a compiler the test is left out."""
+    from dynssm_ros import compiled
+
+    if compiled.LIBRARY is not None:
+        return compiled.LIBRARY
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler")
+    folder = tmp_path_factory.mktemp("compiled")
+    shutil.copy(REPOSITORY / "setup.py", folder)
+    (folder / "dynssm_ros").mkdir()
+    source = shutil.copy(REPOSITORY / "dynssm_ros" / "compiled.c", folder / "dynssm_ros")
+    subprocess.run([sys.executable, "setup.py", "-q", "build_ext", "--inplace"], cwd=folder, check=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiled, "_SOURCE", Path(source))
+        patch.delenv("DYNSSM_COMPILED", raising=False)
+        return compiled._load()
 
 
 def smooth(rng: np.random.Generator, N: int, mean: float, std: float, over: int) -> np.ndarray:

@@ -28,6 +28,7 @@ FLOORS = (  # lowest first; a room imports itself and the floors below, never an
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
 GROUND = {
     "arrays",
+    "compiled",
     "configuration",
     "errors",
     "extras",

@@ -179,7 +179,9 @@ def test_every_module_and_template_is_installed(arguments: dict[str, Any]) -> No
     assert {package.replace(".", "/") for package in arguments["packages"]} == folders
     patterns = arguments["package_data"][PACKAGE]
     data = {path for pattern in patterns for path in (ROOT / PACKAGE).glob(pattern)}
-    others = {path for path in (ROOT / PACKAGE).rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
+    others = {
+        path for path in (ROOT / PACKAGE).rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc", ".so")
+    }
     assert data == others
 
 

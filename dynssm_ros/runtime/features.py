@@ -7,16 +7,19 @@ the car is. All are in units that make one the usual size. Training, evaluation 
 from __future__ import annotations
 
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from dynssm_ros import compiled
 from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.compiled import address
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.online import CHANNELS, MEAN_ERROR, OnlineLayer, Seen
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.compiled_car import car_structure
 from dynssm_ros.vehicle.integrators import Integrator
 
 INPUT_CHANGE = 0.1
@@ -122,6 +125,11 @@ class LayerFeatures:
         self._places = layout.places
         self._car = CarModel.of(vehicle, integrator, substeps)
         self._theta = Coefficients(*vehicle.nominal)
+        self._compiled: dict[int, compiled.FeaturesStructure | None] = {}  # by rows of a window
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what lies in this process."""
+        return vars(self) | {"_compiled": {}}
 
     @classmethod
     def of(cls, layer: OnlineLayer, mean: Vector, std: Vector) -> LayerFeatures | None:
@@ -138,6 +146,10 @@ class LayerFeatures:
 
     def seen(self, windows: Vector, network: Vector | None = None) -> Seen:
         """What the layer sees of ``windows`` ``(N, H, 7)``; ``network`` are its increments ``(N, 3)`` (m/s, m/s, rad/s)."""
+        if compiled.LIBRARY is not None:
+            structure = self._structure(windows.shape[1])
+            if structure is not None:
+                return self._seen_compiled(compiled.LIBRARY, structure, windows, network)
         layout, count = self.layout, len(windows)
         increments = np.diff(windows[:, :, :CHANNELS], axis=1) / self._scale
         columns = np.moveaxis(windows, -1, 0)
@@ -163,3 +175,37 @@ class LayerFeatures:
             parts.append(network / self._scale)
         found = np.concatenate([*parts, np.ones((count, 1))], axis=1)
         return Seen(found[:, self._places], physics)
+
+    def _structure(self, rows: int) -> compiled.FeaturesStructure | None:
+        """What the compiled loop needs to know for windows of so many rows; ``None`` if it cannot do it."""
+        if rows not in self._compiled:
+            layout, car = self.layout, car_structure(self._car, np.array(self._theta), rows)
+            structure = None
+            if car is not None:
+                structure = compiled.FeaturesStructure()
+                structure.fill(
+                    car=car, rows=rows, recent=layout.recent, input_lags=layout.input_lags, errors=layout.errors,
+                    network=layout.network, n=len(self.names), places=self._places.astype(np.int64), mean=self._mean,
+                    std=self._std, scale=self._scale, input_scale=self._input_scale,
+                    moved=np.zeros((compiled.LANES, layout.errors + 1, CHANNELS)),
+                    found=np.zeros(CHANNELS * len(self.names)),
+                )  # fmt: skip
+            self._compiled[rows] = structure
+        return self._compiled[rows]
+
+    def _seen_compiled(
+        self, library: Any, structure: compiled.FeaturesStructure, windows: Vector, network: Vector | None
+    ) -> Seen:
+        """:meth:`seen` by the compiled loop."""
+        count = len(windows)
+        windows = np.ascontiguousarray(windows, dtype=np.float64)
+        if self.layout.network:
+            assert network is not None
+            network = np.ascontiguousarray(network, dtype=np.float64)
+        else:
+            network = None
+        features, physics = np.empty((count, CHANNELS, len(self.names))), np.empty((count, CHANNELS))
+        library.dynssm_seen(
+            structure.address, address(windows), count, address(network), address(features), address(physics)
+        )
+        return Seen(features, physics)

@@ -276,24 +276,34 @@ class CarModel:
         theta = Coefficients(*(each[:, 0] if getattr(each, "ndim", 0) > 1 else each for each in theta))
         known = initial_effect_states(self.effects, *(each[:, 0] for each in feedback))
         carried = self.settled(*rows[0], theta, known)
-        along, names = [carried], tuple(carried)
+        along = [carried]
         for state, acting in rows[:-1]:
-            if carried.keys() == known.keys():
-
-                def rates(y: Sequence[Array], state: State = state, acting: Applied = acting) -> tuple[Array, ...]:
-                    here = dict(zip(names, y, strict=True))
-                    q = inputs_alone(
-                        self.xp, state, acting, self.effects, effect_states=here, h=self.T_s / self.substeps
-                    )
-                    return tuple(q.effect_state_rates[name] for name in names)
-
-                changes = integrate(rates, tuple(carried.values()), self.T_s, self.integrator, self.substeps)
-                changed = dict(zip(names, changes, strict=True))
-            else:
-                _, changed = self.increment(state, acting, theta, carried)
-            carried = {name: value + changed[name] for name, value in carried.items()}
+            carried = self.carried_on(state, acting, theta, carried)
             along.append(carried)
         return along
+
+    def carried_on(
+        self, state: State, applied: Applied, theta: Coefficients, effect_states: EffectStates
+    ) -> dict[str, Array]:
+        """All effect states one step after a row."""
+        names = tuple(effect_states)
+        if names == self._on_inputs:
+
+            def rates(y: Sequence[Array]) -> tuple[Array, ...]:
+                here = dict(zip(names, y, strict=True))
+                q = inputs_alone(self.xp, state, applied, self.effects, effect_states=here, h=self.T_s / self.substeps)
+                return tuple(q.effect_state_rates[name] for name in names)
+
+            changes = integrate(rates, tuple(effect_states.values()), self.T_s, self.integrator, self.substeps)
+            changed = dict(zip(names, changes, strict=True))
+        else:
+            _, changed = self.increment(state, applied, theta, effect_states)
+        return {name: value + changed[name] for name, value in effect_states.items()}
+
+    @cached_property
+    def _on_inputs(self) -> tuple[str, ...]:
+        """Names of the effect states that the inputs alone settle."""
+        return tuple(initial_effect_states(self.effects, 0.0, 0.0))
 
 
 def _meeting(first: Array, second: Array) -> Array:

@@ -1,0 +1,185 @@
+/* Loops of the predictor's step over arrays that Python has allocated. dynssm_ros/compiled.py opens it; each function has its
+   counterpart in numpy, to which a test holds it. The car's equations are not here: they come as a tape of operations
+   (dynssm_ros/vehicle/tape.py). */
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#define LANES 32 /* rows that an operation is executed for at once; compiled.py knows it */
+#define CHANNELS 3
+#define COLUMNS 7
+#ifndef SOURCE
+#define SOURCE ""
+#endif
+
+typedef struct {
+    const int32_t *code; /* (operations, 4): operation, result, operands */
+    int64_t operations;
+    double *work; /* (slots, LANES), with the constants in their places */
+    const int32_t *outputs;
+    int64_t count; /* of the outputs */
+} Tape;
+
+typedef struct {
+    Tape step;   /* v_x, v_y, omega, r, delta, effect states -> increments */
+    Tape settle; /* v_x, v_y, omega, r, delta, r_fb, delta_fb -> effect states */
+    Tape carry;  /* as step -> effect states at the next row */
+    int64_t states;
+    double *along; /* (H, states, LANES) */
+} Car;
+
+typedef struct {
+    Car car;
+    int64_t rows, recent, input_lags, errors, network, n;
+    const int64_t *places; /* (CHANNELS, n) */
+    const double *mean, *std, *scale, *input_scale;
+    double *moved; /* (LANES, errors + 1, CHANNELS) */
+    double *found; /* all features of a window, before they are placed */
+} Features;
+
+typedef struct {
+    int64_t n;
+    double *mean, *covariance, *noise, *physics, *recent, *width, *spread;
+    const double *returning, *widening, *scale;
+    double retained, forget, recently, outlier, quantile, missed_grows, hit_shrinks, widest, largest, smallest_recent,
+        smallest_noise, limit;
+} Layer;
+
+const char *dynssm_source(void) { return SOURCE; }
+
+#define EACH(expression)                         \
+    for (int64_t i = 0; i < lanes; i++) {        \
+        const double a = x[i], b = y[i];         \
+        (void)b;                                 \
+        z[i] = (expression);                     \
+    }                                            \
+    break
+
+static void run(const Tape *tape, int64_t lanes) {
+    const int32_t *code = tape->code;
+    for (int64_t k = 0; k < tape->operations; k++, code += 4) {
+        double *z = tape->work + (int64_t)code[1] * LANES;
+        const double *x = tape->work + (int64_t)code[2] * LANES, *y = tape->work + (int64_t)code[3] * LANES;
+        switch (code[0]) {
+        case 0: EACH(a + b);
+        case 1: EACH(a - b);
+        case 2: EACH(a * b);
+        case 3: EACH(a / b);
+        case 4: EACH(pow(a, b));
+        case 5: EACH(-a);
+        case 6: EACH(fabs(a));
+        case 7: EACH(a < b ? 1.0 : 0.0);
+        case 8: EACH(a <= b ? 1.0 : 0.0);
+        case 9: EACH(sqrt(a));
+        case 10: EACH(sin(a));
+        case 11: EACH(cos(a));
+        case 12: EACH(tan(a));
+        case 13: EACH(atan(a));
+        case 14: EACH(atan2(a, b));
+        case 15: EACH(tanh(a));
+        case 16: EACH(exp(a));
+        case 17: EACH(hypot(a, b));
+        }
+    }
+}
+
+/* Puts a window's row into a lane: state and applied inputs. */
+static inline void enter(double *work, int64_t lane, const double *row) {
+    work[lane] = row[0];
+    work[LANES + lane] = row[1];
+    work[2 * LANES + lane] = row[2];
+    work[3 * LANES + lane] = row[3] + row[5];
+    work[4 * LANES + lane] = row[4] + row[6];
+}
+
+/* Increments (count, latest, CHANNELS) from the latest rows of at most LANES windows (count, rows, COLUMNS). */
+static void over(const Car *car, const double *windows, int64_t count, int64_t rows, int64_t latest, double *moved) {
+    const int64_t first = rows - latest, states = car->states;
+    if (states) {
+        const Tape *settle = &car->settle, *carry = &car->carry;
+        for (int64_t w = 0; w < count; w++) {
+            const double *row = windows + w * rows * COLUMNS;
+            enter(settle->work, w, row);
+            settle->work[5 * LANES + w] = row[3];
+            settle->work[6 * LANES + w] = row[4];
+        }
+        run(settle, count);
+        for (int64_t s = 0; s < states; s++)
+            memcpy(car->along + s * LANES, settle->work + (int64_t)settle->outputs[s] * LANES, LANES * sizeof(double));
+        for (int64_t k = 0; k + 1 < rows; k++) {
+            double *at = car->along + k * states * LANES;
+            for (int64_t w = 0; w < count; w++) enter(carry->work, w, windows + (w * rows + k) * COLUMNS);
+            memcpy(carry->work + 5 * LANES, at, states * LANES * sizeof(double));
+            run(carry, count);
+            at += states * LANES;
+            for (int64_t s = 0; s < states; s++)
+                memcpy(at + s * LANES, carry->work + (int64_t)carry->outputs[s] * LANES, LANES * sizeof(double));
+        }
+    }
+    const Tape *step = &car->step;
+    for (int64_t begin = 0; begin < count * latest; begin += LANES) {
+        const int64_t lanes = count * latest - begin < LANES ? count * latest - begin : LANES;
+        for (int64_t i = 0; i < lanes; i++) {
+            const int64_t w = (begin + i) / latest, k = first + (begin + i) % latest;
+            enter(step->work, i, windows + (w * rows + k) * COLUMNS);
+            for (int64_t s = 0; s < states; s++)
+                step->work[(5 + s) * LANES + i] = car->along[(k * states + s) * LANES + w];
+        }
+        run(step, lanes);
+        for (int64_t i = 0; i < lanes; i++)
+            for (int64_t c = 0; c < CHANNELS; c++)
+                moved[(begin + i) * CHANNELS + c] = step->work[(int64_t)step->outputs[c] * LANES + i];
+    }
+}
+
+void dynssm_over(const Car *car, const double *windows, int64_t count, int64_t rows, int64_t latest, double *moved) {
+    for (int64_t w = 0; w < count; w += LANES)
+        over(car, windows + w * rows * COLUMNS, count - w < LANES ? count - w : LANES, rows, latest,
+             moved + w * latest * CHANNELS);
+}
+
+/* What the layer sees of a window whose physics (errors + 1, CHANNELS) is known: features (CHANNELS, n). */
+static void seen(const Features *f, const double *window, const double *moved, const double *network, double *features) {
+    const int64_t rows = f->rows, errors = f->errors;
+    const double *last = window + (rows - 1) * COLUMNS, *physics = moved + errors * CHANNELS;
+    double *at = f->found;
+    for (int64_t c = 0; c < CHANNELS; c++) *at++ = physics[c] / f->scale[c];
+    for (int64_t k = rows - f->recent; k < rows; k++)
+        for (int64_t c = 0; c < CHANNELS; c++)
+            *at++ = (window[k * COLUMNS + c] - window[(k - 1) * COLUMNS + c]) / f->scale[c];
+    for (int64_t k = rows - f->input_lags; k < rows; k++)
+        for (int64_t u = 3; u < 5; u++) {
+            const double *now = window + k * COLUMNS + u, *before = now - COLUMNS;
+            *at++ = ((now[0] + now[2]) - (before[0] + before[2])) / f->input_scale[u - 3];
+        }
+    for (int64_t k = 0; k < 5; k++) *at++ = (last[k] - f->mean[k]) / f->std[k];
+    for (int64_t c = 0; c < CHANNELS; c++) {
+        double measured = 0.0, predicted = 0.0;
+        for (int64_t k = 0; k < errors; k++) {
+            const double *row = window + (rows - errors + k) * COLUMNS + c;
+            measured += (row[0] - row[-COLUMNS]) / f->scale[c];
+            predicted += moved[k * CHANNELS + c];
+        }
+        *at++ = measured / errors - predicted / errors / f->scale[c];
+    }
+    if (f->network)
+        for (int64_t c = 0; c < CHANNELS; c++) *at++ = network[c] / f->scale[c];
+    *at = 1.0;
+    for (int64_t k = 0; k < CHANNELS * f->n; k++) features[k] = f->found[f->places[k]];
+}
+
+/* Features (count, CHANNELS, n) and the physics' increments (count, CHANNELS) of windows (count, rows, COLUMNS). */
+void dynssm_seen(const Features *f, const double *windows, int64_t count, const double *network, double *features,
+                 double *physics) {
+    const int64_t latest = f->errors + 1, size = f->rows * COLUMNS;
+    for (int64_t begin = 0; begin < count; begin += LANES) {
+        const int64_t some = count - begin < LANES ? count - begin : LANES;
+        over(&f->car, windows + begin * size, some, f->rows, latest, f->moved);
+        for (int64_t w = 0; w < some; w++) {
+            const double *moved = f->moved + w * latest * CHANNELS;
+            seen(f, windows + (begin + w) * size, moved, network ? network + (begin + w) * CHANNELS : 0,
+                 features + (begin + w) * CHANNELS * f->n);
+            memcpy(physics + (begin + w) * CHANNELS, moved + f->errors * CHANNELS, CHANNELS * sizeof(double));
+        }
+    }
+}

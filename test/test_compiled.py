@@ -1,0 +1,84 @@
+"""The compiled loops: found where they were built from this source, and never needed."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dynssm_ros import compiled
+from dynssm_ros.errors import ArtifactError
+from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.features import FeatureLayout
+from dynssm_ros.runtime.onnx_model import OnnxModel
+
+NAMES = FeatureLayout(10, 2, 3, 30, False).names
+SOURCE = Path(compiled.__file__).with_suffix(".c")
+
+
+def test_a_library_of_another_source_is_not_used(tmp_path: Path, library: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "_SOURCE", tmp_path / "compiled.c")
+    assert compiled._load() is None, "none was built"
+    shutil.copy(SOURCE, tmp_path)
+    shutil.copy(library._name, tmp_path / "_compiled.so")
+    assert compiled._load() is not None
+    monkeypatch.setenv("DYNSSM_COMPILED", "0")
+    assert compiled._load() is None, "switched off"
+    monkeypatch.delenv("DYNSSM_COMPILED")
+    (tmp_path / "compiled.c").write_text(SOURCE.read_text() + "\n")
+    assert compiled._load() is None, "the source has changed"
+    (tmp_path / "_compiled.so").unlink()  # the one that is open stays whole
+    (tmp_path / "_compiled.so").write_bytes(b"no library")
+    assert compiled._load() is None
+
+
+def test_arrays_with_gaps_are_refused() -> None:
+    with pytest.raises(ValueError, match="code: an array with gaps"):
+        compiled.TapeStructure().fill(code=np.zeros((4, 4))[:, ::2])
+
+
+def test_the_package_is_built_without_a_compiler(tmp_path: Path) -> None:
+    root = Path(__file__).resolve().parent.parent
+    (tmp_path / "dynssm_ros").mkdir()
+    shutil.copy(root / "setup.py", tmp_path)
+    shutil.copy(SOURCE, tmp_path / "dynssm_ros")
+    done = subprocess.run(
+        [sys.executable, "setup.py", "build_ext", "--inplace"],
+        cwd=tmp_path, env={"PATH": str(tmp_path), "CC": "none"}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert not list((tmp_path / "dynssm_ros").glob("*.so"))
+
+
+def test_the_layer_sees_the_same_with_and_without(
+    rls_model: Path, library: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = OnnxModel(open_artifact(rls_model))
+    scales = model.card.normalisation
+    rng = np.random.default_rng(0)
+    windows = np.array(scales.input_mean) + np.array(scales.input_std) * rng.normal(size=(70, model.H, 7))
+    windows[::5, :, :3] = 0.0
+    windows[1::5, :, 0] *= -1.0
+    monkeypatch.setattr(compiled, "LIBRARY", None)
+    expected = [model.predict(each) for each in (windows, windows[:1])]
+    monkeypatch.setattr(compiled, "LIBRARY", library)
+    for each, plain in zip((windows, windows[:1], np.asfortranarray(windows)), [*expected, expected[0]], strict=True):
+        said = model.predict(each)
+        np.testing.assert_allclose(said.seen.features, plain.seen.features, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(said.state, plain.state, rtol=1e-12, atol=1e-12)
+
+
+def test_a_layout_is_known_by_its_names() -> None:
+    for layout in (
+        FeatureLayout(10, 2, 3, 30, False),
+        FeatureLayout(2, 0, 1, 4, True),
+        FeatureLayout(1, 3, 2, 7, False),
+    ):
+        assert FeatureLayout.of(layout.names, layout.errors) == layout
+    with pytest.raises(ArtifactError, match=r"online layer: features .*; expected "):
+        FeatureLayout.of((*NAMES, "tyre temperature"), 30)
