@@ -43,6 +43,8 @@ EXTRAS = {
     "matlab": ["scipy>=1.12"],
     # what a diagnosis leaves, as a formula
     "formula": ["scikit-learn>=1.4"],
+    # what boosted trees can still learn of the errors of a model, and the tests of its other patterns
+    "residuals": ["scikit-learn>=1.4", "scipy>=1.12"],
     # seasons of logs on several processes
     "scale": ["joblib>=1.4"],
     # settings of models that are searched for

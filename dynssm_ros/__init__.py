@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from dynssm_ros.api.new_vehicle import new_vehicle
     from dynssm_ros.api.race import race
     from dynssm_ros.api.replay import replay
+    from dynssm_ros.api.residuals import residuals
     from dynssm_ros.api.season import extract_season, review_season
     from dynssm_ros.api.simulate import recorded, simulate
     from dynssm_ros.api.sweep import sweep
@@ -67,6 +68,7 @@ __all__ = [
     "register_model",
     "register_plant",
     "replay",
+    "residuals",
     "review_season",
     "save_vehicle",
     "simulate",

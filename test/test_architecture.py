@@ -45,7 +45,7 @@ ROS = {
 OWNERS = {
     "torch": {"learning"}, "casadi": {"control"}, "matplotlib": {"reporting"}, "plotly": {"reporting"},
     "jinja2": {"reporting"}, "joblib": {"parallel"}, "ray": {"parallel"}, "distributed": {"parallel"},
-    "optuna": {"evaluation"}, "sklearn": {"identification"}, "typer": {"cli"}, "rich": {"cli", "reporting"},
+    "optuna": {"evaluation"}, "sklearn": {"identification", "evaluation"}, "typer": {"cli"}, "rich": {"cli", "reporting"},
 }  # fmt: skip
 OWNERS |= {module: {"nodes"} for module in ROS}
 MOST_BY_POSITION, LONGEST_FILE = 5, 450

@@ -17,6 +17,7 @@ from dynssm_ros.api.learn import learn
 from dynssm_ros.api.new_vehicle import new_vehicle
 from dynssm_ros.api.race import race
 from dynssm_ros.api.replay import replay
+from dynssm_ros.api.residuals import residuals
 from dynssm_ros.api.season import extract_season, review_season
 from dynssm_ros.api.simulate import recorded, simulate
 from dynssm_ros.api.sweep import sweep
@@ -35,6 +36,7 @@ __all__ = [
     "race",
     "recorded",
     "replay",
+    "residuals",
     "review_season",
     "simulate",
     "sweep",

@@ -24,6 +24,7 @@ from dynssm_ros.cli.inspect import inspect
 from dynssm_ros.cli.learn import learn
 from dynssm_ros.cli.race import race
 from dynssm_ros.cli.replay import replay
+from dynssm_ros.cli.residuals import residuals
 from dynssm_ros.cli.season import season
 from dynssm_ros.cli.simulate import simulate
 from dynssm_ros.cli.sweep import sweep
@@ -54,6 +55,7 @@ for command in (
     sweep,
     evaluate,
     replay,
+    residuals,
     diagnose,
     season,
     race,

@@ -69,11 +69,17 @@ class DriveThrough(NamedTuple):
 
 
 def drive_through(
-    model: WindowModel, recording: Recording, asked: Sequence[Indices]
+    model: WindowModel, recording: Recording, asked: Sequence[Indices], *, paths: bool = True
 ) -> Iterator[tuple[DriveThrough | None, list[Indices]]]:
     """Lets the model's online layer learn wherever its window is whole and the car not slower than its minimum speed.
 
     It knows a kilobyte of numbers at each row, so it is asked batch by batch, and what it knew is given up after each.
+
+    Args:
+        model: whose layer learns.
+        recording: that is driven through.
+        asked: rows at which it will be asked, ascending.
+        paths: whether it is judged by its paths, as rollouts need it and the next step does not; takes half of the time.
 
     Yields:
         What it knew, with those rows of each ``asked`` (ascending) that the block answers for. ``None``, once and with all
@@ -90,7 +96,7 @@ def drive_through(
         seen, rows = seen_by(model, windows), windows[:, -1]
         following = recording.states(np.minimum(chunk + 1, len(recording) - 1))
         learned = along.over(seen, rows, following - rows[:, :3], chunk)
-        trusted = judge.along(windows, chunk, learned, seen)
+        trusted = judge.along(windows, chunk, learned, seen) if paths else learned.trusted
         own = [rows[block == k] for rows, block in zip(asked, blocks, strict=True)]
         yield DriveThrough(chunk, learned._replace(trusted=trusted)), own
 

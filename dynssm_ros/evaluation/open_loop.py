@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -200,9 +200,7 @@ def evaluate(
     for model in models.values():
         check_fit(model, recording)
     steps = horizon_steps(horizon_s, recording.T_s)
-    H = max(model.H for model in models.values())
-    speeds = [model.vehicle.minimum_speed for model in models.values() if model.vehicle is not None]
-    speed = max(speeds, default=0.0) if min_speed is None else min_speed
+    H, speed = window_and_speed(models.values(), min_speed)
     rows = recording.window_ends(H, 1, speed)
     starts = recording.window_ends(H, steps, speed)[::stride]
     if len(starts) == 0:
@@ -326,6 +324,13 @@ class _OneStep:
     def coverage(self) -> Vector | None:
         """Share of errors inside the stated 90 % interval, shape ``(3,)``; ``None`` if the model states no variances."""
         return np.sum(self._inside, axis=0) / self._rows if self._inside else None
+
+
+def window_and_speed(models: Iterable[WindowModel], min_speed: float | None) -> tuple[int, float]:
+    """Rows that the longest window of ``models`` has, and the speed (m/s) below which they are not scored."""
+    together = list(models)
+    speeds = [model.vehicle.minimum_speed for model in together if model.vehicle is not None]
+    return max(model.H for model in together), max(speeds, default=0.0) if min_speed is None else min_speed
 
 
 def horizon_steps(horizon_s: float, T_s: float) -> int:

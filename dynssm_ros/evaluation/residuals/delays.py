@@ -1,0 +1,104 @@
+"""Patterns of delay: errors that vanish if an input acts later, or earlier, than the model has it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.evaluation.residuals.errors import OneStepErrors
+from dynssm_ros.evaluation.residuals.evidence import chances, limited, share_explained, sums_of_blocks
+from dynssm_ros.evaluation.residuals.patterns import Pattern, Picture
+
+_LAGS_S = (-0.2, 0.5)
+"""Delays that are tried (s), those that :mod:`dynssm_ros.signals.timing` expects of cars."""
+_DRAWS = 100
+_GAIN = (0.2, 2.0)
+"""Of the change that a delay makes by the physics, which must be in the errors: another pattern has another size."""
+
+
+def delays(errors: OneStepErrors, values: Vector, channel: int, name: str, derivatives: Vector) -> Iterator[Pattern]:
+    """Looks for the delay of throttle and steering in the errors ``values`` ``(N,)`` of a channel.
+
+    Args:
+        errors: of the model.
+        values: its errors in this channel, less the patterns found before.
+        channel: number of it.
+        name: of it.
+        derivatives: of the predicted state by throttle and steering, shape ``(N, 3, 2)``.
+
+    Yields:
+        For each input the delay that explains most, with its 95 % interval by a bootstrap over blocks.
+    """
+    y = limited(values)
+    lags = np.arange(round(_LAGS_S[0] / errors.T_s), round(_LAGS_S[1] / errors.T_s) + 1)
+    for k, signal in enumerate(("throttle", "steering")):
+        column = errors.recording[("r_fb", "delta_fb")[k]] + errors.recording[("r_cmd", "delta_cmd")[k]]
+        slope = derivatives[:, channel, k]
+        now = column[errors.rows]
+        changes = [slope * (now - errors.before(column, int(lag))) for lag in lags]
+        cross = np.stack([sums_of_blocks(y * change, errors.block) for change in changes])
+        square = np.stack([sums_of_blocks(change**2, errors.block) for change in changes])
+        total = sums_of_blocks(y**2, errors.block)
+        share = _shares(cross, square, total, np.ones(len(total)))
+        share[lags == 0] = 0.0
+        best = int(np.argmax(share))
+        if share[best] <= 0:
+            continue
+        p = min(1.0, len(lags) * float(chances(cross[best][:, None])[0]))
+        fitted, apart, gain = _halves(values, changes[best], errors)
+        if not _GAIN[0] <= gain <= _GAIN[1]:
+            continue
+        value = _top(share, best, lags) * errors.T_s
+        low, high = np.percentile(_drawn(cross, square, total, lags), [2.5, 97.5]) * errors.T_s
+        low, high = min(float(low), value - errors.T_s / 2), max(float(high), value + errors.T_s / 2)
+        late = "later" if value > 0 else "earlier"
+        told = (
+            f"{name} answers the {signal} {1e3 * abs(value):.0f} ms {late} than the model "
+            f"({1e3 * low:.0f} to {1e3 * high:.0f} ms)"
+        )
+        seconds: Vector = lags * errors.T_s
+        picture = Picture("lags", 1e3 * seconds, 100 * share, f"delay of the {signal} (ms)",
+                          f"% of the squared error\nof {name} explained", None, (), (1e3 * low, 1e3 * high))  # fmt: skip
+        yield Pattern(
+            name, "delay", f"{signal}_delay", told, share_explained(values, apart), p, 2,
+            {"delay_s": round(value, 6), "low_s": round(low, 6), "high_s": round(high, 6)}, fitted, picture,
+        )  # fmt: skip
+
+
+def _shares(cross: Vector, square: Vector, total: Vector, weight: Vector) -> Vector:
+    """Share explained at each lag, of sums by lag and block, ``(lags,)``; none where the error has the other sign."""
+    across = cross @ weight
+    return np.maximum(across, 0.0) ** 2 / np.maximum((square @ weight) * (total @ weight), 1e-300)
+
+
+def _halves(values: Vector, change: Vector, errors: OneStepErrors) -> tuple[Vector, Vector, float]:
+    half = errors.block % 2
+    gains = [
+        float(values[half == h] @ change[half == h]) / max(float(change[half == h] @ change[half == h]), 1e-300)
+        for h in (0, 1)
+    ]
+    gain = float(values @ change) / max(float(change @ change), 1e-300)
+    return gain * change, np.asarray(gains)[1 - half] * change, gain
+
+
+def _top(share: Vector, best: int, lags: Indices) -> float:
+    """The top of the parabola through the best lag and its neighbours."""
+    if 0 < best < len(share) - 1 and lags[best - 1] * lags[best + 1] > 0:
+        before, at, after = share[best - 1 : best + 2]
+        bent = before - 2 * at + after
+        if bent < 0:
+            return float(lags[best] + 0.5 * (before - after) / bent)
+    return float(lags[best])
+
+
+def _drawn(cross: Vector, square: Vector, total: Vector, lags: Indices) -> Vector:
+    """Best lags of drives that are drawn from the blocks."""
+    rng, blocks, found = np.random.default_rng(0), len(total), []
+    for _ in range(_DRAWS):
+        weight = sums_of_blocks(np.ones(blocks), np.sort(rng.integers(0, blocks, blocks)))
+        weight = np.pad(weight, (0, blocks - len(weight)))
+        share = np.where(lags == 0, 0.0, _shares(cross, square, total, weight))
+        found.append(_top(share, int(np.argmax(share)), lags))
+    return np.array(found)

@@ -1,0 +1,132 @@
+"""One-step errors of a model along a recording, and what was going on then."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.evaluation.metrics import Tick, drive_through, predict_rows, silent
+from dynssm_ros.runtime.contract import WindowModel
+from dynssm_ros.signals.inputs import applied_inputs
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.track.lines import ClosedLine
+
+BLOCK_S = 3.0
+"""Length of the blocks of time that count as independent (s): actuators, filters and noise forget within one."""
+_SMALL = 1e-3
+"""Change of an input, in its usual range, that gives its derivative."""
+
+
+@dataclass(frozen=True)
+class OneStepErrors:
+    """Errors of one model at rows of a recording.
+
+    Attributes:
+        model: its name.
+        recording: that was driven.
+        rows: last row of each window, ascending; ``rows + 1`` were predicted, shape ``(N,)``.
+        values: predicted minus measured state, shape ``(N, 3)`` (m/s, m/s, rad/s).
+        line: closed line along which the place on the lap is counted; ``None`` without one.
+        wheelbase: of the car (m), by which wheels are known; ``None`` without a car.
+    """
+
+    model: str
+    recording: Recording
+    rows: Indices
+    values: Vector
+    line: ClosedLine | None = None
+    wheelbase: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def T_s(self) -> float:
+        """Sampling time (s)."""
+        return self.recording.T_s
+
+    @cached_property
+    def driven(self) -> Vector:
+        """The model's input rows from which each prediction starts, shape ``(N, 7)``."""
+        return self.recording.rows(self.rows)
+
+    @cached_property
+    def applied(self) -> Vector:
+        """Throttle and steering that act in each step, shape ``(N, 2)``."""
+        return np.stack(applied_inputs(self.driven.T), axis=1)
+
+    @cached_property
+    def seconds(self) -> Vector:
+        """Stamp of each predicted row since the recording's first full second (s), shape ``(N,)``."""
+        whole = self.recording.time[0] // 1_000_000_000 * 1_000_000_000
+        return np.asarray((self.recording.time[self.rows + 1] - whole) / 1e9)
+
+    @cached_property
+    def number(self) -> Indices:
+        """Which step of the clock each predicted row is, shape ``(N,)``."""
+        return np.rint(self.seconds / self.T_s).astype(np.intp)
+
+    @cached_property
+    def block(self) -> Indices:
+        """Number of the block of :data:`BLOCK_S` of each row, without gaps in the numbers, shape ``(N,)``."""
+        raw = (self.seconds / BLOCK_S).astype(np.intp)
+        return np.unique(raw, return_inverse=True)[1].astype(np.intp)
+
+    @cached_property
+    def run(self) -> Indices:
+        """Number of the stretch of rows in a row, shape ``(N,)``."""
+        return np.cumsum(np.diff(self.rows, prepend=self.rows[:1]) != 1).astype(np.intp)
+
+    def before(self, values: Vector, rows: int) -> Vector:
+        """``values`` ``(M, ...)`` of the recording so many rows before each window's last, held at the segment's first."""
+        at = self.rows - rows
+        first = np.searchsorted(self.recording.segment, self.recording.segment[self.rows])
+        last = np.searchsorted(self.recording.segment, self.recording.segment[self.rows], side="right") - 1
+        return np.asarray(values[np.clip(at, first, last)])
+
+
+def one_step_errors(
+    model: WindowModel,
+    recording: Recording,
+    rows: Indices,
+    *,
+    line: ClosedLine | None = None,
+    wheelbase: float | None = None,
+    tick: Tick = silent,
+) -> OneStepErrors:
+    """The errors of the predictions of ``rows + 1``; an online layer learns along the drive as it does live.
+
+    Args:
+        model: fits the recording.
+        recording: with the commands in use.
+        rows: last row of each window, ascending, as of :meth:`Recording.window_ends`.
+        line: closed line along which the place on the lap is counted.
+        wheelbase: of the car (m).
+        tick: told of the predictions made.
+    """
+    parts = [
+        prediction.state
+        for drive, (ends,) in drive_through(model, recording, (rows,), paths=False)
+        for prediction in predict_rows(model, recording, ends, tick=tick, drive=drive)
+    ]
+    predicted = np.concatenate([np.empty((0, 3)), *parts])
+    return OneStepErrors(model.name, recording, rows, predicted - recording.states(rows + 1), line, wheelbase)
+
+
+def input_derivatives(physics: WindowModel, recording: Recording, rows: Indices) -> Vector:
+    """How the predicted state depends on throttle and steering of the last row, by differences, shape ``(N, 3, 2)``."""
+    out = np.empty((len(rows), 3, 2))
+    for k, column in enumerate((3, 4)):
+        spread = float(np.std(recording.rows(rows)[:, column])) or 1.0
+        step = _SMALL * spread
+        for start in range(0, len(rows), 4096):
+            part = slice(start, start + 4096)
+            windows = np.repeat(recording.windows(rows[part], physics.H)[None], 2, axis=0).copy()
+            windows[0, :, -1, column] -= step
+            windows[1, :, -1, column] += step
+            low, high = (physics.predict(each).state for each in windows)
+            out[part, :, k] = (high - low) / (2 * step)
+    return out

@@ -1,0 +1,228 @@
+"""Patterns in where and when: errors that follow the speed, the inputs, the accelerations, the place, the heading."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.evaluation.regimes import COASTING, round_edges
+from dynssm_ros.evaluation.residuals.errors import OneStepErrors
+from dynssm_ros.evaluation.residuals.evidence import (
+    block_sums,
+    chances,
+    limited,
+    means_of_kinds,
+    share_explained,
+)
+from dynssm_ros.evaluation.residuals.patterns import Pattern, Picture
+from dynssm_ros.signals.recording import COLUMN_UNITS
+from dynssm_ros.track.lap_position import track_position
+
+_BINS, _PLACES, _HEADINGS, _TIMES = 10, 24, 8, 8
+_SMOOTH_S = 0.2
+"""Over which speeds and accelerations are averaged (s), two rows before the window's end: the noise of the measured state,
+which is in the error too, shall not look like a pattern."""
+_RATE_S = 0.1  # over which rates of the inputs are taken
+_STEP = 0.25  # of an input's usual range, within _RATE_S, that is a step of it
+_SINCE_S = (0.0, 0.1, 0.2, 0.4, 0.8)
+_STRAIGHT = 0.15  # of the usual lateral acceleration, below which the car goes straight
+_NAMED = 0.01  # chance of a bin that is named beside the strongest
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What was going on, in kinds.
+
+    Attributes:
+        name: the quantity, as in "by speed".
+        kind: of each row, ``(N,)``; ``K`` stands for none.
+        labels: of the K kinds, as in "between 9 and 15 m/s".
+        edges: of the quantity's bins, ``(K + 1,)``; ``None`` for categories.
+        unit: of the quantity.
+        sign: of each row, by which the error is taken; ``None``: as it is.
+    """
+
+    name: str
+    kind: Indices = field(repr=False)
+    labels: tuple[str, ...]
+    edges: Vector | None = None
+    unit: str = ""
+    sign: Vector | None = field(default=None, repr=False)
+
+
+def situations(errors: OneStepErrors) -> list[Situation]:
+    """The quantities by which errors are sorted, as far as the recording has them."""
+    log, T_s = errors.recording, errors.T_s
+    rows = max(3, round(_SMOOTH_S / T_s))
+    smooth = {name: _smoothed(errors, log[name], rows) for name in ("v_x", "omega")}
+    long_ago = _smoothed(errors, log["v_x"], rows, 2 + rows)
+    v_x, lateral = smooth["v_x"], smooth["v_x"] * smooth["omega"]
+    r, delta = errors.applied.T
+    found = [
+        _all(errors),
+        _bins("time of the drive", errors.seconds, "s", _TIMES),
+        _bins("speed", v_x, "m/s", _BINS),
+        _bins("throttle", r, "", _BINS),
+        _bins("steering", delta, "rad", _BINS),
+        _bins("lateral acceleration", lateral, "m/s²", _BINS),
+        _bins("longitudinal acceleration", (v_x - long_ago) / (rows * T_s), "m/s²", _BINS),
+    ]
+    back = max(1, round(_RATE_S / T_s))
+    for k, (name, unit) in enumerate((("throttle", "1/s"), ("steering", "rad/s"))):
+        column = log[("r_fb", "delta_fb")[k]] + log[("r_cmd", "delta_cmd")[k]]
+        change = column[errors.rows] - errors.before(column, back)
+        found.append(_bins(f"{name} rate", change / (back * T_s), unit, _BINS))
+        since = _since_step(errors, column, back)
+        if since is not None:
+            found.append(_after(f"a step of the {name}", *since))
+    pedal = np.digitize(r, [-COASTING, np.nextafter(COASTING, 1.0)]) if log.info.set_point == "throttle" else None
+    bend = np.digitize(lateral, np.array([-1, 1]) * _STRAIGHT * max(float(np.percentile(np.abs(lateral), 95)), 1e-9))
+    speed = found[2]
+    if pedal is not None:
+        found.append(_crossed("speed and pedal", speed, pedal, ("under braking", "coasting", "under throttle")))
+    found.append(_crossed("speed and bend", speed, bend, ("in right bends", "on straights", "in left bends")))
+    if log.has_pose:
+        turned = np.mod(log["theta"][errors.rows], 2 * np.pi)
+        found.append(_bins("heading", np.degrees(turned), "°", _HEADINGS, (0.0, 360.0)))
+        if errors.line is not None:
+            s = track_position(errors.line, log.select(errors.rows))
+            found.append(_bins("place on the lap", s, "m", _PLACES, (0.0, errors.line.length)))
+    return [each for each in found if len(each.labels) > 1 or each.name == "offset"]
+
+
+def regimes(errors: OneStepErrors, values: Vector, channel: str, sorted_by: list[Situation]) -> Iterator[Pattern]:
+    """Looks for mean errors ``values`` ``(N,)`` that differ from zero somewhere.
+
+    Yields:
+        A pattern for each quantity.
+    """
+    y = limited(values)
+    y += float(np.median(values))
+    offset = float(y.mean())
+    unit, T_s = COLUMN_UNITS[channel], errors.T_s
+    for each in sorted_by:
+        kinds = len(each.labels)
+        sign = 1.0 if each.sign is None else each.sign
+        base = 0.0 if each.name == "offset" else offset
+        sums = block_sums(sign * (y - base), errors.block, each.kind, kinds + 1)
+        chance = chances(sums[:, :kinds])
+        best = int(np.argmin(chance))
+        signed, rest = sign * values, 0.0 if each.name == "offset" else float(values.mean())
+        whole, apart = means_of_kinds(signed - sign * rest, errors.block, each.kind, kinds + 1)
+        none = each.kind == kinds
+        whole[kinds], apart[none] = 0.0, 0.0
+        share = share_explained(values - rest, sign * apart) * share_left(values, rest)
+        low, high = _neighbours(best, whole, chance, each.edges is None)
+        mean = float(
+            np.average(
+                whole[low : high + 1], weights=np.bincount(each.kind, minlength=kinds + 1)[low : high + 1] + 1e-9
+            )
+        )
+        told = f"{channel} errs by {mean / T_s:+.2g} {_per_second(unit)} {_range(each, low, high)}"
+        if each.edges is None:
+            picture = Picture("bars", np.arange(kinds, dtype=float), whole[:kinds] / T_s, each.name, _title(channel, unit),
+                              _spread(sums, each.kind, kinds) / T_s, each.labels, (low, high))  # fmt: skip
+        else:
+            title = f"{each.name} ({each.unit})" if each.unit else each.name
+            picture = Picture("bins", each.edges, whole[:kinds] / T_s, title, _title(channel, unit),
+                              _spread(sums, each.kind, kinds) / T_s, (),
+                              (float(each.edges[low]), float(each.edges[high + 1])))  # fmt: skip
+        yield Pattern(
+            channel, "where", each.name.replace(" ", "_"), told, share, min(1.0, kinds * float(chance[best])), kinds,
+            {"error_per_s": round(mean / T_s, 6)}, sign * whole[each.kind], picture,
+        )  # fmt: skip
+
+
+def share_left(values: Vector, rest: float) -> float:
+    """Share of the squared errors ``(N,)`` that is not their mean ``rest``."""
+    return float(np.sum((values - rest) ** 2)) / max(float(np.sum(values**2)), 1e-300)
+
+
+def _per_second(unit: str) -> str:
+    return f"{unit.partition('/')[0]}/s²"
+
+
+def _title(channel: str, unit: str) -> str:
+    return f"mean error of {channel} ({_per_second(unit)})"
+
+
+def _range(each: Situation, low: int, high: int) -> str:
+    if each.edges is None or high == low:
+        return each.labels[low]
+    return f"between {each.edges[low]:.4g} and {each.edges[high + 1]:.4g} {each.unit} of {each.name}".replace("  ", " ")
+
+
+def _neighbours(best: int, mean: Vector, chance: Vector, alone: bool) -> tuple[int, int]:
+    """From which bin to which the mean has the sign of the strongest, beyond chance."""
+    low = high = best
+    if not alone:
+        like = (np.sign(mean[: len(chance)]) == np.sign(mean[best])) & (chance < _NAMED)
+        while low > 0 and like[low - 1]:
+            low -= 1
+        while high < len(chance) - 1 and like[high + 1]:
+            high += 1
+    return low, high
+
+
+def _spread(sums: Vector, kind: Indices, kinds: int) -> Vector:
+    """Standard errors of the means by the scatter of the blocks, ``(kinds,)``."""
+    count = np.maximum(np.bincount(kind, minlength=kinds + 1)[:kinds], 1)
+    total = sums[:, :kinds]
+    there = np.maximum(np.count_nonzero(total, axis=0), 1)
+    centred = np.where(total != 0, total - total.sum(axis=0) / there, 0.0)
+    return np.asarray(np.sqrt((centred**2).sum(axis=0)) / count)
+
+
+def _smoothed(errors: OneStepErrors, column: Vector, rows: int, back: int = 2) -> Vector:
+    """Mean of so many rows of a column, of which the last is ``back`` rows before the window's end, ``(N,)``."""
+    return np.asarray(np.mean([errors.before(column, back + k) for k in range(rows)], axis=0))
+
+
+def _all(errors: OneStepErrors) -> Situation:
+    return Situation("offset", np.zeros(len(errors), np.intp), ("throughout",))
+
+
+def _bins(name: str, x: Vector, unit: str, most: int, ends: tuple[float, float] | None = None) -> Situation:
+    low, high = np.percentile(x, [1, 99]) if ends is None else ends
+    if not high > low:
+        return Situation(name, np.zeros(len(x), np.intp), ("",), None, unit)
+    edges = round_edges(float(low), float(high), most) if ends is None else np.linspace(low, high, most + 1)
+    kind = np.clip(np.digitize(x, edges) - 1, 0, len(edges) - 2)
+    labels = tuple(f"between {a:.4g} and {b:.4g} {unit} of {name}".replace("  ", " ") for a, b in pairwise(edges))
+    return Situation(name, kind, labels, edges, unit)
+
+
+def _crossed(name: str, speed: Situation, other: Indices, words: tuple[str, ...]) -> Situation:
+    """Each range of speed with each of other kinds."""
+    assert speed.edges is not None or len(speed.labels) == 1
+    ranges = speed.labels if speed.edges is None else [
+        f" between {a:.4g} and {b:.4g} m/s" for a, b in pairwise(speed.edges)
+    ]  # fmt: skip
+    labels = tuple(f"{word}{part}" for part in ranges for word in words)
+    return Situation(name, speed.kind * len(words) + other, labels)
+
+
+def _since_step(errors: OneStepErrors, column: Vector, back: int) -> tuple[Vector, Vector] | None:
+    """Time since the last step of an input (s) and its sign, ``(N,)`` each; ``None`` if it hardly steps."""
+    spread = float(np.ptp(np.percentile(column, [5, 95])))
+    change = np.zeros_like(column)
+    change[back:] = column[back:] - column[:-back]
+    stepped = np.abs(change) > _STEP * spread
+    if spread <= 0 or not 0 < stepped.mean() < 0.3:
+        return None
+    starts = np.flatnonzero(stepped & ~np.concatenate([[False], stepped[:-1]]))
+    last = np.searchsorted(starts, errors.rows, side="right") - 1
+    at = starts[np.maximum(last, 0)]
+    same = (last >= 0) & (errors.recording.segment[at] == errors.recording.segment[errors.rows])
+    return np.where(same, (errors.rows - at) * errors.T_s, np.inf), np.sign(change[at])
+
+
+def _after(name: str, since: Vector, sign: Vector) -> Situation:
+    kind = np.digitize(since, _SINCE_S) - 1
+    last = len(_SINCE_S) - 1
+    labels = tuple(f"{a:g} to {b:g} s after {name}" for a, b in pairwise(_SINCE_S))
+    return Situation(f"time since {name}", np.minimum(kind, last), labels, None, "", sign)

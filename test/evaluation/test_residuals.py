@@ -1,0 +1,108 @@
+"""Patterns that were planted in the errors of a simulated car are found, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dynssm_ros
+from dynssm_ros.arrays import Vector
+from dynssm_ros.errors import RecordingError
+from dynssm_ros.evaluation.residuals.anatomy import ModelAnatomy, anatomy, model_anatomy
+from dynssm_ros.evaluation.residuals.evidence import chances, holm
+from dynssm_ros.evaluation.residuals.learner import left_to_learn
+from dynssm_ros.evaluation.residuals.regimes import situations
+from dynssm_ros.evaluation.residuals.sizes import quantum
+from dynssm_ros.runtime.registry import load_model
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import load_vehicle
+
+NOISE = (0.005, 0.005, 0.02)
+
+
+@pytest.fixture(scope="module")
+def healthy() -> Recording:
+    """A minute and a half of a car that is just what its file says, with noisy sensors."""
+    return dynssm_ros.recorded(dynssm_ros.simulate("orca", "club", duration=90.0, noise=NOISE, seed=3))
+
+
+def taken_apart(recording: Recording, learn: bool = False) -> ModelAnatomy:
+    physics = load_model("single_track", load_vehicle("orca"))
+    return anatomy(recording, {"physics": physics}, physics, learn=learn).models["physics"]
+
+
+def with_column(recording: Recording, name: str, values: Vector) -> Recording:
+    return replace(recording, columns=recording.columns | {name: values})
+
+
+def test_a_healthy_car_has_no_pattern(healthy: Recording) -> None:
+    assert taken_apart(healthy).patterns == ()
+
+
+def test_a_correction_each_second_is_found_with_period_and_share(healthy: Recording) -> None:
+    clean = taken_apart(healthy).errors
+    values, mark = clean.values.copy(), clean.number % 50 == 17
+    step = 6.0 * values[:, 1].std()
+    values[mark, 1] += step
+    found, *others = model_anatomy(replace(clean, values=values), situations(clean), learn=False).patterns
+    assert (found.channel, found.family, found.size["period_s"]) == ("v_y", "time", pytest.approx(1.0))
+    assert found.size["phase_s"] == pytest.approx(17 * 0.02)
+    assert others == []
+    planted = 1.0 - np.sum((values[:, 1] - step * mark) ** 2) / np.sum(values[:, 1] ** 2)
+    assert found.share == pytest.approx(planted, abs=0.02)
+
+
+def test_an_estimate_that_is_pulled_back_each_second_is_found(healthy: Recording) -> None:
+    rows = np.arange(len(healthy))
+    drifting = healthy["v_y"] + 0.03 * (rows / 50 - np.ceil(rows / 50))
+    found = [each for each in taken_apart(with_column(healthy, "v_y", drifting)).patterns if each.channel == "v_y"]
+    assert (found[0].family, found[0].size["period_s"]) == ("time", pytest.approx(1.0))
+    assert found[0].share > 0.4
+
+
+def test_spikes_are_counted(healthy: Recording) -> None:
+    rng = np.random.default_rng(1)
+    omega = healthy["omega"].copy()
+    at = rng.choice(np.arange(100, len(omega) - 100), 25, replace=False)
+    omega[at] += rng.choice([-1.0, 1.0], 25) * 0.5
+    spikes = [each for each in taken_apart(with_column(healthy, "omega", omega)).patterns if each.kind == "spikes"]
+    (found,) = [each for each in spikes if each.channel == "omega"]
+    assert found.size["events"] == pytest.approx(25, abs=3)
+    assert found.share > 0.3
+
+
+def test_a_learner_finds_what_no_test_looks_for(healthy: Recording) -> None:
+    clean = taken_apart(healthy).errors
+    v_x, delta = clean.driven[:, 0], clean.applied[:, 1]
+    product = np.sin(2 * np.pi * (v_x - v_x.mean()) / v_x.std()) * np.tanh(delta / delta.std())
+    values = clean.values.copy()
+    values[:, 0] += 2.0 * values[:, 0].std() * product / product.std()
+    found = left_to_learn(replace(clean, values=values))["v_x"]
+    assert found.share - found.filtered > 0.2
+    assert found.p < 1e-4
+    assert next(iter(found.uses)) == "v_x"
+
+
+def test_a_drive_that_is_too_short_is_refused(healthy: Recording) -> None:
+    with pytest.raises(RecordingError, match="expected 24 s"):
+        taken_apart(healthy.select(slice(0, 600)))
+
+
+def test_a_signal_in_steps_is_known_by_its_step() -> None:
+    smooth = np.sin(np.linspace(0, 30, 4000))
+    assert quantum(np.round(smooth / 0.05) * 0.05) == pytest.approx(0.05)
+    assert quantum(smooth) == 0.0
+
+
+def test_chances_of_sums_without_a_mean_are_uniform() -> None:
+    sums = np.random.default_rng(0).standard_t(3, (30, 4000))
+    found = chances(sums)
+    assert np.mean(found < 0.05) < 0.06
+    assert np.mean(found < 0.001) < 0.002
+
+
+def test_holm_rejects_as_long_as_each_is_below_its_level() -> None:
+    assert holm([0.04, 0.001, 0.02], 0.05) == [True, True, True]
+    assert holm([0.04, 0.001, 0.03], 0.05) == [False, True, False]
