@@ -58,7 +58,7 @@ def delays(errors: OneStepErrors, values: Vector, channel: int, name: str, deriv
             f"{name} answers the {signal} {1e3 * abs(value):.0f} ms {late} than the model "
             f"({1e3 * low:.0f} to {1e3 * high:.0f} ms)"
         )
-        seconds: Vector = lags * errors.T_s
+        seconds = lags.astype(np.float64) * errors.T_s
         picture = Picture("lags", 1e3 * seconds, 100 * share, f"delay of the {signal} (ms)",
                           f"% of the squared error\nof {name} explained", None, (), (1e3 * low, 1e3 * high))  # fmt: skip
         yield Pattern(

@@ -36,7 +36,8 @@ def robust_std(errors: Vector) -> float:
 def block_sums(values: Vector, block: Indices, kind: Indices, kinds: int) -> Vector:
     """Sums of ``values`` ``(N,)`` by block and kind, shape ``(blocks, kinds)``."""
     blocks = int(block[-1]) + 1
-    return np.bincount(block * kinds + kind, values, blocks * kinds).reshape(blocks, kinds)
+    found = np.bincount(block * kinds + kind, values, blocks * kinds)
+    return np.asarray(found, np.float64).reshape(blocks, kinds)
 
 
 def sums_of_blocks(values: Vector, block: Indices) -> Vector:

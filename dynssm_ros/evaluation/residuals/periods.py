@@ -116,11 +116,12 @@ def _comb(
             f"errors of {channel} are {np.sqrt(square[peak]) / max(usual, 1e-300):.2g} times larger every {period:.4g} s, "
             f"{at:.3g} s after"
         )
+    steps = np.arange(rows, dtype=np.float64) * T_s
     told += " the full second" if abs(1.0 / period - round(1.0 / period)) < 1e-6 else " the first"
     return Pattern(
         channel, "time", kind, told, share, p, terms if kind == "period" else 1,
         {"period_s": round(period, 9), "phase_s": round(at, 9)}, fitted,
-        Picture("comb", np.arange(rows) * T_s, np.sqrt(square), "time after the first (s)", f"RMS of {channel} ({unit})"),
+        Picture("comb", steps, np.sqrt(square), "time after the first (s)", f"RMS of {channel} ({unit})"),
     )  # fmt: skip
 
 
@@ -150,7 +151,7 @@ def _echo(errors: OneStepErrors, values: Vector, y: Vector, channel: str) -> Ite
     period = float(lags[best] * errors.T_s)
     told = f"errors of {channel} come back after {period:.4g} s (autocorrelation {correlation:.2f})"
     shown = autocorrelation(values, errors.run, int(lags[-1]))[2:]
-    after: Vector = (2 + np.arange(len(shown))) * errors.T_s
+    after = (2.0 + np.arange(len(shown), dtype=np.float64)) * errors.T_s
     mark = (period - errors.T_s / 2, period + errors.T_s / 2)
     yield Pattern(
         channel, "time", "echo", told, share_explained(values, apart), min(1.0, len(lags) * float(chance[best])), 2,
@@ -181,7 +182,7 @@ def _above(power: Vector, inside: Indices) -> Vector:
     medians = np.array([np.median(part) for part in np.split(power, np.flatnonzero(np.diff(groups)) + 1)])
     centres = half * (np.arange(len(medians)) + 0.5)
     around = np.interp(inside, centres, medians) / np.log(2.0)
-    return power[inside] / np.maximum(around, 1e-300)
+    return np.asarray(power[inside] / np.maximum(around, 1e-300))
 
 
 def _is_driven(errors: OneStepErrors, grid: Indices, period: float) -> bool:

@@ -132,7 +132,7 @@ def spike_period(errors: OneStepErrors, values: Vector, channel: str) -> Iterato
     of_phase = np.bincount(errors.number % rows, square, rows) / np.maximum(
         np.bincount(errors.number % rows, minlength=rows), 1
     )
-    steps: Vector = np.arange(rows) * errors.T_s
+    steps = np.arange(rows, dtype=np.float64) * errors.T_s
     shown = Picture("comb", steps, np.sqrt(of_phase), "time in the period (s)", f"RMS of {channel} ({unit})")
     trials = longest * (longest + 1) // 2
     yield Pattern(channel, "time", "period_of_spikes", told, share, min(1.0, trials * p), 1,
