@@ -35,7 +35,7 @@ demo: $(STAMP) ## from simulated laps to a live prediction and its report
 	@$(BIN)/python -m examples.demo --out "$(OUT)"
 
 paper: OUT = out/paper
-paper: $(STAMP) ## results.md and results_race.md of benchmarks/results measured anew, about two and a half hours on two cores; continues after a kill
+paper: $(STAMP) ## results.md and results_race.md of benchmarks/results measured anew, about four hours on two cores; continues after a kill
 	@doit() { $(BIN)/python -m doit "$$@"; }
 	doit run -n $(JOBS) -f benchmarks/dodo.py group=paper out="$(OUT)" data="$(DYNSSM_DATA)" results=benchmarks/results/results.md $(ARGS) step || true
 	doit run -f benchmarks/dodo.py group=paper out="$(OUT)" data="$(DYNSSM_DATA)" results=benchmarks/results/results.md $(ARGS) document

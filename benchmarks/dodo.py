@@ -8,7 +8,7 @@ kill costs the task under way. Variables of all groups:
 - ``data``: folder of measured logs and tracks; ``DYNSSM_DATA`` if not given.
 
 Of ``paper``: ``test`` (``NAME=R.parquet``, several apart by commas: recordings to predict after training on the whole log of
-the car that has their sampling time),
+the car that has their sampling time; the settings that were tried of a model are trained by ``step:searches/*``),
 ``quick=1`` (a few epochs, one seed: tries everything out), ``plan`` (another plan than ``plan.yaml``), ``results`` (file of
 the first page). Of ``hidden_causes``: ``seed`` (of the first case), ``count`` (of cases), ``healthy=1`` (nothing is hidden in
 any), ``cars`` (those of some truths alone, apart by commas); after a change of the engine ``doit forget`` has cases diagnosed

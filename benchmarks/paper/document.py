@@ -78,6 +78,7 @@ def markdown(results: Results, pictures: Mapping[str, str]) -> str:
         horizons={_CARS[car.reference].lower(): f"{car.horizon:g} s" for car in results.plan.cars.values()},
         mid_range=MID_RANGE,
         results=results,
+        searches=tables.search_table(results).markdown() if any(results.tries.values()) else "",
         suspects=[*suspects(results.reference), *_below_persistence(results)],
         shipped={name: model.base for name, model in models.items() if model.base and model.base not in models},
         short=summary(results),

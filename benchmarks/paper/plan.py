@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -165,6 +166,18 @@ class Sweep(StrictModel):
     seeds: int = Field(default=1, ge=1)  # trainings with each; more than one where one would mislead
 
 
+class Search(StrictModel):
+    """A model with other settings than its own, each with all else as it is; which is best, validation windows say."""
+
+    split: str  # on whose training part
+    commands: Commands
+    model: str
+    tries: dict[Annotated[str, Field(pattern=r"^\w+$")], dict[str, Any]] = Field(
+        min_length=1, description="by name: fields instead of the model's, block by block"
+    )
+    seeds: int = Field(default=1, ge=1)  # trainings with each
+
+
 class Race(StrictModel):
     """Laps in closed loop; fields as the options of ``dynssm race``."""
 
@@ -209,6 +222,7 @@ class Plan(StrictModel):
     models: dict[str, Model]
     studies: dict[str, Study]
     sweeps: dict[str, Sweep] = Field(default_factory=dict)
+    searches: dict[str, Search] = Field(default_factory=dict)
     races: dict[str, Race] = Field(default_factory=dict)
     stride: int = Field(ge=1)  # rollouts start at every stride-th row
     calls: int = Field(ge=1)  # predictions of each model that are timed
@@ -236,6 +250,9 @@ class Plan(StrictModel):
         for name, sweep in self.sweeps.items():
             _check(f"sweeps.{name}.split", [sweep.split], self.splits)
             _check(f"sweeps.{name}.model", [sweep.model], self._trained(sweep.split, sweep.commands))
+        for name, search in self.searches.items():
+            _check(f"searches.{name}.split", [search.split], self.splits)
+            _check(f"searches.{name}.model", [search.model], self._trained(search.split, search.commands))
         for name, race in self.races.items():
             _check(f"races.{name}.split", [race.split], self.splits)
             _check(f"races.{name}.models", race.models, [*FIXED, *self._trained(race.split, race.commands)])
@@ -250,13 +267,13 @@ class Plan(StrictModel):
             if model in self.models
         ]
 
-    def configured(self, name: str) -> ModelConfig:
-        """Configuration of a model of the plan.
+    def configured(self, name: str, other: Mapping[str, Any] = MappingProxyType({})) -> ModelConfig:
+        """Configuration of a model of the plan, with ``other`` fields instead of its own, block by block.
 
         Raises:
             ConfigurationError: no such file, or the changes do not fit it.
         """
-        change: dict[str, Any] = {}
+        change = dict(other)
         base, seen = name, {name}
         while base in self.models:
             model = self.models[base]
@@ -327,7 +344,13 @@ class Plan(StrictModel):
         }
         races = dict(list(self.races.items())[:1])
         sweeps = {name: sweep.model_copy(update={"seeds": 1}) for name, sweep in list(self.sweeps.items())[:1]}
-        short = {"stride": quick.stride, "epochs": quick.epochs, "races": races, "sweeps": sweeps}
+        searches = {
+            name: search.model_copy(update={"seeds": 1, "tries": dict(list(search.tries.items())[:1])})
+            for name, search in list(self.searches.items())[:1]
+        }
+        short = {
+            "stride": quick.stride, "epochs": quick.epochs, "races": races, "sweeps": sweeps, "searches": searches,
+        }  # fmt: skip
         return self.model_copy(update={**short, "drives": drives, "studies": studies})
 
     @property
@@ -349,6 +372,9 @@ def load_plan(path: Path | None = None) -> Plan:
     try:
         for name in plan.models:
             plan.configured(name)
+        for search in plan.searches.values():
+            for other in search.tries.values():
+                plan.configured(search.model, other)
         for vehicle in sorted(plan.vehicles):
             configuration.find_config("vehicles", vehicle)
         for log in plan.logs.values():

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.paper.plan import Car, Plan, Study, Sweep
+from benchmarks.paper.plan import Car, Plan, Search, Study, Sweep
 from benchmarks.paper.racing import NUMBERS
 from benchmarks.paper.reference import load_reference
 from benchmarks.paper.schedule import COSTS, Site, race_key
@@ -38,6 +38,8 @@ class Results:
     rates: Mapping[str, Mapping[float, Sequence[Entry]]]
     """By the plan's names of sweeps, then by learning rate: what the trainings of all seeds say of themselves, as far
     as done."""
+    tries: Mapping[str, Mapping[str, Sequence[Entry]]]
+    """By the plan's names of searches, then by that of the try, the model as it is under an empty one first: likewise."""
     losses: Mapping[str, Entry]
     """What a training of the paper's model says of itself, by the model's name, as far as done."""
     networks: Mapping[str, tuple[int, int]]
@@ -175,6 +177,7 @@ def read_results(plan: Plan, root: Path, steps: Sequence[Step], made: str = "", 
         scores=scores,
         races={name: _read(root / race_key(name) / NUMBERS) for name in plan.races if race_key(name) in done},
         rates={name: _rates(plan, sweep, root, done) for name, sweep in plan.sweeps.items()},
+        tries={name: _tries(plan, search, root, done) for name, search in plan.searches.items()},
         losses=_losses(plan, root, done),
         networks=_networks(plan, root, done),
         costs=_read(root / COSTS)["models"] if COSTS in done else {},
@@ -204,6 +207,15 @@ def _rates(plan: Plan, sweep: Sweep, root: Path, done: Container[str]) -> dict[f
     keys = {rate: [site.rate(sweep, rate, seed) for seed in range(sweep.seeds)] for rate in sweep.rates}
     there = {rate: [key for key in each if key in done] for rate, each in keys.items()}
     return {rate: [_read(root / key / METRICS) for key in each] for rate, each in there.items() if each}
+
+
+def _tries(plan: Plan, search: Search, root: Path, done: Container[str]) -> dict[str, list[Entry]]:
+    """The trainings with each try, one for each seed; those without one are left out."""
+    site, seeds = Site(plan, search.split, search.commands), range(search.seeds)
+    keys = {"": [site.model(search.model, seed) for seed in seeds]}
+    keys |= {name: [site.attempt(search, name, seed) for seed in seeds] for name in search.tries}
+    there = {name: [key for key in each if key in done] for name, each in keys.items()}
+    return {name: [_read(root / key / METRICS) for key in each] for name, each in there.items() if each}
 
 
 def _networks(plan: Plan, root: Path, done: Container[str]) -> dict[str, tuple[int, int]]:

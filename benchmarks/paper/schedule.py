@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.paper.plan import AS_THEY_ARE, FIXED, Car, Plan, Race, Split, Sweep
+from benchmarks.paper.plan import AS_THEY_ARE, FIXED, Car, Plan, Race, Search, Split, Sweep
 from benchmarks.paper.racing import DriveLaps
 from benchmarks.paper.steps import (
     Calibrate,
@@ -42,6 +42,8 @@ def steps_of(plan: Plan, data: Path | None, given: Mapping[str, Path]) -> list[S
             trained.setdefault(step.model, []).append(step.key)
     for sweep in plan.sweeps.values():
         steps += Site(plan, sweep.split, sweep.commands).rates(sweep)
+    for search in plan.searches.values():
+        steps += Site(plan, search.split, search.commands).tries(search)
     for name, race in plan.races.items():
         steps.append(_race_step(name, race, Site(plan, race.split, race.commands), data))
     timing = TimeModels(  # last, while nothing else computes
@@ -124,6 +126,10 @@ class Site:
         """Where the training of a sweep with a learning rate and a seed lies."""
         return f"rates/{self.home}/{sweep.model}.{rate:g}.{seed}"
 
+    def attempt(self, search: Search, name: str, seed: int) -> str:
+        """Where the training of a search with a try and a seed lies."""
+        return f"searches/{self.home}/{search.model}.{name}.{seed}"
+
     @property
     def models(self) -> dict[str, range]:
         """Models with their seeds that any study wants here; no seeds for those without training."""
@@ -183,3 +189,11 @@ class Site:
                 config = plain.config.with_training(learning_rate=rate, restarts=0)
                 title = f"train {sweep.model} at the rate {rate:g}, seed {seed}, on {self.shown}"
                 yield replace(plain, key=self.rate(sweep, rate, seed), title=title, config=config)
+
+    def tries(self, search: Search) -> Iterator[Train]:
+        for seed in range(search.seeds):
+            plain = self._training(search.model, seed, {})
+            for name, other in search.tries.items():
+                config = self.plan.configured(search.model, other)
+                title = f"train {search.model} with {name}, seed {seed}, on {self.shown}"
+                yield replace(plain, key=self.attempt(search, name, seed), title=title, config=config)

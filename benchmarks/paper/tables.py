@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -184,6 +185,37 @@ def rate_table(results: Results) -> Table:
         "deviation over seeds. The loss is the mean squared error in m/s, m/s and rad/s; over that of predicting the mean "
         "change, 1 is a training that has learned nothing."
     )  # fmt: skip
+
+
+def search_table(results: Results) -> Table:
+    """The settings that were tried: what the validation windows of the training part say."""
+    columns = (
+        Column("model"), Column("trained on"), Column("instead of its own"), Column("validation loss"),
+        *(Column(TITLES[channel], UNITS[channel], "RMSE") for channel in STATE_SIGNALS), Column("best epoch"),
+    )  # fmt: skip
+    rows: list[list[Value]] = []
+    for name, tried in results.tries.items():
+        search = results.plan.searches[name]
+        for attempt, trainings in tried.items():
+            losses = [
+                np.array([min(validation_loss(t), default=np.nan), *by_name(t["validation_rmse"])]) for t in trainings
+            ]
+            other = ", ".join(settings(search.tries[attempt])) if attempt else "–"
+            epochs = ", ".join(str(t["best_epoch"]) for t in trainings)
+            rows.append([f"`{search.model}`", search.split, other, *spreads(losses), epochs])
+    return Table(
+        columns, rows, "Each row differs from the first in the settings that it names. Loss and RMSE are those of the "
+        "validation windows, one step ahead; ± is the standard deviation over seeds, where there are several."
+    )  # fmt: skip
+
+
+def settings(change: Mapping[str, Any], block: str = "") -> Iterator[str]:
+    """The fields of a change of a model file, as ``block.field value``."""
+    for name, value in change.items():
+        if isinstance(value, Mapping):
+            yield from settings(value, f"{block}{name}.")
+        else:
+            yield f"{block}{name} {f'{value:g}' if isinstance(value, float) else value}"
 
 
 def validation_loss(metrics: Entry) -> list[float]:

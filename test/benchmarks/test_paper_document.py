@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from benchmarks.paper import document, tables
-from benchmarks.paper.plan import load_plan
+from benchmarks.paper.plan import Search, load_plan
 from benchmarks.paper.reference import load_reference
 from benchmarks.paper.results import Results
 from benchmarks.paper.stale import NOTE, marked
@@ -105,8 +106,8 @@ def make(scores):
 
     def results(**changes):
         parts = {
-            "plan": plan, "reference": load_reference(), "scores": scores, "races": {}, "rates": {}, "losses": {},
-            "networks": {}, "costs": dict.fromkeys(MODELS, cost),
+            "plan": plan, "reference": load_reference(), "scores": scores, "races": {}, "rates": {}, "tries": {},
+            "losses": {}, "networks": {}, "costs": dict.fromkeys(MODELS, cost),
             "missing": {}, "reasons": {}, "made": "Made: today",
         }  # fmt: skip
         return Results(**parts | changes)
@@ -405,6 +406,25 @@ def test_learning_rates_that_were_tried_are_shown_with_the_chosen_one(make, tmp_
     document.write(results, tmp_path / "results.md")
     assert "](results_rates.png)" in (tmp_path / "results.md").read_text()
     assert (tmp_path / "results_rates.png").stat().st_size > 1000
+
+
+def test_settings_that_were_tried_are_shown_below_the_model_as_it_is(make):
+    search = Search(
+        split="ethz", commands="topics", model="dynssm_orca_paper",
+        tries={"weak": {"loss": {"parameters": 1e-5}, "training": {"batch_size": 64}}},
+    )  # fmt: skip
+    found = {
+        "history": {"validation/prediction": [3.0, 1.0, 2.0]}, "best_epoch": 2,
+        "validation_rmse": dict(zip(STATE_SIGNALS, (0.1, 0.2, 0.3), strict=True)),
+    }  # fmt: skip
+    results = make(tries={"orca": {"": [found], "weak": [found | {"best_epoch": 3}, found]}})
+    results = replace(results, plan=results.plan.model_copy(update={"searches": {"orca": search}}))
+    assert [[cell.text for cell in row] for row in tables.search_table(results).cells] == [
+        ["`dynssm_orca_paper`", "ethz", "–", "1.00", "0.100", "0.200", "0.300", "2"],
+        ["`dynssm_orca_paper`", "ethz", "loss.parameters 1e-05, training.batch_size 64", *["1.00 ± 0.00"],
+         "0.100 ± 0.000", "0.200 ± 0.000", "0.300 ± 0.000", "3, 2"],
+    ]  # fmt: skip
+    assert "loss.parameters 1e-05" in document.markdown(results, {})
 
 
 def test_a_page_is_marked_stale_as_soon_as_a_setting_changes(make, tmp_path):

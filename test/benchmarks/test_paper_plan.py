@@ -190,6 +190,8 @@ def test_learning_rates_that_are_tried_hold_the_shipped_one(plan):
         (lambda c: c["splits"]["slow"].update(car="x"), "splits.slow.car: 'x' is not one of"),
         (lambda c: c["cars"]["av21"].update(ddm="x"), "cars.av21: 'x' is not one of"),
         (lambda c: c["drives"]["oval"]["effects"].append({"name": "magic"}), "unknown effect 'magic'"),
+        (lambda c: c["searches"]["orca"]["tries"].update(x={"loss": {"y": 1}}), "loss.y: Extra inputs"),
+        (lambda c: c["searches"]["orca"].update(model="x"), "searches.orca.model: 'x' is not one of"),
         (lambda c: c.update(strides=3), "strides: Extra inputs"),
     ],
 )

@@ -14,6 +14,7 @@ from benchmarks.paper.steps import Evaluate, Take, Train, UnavailableError
 from benchmarks.tasks import output, perform, split_available
 from dynssm_ros.configuration import validate
 from dynssm_ros.files import digest
+from dynssm_ros.learning.models.registry import merge
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import load_vehicle
@@ -130,7 +131,8 @@ def test_rollouts_are_as_long_as_the_car_s_horizon(plan):
 
 def test_every_training_of_a_split_is_evaluated():
     steps = steps_of(load_plan(), None, {})
-    trained = {step.key for step in steps if isinstance(step, Train) and not step.key.startswith("rates/")}
+    others = ("rates/", "searches/")
+    trained = {step.key for step in steps if isinstance(step, Train) and not step.key.startswith(others)}
     assert trained == {key for step in steps if isinstance(step, Evaluate) for key in step.trained}
 
 
@@ -170,6 +172,17 @@ def test_a_sweep_trains_one_model_at_each_rate_without_restarts():
     plain = steps["models/slow.lookahead/ddm_av21.0"].recipe()
     same = settings[1] | {"restarts": plain["model"]["training"]["restarts"]}
     assert plain["model"]["training"] == same
+
+
+def test_a_search_trains_the_model_with_the_fields_of_each_try():
+    plan = load_plan()
+    (search,) = plan.searches.values()
+    steps = by_key(steps_of(plan, None, {}))
+    own = steps[f"models/{search.split}.{search.commands}/{search.model}.0"].recipe()
+    for name, other in search.tries.items():
+        tried = steps[f"searches/{search.split}.{search.commands}/{search.model}.{name}.0"].recipe()
+        assert tried | {"model": own["model"]} == own
+        assert tried["model"] == merge(own["model"], other) != own["model"], name
 
 
 def test_what_is_trained_on_decides_the_identity_of_a_training(plan):

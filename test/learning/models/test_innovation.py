@@ -126,11 +126,12 @@ NEURAL = "base: dynssm_paper_orca\nphysics: null\nadaptation: null\nresidual: {s
         (f"{NEURAL}inputs: {{physics_errors: true}}", "need physics"),
         ("base: dynssm\nresidual: {inputs: raw}", "residual.inputs: raw goes with inputs as in the paper"),
         (
-            "base: dynssm_paper_orca\ninnovation: {history: 0.3}",
+            "base: dynssm_paper_orca\nhistory: 0.3\ninnovation: {history: 0.3}",
             "reaches back over 16 rows; a window of 0.3 s at T_s = 0.02 s has 15",
         ),
         (
-            "base: dynssm_paper_orca\nresidual: {inputs: normalised}\ninputs: {features: increments, history: 0.3}",
+            "base: dynssm_paper_orca\nhistory: 0.3\nresidual: {inputs: normalised}\n"
+            "inputs: {features: increments, history: 0.3}",
             "inputs.history: 15 rows; a window of 0.3 s at T_s = 0.02 s has 14",
         ),
     ],
