@@ -315,3 +315,16 @@ def test_a_locked_differential_pushes_no_harder_than_the_tyres_grip() -> None:
     q, plain = act(state, applied, locked_differential={"stiffness": 60.0}), act(state, applied)
     friction = THETA.D_r / CONSTANTS.F_z0 * q.F_zr / 2
     assert plain.M_z - q.M_z == pytest.approx(friction * 0.55 * WHEELBASE, rel=1e-6)
+
+
+def test_a_gear_changes_the_drive_and_not_the_brakes() -> None:
+    shift = {"factor": 0.7, "gap": 0.4, "up": 40.0, "down": 35.0, "time_constant": 0.2}
+    assert act(gear_shift=shift).F_rx == PLAIN.F_rx  # below
+    fast, brakes = State(50.0, 0.4, 0.2), Applied(-0.3, 0.05)
+    assert act(fast, gear_shift=shift).F_d == pytest.approx(0.7 * act(fast).F_d)
+    assert act(fast, brakes, gear_shift=shift).F_rx == act(fast, brakes).F_rx
+    effect, car = build_effect("gear_shift", shift), CarModel(CONSTANTS, 0.04, (build_effect("gear_shift", shift),))
+    for state, rate in ((fast, 0.5 / 0.2), (State(30.0, 0.4, 0.2), -0.5 / 0.2), (State(37.0, 0.4, 0.2), 0.0)):
+        q = car.motion(state, APPLIED, THETA, {effect.EFFECT_STATES[0]: 0.5})
+        assert q.effect_state_rates[effect.EFFECT_STATES[0]] == pytest.approx(rate)
+        assert q.F_d == pytest.approx(0.85 * (1 - 0.4) * act(state).F_d)  # in the middle of a change

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynssm_ros.vehicle.effects.step_errors import StepErrors, recurring_step
+from dynssm_ros.vehicle.effects.step_errors import StepErrors, changed_above, recurring_step, shift_speeds
 
 
 def steps(errors: np.ndarray, T_s: float, begin: float = 6400.0) -> StepErrors:
@@ -50,3 +50,28 @@ def test_a_smooth_wave_is_no_step() -> None:
 def test_what_is_too_short_or_constant_tells_nothing() -> None:
     assert recurring_step(steps(noise(40, 1), 0.04)) is None
     assert recurring_step(steps(np.zeros((3000, 3)), 0.04)) is None
+
+
+def test_a_gear_stays_until_the_other_speed_is_passed() -> None:
+    speed = np.array([14.0, 15.0, 17.0, 14.0, 12.0, 14.0, 15.9, 16.1])
+    assert changed_above(speed, 16.0, 13.0).tolist() == [0, 0, 1, 1, 0, 0, 0, 1]
+    assert changed_above(np.array([15.0, 14.0, 12.9]), 16.0, 13.0).tolist() == [1, 1, 0]
+
+
+def accelerating(force: float, seed: int) -> StepErrors:
+    """Speeding up and slowing down between 8 and 24 m/s; from 16 m/s on the drive has ``force`` (m/s per row) more."""
+    N, T_s = 5000, 0.04
+    rng, time = np.random.default_rng(seed), T_s * np.arange(N)
+    v_x, r = 16.0 - 8.0 * np.cos(0.4 * time), 0.5 + 0.4 * np.sin(1.7 * time)
+    rows = np.zeros((7, N))
+    rows[0], rows[3] = v_x, r
+    errors = 0.02 * np.diff(rng.standard_normal((N + 1, 3)), axis=0)
+    errors[:, 0] += force * np.maximum(r, 0.0) * changed_above(v_x, 16.0, 13.0) + 0.004 * r * v_x / 16.0
+    return StepErrors(rows, {}, errors, np.zeros(N, dtype=np.intp), T_s)
+
+
+def test_the_speeds_of_a_gear_change_are_found_where_there_is_one() -> None:
+    found = shift_speeds(accelerating(0.02, 1))
+    assert found is not None
+    assert found == pytest.approx((16.0, 13.0), abs=1.0)
+    assert [shift_speeds(accelerating(0.0, seed)) for seed in range(6)] == [None] * 6

@@ -73,7 +73,7 @@ for _effect in (
     longitudinal.DriveGain, longitudinal.PowerLimit, inertia.Mass, inertia.YawInertia, tyres.Grip, tyres.FrontGrip,
     tyres.RearGrip, loads.Downforce, loads.LoadSensitivity, loads.LoadTransfer, tyres.TireRelaxation,
     tyres.CombinedSlip, environment.RoadBank, environment.RoadGrade, environment.Crosswind, tyres.GripDrift,
-    tyres.GripPatch, drivetrain.FrontDrive, drivetrain.LockedDifferential, measurement.OdometryLeverArm,
+    tyres.GripPatch, drivetrain.FrontDrive, drivetrain.GearShift, drivetrain.LockedDifferential, measurement.OdometryLeverArm,
     measurement.OdometryMisalignment, measurement.OdometryDelay, measurement.OdometryCorrection, measurement.YawRateBias,
     measurement.YawRateLag,
 ):  # fmt: skip
