@@ -183,3 +183,82 @@ void dynssm_seen(const Features *f, const double *windows, int64_t count, const 
         }
     }
 }
+
+/* The layer's weights and its variances before a step: what OnlineState.variance computes. */
+static void variance(Layer *layer, const double *features, double *stated) {
+    const int64_t n = layer->n;
+    for (int64_t c = 0; c < CHANNELS; c++) {
+        const double *P = layer->covariance + c * n * n, *f = features + c * n;
+        double explained = 0.0;
+        for (int64_t i = 0; i < n; i++) {
+            double sum = 0.0;
+            for (int64_t j = 0; j < n; j++) sum += P[i * n + j] * f[j];
+            explained += sum * f[i];
+        }
+        stated[c] = layer->width[c] * layer->width[c] * layer->recent[c] * (layer->noise[c] + explained);
+    }
+}
+
+void dynssm_variance(Layer *layer, const double *features, double *stated) { variance(layer, features, stated); }
+
+static inline double larger(double a, double b) { return a > b ? a : b; }
+static inline double smaller(double a, double b) { return a < b ? a : b; }
+
+/* Learns from a step: OnlineState.update. Returns whether it taught something. */
+static int64_t update(Layer *layer, const double *features, const double *physics, const double *increment) {
+    const int64_t n = layer->n;
+    double target[CHANNELS], sum = 0.0;
+    for (int64_t c = 0; c < CHANNELS; c++) sum += target[c] = increment[c] / layer->scale[c];
+    for (int64_t k = 0; k < CHANNELS * n; k++) sum += features[k];
+    if (!isfinite(sum)) return 0;
+    for (int64_t c = 0; c < CHANNELS; c++) {
+        double *P = layer->covariance + c * n * n, *mean = layer->mean + c * n, *spread = layer->spread;
+        const double *f = features + c * n, *widening = layer->widening + c * n * n;
+        const double *returning = layer->returning + c * n, noise = layer->noise[c], kept = layer->retained;
+        double predicted = 0.0, said = 0.0;
+        for (int64_t i = 0; i < n; i++) {
+            double row = 0.0;
+            for (int64_t j = 0; j < n; j++) row += P[i * n + j] * f[j];
+            spread[i] = row;
+            predicted += row * f[i];
+            said += mean[i] * f[i];
+        }
+        const double error = target[c] - said, size = fabs(error) / sqrt(noise + predicted);
+        const double divisor = predicted + noise * larger(1.0, size / layer->outlier);
+        for (int64_t i = 0; i < n; i++) {
+            const double gain = spread[i] / divisor;
+            mean[i] = kept * (mean[i] + gain * error) + returning[i];
+            for (int64_t j = 0; j < n; j++)
+                P[i * n + j] = kept * kept * (P[i * n + j] - gain * spread[j]) + widening[i * n + j];
+        }
+        double *recent = layer->recent + c, *width = layer->width + c;
+        const int missed = size > layer->quantile * *width * sqrt(*recent);
+        *width = smaller(larger(*width * (missed ? layer->missed_grows : layer->hit_shrinks), 1.0 / layer->widest),
+                         layer->widest);
+        const double surprise = smaller(size * size, layer->largest * *recent);
+        *recent = larger(*recent + layer->recently * (surprise - *recent), layer->smallest_recent);
+        const double square = smaller(error * error * noise / (noise + predicted), layer->largest * noise);
+        layer->noise[c] = larger(noise + layer->forget * (square - noise), layer->smallest_noise);
+        const double of_physics = (increment[c] - physics[c]) / layer->scale[c];
+        layer->physics[c] += layer->forget * (of_physics * of_physics - layer->physics[c]);
+    }
+    return 1;
+}
+
+int64_t dynssm_update(Layer *layer, const double *features, const double *physics, const double *increment) {
+    return update(layer, features, physics, increment);
+}
+
+/* Learns along rows, each from the one before if it `follows`; what is known at each goes to weights (count, CHANNELS, n),
+   stated and limits (count, CHANNELS), whether it taught something to taught (count). */
+void dynssm_along(Layer *layer, const double *features, const double *physics, const double *increments, int64_t count,
+                  const uint8_t *follows, uint8_t *taught, double *weights, double *stated, double *limits) {
+    const int64_t size = CHANNELS * layer->n;
+    for (int64_t k = 0; k < count; k++) {
+        taught[k] = follows[k] && update(layer, features + (k - 1) * size, physics + (k - 1) * CHANNELS,
+                                         increments + (k - 1) * CHANNELS);
+        memcpy(weights + k * size, layer->mean, size * sizeof(double));
+        variance(layer, features + k * size, stated + k * CHANNELS);
+        for (int64_t c = 0; c < CHANNELS; c++) limits[k * CHANNELS + c] = layer->limit * sqrt(layer->physics[c]);
+    }
+}

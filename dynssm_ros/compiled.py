@@ -20,7 +20,13 @@ from dynssm_ros.arrays import Vector
 LANES = 32
 """Rows that an operation is executed for at once; as in ``compiled.c``."""
 _KINDS = {"p": ctypes.c_void_p, "i": ctypes.c_int64}
-_FUNCTIONS = {"dynssm_over": "ppiiip", "dynssm_seen": "ppippp"}
+_FUNCTIONS = {
+    "dynssm_over": "ppiiip",
+    "dynssm_seen": "ppippp",
+    "dynssm_variance": "ppp",
+    "dynssm_update": "pppp",
+    "dynssm_along": "ppppippppp",
+}
 """The library's functions with their arguments: p a structure or the first number of an array, i a count."""
 _SOURCE = Path(__file__).with_suffix(".c")
 
@@ -35,7 +41,7 @@ def _load() -> ctypes.PyDLL | None:
             library.dynssm_source.restype = ctypes.c_char_p
             for name, arguments in _FUNCTIONS.items():
                 function = getattr(library, name)
-                function.argtypes, function.restype = [_KINDS[kind] for kind in arguments], None
+                function.argtypes, function.restype = [_KINDS[kind] for kind in arguments], ctypes.c_int64
             if library.dynssm_source().decode() == hashlib.sha256(_SOURCE.read_bytes()).hexdigest():
                 return library
         except (OSError, AttributeError):
@@ -114,4 +120,17 @@ class FeaturesStructure(Structure):
     _fields_ = [
         ("car", CarStructure),
         *_fields("rows recent input_lags errors network n", "places mean std scale input_scale moved found"),
+    ]
+
+
+class LayerStructure(Structure):
+    """``Layer`` of ``compiled.c``."""
+
+    _fields_ = [
+        *_fields(
+            "n",
+            "mean covariance noise physics recent width spread returning widening scale",
+            "retained forget recently outlier quantile missed_grows hit_shrinks widest largest smallest_recent "
+            "smallest_noise limit",
+        ),
     ]

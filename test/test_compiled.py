@@ -15,6 +15,7 @@ from dynssm_ros import compiled
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.features import FeatureLayout
+from dynssm_ros.runtime.online import Along, Learned, Seen
 from dynssm_ros.runtime.onnx_model import OnnxModel
 
 NAMES = FeatureLayout(10, 2, 3, 30, False).names
@@ -71,6 +72,45 @@ def test_the_layer_sees_the_same_with_and_without(
         said = model.predict(each)
         np.testing.assert_allclose(said.seen.features, plain.seen.features, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(said.state, plain.state, rtol=1e-12, atol=1e-12)
+
+
+def test_the_layer_learns_the_same_with_and_without(
+    rls_model: Path, library: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = OnnxModel(open_artifact(rls_model))
+    layer, scales = model.online, model.card.normalisation
+    assert layer is not None
+    rng = np.random.default_rng(1)
+    rows = np.array(scales.input_mean) + np.array(scales.input_std) * np.cumsum(rng.normal(size=(400, 7)) / 20, axis=0)
+    windows = np.lib.stride_tricks.sliding_window_view(rows, model.H, axis=0).swapaxes(1, 2)[:-1]
+    increments = np.diff(rows[model.H - 1 :, :3], axis=0)
+    increments[50] *= 30.0  # an outlier
+    increments[80] = np.nan
+    ends = np.arange(len(windows)) + (np.arange(len(windows)) >= 120)  # with a gap
+    seen, last = model._features.seen(windows), windows[:, -1]  # type: ignore[union-attr]
+    found = {}
+    for which in (None, library):
+        monkeypatch.setattr(compiled, "LIBRARY", which)
+        along, blocks = Along(layer), (slice(0, 90), slice(90, 91), slice(91, None))
+        parts = [along.over(seen.at(block), last[block], increments[block], ends[block]) for block in blocks]
+        state = layer.start()
+        for k in range(1, 60):
+            state.update(Seen(seen.features[k - 1], seen.physics[k - 1]), last[k - 1], increments[k - 1])
+        found[which] = (*Learned.joined(parts), *state.learned(seen.features[60]), along._state.steps, state.covariance)
+    for own, plain in zip(found[library], found[None], strict=True):
+        np.testing.assert_allclose(own, plain, rtol=1e-9, atol=1e-11)  # hundreds of steps on from the last digit
+
+
+def test_what_was_known_stays_when_more_is_learned(rls_model: Path) -> None:
+    layer = OnnxModel(open_artifact(rls_model)).online
+    assert layer is not None
+    state, features = layer.start(), np.ones((3, layer.mean.shape[1]))
+    known = state.learned(features)
+    before = [part.copy() for part in known]
+    state.update(Seen(features, np.zeros(3)), np.zeros(7), np.ones(3))
+    assert not np.array_equal(state.mean, before[0][0])
+    for part, kept in zip(known, before, strict=True):
+        np.testing.assert_array_equal(part, kept)
 
 
 def test_a_layout_is_known_by_its_names() -> None:

@@ -24,7 +24,9 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
+from dynssm_ros import compiled
 from dynssm_ros.arrays import Indices, Mask, Vector
+from dynssm_ros.compiled import address
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import replacing
@@ -207,6 +209,8 @@ class Along:
             increments: measured from them to the next (m/s, m/s, rad/s), ``(N, 3)``.
             ends: row numbers, ascending. The layer learns a step once the row after it is one of them.
         """
+        if compiled.LIBRARY is not None and len(ends):
+            return self._over_compiled(seen, rows, increments, ends)
         state = self._state
         one = state.learned(np.zeros_like(state.mean))
         known = Learned(*(np.empty((len(ends), *part.shape[1:])) for part in one))
@@ -219,6 +223,25 @@ class Along:
             for column, now in zip(known, state.learned(seen.features[k]), strict=True):
                 column[k] = now[0]
         return known
+
+    def _over_compiled(self, seen: Seen, rows: Vector, increments: Vector, ends: Indices) -> Learned:
+        """:meth:`over` by the compiled loop, but for the coefficients."""
+        state, count = self._state, len(ends)
+        if self._last is not None and self._last[0] == ends[0] - 1:
+            state.update(*self._last[1:])
+        else:
+            state.interrupt()
+        follows = np.diff(ends, prepend=ends[0]) == 1
+        weights, stated, limits, taught = state.along(seen, increments, follows)
+        theta = np.empty((count, len(state.coefficients.nominal)))
+        for k, (following, useful) in enumerate(zip(follows.tolist(), taught.tolist(), strict=True)):
+            if useful:
+                state.coefficients.step(rows[k - 1], increments[k - 1])
+            elif k and not following:
+                state.interrupt()
+            theta[k] = state.coefficients.theta
+        self._last = int(ends[-1]), Seen(seen.features[-1].copy(), seen.physics[-1]), rows[-1], increments[-1]
+        return Learned(weights, stated, limits, theta, np.ones(count))
 
 
 class OnlineState:
@@ -244,6 +267,7 @@ class OnlineState:
         self.width = np.ones(CHANNELS)
         self.coefficients.reset()
         self.steps = 0
+        self._compiled: compiled.LayerStructure | None = None
 
     def interrupt(self) -> None:
         """The next step does not follow on the last one."""
@@ -251,7 +275,7 @@ class OnlineState:
 
     def learned(self, features: Vector, trusted: bool = True) -> Learned:
         """What is known now, for a prediction from one window with features ``(3, n)``."""
-        now = self.mean, self.variance(features), self.limit, self.coefficients.theta, np.array(float(trusted))
+        now = self.mean.copy(), self.variance(features), self.limit, self.coefficients.theta, np.array(float(trusted))
         return Learned(*(part[None] for part in now))
 
     @property
@@ -265,8 +289,12 @@ class OnlineState:
 
         That of weights and noise, times the square of the latest errors in its units, times what makes 90 % of them fit in.
         """
+        if compiled.LIBRARY is not None:
+            stated, features = np.empty(CHANNELS), np.ascontiguousarray(features)
+            compiled.LIBRARY.dynssm_variance(self._structure().address, address(features), address(stated))
+            return stated
         spread = (self.covariance @ features[:, :, None])[:, :, 0]
-        stated: Vector = self.width**2 * self.recent * (self.noise + (spread * features).sum(axis=1))
+        stated = self.width**2 * self.recent * (self.noise + (spread * features).sum(axis=1))
         return stated
 
     def update(self, seen: Seen, row: Vector, increment: Vector) -> None:
@@ -278,6 +306,12 @@ class OnlineState:
             increment: measured (m/s, m/s, rad/s), ``(3,)``.
         """
         scale, (features, physics) = self.layer.scale, seen
+        if compiled.LIBRARY is not None:
+            arrays = [np.ascontiguousarray(each) for each in (features, physics, increment)]
+            if compiled.LIBRARY.dynssm_update(self._structure().address, *map(address, arrays)):
+                self.coefficients.step(row, increment)
+                self.steps += 1
+            return
         target = increment / scale
         if not math.isfinite(float(target.sum() + features.sum())):
             return
@@ -288,19 +322,52 @@ class OnlineState:
         size = np.abs(error) / np.sqrt(self.noise + predicted)
         inflation = np.maximum(1.0, size / _OUTLIER)
         gain = spread / (predicted + self.noise * inflation)[:, None]
-        self.mean = self.retained * (self.mean + gain * error[:, None]) + self._returning
-        self.covariance = self.retained**2 * (P - gain[:, :, None] * spread[:, None, :]) + self._widening
+        self.mean[...] = self.retained * (self.mean + gain * error[:, None]) + self._returning
+        P[...] = self.retained**2 * (P - gain[:, :, None] * spread[:, None, :]) + self._widening
         # stochastic approximation of the 90 % quantile (adaptive conformal inference, Gibbs and Candes 2021)
         missed = size > _QUANTILE * self.width * np.sqrt(self.recent)
-        self.width = np.clip(self.width * np.exp(_WIDTH_RATE * (missed - (1.0 - _COVERED))), 1 / _WIDEST, _WIDEST)
+        self.width[...] = np.clip(self.width * np.exp(_WIDTH_RATE * (missed - (1.0 - _COVERED))), 1 / _WIDEST, _WIDEST)
         surprise = np.minimum(size * size, _LARGEST**2 * self.recent)
-        self.recent = np.maximum(self.recent + self._recently * (surprise - self.recent), _SMALLEST**2)
+        self.recent[...] = np.maximum(self.recent + self._recently * (surprise - self.recent), _SMALLEST**2)
         square = np.minimum(error * error * self.noise / (self.noise + predicted), _LARGEST**2 * self.noise)
-        self.noise = np.maximum(self.noise + self._forget * (square - self.noise), _SMALLEST**2)
+        self.noise[...] = np.maximum(self.noise + self._forget * (square - self.noise), _SMALLEST**2)
         of_physics = ((increment - physics) / scale) ** 2
-        self.physics = self.physics + self._forget * (of_physics - self.physics)
+        self.physics += self._forget * (of_physics - self.physics)
         self.coefficients.step(row, increment)
         self.steps += 1
+
+    def along(self, seen: Seen, increments: Vector, follows: Mask) -> tuple[Vector, Vector, Vector, Mask]:
+        """Learns along rows by the compiled loop, each from the one before it where it ``follows``; not the coefficients.
+
+        Returns:
+            Weights, variance and limit as in :class:`Learned` at each row, and whether the row taught something.
+        """
+        count, n = len(follows), self.mean.shape[1]
+        weights, taught = np.empty((count, CHANNELS, n)), np.zeros(count, dtype=np.uint8)
+        stated, limits = np.empty((2, count, CHANNELS))
+        inputs = [np.ascontiguousarray(each) for each in (*seen, increments)]
+        assert compiled.LIBRARY is not None
+        followed = follows.astype(np.uint8)
+        compiled.LIBRARY.dynssm_along(
+            self._structure().address, *map(address, inputs), count,
+            *map(address, (followed, taught, weights, stated, limits)),
+        )  # fmt: skip
+        self.steps += int(taught.sum())
+        return weights, stated, limits, taught.astype(np.bool_)
+
+    def _structure(self) -> compiled.LayerStructure:
+        """Where the compiled loop finds what it learns; it works in these arrays."""
+        if self._compiled is None:
+            self._compiled = compiled.LayerStructure()
+            self._compiled.fill(
+                n=self.mean.shape[1], **{name: getattr(self, name) for name in _SAVED}, spread=np.zeros_like(self.mean[0]),
+                returning=self._returning, widening=self._widening, scale=self.layer.scale, retained=self.retained,
+                forget=self._forget, recently=self._recently, outlier=_OUTLIER, quantile=_QUANTILE,
+                missed_grows=math.exp(_WIDTH_RATE * _COVERED), hit_shrinks=math.exp(_WIDTH_RATE * (_COVERED - 1.0)),
+                widest=_WIDEST, largest=_LARGEST**2, smallest_recent=_SMALLEST**2, smallest_noise=_SMALLEST**2,
+                limit=_ROLLOUT_LIMIT,
+            )  # fmt: skip
+        return self._compiled
 
     def save(self, path: Path, owner: str) -> None:
         """Writes what was learned to ``path``, atomically; ``owner`` names the prior that it belongs to."""
@@ -321,7 +388,7 @@ class OnlineState:
         shapes = {name: value.shape for name, value in expected.items()}
         arrays, about = _parsed(_state_in(path), path, "online state", shapes, owner)
         for name in _SAVED:
-            setattr(self, name, arrays[name])
+            getattr(self, name)[...] = arrays[name]
         self.coefficients.restore({name: arrays[f"coefficients.{name}"] for name in coefficients})
         self.steps = int(about.get("steps", "0"))
 

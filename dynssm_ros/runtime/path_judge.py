@@ -16,7 +16,7 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.runtime.comparison import RunningComparison
 from dynssm_ros.runtime.online import Learned, OnlineLayer, Seen
-from dynssm_ros.runtime.rollout import RolloutCorrection, states_ahead
+from dynssm_ros.runtime.rollout import RolloutCorrection, Step, path_errors, states_ahead
 from dynssm_ros.vehicle import State
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S, SCALAR, Pose, advance_pose
 
@@ -87,14 +87,64 @@ class PathJudge:
             learned: what was known there.
             seen: what the layer saw there.
         """
-        trusted = np.ones(len(ends))
-        for k, row in enumerate(ends.tolist()):
-            if self._last != row - 1:
+        trusted, k = np.ones(len(ends)), 0
+        while k < len(ends):
+            if self._last != ends[k] - 1:
                 self.interrupt()
-            at, self._last = np.array([k]), row
+            at, self._last = np.array([k]), int(ends[k])
             self.step(windows[k], seen.at(at), learned.at(at))
             trusted[k] = self.trusted
+            begun = self._pair is not None and self._pair.steps == 0
+            pairs = (_unbroken(ends[k:]) - 1) // self.steps if begun else 0
+            if pairs == 0:
+                k += 1
+                continue
+            self.interrupt()
+            starts = k + self.steps * np.arange(pairs)
+            for start, (own, plain) in zip(starts, self._distances(windows, starts, learned, seen), strict=True):
+                trusted[start : start + self.steps] = self.trusted
+                self.comparison.add(plain, [own])
+            k = int(starts[-1]) + self.steps
+            self._last = int(ends[k]) - 1
         return trusted
+
+    def _distances(self, windows: Vector, starts: Indices, learned: Learned, seen: Seen) -> list[list[float]]:
+        """Sums of both paths' distances from the measured one (m), for pairs from ``starts`` on, all at once."""
+        both, H, count = np.repeat(starts, 2), windows.shape[1], len(starts)
+        ahead = windows[starts[:, None] + np.arange(1, self.steps + 1), -1]  # measured, (P, steps, 7)
+        rows = np.repeat(np.concatenate([windows[starts], ahead], axis=1), 2, axis=0)
+        step = _pair_steps(self._layer, self._see, seen.at(both), learned.at(both))
+        for _ in states_ahead(step, rows, H):
+            pass
+        predicted, start = rows[:, H:, :3], rows[:, H - 1 : H, :3]
+        distances = path_errors(start, predicted, np.repeat(ahead[..., :3], 2, axis=0), self._layer.T_s)
+        sums: list[list[float]] = distances.sum(axis=1).reshape(count, 2).tolist()
+        return sums
+
+
+def _unbroken(ends: Indices) -> int:
+    """Rows until the first gap."""
+    gaps = np.flatnonzero(np.diff(ends) != 1)
+    return int(gaps[0]) + 1 if len(gaps) else len(ends)
+
+
+def _pair_steps(layer: OnlineLayer, see: See, start: Seen, learned: Learned) -> Step:
+    """The steps of pairs of rollouts, each by the layer and by the physics less its mean error.
+
+    Args:
+        layer: the model's.
+        see: the model's graph.
+        start: what the layer sees of the first windows, each twice, ``N = 2 P``.
+        learned: what is known there, likewise.
+    """
+    alternating = np.tile([1.0, 0.0], len(start.physics) // 2)
+    correction = RolloutCorrection(layer, learned._replace(trusted=alternating))
+
+    def step(windows: Vector) -> Vector:
+        moved = correction.increments(see(windows) if correction.steps else start)
+        return np.clip(np.nan_to_num(windows[:, -1, :3] + moved, nan=_FAR), -_FAR, _FAR)
+
+    return step
 
 
 class _Pair:
@@ -102,13 +152,7 @@ class _Pair:
 
     def __init__(self, layer: OnlineLayer, see: See, window: Vector, seen: Seen, learned: Learned) -> None:
         both = np.zeros(2, dtype=np.intp)
-        start, known = seen.at(both), learned.at(both)._replace(trusted=np.array([1.0, 0.0]))
-        correction = RolloutCorrection(layer, known)
-
-        def step(windows: Vector) -> Vector:
-            moved = correction.increments(see(windows) if correction.steps else start)
-            return np.clip(np.nan_to_num(windows[:, -1, :3] + moved, nan=_FAR), -_FAR, _FAR)
-
+        step = _pair_steps(layer, see, seen.at(both), learned.at(both))
         self._T_s = layer.T_s
         self._H = len(window)
         self._rows = np.zeros((2, self._H + path_steps(layer), window.shape[1]))

@@ -107,3 +107,16 @@ def test_along_a_recording_it_is_what_it_is_live(gap):
     along = PathJudge(layer(), see).along(windows, ends, whole, see(windows))
     assert along[0] == 1.0
     assert along[-1] == 0.0
+    live, blocks, expected = PathJudge(layer(), see), PathJudge(layer(), see), []
+    for end, window in zip(ends, windows, strict=True):
+        if gap and end == 101:
+            live.interrupt()
+        live.step(window, see(window[None]), known)
+        expected.append(live.trusted)
+    np.testing.assert_array_equal(along, expected)
+    for begin in range(0, len(ends), 71):
+        block = slice(begin, begin + 71)
+        found = blocks.along(windows[block], ends[block], whole.at(np.arange(len(ends))[block]), see(windows[block]))
+        np.testing.assert_array_equal(found, along[block])
+    assert blocks.comparison.advantage == pytest.approx(live.comparison.advantage, abs=1e-12)
+    assert blocks.comparison.paths == live.comparison.paths
