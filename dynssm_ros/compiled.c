@@ -38,6 +38,16 @@ typedef struct {
 } Features;
 
 typedef struct {
+    Features features;
+    int64_t steps, mean_error; /* place of that feature */
+    int64_t judged;            /* whether states are kept within `far`, as paths that are judged are */
+    double far, minimum_speed, least, fading; /* share of the correction that a step takes off, after the first horizon */
+    double *moved;    /* (LANES, errors + steps, CHANNELS) */
+    double *now;      /* features of a window (CHANNELS, n) */
+    double *constant; /* the physics' mean error at the start (LANES, CHANNELS) */
+} Rollout;
+
+typedef struct {
     int64_t n;
     double *mean, *covariance, *noise, *physics, *recent, *width, *spread;
     const double *returning, *widening, *scale;
@@ -92,13 +102,14 @@ static inline void enter(double *work, int64_t lane, const double *row) {
     work[4 * LANES + lane] = row[4] + row[6];
 }
 
-/* Increments (count, latest, CHANNELS) from the latest rows of at most LANES windows (count, rows, COLUMNS). */
-static void over(const Car *car, const double *windows, int64_t count, int64_t rows, int64_t latest, double *moved) {
+/* Increments (count, latest, CHANNELS) from the latest rows of at most LANES windows (rows, COLUMNS), `apart` numbers apart. */
+static void over(const Car *car, const double *windows, int64_t apart, int64_t count, int64_t rows, int64_t latest,
+                 double *moved) {
     const int64_t first = rows - latest, states = car->states;
     if (states) {
         const Tape *settle = &car->settle, *carry = &car->carry;
         for (int64_t w = 0; w < count; w++) {
-            const double *row = windows + w * rows * COLUMNS;
+            const double *row = windows + w * apart;
             enter(settle->work, w, row);
             settle->work[5 * LANES + w] = row[3];
             settle->work[6 * LANES + w] = row[4];
@@ -108,7 +119,7 @@ static void over(const Car *car, const double *windows, int64_t count, int64_t r
             memcpy(car->along + s * LANES, settle->work + (int64_t)settle->outputs[s] * LANES, LANES * sizeof(double));
         for (int64_t k = 0; k + 1 < rows; k++) {
             double *at = car->along + k * states * LANES;
-            for (int64_t w = 0; w < count; w++) enter(carry->work, w, windows + (w * rows + k) * COLUMNS);
+            for (int64_t w = 0; w < count; w++) enter(carry->work, w, windows + w * apart + k * COLUMNS);
             memcpy(carry->work + 5 * LANES, at, states * LANES * sizeof(double));
             run(carry, count);
             at += states * LANES;
@@ -121,7 +132,7 @@ static void over(const Car *car, const double *windows, int64_t count, int64_t r
         const int64_t lanes = count * latest - begin < LANES ? count * latest - begin : LANES;
         for (int64_t i = 0; i < lanes; i++) {
             const int64_t w = (begin + i) / latest, k = first + (begin + i) % latest;
-            enter(step->work, i, windows + (w * rows + k) * COLUMNS);
+            enter(step->work, i, windows + w * apart + k * COLUMNS);
             for (int64_t s = 0; s < states; s++)
                 step->work[(5 + s) * LANES + i] = car->along[(k * states + s) * LANES + w];
         }
@@ -134,7 +145,7 @@ static void over(const Car *car, const double *windows, int64_t count, int64_t r
 
 void dynssm_over(const Car *car, const double *windows, int64_t count, int64_t rows, int64_t latest, double *moved) {
     for (int64_t w = 0; w < count; w += LANES)
-        over(car, windows + w * rows * COLUMNS, count - w < LANES ? count - w : LANES, rows, latest,
+        over(car, windows + w * rows * COLUMNS, rows * COLUMNS, count - w < LANES ? count - w : LANES, rows, latest,
              moved + w * latest * CHANNELS);
 }
 
@@ -162,7 +173,7 @@ static void seen(const Features *f, const double *window, const double *moved, c
         }
         *at++ = measured / errors - predicted / errors / f->scale[c];
     }
-    if (f->network)
+    if (network)
         for (int64_t c = 0; c < CHANNELS; c++) *at++ = network[c] / f->scale[c];
     *at = 1.0;
     for (int64_t k = 0; k < CHANNELS * f->n; k++) features[k] = f->found[f->places[k]];
@@ -174,7 +185,7 @@ void dynssm_seen(const Features *f, const double *windows, int64_t count, const 
     const int64_t latest = f->errors + 1, size = f->rows * COLUMNS;
     for (int64_t begin = 0; begin < count; begin += LANES) {
         const int64_t some = count - begin < LANES ? count - begin : LANES;
-        over(&f->car, windows + begin * size, some, f->rows, latest, f->moved);
+        over(&f->car, windows + begin * size, size, some, f->rows, latest, f->moved);
         for (int64_t w = 0; w < some; w++) {
             const double *moved = f->moved + w * latest * CHANNELS;
             seen(f, windows + (begin + w) * size, moved, network ? network + (begin + w) * CHANNELS : 0,
@@ -260,5 +271,60 @@ void dynssm_along(Layer *layer, const double *features, const double *physics, c
         memcpy(weights + k * size, layer->mean, size * sizeof(double));
         variance(layer, features + k * size, stated + k * CHANNELS);
         for (int64_t c = 0; c < CHANNELS; c++) limits[k * CHANNELS + c] = layer->limit * sqrt(layer->physics[c]);
+    }
+}
+
+/* Predicts `steps` rows after the first f->rows of rows (count, f->rows + steps, COLUMNS), each from those before: what
+   RolloutCorrection does of a model that is its physics and the layer. weights (count, CHANNELS, n), limits (count, CHANNELS)
+   and trusted (count) are what was known at the start. */
+void dynssm_rollout(const Rollout *r, double *all, int64_t count, const double *weights, const double *limits,
+                    const double *trusted) {
+    const Features *f = &r->features;
+    const int64_t H = f->rows, apart = (H + r->steps) * COLUMNS, n = f->n, errors = f->errors;
+    const int64_t kept_rows = (errors + r->steps) * CHANNELS, states = f->car.states;
+    for (int64_t begin = 0; begin < count; begin += LANES) {
+        const int64_t some = count - begin < LANES ? count - begin : LANES;
+        double *rows = all + begin * apart;
+        for (int64_t s = 0; s < r->steps; s++) {
+            if (s == 0 || states) { /* effect states depend on where a window begins */
+                over(&f->car, rows + s * COLUMNS, apart, some, H, errors + 1, f->moved);
+                for (int64_t w = 0; w < some; w++)
+                    memcpy(r->moved + w * kept_rows + s * CHANNELS, f->moved + w * (errors + 1) * CHANNELS,
+                           (errors + 1) * CHANNELS * sizeof(double));
+            } else {
+                const Tape *step = &f->car.step;
+                for (int64_t w = 0; w < some; w++) enter(step->work, w, rows + w * apart + (H - 1 + s) * COLUMNS);
+                run(step, some);
+                for (int64_t w = 0; w < some; w++)
+                    for (int64_t c = 0; c < CHANNELS; c++)
+                        r->moved[w * kept_rows + (errors + s) * CHANNELS + c] =
+                            step->work[(int64_t)step->outputs[c] * LANES + w];
+            }
+            const double kept = smaller(larger(2.0 - s * r->fading, 0.0), 1.0);
+            for (int64_t w = 0; w < some; w++) {
+                const double *window = rows + w * apart + s * COLUMNS, *now = window + (H - 1) * COLUMNS;
+                const double *moved = r->moved + w * kept_rows + s * CHANNELS, *physics = moved + errors * CHANNELS;
+                double *next = rows + w * apart + (H + s) * COLUMNS;
+                const int acts = fabs(now[0]) >= r->minimum_speed && now[0] >= r->least;
+                seen(f, window, moved, 0, r->now);
+                for (int64_t c = 0; c < CHANNELS; c++) {
+                    const double *own = weights + ((begin + w) * CHANNELS + c) * n, *feature = r->now + c * n;
+                    double *constant = r->constant + w * CHANNELS + c;
+                    double said = 0.0;
+                    for (int64_t i = 0; i < n; i++) said += feature[i] * own[i];
+                    said *= f->scale[c];
+                    if (s == 0) {
+                        *constant = feature[r->mean_error] * f->scale[c];
+                    } else {
+                        const double bound = limits[(begin + w) * CHANNELS + c] * f->scale[c], off = said - physics[c];
+                        const double held = off < -bound ? -bound : off > bound ? bound : off;
+                        said = physics[c] + kept * (trusted[begin + w] > 0.0 ? physics[c] + held - physics[c] : *constant);
+                    }
+                    double state = now[c] + (acts || r->judged ? said : physics[c]);
+                    if (r->judged) state = isnan(state) ? r->far : smaller(larger(state, -r->far), r->far);
+                    next[c] = state;
+                }
+            }
+        }
     }
 }

@@ -26,6 +26,7 @@ _FUNCTIONS = {
     "dynssm_variance": "ppp",
     "dynssm_update": "pppp",
     "dynssm_along": "ppppippppp",
+    "dynssm_rollout": "ppippp",
 }
 """The library's functions with their arguments: p a structure or the first number of an array, i a count."""
 _SOURCE = Path(__file__).with_suffix(".c")
@@ -120,6 +121,17 @@ class FeaturesStructure(Structure):
     _fields_ = [
         ("car", CarStructure),
         *_fields("rows recent input_lags errors network n", "places mean std scale input_scale moved found"),
+    ]
+
+
+class RolloutStructure(Structure):
+    """``Rollout`` of ``compiled.c``."""
+
+    _fields_ = [
+        ("features", FeaturesStructure),
+        *_fields("steps mean_error judged"),
+        *_fields("", "", "far minimum_speed least fading"),
+        *_fields("", "moved now constant"),
     ]
 
 

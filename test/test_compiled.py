@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ import numpy as np
 import pytest
 
 from dynssm_ros import compiled
+from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.artifact import open_artifact
-from dynssm_ros.runtime.features import FeatureLayout
+from dynssm_ros.runtime.features import FeatureLayout, LayerFeatures
 from dynssm_ros.runtime.online import Along, Learned, Seen
 from dynssm_ros.runtime.onnx_model import OnnxModel
+from dynssm_ros.runtime.path_judge import _FAR, _pair_steps
+from dynssm_ros.runtime.rollout import LayerRollout, RolloutCorrection, roll_out
 
 NAMES = FeatureLayout(10, 2, 3, 30, False).names
 SOURCE = Path(compiled.__file__).with_suffix(".c")
@@ -99,6 +103,54 @@ def test_the_layer_learns_the_same_with_and_without(
         found[which] = (*Learned.joined(parts), *state.learned(seen.features[60]), along._state.steps, state.covariance)
     for own, plain in zip(found[library], found[None], strict=True):
         np.testing.assert_allclose(own, plain, rtol=1e-9, atol=1e-11)  # hundreds of steps on from the last digit
+
+
+@pytest.mark.parametrize("effect", ["", "steering_lag", "tire_relaxation"])
+def test_rollouts_are_the_same_with_and_without(
+    rls_model: Path, orca: Any, acting: Any, library: Any, monkeypatch: pytest.MonkeyPatch, effect: str
+) -> None:
+    """Paths of a controller and paths that are judged: driving, standing, reversing, diverging."""
+    model = OnnxModel(open_artifact(rls_model))
+    scales, plain = model.card.normalisation, model.layer_features
+    assert plain is not None
+    vehicle = orca.with_effect(effect, acting(effect)) if effect else model.vehicle
+    mean, std = np.array(scales.input_mean), np.array(scales.input_std)
+    features = LayerFeatures(
+        plain.layout, vehicle, mean=mean, std=std, increment_scale=np.array(scales.increment_scale),
+        integrator="rk4", substeps=1,
+    )  # fmt: skip
+    layer = replace(model.online, vehicle=vehicle, least=0.05)
+    rng, N, steps = np.random.default_rng(2), 70, 20
+    rows = mean + std * np.cumsum(rng.normal(size=(N, model.H + steps, 7)) / 10, axis=1)
+    rows[::9, :, :3] = 0.0
+    rows[1::9, :, 0] *= -1.0
+    weights = layer.mean + 0.3 * rng.normal(size=(N, *layer.mean.shape))
+    weights[2::9] *= 50.0
+    limit, trusted = np.abs(rng.normal(size=(N, 3))), np.tile([1.0, 0.0], N // 2)
+    learned = Learned(weights, np.ones((N, 3)), limit, np.zeros((N, 17)), trusted)
+    correction = RolloutCorrection(layer, learned)
+
+    def driven(windows: Vector) -> Vector:
+        seen, now = features.seen(windows), windows[:, -1, :3]
+        states: Vector = now + np.where(layer.acts(now[:, :1]), correction.increments(seen), seen.physics)
+        return states
+
+    monkeypatch.setattr(compiled, "LIBRARY", None)
+    assert not LayerRollout(features, layer).roll_out(rows, model.H, learned)
+    first = features.seen(rows[:, : model.H])
+    judged = _pair_steps(layer, features.seen, first, learned)
+    with np.errstate(all="ignore"):
+        expected = [roll_out(step, rows, model.H) for step in (driven, judged)]
+    monkeypatch.setattr(compiled, "LIBRARY", library)
+    for farthest, states in zip((None, _FAR), expected, strict=True):
+        found = rows.copy()
+        assert LayerRollout(features, layer, farthest).roll_out(found, model.H, learned)
+        np.testing.assert_array_equal(found[:, : model.H], rows[:, : model.H])
+        np.testing.assert_array_equal(found[..., 3:], rows[..., 3:])
+        tame = np.abs(states).max(axis=(1, 2)) < 50.0
+        assert tame.sum() > N // 2
+        np.testing.assert_allclose(found[tame, model.H :, :3], states[tame], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(found[tame, model.H, :3], states[tame, 0], rtol=1e-12, atol=1e-12)
 
 
 def test_what_was_known_stays_when_more_is_learned(rls_model: Path) -> None:

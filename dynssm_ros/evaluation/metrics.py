@@ -14,6 +14,7 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.runtime.contract import WindowModel, WindowPrediction, seen_by
 from dynssm_ros.runtime.online import Along, Learned
+from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.path_judge import PathJudge
 from dynssm_ros.runtime.rollout import RolloutCorrection
 from dynssm_ros.signals.recording import Recording
@@ -89,7 +90,8 @@ def drive_through(
     if layer is None or len(ends := recording.window_ends(H, 0, layer.minimum_speed, layer.least)) == 0:
         yield None, list(asked)
         return
-    along, judge = Along(layer), PathJudge(layer, partial(seen_by, model))
+    features = model.layer_features if isinstance(model, OnnxModel) else None
+    along, judge = Along(layer), PathJudge(layer, partial(seen_by, model), features)
     blocks = [(np.searchsorted(ends, rows, side="right") - 1).clip(0) // BATCH for rows in asked]
     for k, chunk in enumerate(batches(ends)):
         windows = recording.windows(chunk, H)

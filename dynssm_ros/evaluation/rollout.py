@@ -19,7 +19,8 @@ from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.metrics import DriveThrough, Tick, batches, silent
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.online import Learned
-from dynssm_ros.runtime.rollout import RolloutCorrection, path_errors, roll_out, step_of
+from dynssm_ros.runtime.onnx_model import OnnxModel
+from dynssm_ros.runtime.rollout import LayerRollout, RolloutCorrection, path_errors, roll_out, step_of
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle.kinematics import path
 
@@ -75,6 +76,10 @@ def predicted_states(
     """
     stretches, layer = recording.windows(starts, model.H, steps), model.online
     correction = None if layer is None or learned is None else RolloutCorrection(layer, learned)
+    if correction is not None and isinstance(model, OnnxModel) and (features := model.layer_features) is not None:
+        rows = np.array(stretches, order="C")
+        if LayerRollout(features, correction.layer).roll_out(rows, model.H, correction.learned):
+            return rows[:, model.H :, :3], stretches[:, model.H :, :3]
     return roll_out(step_of(model, correction), stretches, model.H), stretches[:, model.H :, :3]
 
 

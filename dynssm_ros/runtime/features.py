@@ -147,7 +147,7 @@ class LayerFeatures:
     def seen(self, windows: Vector, network: Vector | None = None) -> Seen:
         """What the layer sees of ``windows`` ``(N, H, 7)``; ``network`` are its increments ``(N, 3)`` (m/s, m/s, rad/s)."""
         if compiled.LIBRARY is not None:
-            structure = self._structure(windows.shape[1])
+            structure = self.structure(windows.shape[1])
             if structure is not None:
                 return self._seen_compiled(compiled.LIBRARY, structure, windows, network)
         layout, count = self.layout, len(windows)
@@ -176,7 +176,7 @@ class LayerFeatures:
         found = np.concatenate([*parts, np.ones((count, 1))], axis=1)
         return Seen(found[:, self._places], physics)
 
-    def _structure(self, rows: int) -> compiled.FeaturesStructure | None:
+    def structure(self, rows: int) -> compiled.FeaturesStructure | None:
         """What the compiled loop needs to know for windows of so many rows; ``None`` if it cannot do it."""
         if rows not in self._compiled:
             layout, car = self.layout, car_structure(self._car, np.array(self._theta), rows)

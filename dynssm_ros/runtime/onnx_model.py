@@ -65,6 +65,11 @@ class OnnxModel:
             self._graph = Graph(self.artifact.onnx, self.artifact.graph, self.H, len(WINDOW_COLUMNS))
 
     @property
+    def layer_features(self) -> LayerFeatures | None:
+        """What the online layer sees, if nothing else predicts beside it: there is no network."""
+        return self._features if self.online is not None and self._graph is None else None
+
+    @property
     def origin(self) -> str:
         """Kind, window, command protocol, vehicle and physics."""
         card = self.card

@@ -15,8 +15,9 @@ import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.runtime.comparison import RunningComparison
+from dynssm_ros.runtime.features import LayerFeatures
 from dynssm_ros.runtime.online import Learned, OnlineLayer, Seen
-from dynssm_ros.runtime.rollout import RolloutCorrection, Step, path_errors, states_ahead
+from dynssm_ros.runtime.rollout import LayerRollout, RolloutCorrection, Step, path_errors, states_ahead
 from dynssm_ros.vehicle import State
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S, SCALAR, Pose, advance_pose
 
@@ -39,11 +40,13 @@ class PathJudge:
     Args:
         layer: the model's.
         see: the model's graph.
+        features: what the layer sees, if nothing but physics and layer predicts.
     """
 
-    def __init__(self, layer: OnlineLayer, see: See) -> None:
+    def __init__(self, layer: OnlineLayer, see: See, features: LayerFeatures | None = None) -> None:
         self._layer = layer
         self._see = see
+        self._rollout = None if features is None else LayerRollout(features, layer, _FAR)
         self.steps = path_steps(layer)
         self.reset()
 
@@ -113,9 +116,11 @@ class PathJudge:
         both, H, count = np.repeat(starts, 2), windows.shape[1], len(starts)
         ahead = windows[starts[:, None] + np.arange(1, self.steps + 1), -1]  # measured, (P, steps, 7)
         rows = np.repeat(np.concatenate([windows[starts], ahead], axis=1), 2, axis=0)
-        step = _pair_steps(self._layer, self._see, seen.at(both), learned.at(both))
-        for _ in states_ahead(step, rows, H):
-            pass
+        known = learned.at(both)._replace(trusted=np.tile([1.0, 0.0], count))
+        if self._rollout is None or not self._rollout.roll_out(rows, H, known):
+            step = _pair_steps(self._layer, self._see, seen.at(both), known)
+            for _ in states_ahead(step, rows, H):
+                pass
         predicted, start = rows[:, H:, :3], rows[:, H - 1 : H, :3]
         distances = path_errors(start, predicted, np.repeat(ahead[..., :3], 2, axis=0), self._layer.T_s)
         sums: list[list[float]] = distances.sum(axis=1).reshape(count, 2).tolist()
@@ -129,7 +134,7 @@ def _unbroken(ends: Indices) -> int:
 
 
 def _pair_steps(layer: OnlineLayer, see: See, start: Seen, learned: Learned) -> Step:
-    """The steps of pairs of rollouts, each by the layer and by the physics less its mean error.
+    """The steps of pairs of rollouts, each by the layer and by the physics less its mean error, as ``trusted`` says.
 
     Args:
         layer: the model's.
@@ -137,8 +142,7 @@ def _pair_steps(layer: OnlineLayer, see: See, start: Seen, learned: Learned) -> 
         start: what the layer sees of the first windows, each twice, ``N = 2 P``.
         learned: what is known there, likewise.
     """
-    alternating = np.tile([1.0, 0.0], len(start.physics) // 2)
-    correction = RolloutCorrection(layer, learned._replace(trusted=alternating))
+    correction = RolloutCorrection(layer, learned)
 
     def step(windows: Vector) -> Vector:
         moved = correction.increments(see(windows) if correction.steps else start)
@@ -152,7 +156,8 @@ class _Pair:
 
     def __init__(self, layer: OnlineLayer, see: See, window: Vector, seen: Seen, learned: Learned) -> None:
         both = np.zeros(2, dtype=np.intp)
-        step = _pair_steps(layer, see, seen.at(both), learned.at(both))
+        known = learned.at(both)._replace(trusted=np.array([1.0, 0.0]))
+        step = _pair_steps(layer, see, seen.at(both), known)
         self._T_s = layer.T_s
         self._H = len(window)
         self._rows = np.zeros((2, self._H + path_steps(layer), window.shape[1]))

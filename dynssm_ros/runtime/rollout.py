@@ -10,10 +10,13 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from dynssm_ros import compiled
 from dynssm_ros.arrays import Vector
+from dynssm_ros.compiled import address
 from dynssm_ros.runtime.contract import WindowModel, WindowPrediction
-from dynssm_ros.runtime.online import Learned, OnlineLayer, Seen
-from dynssm_ros.vehicle.kinematics import path
+from dynssm_ros.runtime.features import LayerFeatures
+from dynssm_ros.runtime.online import CHANNELS, MEAN_ERROR, Learned, OnlineLayer, Seen
+from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S, path
 
 Step = Callable[[Vector], Vector]
 """From windows ``(N, H, 7)`` to the states of the next rows ``(N, 3)`` (m/s, m/s, rad/s)."""
@@ -94,6 +97,52 @@ def roll_out(step: Step, rows: Vector, H: int) -> Vector:
     for _ in states_ahead(step, rows, H):
         pass
     return rows[:, H:, :3]
+
+
+class LayerRollout:
+    """Rollouts of a model that is its physics and its online layer, by the compiled loop.
+
+    Args:
+        features: what the layer sees.
+        layer: the model's.
+        farthest: to which the absolute of states is limited, and NaN set (m/s, rad/s); ``None``: states are as they come, and
+            the physics' alone where the layer does not act.
+    """
+
+    def __init__(self, features: LayerFeatures, layer: OnlineLayer, farthest: float | None = None) -> None:
+        self._features, self._layer, self._farthest = features, layer, farthest
+        self._structures: dict[tuple[int, int], compiled.RolloutStructure | None] = {}
+
+    def roll_out(self, rows: Vector, H: int, learned: Learned) -> bool:
+        """Predicts the states of ``rows`` ``(N, H + steps, 7)`` after the first ``H``, in place.
+
+        ``learned`` is what was known at the start. Returns whether that could be done; else nothing has changed.
+        """
+        library = compiled.LIBRARY
+        structure = None if library is None else self._structure(H, rows.shape[1] - H)
+        if library is None or structure is None:
+            return False
+        assert rows.flags.c_contiguous
+        known = [np.ascontiguousarray(each) for each in (learned.weights, learned.limit, learned.trusted)]
+        library.dynssm_rollout(structure.address, address(rows), len(rows), *map(address, known))
+        return True
+
+    def _structure(self, H: int, steps: int) -> compiled.RolloutStructure | None:
+        if (H, steps) in self._structures:
+            return self._structures[H, steps]
+        layer, layout, structure = self._layer, self._features.layout, None
+        features = None if layout.network else self._features.structure(H)
+        if features is not None:
+            n, structure = len(layout.names), compiled.RolloutStructure()
+            structure.fill(
+                features=features, steps=steps, mean_error=layout.names.index(MEAN_ERROR),
+                judged=self._farthest is not None, far=self._farthest or 0.0, minimum_speed=layer.minimum_speed,
+                least=layer.least, fading=layer.T_s / PATH_HORIZON_S,
+                moved=np.zeros((compiled.LANES, layout.errors + steps, CHANNELS)), now=np.zeros((CHANNELS, n)),
+                constant=np.zeros((compiled.LANES, CHANNELS)),
+            )  # fmt: skip
+        self._structures[H, steps] = structure
+        return structure
 
 
 def path_errors(start: Vector, predicted: Vector, measured: Vector, T_s: float) -> Vector:
