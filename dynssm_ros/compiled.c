@@ -328,3 +328,25 @@ void dynssm_rollout(const Rollout *r, double *all, int64_t count, const double *
         }
     }
 }
+
+/* Values at the times `grid` (rows) of signals whose samples are in ring buffers, to columns (count, rows): linear between
+   samples as numpy's interp, held beyond them; of signals that are `held` the last value at or before the times `late`.
+   Each signal has a row of places: where its oldest sample's time and value lie, their number, whether it is held. */
+void dynssm_sample(const int64_t *places, int64_t count, const double *grid, const double *late, int64_t rows, double *columns) {
+    for (int64_t s = 0; s < count; s++, places += 4, columns += rows) {
+        const double *t = (const double *)(intptr_t)places[0], *v = (const double *)(intptr_t)places[1];
+        const double *wanted = places[3] ? late : grid;
+        const int64_t last = places[2] - 1;
+        int64_t j = last; /* times ascend, and the newest rows are asked for: back from the newest sample */
+        for (int64_t k = rows - 1; k >= 0; k--) {
+            const double x = wanted[k];
+            while (j > 0 && t[j] > x) j--;
+            if (places[3] || j == last || t[j] >= x)
+                columns[k] = v[j];
+            else {
+                const double slope = (v[j + 1] - v[j]) / (t[j + 1] - t[j]);
+                columns[k] = slope * (x - t[j]) + v[j];
+            }
+        }
+    }
+}

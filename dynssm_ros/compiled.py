@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from dynssm_ros.arrays import Vector
+import numpy.typing as npt
 
 LANES = 32
 """Rows that an operation is executed for at once; as in ``compiled.c``."""
@@ -27,6 +26,7 @@ _FUNCTIONS = {
     "dynssm_update": "pppp",
     "dynssm_along": "ppppippppp",
     "dynssm_rollout": "ppippp",
+    "dynssm_sample": "pippip",
 }
 """The library's functions with their arguments: p a structure or the first number of an array, i a count."""
 _SOURCE = Path(__file__).with_suffix(".c")
@@ -54,7 +54,7 @@ LIBRARY = _load()
 """``None`` where there is none; tests set it to that."""
 
 
-def address(array: Vector | None) -> int | None:
+def address(array: npt.NDArray[Any] | None) -> int | None:
     """Where the numbers of a contiguous array lie."""
     if array is None:
         return None

@@ -21,6 +21,8 @@ from dynssm_ros.runtime.online import Along, Learned, Seen
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.path_judge import _FAR, _pair_steps
 from dynssm_ros.runtime.rollout import LayerRollout, RolloutCorrection, roll_out
+from dynssm_ros.signals.history import History, Refusal
+from dynssm_ros.signals.signal_map import load_signal_map
 
 NAMES = FeatureLayout(10, 2, 3, 30, False).names
 SOURCE = Path(compiled.__file__).with_suffix(".c")
@@ -151,6 +153,26 @@ def test_rollouts_are_the_same_with_and_without(
         assert tame.sum() > N // 2
         np.testing.assert_allclose(found[tame, model.H :, :3], states[tame], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(found[tame, model.H, :3], states[tame, 0], rtol=1e-12, atol=1e-12)
+
+
+def test_windows_are_the_same_with_and_without(library: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At odd rates, before the oldest and after the newest sample, of signals that are held, from buffers that turn over."""
+    history = History(load_signal_map("default"), 0.02, 30, max_age=1.0, held=("throttle_command",))
+    rng, compared = np.random.default_rng(3), 0
+    for k in range(600):
+        stamp = 10**18 + k * 7_000_000 + int(rng.integers(0, 3_000_000))
+        names = history.names if k % 3 else history.names[:3]
+        history.add(stamp, dict(zip(names, rng.normal(size=len(names)).tolist(), strict=True)))
+        windows = []
+        for which in (None, library):
+            monkeypatch.setattr(compiled, "LIBRARY", which)
+            windows.append(history.window(stamp))
+        if not isinstance(windows[0], Refusal):
+            np.testing.assert_array_equal(windows[1], windows[0])
+            compared += 1
+        else:
+            assert windows[1] is windows[0]
+    assert compared > 400
 
 
 def test_what_was_known_stays_when_more_is_learned(rls_model: Path) -> None:

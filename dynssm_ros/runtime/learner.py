@@ -38,6 +38,7 @@ class OnlineLearner:
         self._judges = judges
         self._last: _Row | None = None
         self._unjudged: tuple[Vector, Seen, Learned] | None = None
+        self._known: tuple[Seen, Learned] | None = None
         self._correction: RolloutCorrection | None = None
 
     def continued_with(self, model: OnnxModel) -> OnlineLearner:
@@ -50,7 +51,7 @@ class OnlineLearner:
         """Forgets the drive."""
         self.state.reset()
         self._judge.reset()
-        self._last = self._unjudged = None
+        self._last = self._unjudged = self._known = None
 
     def interrupt(self) -> None:
         """The next row is not one T_s after the last one."""
@@ -68,7 +69,7 @@ class OnlineLearner:
             Whether the row after it can be learned: the car was not too slow.
         """
         assert predicted.seen is not None
-        last, self._last = self._last, None
+        last, self._last, self._known = self._last, None, None
         fast = self._is_fast(window)
         if last is None or not fast:
             self.state.interrupt()
@@ -81,13 +82,17 @@ class OnlineLearner:
             self._last = _Row.of(window, predicted)
             if self._judges:
                 self.judge_paths()
-                self._unjudged = window, predicted.seen, self.learned(predicted.seen)
+                known = self.learned(predicted.seen)
+                self._known = predicted.seen, known
+                self._unjudged = window, predicted.seen, known
         return fast
 
     def corrected(self, window: Vector, predicted: WindowPrediction) -> WindowPrediction:
         """What the model predicts from ``window`` ``(H, 7)``, corrected by what was learned; rollouts go on from there."""
         assert predicted.seen is not None
-        self._correction = RolloutCorrection(self.layer, self.learned(predicted.seen))
+        seen, known = predicted.seen, self._known  # nothing was learned since
+        learned = self.learned(seen) if known is None or known[0] is not seen else known[1]
+        self._correction = RolloutCorrection(self.layer, learned)
         return self._correction.corrected(predicted, window[None])
 
     def rollout(self) -> RolloutCorrection:

@@ -290,11 +290,12 @@ class OnlineState:
         That of weights and noise, times the square of the latest errors in its units, times what makes 90 % of them fit in.
         """
         if compiled.LIBRARY is not None:
-            stated, features = np.empty(CHANNELS), np.ascontiguousarray(features)
-            compiled.LIBRARY.dynssm_variance(self._structure().address, address(features), address(stated))
-            return stated
+            found: Vector = np.empty(CHANNELS)
+            features = np.ascontiguousarray(features)
+            compiled.LIBRARY.dynssm_variance(self._structure().address, address(features), address(found))
+            return found
         spread = (self.covariance @ features[:, :, None])[:, :, 0]
-        stated = self.width**2 * self.recent * (self.noise + (spread * features).sum(axis=1))
+        stated: Vector = self.width**2 * self.recent * (self.noise + (spread * features).sum(axis=1))
         return stated
 
     def update(self, seen: Seen, row: Vector, increment: Vector) -> None:
@@ -345,7 +346,7 @@ class OnlineState:
         count, n = len(follows), self.mean.shape[1]
         weights, taught = np.empty((count, CHANNELS, n)), np.zeros(count, dtype=np.uint8)
         stated, limits = np.empty((2, count, CHANNELS))
-        inputs = [np.ascontiguousarray(each) for each in (*seen, increments)]
+        inputs = [np.ascontiguousarray(each) for each in (seen.features, seen.physics, increments)]
         assert compiled.LIBRARY is not None
         followed = follows.astype(np.uint8)
         compiled.LIBRARY.dynssm_along(

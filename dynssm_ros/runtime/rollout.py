@@ -37,14 +37,17 @@ class RolloutCorrection:
         self.learned = learned
         self.steps = 0
         """Taken so far."""
+        self._start: Vector | None = None  # features of the first step
         self._mean_error: Vector | None = None
 
     def increments(self, seen: Seen) -> Vector:
         """Increments ``(N, 3)`` (m/s, m/s, rad/s) of the next step, from what the layer sees there."""
-        if self._mean_error is None:
-            self._mean_error = self.layer.mean_error(seen.features)
+        if self._start is None:
+            self._start = seen.features
             moved = self.layer.increments(seen.features, self.learned.weights)
         else:
+            if self._mean_error is None:
+                self._mean_error = self.layer.mean_error(self._start)
             moved = self.layer.in_rollout(seen, self.learned, self._mean_error, self.steps)
         self.steps += 1
         return moved

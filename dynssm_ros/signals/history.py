@@ -12,8 +12,10 @@ from math import isfinite
 
 import numpy as np
 
+from dynssm_ros import compiled
 from dynssm_ros.arrays import Vector
-from dynssm_ros.signals.inputs import model_inputs
+from dynssm_ros.compiled import address
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS, model_inputs
 from dynssm_ros.signals.signal_map import ROUNDING, SENSORS, STATE_SIGNALS, SignalMap
 
 
@@ -41,6 +43,9 @@ class Refusal(Enum):
     IMPLAUSIBLE_PREDICTION = "the model's output is beyond what the car can do"
 
 
+_NUMBER = 8  # bytes
+
+
 class RingBuffer:
     """The newest samples of one signal, in order, without allocation while running.
 
@@ -54,6 +59,7 @@ class RingBuffer:
         self._times = np.empty(2 * capacity)
         self._values = np.empty(2 * capacity)
         self._capacity = capacity
+        self._addresses = address(self._times) or 0, address(self._values) or 0
         self._next = 0
         self._count = 0
         self.newest = -np.inf
@@ -81,6 +87,12 @@ class RingBuffer:
     def oldest(self) -> float:
         """Time of the oldest sample, ``inf`` if empty."""
         return float(self._times[self._next + self._capacity - self._count]) if self._count else np.inf
+
+    def place(self, held: bool) -> tuple[int, int, int, bool]:
+        """Where the compiled loop finds the samples: the oldest one's time and value, their number; whether it holds them."""
+        start = _NUMBER * (self._next + self._capacity - self._count)
+        times, values = self._addresses
+        return times + start, values + start, self._count, held
 
     def interpolate(self, grid: Vector) -> Vector:
         """Values at the times ``grid``, linear between samples and held beyond the newest."""
@@ -237,11 +249,25 @@ class History:
             return Refusal.FILLING
         grid = self._offsets + now
         late = grid + self._slack
-        sampled = {
-            name: buffer.held(late) if name in self._held else buffer.interpolate(grid)
-            for name, buffer in self._buffers.items()
-        }
-        return np.stack([*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled)], axis=1)
+        sampled = self._sampled(grid, late)
+        window = np.empty((len(grid), len(WINDOW_COLUMNS)))
+        for k, column in enumerate((*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled))):
+            window[:, k] = column
+        return window
+
+    def _sampled(self, grid: Vector, late: Vector) -> dict[str, Vector]:
+        """The signals at the times ``grid``; those that are held at ``late``, which is a little later."""
+        if compiled.LIBRARY is None:
+            return {
+                name: buffer.held(late) if name in self._held else buffer.interpolate(grid)
+                for name, buffer in self._buffers.items()
+            }
+        places = np.array([buffer.place(name in self._held) for name, buffer in self._buffers.items()], dtype=np.int64)
+        columns = np.empty((len(places), len(grid)))
+        compiled.LIBRARY.dynssm_sample(
+            address(places), len(places), address(grid), address(late), len(grid), address(columns)
+        )
+        return dict(zip(self._buffers, columns, strict=True))
 
     def ages(self, stamp: int) -> dict[str, float]:
         """Age of the newest sample of each signal at ``stamp`` (s); infinite where none was received."""
