@@ -19,9 +19,10 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from dynssm_ros import compiled
@@ -348,11 +349,8 @@ class OnlineState:
         stated, limits = np.empty((2, count, CHANNELS))
         inputs = [np.ascontiguousarray(each) for each in (seen.features, seen.physics, increments)]
         assert compiled.LIBRARY is not None
-        followed = follows.astype(np.uint8)
-        compiled.LIBRARY.dynssm_along(
-            self._structure().address, *map(address, inputs), count,
-            *map(address, (followed, taught, weights, stated, limits)),
-        )  # fmt: skip
+        others: list[npt.NDArray[Any]] = [follows.astype(np.uint8), taught, weights, stated, limits]
+        compiled.LIBRARY.dynssm_along(self._structure().address, *map(address, inputs), count, *map(address, others))
         self.steps += int(taught.sum())
         return weights, stated, limits, taught.astype(np.bool_)
 
