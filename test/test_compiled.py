@@ -15,9 +15,10 @@ import pytest
 from dynssm_ros import compiled
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ArtifactError
+from dynssm_ros.runtime.along import Along
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.features import FeatureLayout, LayerFeatures
-from dynssm_ros.runtime.online import Along, Learned, Seen
+from dynssm_ros.runtime.online import Learned, Seen
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.path_judge import _FAR, _pair_steps
 from dynssm_ros.runtime.rollout import LayerRollout, RolloutCorrection, roll_out

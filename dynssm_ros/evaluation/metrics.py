@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.runtime.along import Along
 from dynssm_ros.runtime.contract import WindowModel, WindowPrediction, seen_by
-from dynssm_ros.runtime.online import Along, Learned
+from dynssm_ros.runtime.online import Learned
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.path_judge import PathJudge
 from dynssm_ros.runtime.rollout import RolloutCorrection

@@ -10,10 +10,11 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.learning.models.base import OnlineConfig
+from dynssm_ros.runtime.along import Along
 from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
 from dynssm_ros.runtime.features import LayerFeatures
-from dynssm_ros.runtime.online import CHANNELS, Along, Learned, OnlineLayer, OnlineLayerCard, Seen
+from dynssm_ros.runtime.online import CHANNELS, Learned, OnlineLayer, OnlineLayerCard, Seen
 from dynssm_ros.signals.recording import Recording
 
 _BLOCK = 4096  # rows that are worked on at once

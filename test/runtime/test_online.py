@@ -7,8 +7,9 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from dynssm_ros.errors import ArtifactError
+from dynssm_ros.runtime.along import Along
 from dynssm_ros.runtime.coefficients import SPREAD
-from dynssm_ros.runtime.online import Along, OnlineLayer, OnlineLayerCard, Seen, load_layer, save_layer
+from dynssm_ros.runtime.online import OnlineLayer, OnlineLayerCard, Seen, load_layer, save_layer
 from dynssm_ros.vehicle import load_vehicle
 
 N = 4
