@@ -34,6 +34,9 @@ class EvaluateSettings(CommandsSettings, WorkerSettings):
     min_speed: float | None = MIN_SPEED
     horizon: float = setting(PATH_HORIZON_S, "Length of the rollouts (s).", ge=0.0)
     stride: int = setting(1, "Start a rollout at every n-th row.", ge=1)
+    left_to_learn: bool = setting(
+        False, "Say what boosted trees still take off the one-step errors of each model; some seconds a model."
+    )
     track: Any = setting(
         None,
         "Track along which errors are placed: built-in name or file, in the recording's coordinates.",
@@ -67,7 +70,7 @@ def evaluate(
         >>> bool(scores["single_track"].rmse[0] < 1e-9)
         True
     """
-    require("evaluate", "race")
+    require("evaluate", "race", *(["residuals"] if settings.left_to_learn else []))
     from dynssm_ros.evaluation.open_loop import evaluate, shared_commands
     from dynssm_ros.runtime.registry import open_models, with_offline
     from dynssm_ros.track.lap_position import first_lap
@@ -88,6 +91,8 @@ def evaluate(
         log, with_offline(known), name=name, split=split, min_speed=s.min_speed, horizon_s=s.horizon, stride=s.stride,
         line=line, progress=on_progress, workers=s.workers,
     )  # fmt: skip
+    if s.left_to_learn:
+        found = found.with_left_to_learn
     for note in found.not_tests:
         warnings.warn(note, DataWarning, stacklevel=3)
     return found

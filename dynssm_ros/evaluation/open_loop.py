@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -28,6 +28,8 @@ from dynssm_ros.evaluation.metrics import (
     silent,
 )
 from dynssm_ros.evaluation.regimes import Regime, driving_regimes, liveliest, regime_rmse
+from dynssm_ros.evaluation.residuals.errors import OneStepErrors
+from dynssm_ros.evaluation.residuals.learner import LeftToLearn, left_to_learn
 from dynssm_ros.evaluation.rollout import Rollout, score_rollouts
 from dynssm_ros.evaluation.score import Group, Score, grouped
 from dynssm_ros.parallel import HERE, Workers, each
@@ -57,6 +59,7 @@ class Evaluation:
         regimes: how these rows were driven.
         scores: by label, in the order in which the models were given.
         line: closed line that the position on the lap is counted along, if there is one.
+        left: by group, what a strong learner still takes off the errors of its first model, by channel; empty if not asked.
     """
 
     recording: Recording
@@ -68,6 +71,16 @@ class Evaluation:
     regimes: tuple[Regime, ...]
     scores: dict[str, Score]
     line: ClosedLine | None
+    left: dict[str, dict[str, LeftToLearn]] = field(default_factory=dict)
+
+    @property
+    def with_left_to_learn(self) -> Evaluation:
+        """The same with :attr:`left`, by boosted trees; a model that diverges, or a short drive, has none."""
+        found = {}
+        for name, group in self.groups.items():
+            errors = OneStepErrors(name, self.recording, self.rows, group.first.state - self.measured)
+            found[name] = left_to_learn(errors, importance=False) if np.isfinite(errors.values).all() else {}
+        return replace(self, left=found)
 
     @property
     def groups(self) -> dict[str, Group]:
@@ -147,6 +160,9 @@ class Evaluation:
             "starts": self.starts,
             "persistence_rmse": by_channel(self.persistence_rmse),
             "not_tests": self.not_tests,
+            "left_to_learn": {
+                name: {channel: each.to_json() for channel, each in found.items()} for name, found in self.left.items()
+            },
             "findings": [finding.model_dump() for finding in self.recording.info.findings],
         }
 

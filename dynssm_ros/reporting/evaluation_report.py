@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -45,6 +46,7 @@ def summary_table(evaluation: Evaluation) -> Table:
         ),
         (_channels("RMSE", "min", brief=True), lambda group: group.spreads(lambda score: score.rmse)),
         (_channels("largest error", "min"), lambda group: group.spreads(lambda score: score.max_error)),
+        *([(_channels("left to learn", unit="%", brief=True), partial(_left, evaluation))] if evaluation.left else []),
         (Column("parameters"), lambda group: group.first.model.parameters),
         (Column("FLOPs"), lambda group: group.first.model.flops),
         (
@@ -55,6 +57,12 @@ def summary_table(evaluation: Evaluation) -> Table:
         f"{evaluation.horizon_s:g} s, the same rows for every model.{_seeds_in_words(evaluation)}"
         + "".join(f" No test: {note}." for note in evaluation.not_tests),
     )
+
+
+def _left(evaluation: Evaluation, group: Group) -> list[float]:
+    """Percentage of the squared one-step error that boosted trees still take away, by channel."""
+    found = evaluation.left.get(group.name, {})
+    return [100 * found[channel].share if channel in found else np.nan for channel in STATE_SIGNALS]
 
 
 def _channels(group: str, best: Literal["min"] | None = None, unit: str = "", brief: bool = False) -> list[Column]:

@@ -75,7 +75,8 @@ def _interval(picture: Picture) -> Vector | None:
 def _comb(panel: Axes, picture: Picture) -> None:
     strongest = int(np.argmax(np.abs(picture.y - np.median(picture.y))))
     width = float(picture.x[1] - picture.x[0]) if len(picture.x) > 1 else 1.0
-    colours = [_MARKED if k == strongest else _PLAIN for k in range(len(picture.y))]
+    low, high = picture.mark or (picture.x[strongest], picture.x[strongest])
+    colours = [_MARKED if low <= place <= high else _PLAIN for place in picture.x]
     panel.bar(picture.x, picture.y, 0.9 * width, color=colours)
     panel.axhline(0.0, color=MEASURED, lw=0.8)
 

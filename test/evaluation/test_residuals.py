@@ -15,6 +15,7 @@ from dynssm_ros.evaluation.residuals.evidence import chances, holm
 from dynssm_ros.evaluation.residuals.learner import left_to_learn
 from dynssm_ros.evaluation.residuals.regimes import situations
 from dynssm_ros.evaluation.residuals.sizes import quantum
+from dynssm_ros.reporting.evaluation_report import summary_table
 from dynssm_ros.runtime.registry import load_model
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import load_vehicle
@@ -106,3 +107,29 @@ def test_chances_of_sums_without_a_mean_are_uniform() -> None:
 def test_holm_rejects_as_long_as_each_is_below_its_level() -> None:
     assert holm([0.04, 0.001, 0.02], 0.05) == [True, True, True]
     assert holm([0.04, 0.001, 0.03], 0.05) == [False, True, False]
+
+
+def test_an_evaluation_says_what_is_left_to_learn(healthy: Recording) -> None:
+    scored = dynssm_ros.evaluate(healthy, ["single_track", "persistence"], "orca", stride=500, left_to_learn=True)
+    left = scored.to_json()["left_to_learn"]
+    assert left["persistence"]["v_x"]["share"] > 0.5 > left["single_track"]["v_x"]["share"]
+    heads = [column.group for column in summary_table(scored).columns]
+    assert heads.count("left to learn") == 3
+
+
+def test_steering_that_acts_two_samples_late_is_told_with_its_delay(healthy: Recording) -> None:
+    ahead = {name: np.roll(healthy[name], -2) for name in ("delta_fb", "delta_cmd")}
+    late = replace(healthy, columns=healthy.columns | ahead)
+    found = [each for each in taken_apart(late).patterns if each.kind == "steering_delay"]
+    assert found
+    for each in found:
+        assert each.size["low_s"] <= 0.04 <= each.size["high_s"]
+
+
+def test_resistance_at_some_speeds_is_told_with_the_speeds(healthy: Recording) -> None:
+    clean = taken_apart(healthy).errors
+    values, v_x = clean.values.copy(), clean.driven[:, 0]
+    values[v_x > np.percentile(v_x, 60), 0] += 0.01
+    found = model_anatomy(replace(clean, values=values), situations(clean), learn=False).patterns[0]
+    assert (found.channel, found.kind) == ("v_x", "speed")
+    assert found.size["error_per_s"] == pytest.approx(0.01 / 0.02, rel=0.4)

@@ -19,7 +19,7 @@ from dynssm_ros.errors import RecordingError
 from dynssm_ros.evaluation.metrics import by_channel, rmse
 from dynssm_ros.evaluation.open_loop import check_fit, window_and_speed
 from dynssm_ros.evaluation.residuals.delays import delays
-from dynssm_ros.evaluation.residuals.errors import BLOCK_S, OneStepErrors, input_derivatives, one_step_errors
+from dynssm_ros.evaluation.residuals.errors import BLOCK_S, OneStepErrors, derivatives, one_step_errors
 from dynssm_ros.evaluation.residuals.evidence import FALSE_ALARMS, FEWEST_BLOCKS, holm
 from dynssm_ros.evaluation.residuals.learner import LeftToLearn, learner_patterns, left_to_learn
 from dynssm_ros.evaluation.residuals.patterns import Pattern
@@ -147,7 +147,7 @@ def anatomy(
         )
     line = first_lap(recording) if line is None else line
     found: dict[str, ModelAnatomy] = {}
-    derivatives = None if physics is None else input_derivatives(physics, recording, rows)
+    slopes = None if physics is None else derivatives(physics, recording, rows)
     sorted_by: list[Situation] = []
     for k, (label, model) in enumerate(models.items()):
         if progress is not None:
@@ -155,17 +155,14 @@ def anatomy(
         wheelbase = None if model.vehicle is None else model.vehicle.constants.wheelbase
         errors = one_step_errors(model, recording, rows, line=line, wheelbase=wheelbase)
         sorted_by = sorted_by or situations(errors)
-        found[label] = model_anatomy(
-            errors, sorted_by, derivatives, physics, learn=learn, models=len(models),
-        )  # fmt: skip
+        found[label] = model_anatomy(errors, sorted_by, slopes, learn=learn, models=len(models))
     return Anatomy(name or ", ".join(recording.info.source), recording, found)
 
 
 def model_anatomy(
     errors: OneStepErrors,
     sorted_by: Sequence[Situation],
-    derivatives: Vector | None = None,
-    physics: WindowModel | None = None,
+    slopes: Vector | None = None,
     *,
     learn: bool = True,
     models: int = 1,
@@ -175,15 +172,15 @@ def model_anatomy(
     Args:
         errors: of the model.
         sorted_by: the quantities of :func:`situations`.
-        derivatives: of the predicted state by the inputs, ``(N, 3, 2)``.
-        physics: model by which the effect of a rounded signal is judged.
+        slopes: how the predicted state depends on the last row's signals, as of :func:`derivatives`; without them
+            delays and rounded signals are not judged.
         learn: whether boosted trees are asked.
         models: that are looked at together, among which the chance of a false alarm is shared.
     """
     level = FALSE_ALARMS / (models * len(STATE_SIGNALS))
     learned = left_to_learn(errors) if learn else {}
     by_learner = learner_patterns(learned)
-    faults = list(signal_faults(errors, _effects(errors, physics)))
+    faults = list(signal_faults(errors, slopes))
     scale = np.maximum(rmse(np.diff(errors.recording.states(errors.rows), axis=0)), 1e-300)
     patterns: list[Pattern] = []
     tests = 0
@@ -196,7 +193,7 @@ def model_anatomy(
         beside = [each for each in (*faults, *by_learner) if each.channel == channel]
         others = len(beside) + _OF_SIZE
         for _ in range(_MOST):
-            looked = list(_tried(errors, values, c, sorted_by, derivatives))
+            looked = list(_tried(errors, values, c, sorted_by, slopes))
             tests = max(tests, len(looked) + others)
             sure = _beyond_chance(looked, level, float(np.sum(values**2)) / total, others)
             before = [each.size.get("period_s") for each in found]
@@ -209,7 +206,7 @@ def model_anatomy(
             if best.fitted is not None:
                 values -= best.fitted
         left = float(np.sum(values**2)) / total
-        of_size = [*spikes(errors, values, channel), *spike_period(errors, values, channel)]
+        of_size = [*spikes(errors, values, c, slopes), *spike_period(errors, values, c, slopes)]
         patterns += [*found, *_beyond_chance(of_size, level, left, tests), *_beyond_chance(beside, level, 1.0, tests)]
     lags = round(_AUTOCORRELATION_S / errors.T_s)
     return ModelAnatomy(
@@ -237,27 +234,10 @@ def _beyond_chance(looked: Sequence[Pattern], level: float, left: float, others:
 
 
 def _tried(
-    errors: OneStepErrors, values: Vector, channel: int, sorted_by: Sequence[Situation], derivatives: Vector | None
+    errors: OneStepErrors, values: Vector, channel: int, sorted_by: Sequence[Situation], slopes: Vector | None
 ) -> Iterator[Pattern]:
     name = STATE_SIGNALS[channel]
     yield from periods(errors, values, name)
     yield from regimes(errors, values, name, list(sorted_by))
-    if derivatives is not None:
-        yield from delays(errors, values, channel, name, derivatives)
-
-
-def _effects(errors: OneStepErrors, physics: WindowModel | None) -> dict[str, Vector]:
-    """Share of the squared error of each channel per squared unit of noise in a signal of the last row, by signal."""
-    if physics is None:
-        return {}
-    some = errors.rows[:: max(1, len(errors) // 2000)]
-    windows = errors.recording.windows(some, physics.H).copy()
-    base, mean_square = physics.predict(windows).state, np.maximum((errors.values**2).mean(axis=0), 1e-300)
-    out = {}
-    for k, name in enumerate((*STATE_SIGNALS, "r_fb", "delta_fb")):
-        step = 1e-3 * (float(np.std(windows[:, -1, k])) or 1.0)
-        windows[:, -1, k] += step
-        slope = (physics.predict(windows).state - base) / step
-        windows[:, -1, k] -= step
-        out[name] = (slope**2).mean(axis=0) / mean_square
-    return out
+    if slopes is not None:
+        yield from delays(errors, values, channel, slopes)

@@ -10,6 +10,7 @@ from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.residuals.errors import OneStepErrors
 from dynssm_ros.evaluation.residuals.evidence import chances, limited, share_explained, sums_of_blocks
 from dynssm_ros.evaluation.residuals.patterns import Pattern, Picture
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _LAGS_S = (-0.2, 0.5)
 """Delays that are tried (s), those that :mod:`dynssm_ros.signals.timing` expects of cars."""
@@ -18,24 +19,23 @@ _GAIN = (0.2, 2.0)
 """Of the change that a delay makes by the physics, which must be in the errors: another pattern has another size."""
 
 
-def delays(errors: OneStepErrors, values: Vector, channel: int, name: str, derivatives: Vector) -> Iterator[Pattern]:
+def delays(errors: OneStepErrors, values: Vector, channel: int, slopes: Vector) -> Iterator[Pattern]:
     """Looks for the delay of throttle and steering in the errors ``values`` ``(N,)`` of a channel.
 
     Args:
         errors: of the model.
         values: its errors in this channel, less the patterns found before.
         channel: number of it.
-        name: of it.
-        derivatives: of the predicted state by throttle and steering, shape ``(N, 3, 2)``.
+        slopes: how the predicted state depends on the last row's signals, shape ``(N, 3, 5)``.
 
     Yields:
         For each input the delay that explains most, with its 95 % interval by a bootstrap over blocks.
     """
-    y = limited(values)
+    y, name = limited(values), STATE_SIGNALS[channel]
     lags = np.arange(round(_LAGS_S[0] / errors.T_s), round(_LAGS_S[1] / errors.T_s) + 1)
     for k, signal in enumerate(("throttle", "steering")):
         column = errors.recording[("r_fb", "delta_fb")[k]] + errors.recording[("r_cmd", "delta_cmd")[k]]
-        slope = derivatives[:, channel, k]
+        slope = slopes[:, channel, len(STATE_SIGNALS) + k]
         now = column[errors.rows]
         changes = [slope * (now - errors.before(column, int(lag))) for lag in lags]
         cross = np.stack([sums_of_blocks(y * change, errors.block) for change in changes])

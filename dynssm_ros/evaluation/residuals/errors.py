@@ -10,14 +10,16 @@ import numpy as np
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.metrics import Tick, drive_through, predict_rows, silent
 from dynssm_ros.runtime.contract import WindowModel
-from dynssm_ros.signals.inputs import applied_inputs
+from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.lines import ClosedLine
 
 BLOCK_S = 3.0
 """Length of the blocks of time that count as independent (s): actuators, filters and noise forget within one."""
-_SMALL = 1e-3
-"""Change of an input, in its usual range, that gives its derivative."""
+DRIVEN_SIGNALS = WINDOW_COLUMNS[:5]
+"""State and feedback, by which a prediction is driven."""
+_SMALL, _AT_ONCE = 1e-3, 4096
+"""Change of a signal, in its standard deviations, that gives its derivative; windows that exist at a time."""
 
 
 @dataclass(frozen=True)
@@ -116,17 +118,16 @@ def one_step_errors(
     return OneStepErrors(model.name, recording, rows, predicted - recording.states(rows + 1), line, wheelbase)
 
 
-def input_derivatives(physics: WindowModel, recording: Recording, rows: Indices) -> Vector:
-    """How the predicted state depends on throttle and steering of the last row, by differences, shape ``(N, 3, 2)``."""
-    out = np.empty((len(rows), 3, 2))
-    for k, column in enumerate((3, 4)):
-        spread = float(np.std(recording.rows(rows)[:, column])) or 1.0
-        step = _SMALL * spread
-        for start in range(0, len(rows), 4096):
-            part = slice(start, start + 4096)
+def derivatives(physics: WindowModel, recording: Recording, rows: Indices) -> Vector:
+    """How the predicted state depends on each of :data:`DRIVEN_SIGNALS` of the last row, by differences, ``(N, 3, 5)``."""
+    out = np.empty((len(rows), 3, len(DRIVEN_SIGNALS)))
+    for k in range(len(DRIVEN_SIGNALS)):
+        step = _SMALL * (float(np.std(recording.rows(rows)[:, k])) or 1.0)
+        for start in range(0, len(rows), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
             windows = np.repeat(recording.windows(rows[part], physics.H)[None], 2, axis=0).copy()
-            windows[0, :, -1, column] -= step
-            windows[1, :, -1, column] += step
+            windows[0, :, -1, k] -= step
+            windows[1, :, -1, k] += step
             low, high = (physics.predict(each).state for each in windows)
             out[part, :, k] = (high - low) / (2 * step)
     return out

@@ -121,7 +121,8 @@ def _comb(
     return Pattern(
         channel, "time", kind, told, share, p, terms if kind == "period" else 1,
         {"period_s": round(period, 9), "phase_s": round(at, 9)}, fitted,
-        Picture("comb", steps, np.sqrt(square), "time after the first (s)", f"RMS of {channel} ({unit})"),
+        Picture("comb", steps, np.sqrt(square), f"time in the period of {period:.4g} s (s)", f"RMS of {channel} ({unit})",
+                None, (), (at - T_s / 2, at + T_s / 2)),
     )  # fmt: skip
 
 

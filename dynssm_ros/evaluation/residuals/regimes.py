@@ -23,9 +23,9 @@ from dynssm_ros.signals.recording import COLUMN_UNITS
 from dynssm_ros.track.lap_position import track_position
 
 _BINS, _PLACES, _HEADINGS, _TIMES = 10, 24, 8, 8
-_SMOOTH_S = 0.2
-"""Over which speeds and accelerations are averaged (s), two rows before the window's end: the noise of the measured state,
-which is in the error too, shall not look like a pattern."""
+_SMOOTH_ROWS, _CHANGE_S = 3, 0.2
+"""Rows over which states are averaged, the last two rows before the window's end: the noise of the measured state, which is
+in the error too, shall not look like a pattern. Time over which the acceleration is taken (s)."""
 _RATE_S = 0.1  # over which rates of the inputs are taken
 _STEP = 0.25  # of an input's usual range, within _RATE_S, that is a step of it
 _SINCE_S = (0.0, 0.1, 0.2, 0.4, 0.8)
@@ -57,9 +57,9 @@ class Situation:
 def situations(errors: OneStepErrors) -> list[Situation]:
     """The quantities by which errors are sorted, as far as the recording has them."""
     log, T_s = errors.recording, errors.T_s
-    rows = max(3, round(_SMOOTH_S / T_s))
-    smooth = {name: _smoothed(errors, log[name], rows) for name in ("v_x", "omega")}
-    long_ago = _smoothed(errors, log["v_x"], rows, 2 + rows)
+    rows = max(1, round(_CHANGE_S / T_s))
+    smooth = {name: _smoothed(errors, log[name]) for name in ("v_x", "omega")}
+    long_ago = _smoothed(errors, log["v_x"], 2 + rows)
     v_x, lateral = smooth["v_x"], smooth["v_x"] * smooth["omega"]
     r, delta = errors.applied.T
     found = [
@@ -97,25 +97,23 @@ def situations(errors: OneStepErrors) -> list[Situation]:
 def regimes(errors: OneStepErrors, values: Vector, channel: str, sorted_by: list[Situation]) -> Iterator[Pattern]:
     """Looks for mean errors ``values`` ``(N,)`` that differ from zero somewhere.
 
+    Where they are the same everywhere, the offset explains as much with one number and is taken.
+
     Yields:
         A pattern for each quantity.
     """
     y = limited(values)
     y += float(np.median(values))
-    offset = float(y.mean())
     unit, T_s = COLUMN_UNITS[channel], errors.T_s
     for each in sorted_by:
         kinds = len(each.labels)
         sign = 1.0 if each.sign is None else each.sign
-        base = 0.0 if each.name == "offset" else offset
-        sums = block_sums(sign * (y - base), errors.block, each.kind, kinds + 1)
+        sums = block_sums(sign * y, errors.block, each.kind, kinds + 1)
         chance = chances(sums[:, :kinds])
         best = int(np.argmin(chance))
-        signed, rest = sign * values, 0.0 if each.name == "offset" else float(values.mean())
-        whole, apart = means_of_kinds(signed - sign * rest, errors.block, each.kind, kinds + 1)
-        none = each.kind == kinds
-        whole[kinds], apart[none] = 0.0, 0.0
-        share = share_explained(values - rest, sign * apart) * share_left(values, rest)
+        whole, apart = means_of_kinds(sign * values, errors.block, each.kind, kinds + 1)
+        whole[kinds], apart[each.kind == kinds] = 0.0, 0.0
+        share = share_explained(values, sign * apart)
         low, high = _neighbours(best, whole, chance, each.edges is None)
         mean = float(
             np.average(
@@ -135,11 +133,6 @@ def regimes(errors: OneStepErrors, values: Vector, channel: str, sorted_by: list
             channel, "where", each.name.replace(" ", "_"), told, share, min(1.0, kinds * float(chance[best])), kinds,
             {"error_per_s": round(mean / T_s, 6)}, sign * whole[each.kind], picture,
         )  # fmt: skip
-
-
-def share_left(values: Vector, rest: float) -> float:
-    """Share of the squared errors ``(N,)`` that is not their mean ``rest``."""
-    return float(np.sum((values - rest) ** 2)) / max(float(np.sum(values**2)), 1e-300)
 
 
 def _per_second(unit: str) -> str:
@@ -177,9 +170,9 @@ def _spread(sums: Vector, kind: Indices, kinds: int) -> Vector:
     return np.asarray(np.sqrt((centred**2).sum(axis=0)) / count)
 
 
-def _smoothed(errors: OneStepErrors, column: Vector, rows: int, back: int = 2) -> Vector:
-    """Mean of so many rows of a column, of which the last is ``back`` rows before the window's end, ``(N,)``."""
-    return np.asarray(np.mean([errors.before(column, back + k) for k in range(rows)], axis=0))
+def _smoothed(errors: OneStepErrors, column: Vector, back: int = 2) -> Vector:
+    """Mean of a few rows of a column, of which the last is ``back`` rows before the window's end, ``(N,)``."""
+    return np.asarray(np.mean([errors.before(column, back + k) for k in range(_SMOOTH_ROWS)], axis=0))
 
 
 def _all(errors: OneStepErrors) -> Situation:

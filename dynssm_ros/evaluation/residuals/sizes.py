@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import stats
+from scipy import optimize, stats
 
 from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.evaluation.regimes import round_edges
-from dynssm_ros.evaluation.residuals.errors import OneStepErrors
-from dynssm_ros.evaluation.residuals.evidence import robust_std
+from dynssm_ros.evaluation.residuals.errors import DRIVEN_SIGNALS, OneStepErrors
+from dynssm_ros.evaluation.residuals.evidence import limited, robust_std
 from dynssm_ros.evaluation.residuals.patterns import Pattern, Picture
 from dynssm_ros.evaluation.residuals.periods import LONGEST_PERIOD_S
 from dynssm_ros.signals.recording import COLUMN_UNITS, Recording
@@ -47,9 +47,16 @@ def statistics(values: Vector) -> dict[str, float]:
     }
 
 
-def spikes(errors: OneStepErrors, values: Vector, channel: str) -> Iterator[Pattern]:
-    """Looks for rare errors that are far larger than those around them, and for the speeds at which they come."""
-    deviation = _local_deviation(errors, values)
+def spikes(errors: OneStepErrors, values: Vector, c: int, slopes: Vector | None) -> Iterator[Pattern]:
+    """Looks for rare errors that are far larger than those around them, and for the speeds at which they come.
+
+    Args:
+        errors: of the model.
+        values: its errors in channel ``c``, less the patterns found before, ``(N,)``.
+        c: number of the channel.
+        slopes: how the predicted state depends on the last row's signals, ``(N, 3, 5)``, if it is known.
+    """
+    channel, deviation = STATE_SIGNALS[c], _deviation(errors, values, c, slopes)
     far = np.abs(values - np.median(values)) > _SPIKE * deviation
     at = errors.seconds[far]
     events = int(np.count_nonzero(np.diff(at, prepend=-np.inf) > _APART_S))
@@ -75,13 +82,25 @@ def _listed(speeds: tuple[tuple[float, float], ...]) -> str:
     return ", ".join(f"{low:g} to {high:g}" for low, high in speeds)
 
 
-def _local_deviation(errors: OneStepErrors, values: Vector) -> Vector:
-    """Robust standard deviation in the block of each row and those beside it, at least half of that of all, ``(N,)``."""
+def _deviation(errors: OneStepErrors, values: Vector, c: int, slopes: Vector | None) -> Vector:
+    """Robust standard deviation around each row, at least half of that of all, ``(N,)``.
+
+    Within a few seconds it is that of the noise of the sensors: an error is the noise of the measured state less that of the
+    state before, times how the prediction depends on it, which differs much where tyres slide.
+    """
+    noise = np.ones(len(values))
+    if slopes is not None:
+        squares = np.column_stack([np.ones(len(values)), slopes[:, c, : len(STATE_SIGNALS)] ** 2])
+        size = squares.mean(axis=0)
+        weights = optimize.nnls((squares / size)[:: max(1, len(values) // 5000)],
+                                limited(values)[:: max(1, len(values) // 5000)] ** 2)[0]  # fmt: skip
+        noise = np.sqrt(np.maximum(squares / size @ weights, 1e-300))
+    even = values / noise
     edges = np.flatnonzero(np.diff(errors.block)) + 1
     starts, ends = np.append(0, edges), np.append(edges, len(values))
     blocks = len(starts)
-    local = np.array([robust_std(values[starts[max(b - 1, 0)] : ends[min(b + 1, blocks - 1)]]) for b in range(blocks)])
-    deviation: Vector = np.maximum(local, 0.5 * robust_std(values))[errors.block]
+    local = np.array([robust_std(even[starts[max(b - 1, 0)] : ends[min(b + 1, blocks - 1)]]) for b in range(blocks)])
+    deviation: Vector = np.maximum(local, 0.5 * robust_std(even))[errors.block] * noise
     return deviation
 
 
@@ -110,9 +129,10 @@ def _speeds(errors: OneStepErrors, large: Mask) -> tuple[tuple[float, float], ..
     return tuple(out)
 
 
-def spike_period(errors: OneStepErrors, values: Vector, channel: str) -> Iterator[Pattern]:
-    """Looks for the fixed period at one step of which large errors gather, by the count at that step (binomial)."""
-    at = np.flatnonzero(np.abs(values - np.median(values)) > _SPIKE * _local_deviation(errors, values))
+def spike_period(errors: OneStepErrors, values: Vector, c: int, slopes: Vector | None) -> Iterator[Pattern]:
+    """Looks for the fixed period at one step of which spikes gather, by the count at that step; see :func:`spikes`."""
+    channel, deviation = STATE_SIGNALS[c], _deviation(errors, values, c, slopes)
+    at = np.flatnonzero(np.abs(values - np.median(values)) > _SPIKE * deviation)
     longest = int(LONGEST_PERIOD_S / errors.T_s)
     if len(at) < _FEWEST_SPIKES:
         return
@@ -139,15 +159,19 @@ def spike_period(errors: OneStepErrors, values: Vector, channel: str) -> Iterato
                   {"period_s": round(period, 9), "phase_s": round(phase * errors.T_s, 9)}, None, shown)  # fmt: skip
 
 
-def signal_faults(errors: OneStepErrors, effect: dict[str, Vector]) -> Iterator[Pattern]:
+def signal_faults(errors: OneStepErrors, slopes: Vector | None) -> Iterator[Pattern]:
     """Signals in steps, samples that repeat, and states at the end of their range.
 
     Args:
-        errors: of the physics.
-        effect: share of each channel's squared error that a step of one unit in a signal makes, by signal, ``(3,)``.
+        errors: of the model.
+        slopes: how the predicted state depends on the last row's signals, ``(N, 3, 5)``; without them steps are not judged.
     """
+    effect = {}
+    if slopes is not None:
+        mean_square = np.maximum((errors.values**2).mean(axis=0), 1e-300)
+        effect = dict(zip(DRIVEN_SIGNALS, ((slopes**2).mean(axis=0) / mean_square[:, None]).T, strict=True))
     log = errors.recording
-    for name in (*STATE_SIGNALS, "r_fb", "delta_fb"):
+    for name in DRIVEN_SIGNALS:
         step = quantum(log[name])
         if step > 0 and name in effect:
             for c, channel in enumerate(STATE_SIGNALS):
