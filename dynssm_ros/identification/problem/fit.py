@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -231,7 +231,6 @@ class IdentificationProblem:
         errors, n, given = self.errors(car), len(car.moved), noise is not None
         noise = self.noise(errors) if noise is None else noise
         p = position(car, free)
-        lower, upper = limits(car, free)
         best = self.objective(errors, p, noise)
         nominal = None if near is None else near.jacobian[..., :n]
         jacobian = np.empty(0)
@@ -243,10 +242,7 @@ class IdentificationProblem:
                 jacobian, stale = self.columns(car, errors, free), False
             H, g = self.normal(errors, noise.whiten(jacobian), p, noise)
             before, promised, kept = best, 0.0, 0.0
-            for damping in tuning.DAMPING:
-                step = _step(H + damping * np.diag(np.diag(H)), g, lower - p, upper - p)
-                other = with_values(car, free, p + step)
-                there = self.errors(other)
+            for step, other, there in self._tried(car, free, p, H, g):
                 value = self.objective(there, position(other, free), noise)
                 if value < best:
                     promised = -float(2 * g @ step + step @ H @ step)
@@ -264,6 +260,19 @@ class IdentificationProblem:
             elif not stale:
                 nominal = jacobian[..., :n]
         return Fit(car, free, errors, jacobian, noise, best)
+
+    def _tried(
+        self, car: CarEstimate, free: Free, p: Vector, H: Vector, g: Vector
+    ) -> Iterator[tuple[Vector, CarEstimate, Vector]]:
+        """Steps from ``p``, less and less far, with the cars that they lead to and their errors.
+
+        The first is simulated alone, as it mostly serves, and all others together, which takes little more than one.
+        """
+        lower, upper = limits(car, free)
+        for dampings in (tuning.DAMPING[:1], tuning.DAMPING[1:]):
+            steps = [_step(H + damping * np.diag(np.diag(H)), g, lower - p, upper - p) for damping in dampings]
+            cars = [with_values(car, free, p + step) for step in steps]
+            yield from zip(steps, cars, self.errors_of(cars), strict=True)
 
     def recalibrated(self, car: CarEstimate) -> Fit:
         """The nominal values alone, from where they were known to be; from where ``car`` has them if that is clearly closer.

@@ -9,6 +9,7 @@ be closer to the data with either by chance, so that the choice is made anew wit
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -73,10 +74,10 @@ def search_causes(
     # noise is carried along as by the car that was known, so that a calibration on the same laps changes nothing
     known = car.as_known
 
-    def search(windows: SimulationWindows, start: Fit | None = None) -> SearchResult:
-        problem = IdentificationProblem(windows, known)
+    def search(stepped: tuple[IdentificationProblem, Fit], start: Fit | None = None) -> SearchResult:
+        problem, base = stepped
         found, impossible = candidates(problem, known, exclude, levels)
-        searching = Search(problem, car, found, left_out, on_progress=on_progress, pool=pool)
+        searching = Search(problem, car, found, left_out, on_progress=on_progress, pool=pool, base=base)
         return SearchResult(problem, searching, searching.run(start), impossible)
 
     on_progress("choosing how the model steps")
@@ -84,8 +85,10 @@ def search_causes(
     options.sort(key=lambda one: car.vehicle.integrator not in (None, one[0]))  # those of the file first
     stepped = {one: _stepped(replace(windows, hold=one[1]), car, one[0]) for one in options}
     first = _closest(stepped)
-    found = search(stepped[first][0].windows)
+    found = search((copy(stepped[first][0]), stepped[first][1]))
     fit = found.selection.fit
+    if first == options[0] and not found.selection.chosen:
+        return found  # nothing has come beside it, and errors that hang together tell less, not more
 
     def refitted(one: tuple[Integrator, Hold]) -> tuple[IdentificationProblem, Fit]:
         if one == first:
@@ -94,7 +97,7 @@ def search_causes(
         return problem, problem.fit(fit.car, fit.free)
 
     last = _closest({one: refitted(one) for one in options})
-    return found if last == first else search(stepped[last][0].windows, fit)
+    return found if last == first else search(stepped[last], fit)
 
 
 def _stepped(windows: SimulationWindows, car: CarEstimate, integrator: Integrator) -> tuple[IdentificationProblem, Fit]:

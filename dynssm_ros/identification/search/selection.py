@@ -6,9 +6,10 @@ An information criterion finds what is worth a look. What is named has to predic
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from dynssm_ros.identification.search.size_search import CandidateStart, SizeSea
 from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.vehicle.effects import EFFECTS, LOCATION
+
+Tried = TypeVar("Tried", bound=ScoredCandidate | CandidateStart)
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,17 @@ def _fitted_roughly(problem: IdentificationProblem, near: Fit, start: CandidateS
     return problem.fit(start.car, (*near.free, *start.candidate.free), near, rough=True)
 
 
+@dataclass
+class _Kept:
+    """What was found with one weight of the data, so that it is fitted once, also where the search begins anew."""
+
+    left_out: LeaveOneOut
+    fits: dict[frozenset[Candidate], Fit]
+    ranked: dict[frozenset[Candidate], list[Refined]] = field(default_factory=dict)
+    starts: dict[tuple[object, ...], CandidateStart] = field(default_factory=dict)
+    rough: dict[tuple[object, ...], Fit] = field(default_factory=dict)
+
+
 class Search:
     """Selects effects by what they predict on parts of the data that were left out.
 
@@ -142,6 +157,7 @@ class Search:
         car: where to start.
         found: the candidates.
         left_out, on_progress, pool: see :func:`~dynssm_ros.identification.search.integrator.search_causes`.
+        base: the nominal car fitted to the windows, if that is known already.
     """
 
     def __init__(
@@ -153,23 +169,28 @@ class Search:
         *,
         on_progress: OnProgress = lambda words: None,
         pool: Pool = IN_TURN,
+        base: Fit | None = None,
     ) -> None:
         self._problem, self.found, self._report = problem, list(found), on_progress
         self._known, self._folds, self._pool = car.as_known, left_out, pool
         self._price = np.log(3.0 * problem.windows.steps * len(problem.windows))
         on_progress("recalibrating the nominal car")
-        self.base = problem.temper(problem.recalibrated(car))
+        self.base = problem.temper(problem.recalibrated(car) if base is None else base)
         self._tempering = problem.tempering
+        self._by_tempering: dict[float, _Kept] = {}
         self.responses = Responses(problem, self.base.car, self.base.errors)
         """Of the library, beside the recalibrated car."""
         self.tried: dict[str, float] = {}
-        self._forget()
+        self._kept = self._weigh(self._tempering)
 
-    def _forget(self) -> None:
-        """Fits and candidates of other weights of the data."""
-        self._ranked: dict[frozenset[Candidate], list[Refined]] = {}
-        self._fits: dict[frozenset[Candidate], Fit] = {frozenset(): self.base}
-        self._left_out = LeaveOneOut(self._problem, self._folds, self._pool)
+    def _weigh(self, tempering: float) -> _Kept:
+        """Weighs the data; what was found with these weights before is at hand."""
+        self._problem.tempering = tempering
+        if tempering not in self._by_tempering:
+            base = self.base if tempering == self._tempering else self._problem.refit(self.base)
+            left_out = LeaveOneOut(self._problem, self._folds, self._pool)
+            self._by_tempering[tempering] = _Kept(left_out, {frozenset(): base})
+        return self._by_tempering[tempering]
 
     def run(self, start: Fit | None = None) -> Selection:
         """Forward while it pays; then each effect is exchanged against all others, or dropped.
@@ -191,8 +212,9 @@ class Search:
     def reject(self, effect: str) -> Selection:
         """Selects anew without an effect."""
         self.found = [candidate for candidate in self.found if candidate.effect != effect]
-        self._problem.tempering = self._tempering
-        self._forget()
+        self._kept = self._weigh(self._tempering)
+        for kept in self._by_tempering.values():
+            kept.ranked.clear()  # another candidate may take the place
         return self.run()
 
     def eliminated(self, chosen: tuple[Candidate, ...]) -> Selection:
@@ -211,7 +233,7 @@ class Search:
 
     def _unconfirmed(self, chosen: tuple[Candidate, ...], fit: Fit) -> Refined | None:
         """The best by the criterion of those that were tried beside ``chosen``, if it is large, sure, and not confirmed."""
-        best = next(iter(self._ranked.get(frozenset(chosen), [])), None)
+        best = next(iter(self._kept.ranked.get(frozenset(chosen), [])), None)
         if best is None or best.delta_bic <= tuning.DECISIVE_DELTA_BIC:
             return None
         tried = self._confirm(fit, best)
@@ -224,26 +246,26 @@ class Search:
     def fit(self, chosen: tuple[Candidate, ...]) -> Fit:
         """All of ``chosen`` together, linearised anew."""
         key = frozenset(chosen)
-        if key not in self._fits:
-            starts = [r.fit for c in chosen for r in self._ranked.get(key - {c}, []) if r.candidate == c]
-            self._fits[key] = self._problem.again(min(starts, key=lambda fit: fit.objective))
-        return self._fits[key]
+        if key not in self._kept.fits:
+            starts = [r.fit for c in chosen for r in self._kept.ranked.get(key - {c}, []) if r.candidate == c]
+            self._kept.fits[key] = self._problem.again(min(starts, key=lambda fit: fit.objective))
+        return self._kept.fits[key]
 
     def ranked(self, before: tuple[Candidate, ...]) -> list[Refined]:
         """The most promising candidates beside ``before``, fitted, the best first."""
         key = frozenset(before)
-        if key in self._ranked:
-            return self._ranked[key]
+        if key in self._kept.ranked:
+            return self._kept.ranked[key]
         fit = self.fit(before)
-        refined = self._refined(fit, self._starts(before, fit))
+        refined = self._refined(before, fit, self._starts(before, fit))
         share, apart = tuning.NEAR_BEST_SHARE, tuning.AMBIGUITY_DELTA_BIC
         close = max([-apart, *(share * r.delta_bic - 2 * apart for r in refined)])
-        rough = [r for r in refined if r.delta_bic > close and key | {r.candidate} not in self._fits]
+        rough = [r for r in refined if r.delta_bic > close and key | {r.candidate} not in self._kept.fits]
         finished = self._pool.map(self._problem.again, [r.fit for r in rough])
-        self._fits |= {key | {r.candidate}: done for r, done in zip(rough, finished, strict=True)}
+        self._kept.fits |= {key | {r.candidate}: done for r, done in zip(rough, finished, strict=True)}
         refined = [self._against((*before, r.candidate), r.candidate) if r.delta_bic > close else r for r in refined]
-        self._ranked[key] = sorted(refined, key=lambda r: -r.delta_bic)
-        return self._ranked[key]
+        self._kept.ranked[key] = sorted(refined, key=lambda r: -r.delta_bic)
+        return self._kept.ranked[key]
 
     def _starts(self, before: tuple[Candidate, ...], fit: Fit) -> list[CandidateStart]:
         """Where to fit the most promising candidates beside ``before`` from, by a score test and in several sizes."""
@@ -259,7 +281,7 @@ class Search:
         shortlist = [each for each in best.values() if self._expected_delta_bic(each) >= -self._price]
         some, near = self._problem.part(fit, max(1, len(self._problem.windows) // tuning.SHORTLIST_WINDOWS))
         trial = SizeSearch(some, near, self._known, self._price, self._problem.tempering)
-        starts = self._pool.map(trial.start, shortlist[: tuning.SHORTLIST])
+        starts = self._once(self._kept.starts, before, shortlist[: tuning.SHORTLIST], trial.start)
         starts.sort(key=lambda start: start.expected_delta_bic, reverse=True)
         least = max([-self._price, *(tuning.SHORTLIST_SHARE * start.expected_delta_bic for start in starts[:1])])
         return [start for start in starts[: tuning.REFINED] if start.expected_delta_bic >= least]
@@ -271,7 +293,7 @@ class Search:
         met in real cars.
         """
         found = sorted(self._confirmed(before), key=lambda r: -r.confirmed_improvement)
-        alike = [r for r in found if r is found[0] or self._left_out.compare(r.fit, found[0].fit).alike]
+        alike = [r for r in found if r is found[0] or self._kept.left_out.compare(r.fit, found[0].fit).alike]
         return min(alike, key=lambda r: r.strangeness, default=None)
 
     def _taken_over(self, start: Fit | None) -> list[Candidate]:
@@ -288,7 +310,7 @@ class Search:
             )
             for name in values
         ]
-        self._fits[frozenset(chosen)] = self._problem.fit(start.car, start.free)
+        self._kept.fits[frozenset(chosen)] = self._problem.fit(start.car, start.free)
         self._temper(tuple(chosen))
         return chosen
 
@@ -301,7 +323,7 @@ class Search:
 
     def _confirm(self, without: Fit, refined: Refined) -> Refined:
         self._report(f"leaving parts out: {refined.candidate.effect}")
-        confirmation = self._left_out.compare(without, refined.fit)
+        confirmation = self._kept.left_out.compare(without, refined.fit)
         fit, candidate = refined.fit, refined.candidate
         bounded = tuple(name for name in candidate.amplitudes if candidate.about[name].at_bound(refined.values[name]))
         off = np.abs(fit.position) / np.sqrt(np.diag(self._problem.covariance(fit)))
@@ -313,18 +335,31 @@ class Search:
         fit = self.fit(chosen)
         inflation = self._problem.inflation(fit)
         if abs(np.log(inflation / self._problem.tempering)) >= tuning.TEMPERING_CHANGE:
-            self._problem.tempering = inflation
-            self._forget()
-            self._fits = {frozenset(): self._problem.refit(self.base), frozenset(chosen): self._problem.refit(fit)}
+            self._kept = self._weigh(inflation)
+            if frozenset(chosen) not in self._kept.fits:
+                self._kept.fits[frozenset(chosen)] = self._problem.refit(fit)
 
     def _expected_delta_bic(self, scored: ScoredCandidate) -> float:
         return float(scored.improvement / self._problem.tempering - self._price * scored.candidate.cost)
 
-    def _refined(self, fit: Fit, starts: Sequence[CandidateStart]) -> list[Refined]:
+    def _refined(self, before: tuple[Candidate, ...], fit: Fit, starts: Sequence[CandidateStart]) -> list[Refined]:
         if starts:
             self._report(f"fitting {', '.join(start.candidate.effect for start in starts)}")
-        fits = self._pool.map(partial(_fitted_roughly, self._problem, fit), starts)
+        fits = self._once(self._kept.rough, before, starts, partial(_fitted_roughly, self._problem, fit))
         return [self._judge(fit, found, start.candidate) for found, start in zip(fits, starts, strict=True)]
+
+    def _once(
+        self,
+        known: dict[tuple[object, ...], Found],
+        before: tuple[Candidate, ...],
+        tried: Sequence[Tried],
+        work: Callable[[Tried], Found],
+    ) -> list[Found]:
+        """What ``work`` makes of each candidate beside ``before``, made once."""
+        keys = [(frozenset(before), one.candidate, *sorted(one.values.items())) for one in tried]
+        new = {key: one for key, one in zip(keys, tried, strict=True) if key not in known}
+        known.update(zip(new, self._pool.map(work, list(new.values())), strict=True))
+        return [known[key] for key in keys]
 
     def _judge(self, without: Fit, fit: Fit, candidate: Candidate) -> Refined:
         own = self._problem.inflation(fit, len(fit.free) - len(without.free))
@@ -339,11 +374,11 @@ class Search:
     def _without(self, chosen: tuple[Candidate, ...], one: Candidate) -> Fit:
         """The fit of ``chosen`` but ``one``, from that of all."""
         key = frozenset(chosen) - {one}
-        if key not in self._fits:
+        if key not in self._kept.fits:
             fit = self.fit(chosen)
             free = tuple(pair for pair in fit.free if pair[0] != one.effect)
-            self._fits[key] = self._problem.fit(fit.car.without(one.effect), free, fit)
-        return self._fits[key]
+            self._kept.fits[key] = self._problem.fit(fit.car.without(one.effect), free, fit)
+        return self._kept.fits[key]
 
     def _exchange(self, chosen: list[Candidate]) -> None:
         """Replaces earlier effects by others that go better with the later ones."""
@@ -370,4 +405,4 @@ class Search:
         rest = tuple(c for c in chosen if c != one)
         fit = self.fit(chosen)
         others = [r for r in self._confirmed(rest) if r.candidate.effect != one.effect]
-        return [r.candidate.effect for r in others if self._left_out.compare(r.fit, fit).alike]
+        return [r.candidate.effect for r in others if self._kept.left_out.compare(r.fit, fit).alike]

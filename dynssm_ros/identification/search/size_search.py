@@ -20,6 +20,11 @@ class CandidateStart(NamedTuple):
     car: CarEstimate
     expected_delta_bic: float
 
+    @property
+    def values(self) -> Values:
+        """With which its effect is to be fitted from."""
+        return self.car.effects[self.candidate.effect]
+
 
 @dataclass(frozen=True)
 class SizeSearch:
