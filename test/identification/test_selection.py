@@ -18,7 +18,7 @@ from dynssm_ros.identification.search.confirmation import Confirmation, LeaveOne
 from dynssm_ros.identification.search.integrator import _with_what_hides, search_causes
 from dynssm_ros.identification.search.selection import Refined, Search
 from dynssm_ros.identification.search.size_search import SizeSearch
-from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC
+from dynssm_ros.identification.tuning import CONVERGED, DECISIVE_DELTA_BIC
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.simulation.laps import as_recording, simulate
 from dynssm_ros.track.lap_position import lap_context
@@ -74,6 +74,18 @@ def test_a_pair_is_found_the_stronger_first_and_with_its_sizes() -> None:
     assert found.fit.car.effects["steering_offset"]["offset"] == pytest.approx(0.03, rel=0.1)
     assert found.fit.car.effects["drive_gain"]["factor"] == pytest.approx(1.15, rel=0.05)
     assert all(one.confirmation is not None and one.confirmation.holds for one in found.chosen)
+
+
+def test_a_search_that_begins_anew_finds_what_one_without_the_effect_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    searching, fresh = (search(steering_offset={"offset": 0.03}, drive_gain={"factor": 1.15}) for _ in range(2))
+    first = searching.run().chosen[0].candidate.effect
+    again = searching.reject(first)
+    fresh.found = [one for one in fresh.found if one.effect != first]
+    expected = fresh.run()
+    assert [one.candidate for one in again.chosen] == [one.candidate for one in expected.chosen]
+    assert again.fit.objective == pytest.approx(expected.fit.objective, abs=CONVERGED)
+    monkeypatch.setattr(searching._problem, "fit", None)  # nothing of it is fitted another time
+    assert [one.candidate for one in searching.reject(first).chosen] == [one.candidate for one in again.chosen]
 
 
 def test_nothing_is_chosen_where_nothing_is_hidden() -> None:
@@ -157,7 +169,7 @@ def test_what_is_not_confirmed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     (best, *_) = searching.ranked(())
     assert searching.eliminated(()).unconfirmed is None, "it would be"
     once = Confirmation(np.array([24.0, 24.0, -240.0, 24.0]), 100.0, 0.0, np.zeros(3))
-    monkeypatch.setattr(searching._left_out, "compare", lambda without, fit: once)
+    monkeypatch.setattr(searching._kept.left_out, "compare", lambda without, fit: once)
     doubtful = searching.eliminated(()).unconfirmed
     assert doubtful is not None
     assert doubtful.candidate == best.candidate
