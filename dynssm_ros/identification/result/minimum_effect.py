@@ -135,18 +135,13 @@ class _Nearby:
                 move = np.asarray(np.linalg.solve(self._H, pull.T).T)
             else:  # as for the size before
                 move = np.stack([one.size * one.follows for one in sizes])
-            left = np.arange(len(sizes))  # that no longer step has served yet
             for share in tuning.FOLLOW_SHARES if k else (1.0,):
-                tried = np.clip(fit.position + followed[left] + share * move[left], *self._limits) - fit.position
+                tried = np.clip(fit.position + followed + share * move, *self._limits) - fit.position
                 moved = [with_values(car, fit.free, fit.position + each) for each in tried]
-                other = present[left] - self._problem.errors_of(moved)
+                other = present - self._problem.errors_of(moved)
                 less = self._told(other, tried)
-                better = less < told[left]
-                won = left[better]
-                rest[won], followed[won], told[won] = other[better], tried[better], less[better]
-                left = left[~better]
-                if not len(left):
-                    break
+                better = less < told
+                rest[better], followed[better], told[better] = other[better], tried[better], less[better]
         for one, each in zip(sizes, followed, strict=True):
             one.follows = each / one.size
         seen = told - self._surprise(followed)
