@@ -1,12 +1,12 @@
-"""Signals that do not live: constant where the car moves, clipped, or in coarse steps."""
+"""Signals that do not live or are not of the car: constant where it moves, clipped, in coarse steps, with single spikes."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from dynssm_ros.arrays import Vector
+from dynssm_ros.arrays import Mask, Vector
 from dynssm_ros.signals.findings import Finding, number
-from dynssm_ros.signals.spans import Drive, varies
+from dynssm_ros.signals.spans import SIGMAS, Drive, varies
 
 _TURNS_RAD_S, _BOTH_WAYS = 0.02, 0.3
 """Rate of turning that shows (rad/s); share of the largest that it has to both sides."""
@@ -16,15 +16,19 @@ _CLIPPED_SHARE, _CLIPPED_S = 0.01, 0.2
 """Share of rows at the very largest value, and the time at a stretch, that no sensor shows that is not clipped."""
 _STEP = 0.3
 """Step of a signal in units of its standard deviation, from which on it is coarse."""
+_SPIKE, _SPIKE_SHARE = 15.0, 0.05
+"""How far off its neighbours a spike is: in standard deviations of that, and as a share of the signal's usual range."""
+_SPIKES, _SPIKES_SHARE = 5, 0.01
+"""How many make a finding (a healthy motion capture log has four), and how many a row there are at most: more are noise."""
 
 
 def check_liveness(drive: Drive) -> list[Finding]:
-    """Constants, clipping and coarse steps."""
+    """Constants, clipping, coarse steps and spikes."""
     found = [*_constants(drive)]
     dead = {each.what.removesuffix("_constant") for each in found}
     for name, values in (("v_x", drive.velocity.real), ("v_y", drive.velocity.imag), ("omega", drive.omega)):
         if name not in dead and varies(values):
-            found += _clipped(name, values, drive) or _coarse(name, values)
+            found += _clipped(name, values, drive) or _coarse(name, values) or _spikes(name, values, drive)
     return found
 
 
@@ -106,11 +110,11 @@ def _clipped(name: str, values: Vector, drive: Drive) -> list[Finding]:
     return []
 
 
-def _runs(at: Vector) -> int:
+def _runs(at: Mask) -> int:
     return int((np.diff(at.astype(int), prepend=0) > 0).sum())
 
 
-def _longest_run(at: Vector) -> int:
+def _longest_run(at: Mask) -> int:
     edges = np.flatnonzero(np.diff(at.astype(int), prepend=0, append=0))
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
@@ -128,5 +132,27 @@ def _coarse(name: str, values: Vector) -> list[Finding]:
         Finding(
             what=f"{name}_coarse", told=f"{name} comes in steps of {number(step)}", size=step, low=step, high=step,
             expected=f"steps below {number(_STEP * spread)}", remedy="find the field that is not rounded",
+        )
+    ]  # fmt: skip
+
+
+def _spikes(name: str, values: Vector, drive: Drive) -> list[Finding]:
+    """A signal that leaves for a row or two and comes back, again and again: no car moves like that."""
+    if len(values) < 5:
+        return []
+    five = np.lib.stride_tricks.sliding_window_view(values, 5)
+    off = np.where(drive.segment[4:] == drive.segment[:-4], five[:, 2] - np.median(five, axis=1), 0.0)
+    usual = float(np.ptp(np.percentile(values, [2.0, 98.0])))
+    spread = 1.4826 * float(np.median(np.abs(off[off != 0.0]))) if (off != 0.0).any() else 0.0
+    at = np.abs(off) > max(_SPIKE * spread, _SPIKE_SHARE * usual)
+    count, minutes = _runs(at), len(values) * drive.T_s / 60.0
+    if count < _SPIKES or count > _SPIKES_SHARE * len(values):
+        return []
+    rate, half, size = count / minutes, SIGMAS * float(np.sqrt(count)) / minutes, float(np.median(np.abs(off[at])))
+    return [
+        Finding(
+            what=f"{name}_spikes", told=f"{name} jumps by {number(size)} and back {number(rate)} times a minute", size=rate,
+            low=max(rate - half, 0.0), high=rate + half, unit="1/min", expected="no spikes of a row or two",
+            remedy="find where they come from (plug, radio, a filter's restart), or leave those rows out",
         )
     ]  # fmt: skip

@@ -235,6 +235,22 @@ def test_signals_clip_and_come_in_steps() -> None:
     assert [each.size for each in contradictions(coarse) if each.what == "v_x_coarse"] == [2.0]
 
 
+@pytest.mark.parametrize(("name", "size", "rows"), [("omega", 0.4, 1), ("v_y", -1.0, 2), ("v_x", 6.0, 1)])
+def test_spikes_are_told_with_their_rate_and_size(name: str, size: float, rows: int) -> None:
+    drive = driven()
+    values = drive[name].copy()
+    for at in (100, 333, 500, 777, 1000, 1111):
+        values[at : at + rows] += size
+    found = contradictions(with_columns(drive, **{name: values}))
+    assert [each.what for each in found] == [f"{name}_spikes"]
+    assert found[0].size == pytest.approx(6.0)
+    assert found[0].low < 6.0 < found[0].high
+    once = drive[name].copy()
+    once[600:] += size / 100.0  # a step that stays is none, nor is a single spike
+    once[300] += size
+    assert contradictions(with_columns(drive, **{name: once})) == ()
+
+
 def test_a_steering_that_is_held_says_nothing_of_curvature() -> None:
     rng = np.random.default_rng(0)
     curvature = 0.03 + 0.01 * rng.standard_normal(400)
