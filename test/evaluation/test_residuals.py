@@ -133,3 +133,11 @@ def test_resistance_at_some_speeds_is_told_with_the_speeds(healthy: Recording) -
     found = model_anatomy(replace(clean, values=values), situations(clean), learn=False).patterns[0]
     assert (found.channel, found.kind) == ("v_x", "speed")
     assert found.size["error_per_s"] == pytest.approx(0.01 / 0.02, rel=0.4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_errors_of_which_nothing_can_be_fitted_have_no_period(healthy: Recording, seed: int) -> None:
+    clean = taken_apart(healthy).errors
+    wild = np.random.default_rng(seed).standard_t(1.2, clean.values.shape)
+    found = model_anatomy(replace(clean, values=wild), situations(clean), learn=False).patterns
+    assert {each.kind for each in found} <= {"spikes"}

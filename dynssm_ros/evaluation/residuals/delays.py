@@ -53,6 +53,8 @@ def delays(errors: OneStepErrors, values: Vector, channel: int, slopes: Vector) 
         value = _top(share, best, lags) * errors.T_s
         low, high = np.percentile(_drawn(cross, square, total, lags), [2.5, 97.5]) * errors.T_s
         low, high = min(float(low), value - errors.T_s / 2), max(float(high), value + errors.T_s / 2)
+        if low <= 0.0 <= high:
+            continue
         late = "later" if value > 0 else "earlier"
         told = (
             f"{name} answers the {signal} {1e3 * abs(value):.0f} ms {late} than the model "

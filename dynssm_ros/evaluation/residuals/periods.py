@@ -80,7 +80,8 @@ def _clock(errors: OneStepErrors, values: Vector, y: Vector, channel: str) -> It
         strongest = sorted(best, reverse=True)[:_BEST]
         combs = [_comb(errors, values, tested, channel, kind, rows, trials) for _, rows in strongest]
         most = max(comb.share for comb in combs)
-        yield min((comb for comb in combs if comb.share >= _AS_GOOD * most), key=lambda comb: comb.size["period_s"])
+        enough = most - (1.0 - _AS_GOOD) * abs(most)  # shares by chance are negative
+        yield min((comb for comb in combs if comb.share >= enough), key=lambda comb: comb.size["period_s"])
 
 
 def _comb(
