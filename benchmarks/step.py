@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import importlib
 import math
 import subprocess
 import sys
@@ -97,7 +98,7 @@ def means(integrator: Integrator) -> dict[str, Means]:
         loop, seconds = compiled.LIBRARY.dynssm_over, time.monotonic() - begin
         found["tape, compiled loop"] = Means(lambda: loop(*arguments), lambda: moved, seconds, (structure, window))
     try:
-        import numba
+        numba = importlib.import_module("numba")
     except ImportError:
         return found
     return found | {"Numba": _by_numba(step, inputs, moved.copy(), numba)}
