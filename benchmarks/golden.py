@@ -37,7 +37,8 @@ DYNSSM_ORCA = {
     "base": "dynssm_paper_orca", "name": "dynssm_orca", "history": 0.3, "ssm": {"channels": 256, "states": 48},
     "gru": {"hidden": 128}, "physics": {"nominal": "calibrated"}, "adaptation": {"hidden": 256},
     "residual": {"hidden": [192, 192], "inputs": "normalised"}, "loss": {"scale": "increment", "parameters": 0.001},
-    "training": {"epochs": 200, "batch_size": 128, "learning_rate": 0.001, "weight_decay": 0.0001, "patience": 60},
+    "training": {"epochs": 200, "batch_size": 128, "learning_rate": 0.001, "weight_decay": 0.0001, "gradient_clip": 1.0,
+                 "patience": 60},
 }  # fmt: skip
 """The model file that is trained, as changes of a shipped one."""
 

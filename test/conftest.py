@@ -253,7 +253,7 @@ physics: {nominal: vehicle}
 adaptation: {hidden: 8}
 residual: {hidden: [8], inputs: normalised}
 loss: {scale: increment, parameters: 0.001}
-training: {epochs: 4, batch_size: 64, learning_rate: 0.001, weight_decay: 0.0001, patience: 60}
+training: {epochs: 4, batch_size: 64, learning_rate: 0.001, weight_decay: 0.0001, gradient_clip: 1.0, patience: 60}
 """
 
 
