@@ -63,7 +63,8 @@ CARRYING = sorted(name for name in ANYWHERE if EFFECTS[name](**{}).EFFECT_STATES
 def test_the_layer_carries_effect_states_over_a_window_as_the_baseline_does(name: str, acting: Acting) -> None:
     car = with_effect(name, acting)
     model = SingleTrack(car, "rk4", 2)
-    smooth = np.cumsum(rows(model.H * 4).reshape(4, model.H, 7) - rows(1), axis=1) * 0.002 + [30, 0, 0, 0.2, 0, 0, 0]
+    smooth = np.cumsum(rows(model.H * 4).reshape(4, model.H, 7) - rows(1), axis=1) * 0.002 + [0, 0, 0, 0.2, 0, 0, 0]
+    smooth[..., 0] += np.linspace(18.0, 14.0, model.H)  # m/s, slower through where a gear depends on what was before
     layer = PhysicsLayer(car, PhysicsConfig(integrator="rk4", substeps=2))
     found = layer.over(torch.from_numpy(smooth), torch.tensor(car.nominal), 1)[:, 0].numpy()
     np.testing.assert_allclose(found, model.predict(smooth).state - smooth[:, -1, :3], atol=1e-12)
