@@ -28,8 +28,8 @@ from dynssm_ros.vehicle.parameters import EffectEntry
 
 Quantity = Literal["time", "speed", "yaw_rate", "lateral_acceleration"]
 MID_RANGE = "mid_range"
-AS_THEY_ARE = (*UNTRAINED, MID_RANGE)
-"""Models that need no training: those on the calibrated car, and the single-track model with the middle of the bounds."""
+AS_THEY_ARE = (MID_RANGE, *UNTRAINED)
+"""Models that need no training: the single-track model with the middle of the bounds, and those on the calibrated car."""
 FIXED = (TRUE, *AS_THEY_ARE)
 """The same of a race, with the plant's own."""
 _SAME_TIME = 1e-3  # share by which sampling times may differ

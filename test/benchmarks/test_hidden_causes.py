@@ -218,7 +218,11 @@ def test_the_least_sizes_are_just_noticeable() -> None:
     time = (drive.time - drive.time[0]) / 1e9
     lap = {"s": drive.s % drive.track.length, "lap_length": np.full(len(time), drive.track.length)}
     track = RecordedRows(
-        rows, {"t": time, "theta": drive.pose[:, 2]} | lap, car.sampling_time, time, np.zeros(len(time), dtype=np.intp)
+        rows,
+        {"t": time, "clock": time, "theta": drive.pose[:, 2]} | lap,
+        car.sampling_time,
+        time,
+        np.zeros(len(time), dtype=np.intp),
     )
     problem = IdentificationProblem(
         SimulationWindows(track, np.arange(8, rows.shape[1] - 14, 13), 13, 8, "euler"), CarEstimate.of(car)
@@ -230,4 +234,5 @@ def test_the_least_sizes_are_just_noticeable() -> None:
         change = fit.noise.whiten(problem.errors(fit.car.with_effect(name, values)) - fit.errors).ravel()
         seen = J.T @ change
         evidence = change @ change - seen @ np.linalg.solve(J.T @ J + np.eye(18), seen)
-        assert 40 < evidence < 5 * 49, name
+        most = np.inf if effect.READ_OFF else 5 * 49  # single steps must show when it acts, before it is fitted
+        assert 40 < evidence < most, name

@@ -33,7 +33,7 @@ def test_the_folder_holds_vehicle_report_and_results(dynssm: Run, offset: tuple[
     status, out, err = dynssm("diagnose", laps, *arguments, *FEW, "--track", "road_course")
     assert status == 0
     assert all(line.startswith("diagnosing: ") for line in err.splitlines()), "nothing but how far it is"
-    assert out.startswith("The simulation lacks: steering_offset.\n")
+    assert out.startswith("cause: The simulation lacks: steering_offset.\n")
     assert "What to do: Re-zero the steering sensor" in out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["report.html", "results.json", "vehicle.yaml"]
     result = json.loads((tmp_path / "copy.json").read_text())

@@ -97,6 +97,7 @@ INSIDE = {
     "train": ["train", "R", "--vehicle", "orca"],
     "sweep": ["sweep", "laps.parquet", "--vehicle", "orca", "--validation", "R"],
     "evaluate": ["evaluate", "laps.parquet", "--model", "R"],
+    "residuals": ["residuals", "R", "--vehicle", "orca"],
     "replay": ["replay", "bag", "--model=R"],
     "diagnose": ["diagnose", "--reference", "laps.parquet", "--suspect", "R", "--vehicle", "orca"],
     "season": ["season", "R", "--vehicle", "orca"],

@@ -78,7 +78,7 @@ def test_every_effect_acts_and_can_be_differentiated(orca, acting, name):
         pytest.skip("needs the measured roll, which a controller does not have")
     effects = (effect,)
     model = HorizonModel(CarModel(car.constants, 0.02, effects), N)
-    x = np.concatenate([NOW, np.zeros(model.size - 8)])
+    x = np.concatenate([NOW, np.full(model.size - 8, float(name == "gear_shift"))])  # in the upper gear
     following, by_x, _ = model.linearised(np.tile(x, (N, 1)), np.tile(U, (N, 1)), np.tile(parameters(orca), (N, 1)))
     plain = HorizonModel(CarModel(car.constants, 0.02), N).step(NOW, U, parameters(orca))
     assert np.all(np.isfinite(by_x))

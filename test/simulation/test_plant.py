@@ -100,6 +100,7 @@ def test_effects_see_time_place_and_pose():
     seen.clear()
     car.advance(Applied(0.0, 0.0), s=3.0)
     car.advance(Applied(0.0, 0.0), s=3.1)
-    assert seen[0] == {"t": 0.0, **line.place(3.0), "x": 1.0, "y": 2.0, "theta": 0.5}
+    clock = 6400.0  # s; a drive begins 1e9 s after the epoch, at 01:46:40
+    assert seen[0] == {"t": 0.0, "clock": clock, **line.place(3.0), "x": 1.0, "y": 2.0, "theta": 0.5}
     assert seen[1]["t"] == pytest.approx(0.02)
     assert seen[1]["x"] > 1.0
