@@ -81,7 +81,10 @@ def test_a_learner_finds_what_no_test_looks_for(healthy: Recording) -> None:
     values = clean.values.copy()
     values[:, 0] += 2.0 * values[:, 0].std() * product / product.std()
     found = left_to_learn(replace(clean, values=values))["v_x"]
-    assert found.share - found.filtered > 0.2
+    assert 0.6 < found.share < 0.85  # 0.8 of the squared error is planted
+    assert (
+        found.share - found.filtered > 0.1
+    )  # as the rest lasts for some rows, a filter of the last errors knows it too
     assert found.p < 1e-4
     assert next(iter(found.uses)) == "v_x"
 
