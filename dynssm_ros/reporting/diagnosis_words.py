@@ -122,12 +122,19 @@ def _recalibration_in_words(diagnosis: Diagnosis) -> str:
 
 
 def _shift_in_words(one: CoefficientShift) -> str:
-    unit = "kg" if one.name == "m" else COEFFICIENT_UNITS[one.name]
-    unit = "" if unit == "1" else f" {unit}"
     return (
-        f"{one.name} ({_change(one.given, one.value)}, {text(one.value)} ± {one.std:.2g}{unit}, "
+        f"{one.name} ({_change(one.given, one.value)}, {text(one.value)} ± {one.std:.2g}{_unit_of(one.name)}, "
         f"{abs(one.deviations):.1f} of its standard deviations; {percent(one.explains)} of the error)"
     )
+
+
+def _unit_of(coefficient: str) -> str:
+    """Its unit after a number."""
+    return _spaced("kg" if coefficient == "m" else COEFFICIENT_UNITS[coefficient])
+
+
+def _spaced(unit: str) -> str:
+    return "" if unit == "1" else f" {unit}"
 
 
 def _change(was: float, now: float) -> str:
@@ -206,12 +213,10 @@ def moved_in_words(diagnosis: Diagnosis) -> list[str]:
     for name, (was, now) in diagnosis.recalibrated.items():
         if abs(diagnosis.moved[name]) <= SURE_STD:
             continue  # told by its part in the error
-        unit = "kg" if name == "m" else COEFFICIENT_UNITS[name]
-        value = text(now) if unit == "1" else f"{text(now)} {unit}"
         what = f"{words[name]} ({name})" if name in words else name
         sentences.append(
-            f"Recalibrated: {what} is {value}, {_change(was, now)}: {abs(diagnosis.moved[name]):.1f} of its standard "
-            "deviations."
+            f"Recalibrated: {what} is {text(now)}{_unit_of(name)}, {_change(was, now)}: "
+            f"{abs(diagnosis.moved[name]):.1f} of its standard deviations."
         )
     return sentences
 
@@ -224,8 +229,7 @@ def size_in_words(cause: Cause) -> str:
         return f"{label} from {values.min():.3g} to {values.max():.3g} along the lap, {len(cause.std)} parameters"
     parts = []
     for name, value in cause.values.items():
-        unit = EFFECTS[cause.effect].PARAMETERS[name].unit
-        unit = "" if unit == "1" else f" {unit}"
+        unit = _spaced(EFFECTS[cause.effect].PARAMETERS[name].unit)
         if name in cause.on_bound:
             spread = " or farther from neutral (at its bound)"
         else:

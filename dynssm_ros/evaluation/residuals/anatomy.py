@@ -25,7 +25,7 @@ from dynssm_ros.evaluation.residuals.learner import LeftToLearn, learner_pattern
 from dynssm_ros.evaluation.residuals.patterns import Pattern
 from dynssm_ros.evaluation.residuals.periods import autocorrelation, periods
 from dynssm_ros.evaluation.residuals.regimes import Situation, regimes, situations
-from dynssm_ros.evaluation.residuals.sizes import signal_faults, spike_period, spikes, statistics
+from dynssm_ros.evaluation.residuals.sizes import signal_faults, spikes, statistics
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
@@ -206,7 +206,7 @@ def model_anatomy(
             if best.fitted is not None:
                 values -= best.fitted
         left = float(np.sum(values**2)) / total
-        of_size = [*spikes(errors, values, c, slopes), *spike_period(errors, values, c, slopes)]
+        of_size = list(spikes(errors, values, c, slopes))
         patterns += [*found, *_beyond_chance(of_size, level, left, tests), *_beyond_chance(beside, level, 1.0, tests)]
     lags = round(_AUTOCORRELATION_S / errors.T_s)
     return ModelAnatomy(

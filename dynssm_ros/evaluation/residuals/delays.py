@@ -33,8 +33,7 @@ def delays(errors: OneStepErrors, values: Vector, channel: int, slopes: Vector) 
     """
     y, name = limited(values), STATE_SIGNALS[channel]
     lags = np.arange(round(_LAGS_S[0] / errors.T_s), round(_LAGS_S[1] / errors.T_s) + 1)
-    for k, signal in enumerate(("throttle", "steering")):
-        column = errors.recording[("r_fb", "delta_fb")[k]] + errors.recording[("r_cmd", "delta_cmd")[k]]
+    for k, (signal, column) in enumerate(errors.inputs.items()):
         slope = slopes[:, channel, len(STATE_SIGNALS) + k]
         now = column[errors.rows]
         changes = [slope * (now - errors.before(column, int(lag))) for lag in lags]

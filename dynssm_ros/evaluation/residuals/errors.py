@@ -56,9 +56,15 @@ class OneStepErrors:
         return self.recording.rows(self.rows)
 
     @cached_property
+    def inputs(self) -> dict[str, Vector]:
+        """Throttle and steering that act at each row of the recording, by name, each of shape ``(M,)``."""
+        rows = self.recording.rows(np.arange(len(self.recording)))
+        return dict(zip(("throttle", "steering"), applied_inputs(rows.T), strict=True))
+
+    @cached_property
     def applied(self) -> Vector:
         """Throttle and steering that act in each step, shape ``(N, 2)``."""
-        return np.stack(applied_inputs(self.driven.T), axis=1)
+        return np.stack([column[self.rows] for column in self.inputs.values()], axis=1)
 
     @cached_property
     def seconds(self) -> Vector:
@@ -84,10 +90,14 @@ class OneStepErrors:
 
     def before(self, values: Vector, rows: int) -> Vector:
         """``values`` ``(M, ...)`` of the recording so many rows before each window's last, held at the segment's first."""
-        at = self.rows - rows
-        first = np.searchsorted(self.recording.segment, self.recording.segment[self.rows])
-        last = np.searchsorted(self.recording.segment, self.recording.segment[self.rows], side="right") - 1
-        return np.asarray(values[np.clip(at, first, last)])
+        return np.asarray(values[np.clip(self.rows - rows, *self._segment_ends)])
+
+    @cached_property
+    def _segment_ends(self) -> tuple[Indices, Indices]:
+        """First and last row of the segment of each window's last row, ``(N,)`` each."""
+        segment = self.recording.segment
+        first, after = (np.searchsorted(segment, segment[self.rows], side=side) for side in ("left", "right"))
+        return first, after - 1
 
 
 def one_step_errors(

@@ -115,10 +115,7 @@ def _has_history(errors: OneStepErrors) -> Mask:
 def _features(errors: OneStepErrors, usable: Indices) -> tuple[dict[str, list[int]], Vector]:
     """What the learner sees: columns by the name of the signal that they come from, and their values ``(M, n)``."""
     log, rows = errors.recording, errors.rows[usable]
-    names = {
-        "v_x": log["v_x"], "v_y": log["v_y"], "omega": log["omega"],
-        "throttle": log["r_fb"] + log["r_cmd"], "steering": log["delta_fb"] + log["delta_cmd"],
-    }  # fmt: skip
+    names = {name: log[name] for name in STATE_SIGNALS} | errors.inputs
     columns: list[Vector] = []
     groups: dict[str, list[int]] = {}
 

@@ -72,8 +72,7 @@ def situations(errors: OneStepErrors) -> list[Situation]:
         _bins("longitudinal acceleration", (v_x - long_ago) / (rows * T_s), "m/s²", _BINS),
     ]
     back = max(1, round(_RATE_S / T_s))
-    for k, (name, unit) in enumerate((("throttle", "1/s"), ("steering", "rad/s"))):
-        column = log[("r_fb", "delta_fb")[k]] + log[("r_cmd", "delta_cmd")[k]]
+    for (name, column), unit in zip(errors.inputs.items(), ("1/s", "rad/s"), strict=True):
         change = column[errors.rows] - errors.before(column, back)
         found.append(_bins(f"{name} rate", change / (back * T_s), unit, _BINS))
         since = _since_step(errors, column, back)

@@ -48,7 +48,7 @@ def statistics(values: Vector) -> dict[str, float]:
 
 
 def spikes(errors: OneStepErrors, values: Vector, c: int, slopes: Vector | None) -> Iterator[Pattern]:
-    """Looks for rare errors that are far larger than those around them, and for the speeds at which they come.
+    """Looks for rare errors that are far larger than those around them, and for the speeds and the period at which they come.
 
     Args:
         errors: of the model.
@@ -76,6 +76,7 @@ def spikes(errors: OneStepErrors, values: Vector, c: int, slopes: Vector | None)
     by_speed = 100 * np.bincount(kind[far], values[far] ** 2, len(edges) - 1) / max(float(np.sum(values**2)), 1e-300)
     drawn = Picture("bins", edges, by_speed, "speed (m/s)", f"% of the squared error\nof {channel} in spikes ({unit})")
     yield Pattern(channel, "size", "spikes", told, share, p, 1, size, None, drawn)
+    yield from _spike_period(errors, values, channel, np.flatnonzero(far))
 
 
 def _listed(speeds: tuple[tuple[float, float], ...]) -> str:
@@ -129,10 +130,8 @@ def _speeds(errors: OneStepErrors, large: Mask) -> tuple[tuple[float, float], ..
     return tuple(out)
 
 
-def spike_period(errors: OneStepErrors, values: Vector, c: int, slopes: Vector | None) -> Iterator[Pattern]:
-    """Looks for the fixed period at one step of which spikes gather, by the count at that step; see :func:`spikes`."""
-    channel, deviation = STATE_SIGNALS[c], _deviation(errors, values, c, slopes)
-    at = np.flatnonzero(np.abs(values - np.median(values)) > _SPIKE * deviation)
+def _spike_period(errors: OneStepErrors, values: Vector, channel: str, at: Indices) -> Iterator[Pattern]:
+    """Looks for the fixed period at one step of which the spikes ``at`` gather, by the count at that step."""
     longest = int(LONGEST_PERIOD_S / errors.T_s)
     if len(at) < _FEWEST_SPIKES:
         return

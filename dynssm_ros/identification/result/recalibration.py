@@ -104,7 +104,7 @@ def recalibration(
     share = _share(before, after)
     interval, explains = reduction_interval(before, after, windows.block), mean_reduction(before, after)
     noticed = explains > 0.0 and bool(((share > tuning.NOTICEABLE_SHARE) & (interval[0] > 0.0)).any())
-    selection = _Selection(problem, fit, given)
+    selection = _ForwardSelection(problem, fit, given)
     chosen = selection.fewest()
     if not noticed and not selection.is_sure(chosen):
         return None
@@ -199,7 +199,7 @@ def _values(car: CarEstimate) -> list[float]:
     return [*car.theta, car.constants.m]
 
 
-class _Selection:
+class _ForwardSelection:
     """Which of the coefficients have to leave the file's values.
 
     Args:
