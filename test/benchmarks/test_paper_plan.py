@@ -178,7 +178,7 @@ def test_learning_rates_that_are_tried_hold_the_shipped_one(plan):
     [
         (lambda c: c["models"].update(gpt_av21={}), "models: 'gpt_av21' is neither a file nor a shipped name"),
         (lambda c: c["cars"]["orca"].update(vehicle="trabant"), "vehicles: 'trabant' is neither a file nor"),
-        (lambda c: c["studies"]["laps"]["models"].append("x"), "studies.laps.models: 'x' is not one of persistence"),
+        (lambda c: c["studies"]["laps"]["models"].append("x"), "studies.laps.models: 'x' is not one of"),
         (lambda c: c["studies"]["laps"]["splits"].append("x"), "studies.laps.splits: 'x' is not one of"),
         (lambda c: c["studies"]["laps"]["splits"].append("ethz"), "studies.laps.splits: of several cars"),
         (
