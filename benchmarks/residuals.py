@@ -2,6 +2,7 @@
 
     python -m benchmarks.residuals healthy --count 100 [--seed 0] [--rls]
     python -m benchmarks.residuals planted --count 10 [--seed 0]
+    python -m benchmarks.residuals time [--seconds 600]
 
 A healthy drive is of a car that is just what its file says, stepped as the model steps, whose sensors have white or coloured
 noise. Car, track, style, length and noise are drawn by the seed. Planted are patterns of a size drawn evenly in its logarithm
@@ -11,6 +12,7 @@ from barely to clearly visible, in a drive of the same kind.
 from __future__ import annotations
 
 import argparse
+import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -200,6 +202,27 @@ def planted(seed: int, count: int) -> str:
     return table(["planted", "size 0.3 to 1", "size 1 to 3"], rows)
 
 
+def times(seconds: float) -> str:
+    """Processor time of the anatomy of a simulated drive at 50 Hz, by what it is asked for."""
+    scale, noise = _CARS["orca"]
+    log = dynssm_ros.recorded(
+        dynssm_ros.simulate("orca", "club_b", duration=seconds, scale=scale, noise=noise, plant="euler", seed=3)
+    )
+    rows = []
+    for name, models, learner in (
+        ("physics and rls, the command's first call", (), True),
+        ("physics and rls", (), True),
+        ("physics and rls, without trees", (), False),
+        ("physics", ("single_track",), True),
+        ("physics, without trees", ("single_track",), False),
+    ):
+        start = time.process_time()
+        dynssm_ros.residuals(log, "orca", models, learner=learner)
+        rows.append([name, f"{time.process_time() - start:.1f} s"])
+        print(rows[-1], flush=True)
+    return f"{len(log)} rows\n" + table(["asked for", "processor time"], rows)
+
+
 def _interval(wrong: int, done: int) -> tuple[float, float]:
     """Clopper and Pearson's 95 % interval of a share, in percent."""
     low = stats.beta.ppf(0.025, wrong, done - wrong + 1) if wrong else 0.0
@@ -210,16 +233,19 @@ def _interval(wrong: int, done: int) -> tuple[float, float]:
 def main() -> None:
     """Measures and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("what", choices=("healthy", "planted"))
+    parser.add_argument("what", choices=("healthy", "planted", "time"))
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rls", action="store_true", help="also of rls, which takes longer")
+    parser.add_argument("--seconds", type=float, default=600.0, help="length of the drive that is timed (s)")
     given = parser.parse_args()
     warnings.simplefilter("ignore", DataWarning)
     if given.what == "healthy":
         print(healthy(given.seed, given.count, given.rls))
-    else:
+    elif given.what == "planted":
         print(planted(given.seed, given.count))
+    else:
+        print(times(given.seconds))
 
 
 if __name__ == "__main__":

@@ -81,10 +81,13 @@ def left_to_learn(errors: OneStepErrors, *, importance: bool = True) -> dict[str
     change = np.flatnonzero(np.diff(fold)) + 1
     for k in range(-_LONG_ROWS[-1], _LONG_ROWS[-1]):
         edge[np.clip(change + k, 0, len(edge) - 1)] = True
-    return {
-        channel: _learned(X, groups, errors.values[usable, c], fold, edge, errors.block[usable], importance)
-        for c, channel in enumerate(STATE_SIGNALS)
-    }
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1):  # so few rows that threads wait for each other: they took half of all processor time
+        return {
+            channel: _learned(X, groups, errors.values[usable, c], fold, edge, errors.block[usable], importance)
+            for c, channel in enumerate(STATE_SIGNALS)
+        }
 
 
 def learner_patterns(found: dict[str, LeftToLearn]) -> list[Pattern]:

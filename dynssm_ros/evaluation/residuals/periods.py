@@ -21,10 +21,8 @@ from dynssm_ros.signals.recording import COLUMN_UNITS
 
 LONGEST_PERIOD_S = 2.0
 """Longest period that is looked for (s): what comes back later does so with bends and laps."""
-_BEST, _AS_GOOD = (
-    3,
-    0.95,
-)  # periods that are tested of those tried; share of the best from which on a shorter one is taken
+_BEST, _AS_GOOD = 3, 0.95
+"""Periods that are tested of those tried; share of the best from which on a shorter one is taken."""
 _CONTINUUM = 101  # frequencies whose median is the spectrum around a line
 _DRIVEN_ABOVE_S, _DRIVEN = 0.3, 12.0
 """Periods from which on, and how many times above its surroundings, a line of an input makes it the driving's."""
@@ -180,9 +178,9 @@ def _line(y: Vector, place: Vector, shortest: float, longest: float) -> tuple[fl
 def _above(power: Vector, inside: Indices) -> Vector:
     """Power at ``inside`` over that around it, by medians of neighbours."""
     half = _CONTINUUM // 2
-    groups = np.arange(len(power)) // half
-    medians = np.array([np.median(part) for part in np.split(power, np.flatnonzero(np.diff(groups)) + 1)])
-    centres = half * (np.arange(len(medians)) + 0.5)
+    whole = len(power) // half
+    medians = np.median(power[: whole * half].reshape(whole, half), axis=1)
+    centres = half * (np.arange(whole) + 0.5)
     around = np.interp(inside, centres, medians) / np.log(2.0)
     return np.asarray(power[inside] / np.maximum(around, 1e-300))
 
