@@ -9,18 +9,16 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from functools import wraps
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, ValidationError
 from typing_extensions import Self
 
 from dynssm_ros.configuration import StrictModel, describe
 from dynssm_ros.errors import SettingError
-from dynssm_ros.parallel import Backend, Workers
+from dynssm_ros.parallel import Backend, Result, Workers
 from dynssm_ros.signals.signal_map import Commands
 from dynssm_ros.vehicle.effects import parse_effect
-
-Result = TypeVar("Result")
 
 
 def setting(

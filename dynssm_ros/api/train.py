@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -72,7 +73,6 @@ def train(
         30
     """
     require("train", "train")
-    from dynssm_ros.identification.result.calibration import calibrate
     from dynssm_ros.learning.export import check_replaceable, save_artifact
     from dynssm_ros.learning.sampling import sampled
     from dynssm_ros.learning.stages import check_device, checkpoints, train
@@ -91,21 +91,26 @@ def train(
         paths, begins = zip(*_looked_at(recordings, car, s.strict), strict=True)
         left_out = held_out(begins, s.holdout, car)
         data = sampled(paths, s.memory, commands=s.commands, holdouts=[left_out[each] for each in begins])
-    car = car.with_held_out(left_out)
-
-    def calibrated(laps: Recording, car: Vehicle, integrator: Integrator | None) -> Vehicle:
-        if integrator in (None, car.integrator) and car.was_calibrated_on(laps.fingerprints):
-            return car
-        found = calibrate(laps, car, integrator=integrator)
-        if len(laps) == len(data):  # parts of the laps only tell how large errors are
-            require_physics(found)
-        return found.vehicle
-
+    car, calibrated = car.with_held_out(left_out), partial(_calibrated, rows=len(data))
     trained = train(data, config, car, checkpoint, device=s.device, progress=on_progress, calibrate=calibrated)
     artifact = save_artifact(trained, folder, {"holdout": _in_brief(left_out), "device": s.device}, picture)
     for path in checkpoints(config, checkpoint):
         path.unlink(missing_ok=True)
     return TrainingResult(trained, artifact)
+
+
+def _calibrated(laps: Recording, car: Vehicle, integrator: Integrator | None, *, rows: int) -> Vehicle:
+    """The car calibrated on laps, taken as it is where it was. Those of all ``rows`` must be worth a car file; parts of
+    them only tell how large errors are.
+    """
+    from dynssm_ros.identification.result.calibration import calibrate
+
+    if integrator in (None, car.integrator) and car.was_calibrated_on(laps.fingerprints):
+        return car
+    found = calibrate(laps, car, integrator=integrator)
+    if len(laps) == rows:
+        require_physics(found)
+    return found.vehicle
 
 
 def model_config(model: ModelConfig | PathLike, **training: Any) -> ModelConfig:

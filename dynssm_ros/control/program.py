@@ -81,27 +81,10 @@ class HorizonProgram:
             p: see above.
             margins: see above.
         """
-        N, w = self.settings.N, self.settings.weights
+        N = self.settings.N
         positions, moves = offset[1:, :2], slope[1:, :2]
         points = self.reference_points(guess)
-        point, tangent, normal = self.reference.line.frame(points)
-        H, g = np.zeros((self.variables,) * 2), np.zeros(self.variables)
-        length, h = self.settings.scale.length, self.model.car.T_s / self.settings.scale.time
-        along, across = np.full(N, h * w.along), np.full(N, h * w.across)
-        across[-1] += w.terminal_across
-        for direction, weights in ((tangent, along), (normal, across)):
-            scale = np.sqrt(2 * weights) / length
-            errors = scale * np.einsum("ki,ki->k", direction, positions - point)
-            by_u = scale[:, None] * np.einsum("ki,kij->kj", direction, moves)
-            H[: 2 * N, : 2 * N] += by_u.T @ by_u
-            g[: 2 * N] += by_u.T @ errors
-        g[: 2 * N] -= w.progress * tangent[-1] @ moves[-1] / length
-        rates = np.tile(self.settings.rates, N) / h
-        H[np.diag_indices(self.variables)] += 2 * np.concatenate(
-            [rates, np.full(N, h * w.border), [max(w.terminal_speed, 1.0)]]
-        )
-        g[2 * N : 3 * N] = h * w.border
-        g[3 * N] = w.terminal_speed
+        H, g = self._cost(points, positions, moves)
 
         A = np.zeros((self.rows, self.variables))
         low, high = np.full(self.rows, -np.inf), np.full(self.rows, np.inf)
@@ -124,8 +107,8 @@ class HorizonProgram:
         self.add_slip(
             A[slips], high[slips], guess=guess[1:], offset=offset[1:], slope=slope[1:], p=p, margin=margins.slip
         )
-        if w.terminal_speed > 0:
-            A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -length / self.settings.scale.time
+        if self.settings.weights.terminal_speed > 0:
+            A[-1, : 2 * N], A[-1, -1] = slope[-1, V_X], -self.settings.scale.length / self.settings.scale.time
             high[-1] = float(self.reference.terminal_speed_at(points[-1])) - offset[-1, V_X]
 
         reach = self.limits.steering_rate * self.model.car.T_s
@@ -133,6 +116,31 @@ class HorizonProgram:
         z_low = np.concatenate([np.tile([-span, -reach], N), np.zeros(N + 1)])
         z_high = np.concatenate([np.tile([span, reach], N), np.full(N + 1, np.inf)])
         return QuadraticProgram(H, g, A, low, high, z_low, z_high)
+
+    def _cost(self, points: Vector, positions: Vector, moves: Vector) -> tuple[Vector, Vector]:
+        """Hessian ``(variables, variables)`` and gradient ``(variables,)`` of the costs at places ``points`` of the
+        reference, where positions ``(N, 2)`` move by ``moves`` ``(N, 2, 2 N)`` with the increments.
+        """
+        N, w = self.settings.N, self.settings.weights
+        point, tangent, normal = self.reference.line.frame(points)
+        H, g = np.zeros((self.variables,) * 2), np.zeros(self.variables)
+        length, h = self.settings.scale.length, self.model.car.T_s / self.settings.scale.time
+        along, across = np.full(N, h * w.along), np.full(N, h * w.across)
+        across[-1] += w.terminal_across
+        for direction, weights in ((tangent, along), (normal, across)):
+            scale = np.sqrt(2 * weights) / length
+            errors = scale * np.einsum("ki,ki->k", direction, positions - point)
+            by_u = scale[:, None] * np.einsum("ki,kij->kj", direction, moves)
+            H[: 2 * N, : 2 * N] += by_u.T @ by_u
+            g[: 2 * N] += by_u.T @ errors
+        g[: 2 * N] -= w.progress * tangent[-1] @ moves[-1] / length
+        rates = np.tile(self.settings.rates, N) / h
+        H[np.diag_indices(self.variables)] += 2 * np.concatenate(
+            [rates, np.full(N, h * w.border), [max(w.terminal_speed, 1.0)]]
+        )
+        g[2 * N : 3 * N] = h * w.border
+        g[3 * N] = w.terminal_speed
+        return H, g
 
     def costs(self, x: Vector, u: Vector, p: Vector, margins: Margins) -> Vector:
         """What the program minimises, ``(M,)``, at states ``x`` ``(M, N + 1, size)``, not linearised, where increments

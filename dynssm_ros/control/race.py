@@ -170,7 +170,7 @@ def _milliseconds(seconds: Vector) -> dict[str, float]:
     return {"p50": float(p50), "p99": float(p99)}
 
 
-class _Drive:
+class _RaceCar:
     """The car of a race on its way."""
 
     def __init__(self, course: Course, model: PredictionModel) -> None:
@@ -261,7 +261,7 @@ def race(course: Course, model: PredictionModel, progress: NamedProgress | None 
         SimulationError: the road is too narrow for the car, or the start is not on it.
         ConfigurationError: the model's physics needs a signal that there is not.
     """
-    drive = _Drive(course, model)
+    drive = _RaceCar(course, model)
     # a search for garbage through all that is there takes longer than some T_s, and a plan would be late for it
     gc.collect()
     gc.freeze()

@@ -224,27 +224,10 @@ def evaluate(
             f"recording {name or ', '.join(recording.info.source)} ({split}): no stretch of {H + steps} rows "
             f"(window {H}, horizon {steps}) without a gap at {speed:g} m/s or more among its {len(recording)} rows"
         )
-    each_model = len(rows) + len(starts) * steps
-    done = 0
-
-    def tick(predictions: int) -> None:
-        nonlocal done
-        done += predictions
-        if progress is not None:
-            progress(done, len(models) * each_model)
-
     regimes = driving_regimes(recording.rows(rows), recording.info.set_point)
-    time = (recording.time[rows + 1] - recording.time[0]) / 1e9
-    lively = rows[liveliest(time, recording.states(rows + 1), max(_DRAWN_S, steps * recording.T_s))]
-    drawn = lively[: len(lively) - steps + 1 : steps]  # rollouts one after the other
+    drawn = _drawn_starts(recording, rows, steps)
     score_of = partial(_score, recording=recording, rows=rows, regimes=regimes, starts=starts, drawn=drawn, steps=steps)
-    labels = list(models)
-    found: dict[str, Score] = {}
-    task = score_of if workers.elsewhere else partial(score_of, tick=tick)
-    for k, score in each(task, list(models.values()), workers):
-        found[labels[k]] = replace(score, model=models[labels[k]])
-        if workers.elsewhere:
-            tick(each_model)
+    found = _scored(models, score_of, len(rows) + len(starts) * steps, progress, workers)
     scores = {
         label: replace(found[label], latency_us=latency_us(model, recording.windows(rows[:50], model.H), calls))
         for label, model in models.items()
@@ -260,6 +243,39 @@ def evaluate(
         scores=scores,
         line=first_lap(recording) if line is None else line,
     )
+
+
+def _drawn_starts(recording: Recording, rows: Indices, steps: int) -> Indices:
+    """Rows from which the rollouts start that figures show, one after the other where most happens."""
+    time = (recording.time[rows + 1] - recording.time[0]) / 1e9
+    lively = rows[liveliest(time, recording.states(rows + 1), max(_DRAWN_S, steps * recording.T_s))]
+    return lively[: len(lively) - steps + 1 : steps]
+
+
+def _scored(
+    models: Mapping[str, WindowModel],
+    score_of: partial[Score],
+    predictions: int,
+    progress: Callable[[int, int], None] | None,
+    workers: Workers,
+) -> dict[str, Score]:
+    """The scores of the models, each of which makes ``predictions``; ``progress`` as of :func:`evaluate`."""
+    done = 0
+
+    def tick(made: int) -> None:
+        nonlocal done
+        done += made
+        if progress is not None:
+            progress(done, len(models) * predictions)
+
+    labels = list(models)
+    found: dict[str, Score] = {}
+    task = score_of if workers.elsewhere else partial(score_of, tick=tick)
+    for k, score in each(task, list(models.values()), workers):
+        found[labels[k]] = replace(score, model=models[labels[k]])
+        if workers.elsewhere:
+            tick(predictions)
+    return found
 
 
 def _score(

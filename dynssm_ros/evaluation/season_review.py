@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -25,14 +25,13 @@ from dynssm_ros.files import checksum, content_key, digest, write_json
 from dynssm_ros.identification.result.calibration import calibrate
 from dynssm_ros.identification.result.diagnose import diagnose
 from dynssm_ros.identification.result.diagnosis import Cause
+from dynssm_ros.parallel import Result
 from dynssm_ros.runtime.coefficients import SHIFTS, daily_change
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.registry import open_models
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.season import Session
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
-
-Result = TypeVar("Result")
 
 SIMPLE = ("single_track", "single_track_ewma")
 """What a model has to beat: the vehicle file, and the same with an average of its errors."""

@@ -81,7 +81,7 @@ def save_artifact(
         ArtifactError: ``out`` is something else, or the exported graph differs from the trained model.
     """
     check_replaceable(out)
-    model, config = trained.model, trained.config
+    model = trained.model
     sample = _sample_windows(trained)
     with replacing(out, may_hold=(ONLINE, LOSSES)) as folder:
         folder.mkdir()
@@ -96,37 +96,38 @@ def save_artifact(
         if trained.start is not None:
             metrics["start"] = _metrics(trained.start)
         (folder / METRICS).write_text(json.dumps(metrics, indent=1), encoding="utf-8")
-        integrator, substeps = config.with_physics.stepping(trained.vehicle)
-        card = ModelCard(
-            name=config.name,
-            kind=config.kind,
-            architecture=config.model_dump(mode="json"),
-            vehicle=trained.vehicle,
-            sampling_time=trained.vehicle.sampling_time,
-            window=trained.H,
-            commands=trained.recording.info.commands,
-            held=trained.recording.info.held,
-            integrator=integrator,
-            substeps=substeps,
-            normalisation=trained.normalisation,
-            slowest=_slowest(trained),
-            network=trained.deploys_network,
-            covariance=_covariance(trained),
-            online=None if trained.online is None else trained.online.card,
-            parameters=sum(p.numel() for p in model.parameters()),
-            flops=count_flops(model, trained.H) if trained.deploys_network else 0,
-            training={
-                "recordings": list(trained.recording.info.source),
-                "seed": config.training.seed,
-                **(training or {}),
-            },
-            laps=trained.recording.fingerprints,
-            checksums={each.name: checksum(each) for each in sorted(folder.iterdir())},
-        )
-        write_card(card, folder)
+        write_card(_card(trained, folder, training or {}), folder)
         if picture is not None and trained.history:
             picture(trained, folder / LOSSES)
     return open_artifact(out)
+
+
+def _card(trained: Trained, folder: Path, training: dict[str, object]) -> ModelCard:
+    """The card of a model whose other files are in ``folder``."""
+    model, config, info = trained.model, trained.config, trained.recording.info
+    integrator, substeps = config.with_physics.stepping(trained.vehicle)
+    return ModelCard(
+        name=config.name,
+        kind=config.kind,
+        architecture=config.model_dump(mode="json"),
+        vehicle=trained.vehicle,
+        sampling_time=trained.vehicle.sampling_time,
+        window=trained.H,
+        commands=info.commands,
+        held=info.held,
+        integrator=integrator,
+        substeps=substeps,
+        normalisation=trained.normalisation,
+        slowest=_slowest(trained),
+        network=trained.deploys_network,
+        covariance=_covariance(trained),
+        online=None if trained.online is None else trained.online.card,
+        parameters=sum(p.numel() for p in model.parameters()),
+        flops=count_flops(model, trained.H) if trained.deploys_network else 0,
+        training={"recordings": list(info.source), "seed": config.training.seed, **training},
+        laps=trained.recording.fingerprints,
+        checksums={each.name: checksum(each) for each in sorted(folder.iterdir())},
+    )
 
 
 def _covariance(trained: Trained) -> tuple[float, float, float]:

@@ -52,7 +52,7 @@ class Heading(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Column:
+class LogColumn:
     """A column that was read."""
 
     type: str
@@ -168,7 +168,7 @@ def _or_zero(cells: Any) -> Any:
     return pc.if_else(pc.equal(cells, ""), "0", cells)
 
 
-def typed_column(array: Any, kind: str, bad: str = "") -> Column:
+def typed_column(array: Any, kind: str, bad: str = "") -> LogColumn:
     """The column of a pyarrow array whose type says what it holds; ``kind`` is what a user reads of it."""
     array = array.combine_chunks() if isinstance(array, pa.ChunkedArray) else array
     array = array.combine_chunks() if isinstance(array, pa.ChunkedArray) else array  # of no chunk
@@ -176,12 +176,12 @@ def typed_column(array: Any, kind: str, bad: str = "") -> Column:
         array = array.dictionary_decode()
     nothing, present = np.full(len(array), np.nan), np.asarray(pc.is_valid(array))
     if not present.any():
-        return Column(kind, nothing, present, reason="no cell has a value")
+        return LogColumn(kind, nothing, present, reason="no cell has a value")
     if pa.types.is_string(array.type) or pa.types.is_large_string(array.type):
         first = str(array[int(np.argmax(present))])[:20]
         found = kind_of([str(one) for one in array.drop_null()[:50]], False)
         if found == "text":
-            return Column(kind, nothing, present, reason=f"text, '{first}' first")
+            return LogColumn(kind, nothing, present, reason=f"text, '{first}' first")
         numbers, wrong = parsed(array, found, False)
         return typed_column(numbers, f"{kind}, {found}", told_bad(array, wrong))
     if pa.types.is_temporal(array.type):
@@ -189,14 +189,14 @@ def typed_column(array: Any, kind: str, bad: str = "") -> Column:
     try:
         values = np.asarray(pc.fill_null(pc.cast(array, pa.float64(), safe=False), np.nan), np.float64)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
-        return Column(kind, nothing, present, reason=f"{array.type}, no number")
+        return LogColumn(kind, nothing, present, reason=f"{array.type}, no number")
     exact = None
     if pa.types.is_integer(array.type):
         exact = np.asarray(pc.fill_null(pc.cast(array, pa.int64(), safe=False), 0), np.int64)
-    return Column(kind, values, present, exact, bad)
+    return LogColumn(kind, values, present, exact, bad)
 
 
-def _time_column(array: Any, kind: str, present: npt.NDArray[np.bool_], bad: str) -> Column:
+def _time_column(array: Any, kind: str, present: npt.NDArray[np.bool_], bad: str) -> LogColumn:
     """Of timestamps, dates, times of day and durations."""
     try:
         if pa.types.is_date(array.type):
@@ -208,9 +208,9 @@ def _time_column(array: Any, kind: str, present: npt.NDArray[np.bool_], bad: str
         else:
             array = pc.cast(array, pa.timestamp("ns", array.type.tz))
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        return Column(kind, np.full(len(array), np.nan), present, reason=" ".join(str(error).split()))
+        return LogColumn(kind, np.full(len(array), np.nan), present, reason=" ".join(str(error).split()))
     exact = np.asarray(pc.fill_null(array.cast(pa.int64()), 0), np.int64)
-    return Column(kind, np.where(present, exact / 1e9, np.nan), present, exact, bad, is_time=True)
+    return LogColumn(kind, np.where(present, exact / 1e9, np.nan), present, exact, bad, is_time=True)
 
 
 def told_bad(text: Any, bad: Any, row: int = 0) -> str:

@@ -15,12 +15,12 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import BagError
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.bags import Bag
-from dynssm_ros.signals.columns import Column, known_unit
+from dynssm_ros.signals.columns import LogColumn, known_unit
 from dynssm_ros.signals.decoding import LOG_TIME, frames_told, header_stamp_ns, stamped_by
 from dynssm_ros.signals.signal_map import compile_field
 from dynssm_ros.signals.stamps import Lateness, possible
 from dynssm_ros.signals.table_clock import Clock
-from dynssm_ros.signals.tables import Table
+from dynssm_ros.signals.tables import LogTable
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = {"v_x": "twist.twist.linear.x", "v_y": "twist.twist.linear.y", "omega": "twist.twist.angular.z"}
@@ -109,7 +109,7 @@ def contents_of_bag(bag: Bag, progress: Progress | None) -> tuple[dict[str, Topi
     return found, begin, end
 
 
-def contents_of_table(table: Table, clock: Clock) -> tuple[dict[str, TopicContent], int, int]:
+def contents_of_table(table: LogTable, clock: Clock) -> tuple[dict[str, TopicContent], int, int]:
     """All columns but that of time, with the table's first and last time (ns); one of no use has a reason."""
     stamps = clock.stamps[clock.known]
     begin, end = int(stamps.min()), int(stamps.max())
@@ -121,7 +121,7 @@ def contents_of_table(table: Table, clock: Clock) -> tuple[dict[str, TopicConten
     return found, begin, end
 
 
-def _column_content(name: str, unit: str, column: Column, clock: Clock, begin: int) -> TopicContent:
+def _column_content(name: str, unit: str, column: LogColumn, clock: Clock, begin: int) -> TopicContent:
     """A column whose samples are those cells that have a value."""
     there = np.flatnonzero(column.present & clock.known)
     apart = np.diff(clock.stamps[there]) / 1e9

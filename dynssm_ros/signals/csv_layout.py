@@ -29,7 +29,7 @@ _LEAST = 0.5  # share of cells that are values
 
 
 @dataclass(frozen=True)
-class Layout:
+class TextLayout:
     """The layout of a text table."""
 
     encoding: str
@@ -51,7 +51,7 @@ class Layout:
         return f"text, columns apart by {_DELIMITERS[self.delimiter]}{decimal}{coded}, {lines}"
 
 
-def layout_of(path: Path) -> Layout:
+def layout_of(path: Path) -> TextLayout:
     """Finds the layout by the first 256 KB of a file.
 
     Raises:
@@ -76,7 +76,7 @@ def layout_of(path: Path) -> Layout:
         places = " and ".join(str(k + 1) for k, name in enumerate(names) if name == twice)
         raise BagError(f"{path}: columns {places} are all named '{twice}'; expected different names")
     written = [len(lines[k].encode(encoding)) + 1 for k in filled if k >= first]
-    return Layout(encoding, delimiter, comma, tuple(names), tuple(units), first, sum(written) / len(written))
+    return TextLayout(encoding, delimiter, comma, tuple(names), tuple(units), first, sum(written) / len(written))
 
 
 class OneBlank(io.RawIOBase):

@@ -22,7 +22,7 @@ from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, SENSORS, SPEED_SIGNALS, STATE_SIGNALS, SignalMap, yaw_of
 from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, frames_note, log_time_note
 from dynssm_ros.signals.table_clock import clock_of
-from dynssm_ros.signals.tables import Table
+from dynssm_ros.signals.tables import LogTable
 from dynssm_ros.signals.velocities import velocities_along
 
 
@@ -103,12 +103,12 @@ def _with_brakes_at_rest(streams: dict[str, Stream], signal_map: SignalMap) -> t
     return found, notes
 
 
-def _with_commands_of(log: Bag | Table, signal_map: SignalMap) -> tuple[SignalMap, list[str]]:
+def _with_commands_of(log: Bag | LogTable, signal_map: SignalMap) -> tuple[SignalMap, list[str]]:
     """The map, without commands where the log lacks a topic or column of them, and a note on it."""
     if signal_map.commands != "topics":
         return signal_map, []
     sources = [signal_map.signals[name] for name in signal_map.command_signals]
-    if isinstance(log, Table):
+    if isinstance(log, LogTable):
         missing = [f"column '{one.column}'" for one in sources if one.column and one.column not in log.headings]
     else:
         missing = [f"topic {one.recorded}" for one in sources if not one.column and not log.counts.get(one.recorded)]
@@ -197,7 +197,7 @@ def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: f
 
 
 def read_streams(
-    log: Bag | Table, signal_map: SignalMap, drop_bad: bool = False, progress: Progress | None = None
+    log: Bag | LogTable, signal_map: SignalMap, drop_bad: bool = False, progress: Progress | None = None
 ) -> tuple[dict[str, Stream], dict[str, str], list[str]]:
     """Reads the samples of every mapped signal; memory holds these and one message, or the columns, at a time.
 
@@ -211,7 +211,7 @@ def read_streams(
         BagError: a topic, field or column is missing, or samples are bad and ``drop_bad`` is off.
     """
     stamped: dict[str, str] = {}
-    if isinstance(log, Table):
+    if isinstance(log, LogTable):
         found, notes = _table_streams(log, signal_map, drop_bad), list(log.notes)
     else:
         found, stamped, told = _bag_streams(log, signal_map, progress)
@@ -227,7 +227,7 @@ def read_streams(
         if len(stream.stamps):
             streams[name] = stream
             continue
-        counted = 1 if isinstance(log, Table) else log.counts[source.recorded]
+        counted = 1 if isinstance(log, LogTable) else log.counts[source.recorded]
         lack = f"has no good sample of '{source.field}'" if dropped else f"never carries '{source.field}'"
         lack = "has no good value" if source.column else lack
         if name not in POSE_SIGNALS or not counted:
@@ -281,7 +281,7 @@ def _bag_streams(
     return streams, {name: stamped[source.recorded] for name, source in active}, notes
 
 
-def _table_streams(table: Table, signal_map: SignalMap, drop_bad: bool) -> dict[str, Stream]:
+def _table_streams(table: LogTable, signal_map: SignalMap, drop_bad: bool) -> dict[str, Stream]:
     """The cells of every mapped column that have a value, as they came."""
     if not signal_map.is_of_table:
         raise BagError(

@@ -28,7 +28,7 @@ from dynssm_ros.signals.signal_map import (
 )
 from dynssm_ros.signals.suggestions import Suggestion, suggest
 from dynssm_ros.signals.table_clock import clock_of
-from dynssm_ros.signals.tables import Table
+from dynssm_ros.signals.tables import LogTable
 
 _FASTEST_HZ = 50.0  # at which a log is extracted to compare its signals
 _WINDOW = 0.1  # s, of poses from which velocities follow
@@ -106,7 +106,7 @@ def inspect(path: str | Path, wheelbase: float | None = None, progress: Progress
         BagError: unreadable, or without messages or a time column.
     """
     with open_log(path) as log:
-        if isinstance(log, Table):
+        if isinstance(log, LogTable):
             clock = clock_of(log, None)
             topics, begin, end = contents_of_table(log, clock)
             notes, time = [f"{log.kind}; {clock.told}", *log.notes], clock.as_given

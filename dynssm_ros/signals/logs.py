@@ -8,13 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dynssm_ros.signals.bags import STORAGE_SUFFIXES, Bag, bag_suffix, open_bag
-from dynssm_ros.signals.tables import Table, open_table
+from dynssm_ros.signals.tables import LogTable, open_table
 
 _BAGS = (*STORAGE_SUFFIXES, ".bag", ".zstd")  # of files that may be damaged from their first byte on
 
 
 @contextmanager
-def open_log(path: str | Path) -> Iterator[Bag | Table]:
+def open_log(path: str | Path) -> Iterator[Bag | LogTable]:
     """Opens a log; what it is follows from its content, and from its name where that is damaged.
 
     Raises:

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from dynssm_ros.errors import BagError
-from dynssm_ros.signals.columns import Column, known_unit
+from dynssm_ros.signals.columns import LogColumn, known_unit
 from dynssm_ros.signals.signal_map import TIME_UNITS, TimeColumn
-from dynssm_ros.signals.tables import Table
+from dynssm_ros.signals.tables import LogTable
 
 _CERTAIN = re.compile(
     r"^[%# ]*(time|t|timestamp|time_?stamp|stamp|zeit|utc|datetime|date_?time|.*[/.]stamp)$", re.IGNORECASE
@@ -49,7 +49,7 @@ class Clock:
         return TimeColumn.model_validate({"column": self.column, "unit": self.unit, "nanoseconds": self.nanoseconds})
 
 
-def clock_of(table: Table, given: TimeColumn | None) -> Clock:
+def clock_of(table: LogTable, given: TimeColumn | None) -> Clock:
     """The time of the rows, by the column that is ``given`` or else by name and steps.
 
     Raises:
@@ -63,7 +63,7 @@ def clock_of(table: Table, given: TimeColumn | None) -> Clock:
     return clock
 
 
-def _chosen(table: Table, given: TimeColumn | None) -> Clock:
+def _chosen(table: LogTable, given: TimeColumn | None) -> Clock:
     """The clock of the column that is given, or else found."""
     if given is not None:
         clock = _clock(table, given.column, table.read([given.column])[given.column], given.unit)
@@ -106,7 +106,7 @@ def _chosen(table: Table, given: TimeColumn | None) -> Clock:
     raise BagError(f"{table.path}: no time column among {table.told_columns}; expected one that rises, such as 'time'")
 
 
-def _nanoseconds_beside(table: Table, name: str) -> str | None:
+def _nanoseconds_beside(table: LogTable, name: str) -> str | None:
     """The column with the ns of a column of whole seconds, such as ``stamp.nanosec`` of ``stamp.sec``."""
     if not _SECONDS.search(name):
         return None
@@ -115,7 +115,7 @@ def _nanoseconds_beside(table: Table, name: str) -> str | None:
     )
 
 
-def _with_nanoseconds(table: Table, clock: Clock, name: str | None) -> Clock:
+def _with_nanoseconds(table: LogTable, clock: Clock, name: str | None) -> Clock:
     """The clock with the ns that stand in a column of their own."""
     if name is None:
         return clock
@@ -127,7 +127,7 @@ def _with_nanoseconds(table: Table, clock: Clock, name: str | None) -> Clock:
     return replace(clock, stamps=stamps, known=known, told=f"{clock.told} and ns from '{name}'", nanoseconds=name)
 
 
-def _certain(table: Table, name: str) -> bool:
+def _certain(table: LogTable, name: str) -> bool:
     return bool(_CERTAIN.match(table.headings[name].bare.strip()))
 
 
@@ -137,7 +137,7 @@ def _rising(clock: Clock) -> float:
     return float((steps > 0).mean()) if len(steps) else 0.0
 
 
-def _clock(table: Table, name: str, column: Column, unit: str | None) -> Clock:
+def _clock(table: LogTable, name: str, column: LogColumn, unit: str | None) -> Clock:
     """The clock that a column is.
 
     Raises:

@@ -16,8 +16,8 @@ import pyarrow.parquet as pq
 
 from dynssm_ros.errors import BagError
 from dynssm_ros.signals.array_files import mat_arrays, npz_arrays
-from dynssm_ros.signals.columns import Column, Heading, heading, kind_of, parsed, told_bad, typed_column
-from dynssm_ros.signals.csv_layout import Layout, OneBlank, layout_of
+from dynssm_ros.signals.columns import Heading, LogColumn, heading, kind_of, parsed, told_bad, typed_column
+from dynssm_ros.signals.csv_layout import OneBlank, TextLayout, layout_of
 from dynssm_ros.signals.recover import vast_table
 
 _GROUP_BYTES, _CELL_BYTES = 512 << 20, 16  # of columns that are in memory at once, and of a cell of them
@@ -28,14 +28,14 @@ _PARQUET, _ZIP, _MATLAB = b"PAR1", b"PK\x03\x04", b"MATLAB "
 
 
 @dataclass(frozen=True)
-class Table:
+class LogTable:
     """A table whose columns are read when they are asked for. Use :func:`open_table`."""
 
     path: Path
     kind: str  # what it is and how it is laid out, in words
     rows: int  # about
     headings: dict[str, Heading]  # by column
-    read_columns: Callable[[Sequence[str]], dict[str, Column]]
+    read_columns: Callable[[Sequence[str]], dict[str, LogColumn]]
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -44,7 +44,7 @@ class Table:
         names = list(self.headings)
         return ", ".join(names[:_TOLD]) + (f" and {len(names) - _TOLD} more" if len(names) > _TOLD else "")
 
-    def read(self, names: Sequence[str]) -> dict[str, Column]:
+    def read(self, names: Sequence[str]) -> dict[str, LogColumn]:
         """The columns ``names``.
 
         Raises:
@@ -59,7 +59,7 @@ class Table:
             raise BagError(f"{self.path}: cannot be read ({_one_line(error)})") from error
         return found
 
-    def groups(self) -> Iterator[dict[str, Column]]:
+    def groups(self) -> Iterator[dict[str, LogColumn]]:
         """Yields all columns, as many at once as may be in memory."""
         names = list(self.headings)
         size = max(1, _GROUP_BYTES // (_CELL_BYTES * max(self.rows, 1)))
@@ -67,7 +67,7 @@ class Table:
             yield self.read(names[first : first + size])
 
 
-def open_table(path: str | Path) -> Table:
+def open_table(path: str | Path) -> LogTable:
     """Opens a table; what it is follows from its content.
 
     Raises:
@@ -95,7 +95,7 @@ def open_table(path: str | Path) -> Table:
     return table
 
 
-def _parquet_table(path: Path) -> Table:
+def _parquet_table(path: Path) -> LogTable:
     with pq.ParquetFile(path) as file:
         names, rows = file.schema_arrow.names, file.metadata.num_rows
         is_recording = b"dynssm" in (file.schema_arrow.metadata or {})
@@ -107,14 +107,14 @@ def _parquet_table(path: Path) -> Table:
         raise BagError(f"{path}: two columns are named '{twice}'; expected different names")
     notes = ["this is a recording of dynssm, which other commands take as it is"] if is_recording else []
 
-    def read(wanted: Sequence[str]) -> dict[str, Column]:
+    def read(wanted: Sequence[str]) -> dict[str, LogColumn]:
         table = pq.read_table(path, columns=list(wanted), partitioning=None, page_checksum_verification=True)
         return {name: typed_column(table[name], str(table[name].type)) for name in wanted}
 
-    return Table(path, "Parquet", rows, {name: heading(name) for name in names}, read, notes)
+    return LogTable(path, "Parquet", rows, {name: heading(name) for name in names}, read, notes)
 
 
-def _array_table(path: Path, kind: str, arrays: dict[str, npt.NDArray[Any]], left_out: dict[str, str]) -> Table:
+def _array_table(path: Path, kind: str, arrays: dict[str, npt.NDArray[Any]], left_out: dict[str, str]) -> LogTable:
     """A table of equally long vectors; ``left_out`` has what the file holds besides, with the reason."""
     lengths = {name: len(values) for name, values in arrays.items()}
     if not lengths:
@@ -124,11 +124,11 @@ def _array_table(path: Path, kind: str, arrays: dict[str, npt.NDArray[Any]], lef
         one, other = (f"{n} of {length} values" for n, length in _extremes(lengths))
         raise BagError(f"{path}: not a table: {one}, {other}; expected vectors of the same length")
 
-    def read(wanted: Sequence[str]) -> dict[str, Column]:
+    def read(wanted: Sequence[str]) -> dict[str, LogColumn]:
         return {name: typed_column(_arrow(arrays[name]), str(arrays[name].dtype)) for name in wanted}
 
     notes = [f"{name} is left out: {reason}" for name, reason in left_out.items()]
-    return Table(path, kind, next(iter(lengths.values())), {name: heading(name) for name in arrays}, read, notes)
+    return LogTable(path, kind, next(iter(lengths.values())), {name: heading(name) for name in arrays}, read, notes)
 
 
 def _extremes(lengths: dict[str, int]) -> tuple[tuple[str, int], tuple[str, int]]:
@@ -140,15 +140,15 @@ def _arrow(values: npt.NDArray[Any]) -> Any:
     return pa.array(native.astype("datetime64[ns]") if native.dtype.kind == "M" else native)
 
 
-def _text_table(path: Path, layout: Layout) -> Table:
+def _text_table(path: Path, layout: TextLayout) -> LogTable:
     units = layout.units or ("",) * len(layout.names)
     headings = {name: heading(name, unit) for name, unit in zip(layout.names, units, strict=True)}
     rows = max(1, round(os.stat(path).st_size / layout.row_bytes))
-    table = Table(path, layout.told, rows, headings, lambda wanted: _text_columns(path, layout, wanted, table.notes))
+    table = LogTable(path, layout.told, rows, headings, lambda wanted: _text_columns(path, layout, wanted, table.notes))
     return table
 
 
-def _text_columns(path: Path, layout: Layout, wanted: Sequence[str], notes: list[str]) -> dict[str, Column]:
+def _text_columns(path: Path, layout: TextLayout, wanted: Sequence[str], notes: list[str]) -> dict[str, LogColumn]:
     """Reads columns of a text table, a piece of the file at a time."""
     ragged: list[pa.csv.InvalidRow] = []
 
@@ -208,11 +208,11 @@ def _kind(text: Any, comma: bool) -> str | None:
     return kind_of([str(cell) for cell in there[:50]], comma) if len(there) else None
 
 
-def _joined(chunks: list[Any], kind: str, bad: str) -> Column:
+def _joined(chunks: list[Any], kind: str, bad: str) -> LogColumn:
     if kind == "text":
         first = next(str(cell) for chunk in chunks if chunk.type == pa.string() for cell in chunk if str(cell).strip())
         count = sum(map(len, chunks))
-        return Column(kind, np.full(count, np.nan), np.ones(count, bool), reason=f"text, '{first[:20]}' first")
+        return LogColumn(kind, np.full(count, np.nan), np.ones(count, bool), reason=f"text, '{first[:20]}' first")
     types = {chunk.type for chunk in chunks if chunk.type != pa.null()}
     common = pa.null() if not types else types.pop() if len(types) == 1 else pa.float64()
     return typed_column(pa.chunked_array([chunk.cast(common) for chunk in chunks], common), kind, bad)

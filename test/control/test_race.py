@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.control import state_estimator
-from dynssm_ros.control.race import Course, Start, _Drive, race
+from dynssm_ros.control.race import Course, Start, _RaceCar, race
 from dynssm_ros.control.race_models import load_prediction_model, true_model
 from dynssm_ros.control.reference import Reference, load_reference
 from dynssm_ros.control.settings import Settings
@@ -46,7 +46,7 @@ def test_the_full_size_car_takes_a_bend_at_its_limit(objective):
     car, track = load_vehicle("av21"), load_track("road_course")
     reference = load_reference("racing", car, track)
     course = Course(car, track, "rk4", reference, Settings.of(car, objective), start=Start(s=600.0))
-    drive = _Drive(course, true_model(car, "rk4"))
+    drive = _RaceCar(course, true_model(car, "rk4"))
     assert all(drive.step() is None for _ in range(60))
     driven = drive.result("true", "")
     beside = reference.line.project(driven.pose[:, :2])[1]
