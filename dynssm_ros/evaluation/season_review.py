@@ -21,10 +21,11 @@ from dynssm_ros import __version__
 from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import UserError
 from dynssm_ros.evaluation.open_loop import Accuracy, accuracies, shared_commands
+from dynssm_ros.evaluation.residuals.diagnosed import left_by
 from dynssm_ros.files import checksum, content_key, digest, write_json
 from dynssm_ros.identification.result.calibration import calibrate
 from dynssm_ros.identification.result.diagnose import diagnose
-from dynssm_ros.identification.result.diagnosis import Cause
+from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis
 from dynssm_ros.parallel import Result
 from dynssm_ros.runtime.coefficients import SHIFTS, daily_change
 from dynssm_ros.runtime.contract import WindowModel
@@ -36,6 +37,7 @@ from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 SIMPLE = ("single_track", "single_track_ewma")
 """What a model has to beat: the vehicle file, and the same with an average of its errors."""
 DEVIATIONS, BEFORE = 4.0, 3  # of a coefficient that has moved; points before it that are needed to say so
+_PATTERNS = 3  # of what is left, that are kept of a session
 LOSS, WORSE = 1.05, 1.5  # ADE over that of the best simple model; over the median of the sessions before
 
 
@@ -62,6 +64,14 @@ class Found(StrictModel):
     improvement: float = Field(description="share of the error on held-out rows that is gone by it")
 
 
+class LeftOver(StrictModel):
+    """A pattern of the one-step errors that the diagnosed car leaves."""
+
+    channel: str
+    share: float = Field(description="of the channel's squared error")
+    words: str
+
+
 class Review(StrictModel):
     """What was found in a session."""
 
@@ -75,6 +85,7 @@ class Review(StrictModel):
     stretches: tuple[Stretch, ...] = ()
     verdict: str = Field(default="", description="of the diagnosis; empty if there is none")
     causes: tuple[Found, ...] = ()
+    patterns: tuple[LeftOver, ...] = Field(default=(), description="that the diagnosed car leaves, the largest first")
     failures: tuple[str, ...] = Field(default=(), description="what could not be done, and why")
 
 
@@ -117,6 +128,7 @@ def review(
         stretches=stretches or (),
         verdict=diagnosis.verdict if diagnosis else "",
         causes=tuple(map(_found, diagnosis.causes)) if diagnosis else (),
+        patterns=tuple(_patterns(diagnosis)) if diagnosis else (),
         failures=tuple(failures),
     )
 
@@ -155,6 +167,12 @@ def another_day(vehicle: Vehicle) -> Vehicle:
 def _found(cause: Cause) -> Found:
     std = {name: value for name, value in cause.std.items() if np.isfinite(value)}
     return Found(effect=cause.effect, values=cause.values, std=std, improvement=cause.heldout_improvement)
+
+
+def _patterns(diagnosis: Diagnosis) -> Iterator[LeftOver]:
+    left = left_by(diagnosis)
+    for each in () if left is None else left.patterns[:_PATTERNS]:
+        yield LeftOver(channel=each.channel, share=each.share, words=each.words)
 
 
 def _parts(recording: Recording, stretch: float | None) -> Iterator[tuple[float, Recording]]:

@@ -115,7 +115,7 @@ def cause_pictures(windows: SimulationWindows, without: Vector, with_it: Vector,
     panels = grid[0, 2].subgridspec(len(driven), 1).subplots(sharey=True, squeeze=False)[:, 0]
     for over, rows in zip(panels, driven, strict=True):
         _error_gone(over, windows.data.context["t"][windows.starts[rows]], gone[rows], _BLOCKS // len(driven))
-    panels[0].set_title("when: error gone, 1 = the mean error")
+    panels[0].set_title("when: error gone (1: mean)")
     panels[-1].set_xlabel("time (s)" if len(driven) == 1 else "time of each recording (s)")
     if profile:
         what, values = profile

@@ -7,10 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynssm_ros.evaluation.residuals.anatomy import ModelAnatomy
 from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Diagnosis
 from dynssm_ros.identification.result.improvement import Improvement
 from dynssm_ros.reporting import diagnosis_figures
 from dynssm_ros.reporting.diagnosis_words import (
+    MOST_PATTERNS,
     cause_in_words,
     conclusion_in_words,
     formula_in_words,
@@ -24,6 +26,7 @@ from dynssm_ros.reporting.diagnosis_words import (
 )
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.page import Prose, Report, Section, State, Verdict, data_verdicts
+from dynssm_ros.reporting.residuals_report import pattern_sections, sentence
 from dynssm_ros.reporting.tables import Column, ColumnOf, Table
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS
@@ -32,19 +35,19 @@ from dynssm_ros.vehicle.effects import EFFECTS
 _MOST_RECORDINGS = 6  # whose errors are drawn over time
 
 
-def diagnosis_report(diagnosis: Diagnosis) -> Report:
-    """The report with figures."""
+def diagnosis_report(diagnosis: Diagnosis, left: ModelAnatomy | None = None) -> Report:
+    """The report with figures; ``left`` are the one-step errors of the extended car."""
     return Report(
         f"Diagnosis of {diagnosis.vehicle.name}",
         headline(diagnosis),
-        tuple(_sections(diagnosis)),
+        tuple(_sections(diagnosis, left)),
         diagnosis.protocol,
         _causes(diagnosis) if diagnosis.found else None,
-        verdicts=(*data_verdicts(signal_findings(diagnosis)), *_lines(diagnosis)),
+        verdicts=(*data_verdicts(signal_findings(diagnosis)), *_lines(diagnosis, left)),
     )
 
 
-def _lines(diagnosis: Diagnosis) -> Iterator[Verdict]:
+def _lines(diagnosis: Diagnosis, left: ModelAnatomy | None) -> Iterator[Verdict]:
     """The first screen: a line for each finding."""
     look: dict[str, tuple[str, State]] = {
         "no_better": ("input", "wrong"), "cause": ("cause", "look"), "recalibration": ("file", "look"),
@@ -52,6 +55,8 @@ def _lines(diagnosis: Diagnosis) -> Iterator[Verdict]:
     }  # fmt: skip
     for one in diagnosis.conclusions:
         yield Verdict(*look[one.kind], conclusion_in_words(diagnosis, one))
+    for pattern in () if left is None else left.patterns[:MOST_PATTERNS]:
+        yield Verdict("step", "look", f"Single steps: {sentence(pattern)}.")
     if diagnosis.verdict == "healthy":
         yield Verdict("car", "ok", headline(diagnosis))
 
@@ -72,7 +77,7 @@ def _causes(diagnosis: Diagnosis) -> Table:
     )
 
 
-def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
+def _sections(diagnosis: Diagnosis, left: ModelAnatomy | None) -> Iterator[Section]:
     improvement = diagnosis.improvement
     windows, horizon = improvement.windows, improvement.horizons[improvement.horizon]
     prose = Prose(
@@ -86,6 +91,8 @@ def _sections(diagnosis: Diagnosis) -> Iterator[Section]:
         pictures = diagnosis_figures.cause_pictures(windows, cause.without, with_it, effect)
         about = " ".join((f"{size_in_words(cause)}.", *cause_in_words(cause)))
         yield prose.section("cause", pictures, cause=cause.effect + recordings_of(cause), about=about)
+    if left is not None:
+        yield from pattern_sections("What is left", left, MOST_PATTERNS)
     yield prose.section("simulated", diagnosis_figures.simulated_and_measured(improvement))
     yield prose.section(
         "improvement", diagnosis_figures.improvement_by_horizon(improvement), _improvement_table(improvement)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from dynssm_ros.evaluation.residuals.anatomy import ModelAnatomy
 from dynssm_ros.identification.result.diagnosis import RECALIBRATED, Cause, Conclusion, Diagnosis
 from dynssm_ros.identification.result.formula import Formula
 from dynssm_ros.identification.result.recalibration import CoefficientShift
@@ -14,6 +15,7 @@ from dynssm_ros.identification.result.residuals import ExplainedVariance
 from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC, SURE_STD
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.page import Prose
+from dynssm_ros.reporting.residuals_report import pattern_lines
 from dynssm_ros.reporting.tables import percent, text
 from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
@@ -24,16 +26,23 @@ _LITTLE = 0.02  # of the squared error; less is not worth a word
 _WIDTH = 110
 _MANY_TIMES = 2.0  # farther off, a percentage says nothing
 _MOST_COEFFICIENTS = 4  # that are named in a sentence
+MOST_PATTERNS = 3  # of single steps, that are told
 _FEW = 4  # parameters of a curve that are shown one by one
 
 
-def as_text(diagnosis: Diagnosis) -> str:
-    """The result for a terminal: a sentence for each finding, then evidence, improvement, and what cannot be judged."""
+def as_text(diagnosis: Diagnosis, left: ModelAnatomy | None = None) -> str:
+    """The result for a terminal: a sentence for each finding, then evidence, improvement, and what cannot be judged.
+
+    ``left`` are the one-step errors of the extended car.
+    """
     lines = [f"{diagnosis.verdict}: {headline(diagnosis)}"]
     for found in signal_findings(diagnosis):
         lines += textwrap.wrap(f"Signals that cannot be right: {found.line}.", _WIDTH)
     for number, one in enumerate(diagnosis.conclusions, 1):
         lines += textwrap.wrap(f"{number}. {conclusion_in_words(diagnosis, one)}", _WIDTH, subsequent_indent="   ")
+    if left is not None and left.patterns:
+        lines += ["What single steps of the extended car still get wrong, by its share of the squared error:"]
+        lines += pattern_lines(left, MOST_PATTERNS)
     for cause in diagnosis.found:
         lines += ["", f"{cause.effect}{recordings_of(cause)}"]
         lines += [f"   {line}" for words in cause_in_words(cause) for line in textwrap.wrap(words, _WIDTH)]

@@ -35,14 +35,15 @@ def residuals_report(found: Anatomy) -> Report:
 def summary(found: Anatomy) -> str:
     """The largest pattern of each model in a sentence."""
     return " ".join(
-        f"{label}: {_sentence(model.patterns[0])}."
+        f"{label}: {sentence(model.patterns[0])}."
         if model.patterns
         else f"{label}: no pattern beyond chance; what is left looks like noise."
         for label, model in found.models.items()
     )
 
 
-def _sentence(pattern: Pattern) -> str:
+def sentence(pattern: Pattern) -> str:
+    """A pattern with its share."""
     return f"{pattern.words} ({100 * pattern.share:.2g} % of the squared error)"
 
 
@@ -78,12 +79,18 @@ def as_text(found: Anatomy) -> str:
     for label, model in found.models.items():
         errors = ", ".join(f"{c} {value:.3g} {UNITS[c]}" for c, value in zip(STATE_SIGNALS, model.rmse, strict=True))
         lines.append(f"{label} (one-step RMSE {errors})")
-        lines += [f"  {100 * each.share:5.1f} %  {each.words}" for each in model.patterns[:_SHOWN]]
-        more = len(model.patterns) - _SHOWN
-        lines += [f"           and {more} smaller, in the report"] if more > 0 else []
+        lines += pattern_lines(model, _SHOWN)
         lines += [] if model.patterns else ["           no pattern beyond chance"]
         lines += [f"  left to learn: {left_in_words(model)}"] if model.left_to_learn else []
     return "\n".join(lines)
+
+
+def pattern_lines(model: ModelAnatomy, most: int) -> list[str]:
+    """A line for each of the ``most`` largest patterns, and how many are smaller."""
+    more = len(model.patterns) - most
+    return [f"  {100 * each.share:5.1f} %  {each.words}" for each in model.patterns[:most]] + (
+        [f"           and {more} smaller, in the report"] if more > 0 else []
+    )
 
 
 def left_in_words(model: ModelAnatomy) -> str:
@@ -91,11 +98,17 @@ def left_in_words(model: ModelAnatomy) -> str:
     return ", ".join(f"{channel} {100 * each.share:.2g} %" for channel, each in model.left_to_learn.items())
 
 
+def pattern_sections(label: str, model: ModelAnatomy, most: int) -> Iterator[Section]:
+    """A figure for each of the ``most`` largest patterns that have one."""
+    prose = Prose("residuals")
+    for pattern in [each for each in model.patterns if each.picture is not None][:most]:
+        figure = residuals_figures.pattern_figure(pattern)
+        yield prose.section(pattern.family, figure, model=label, channel=pattern.channel, words=sentence(pattern))
+
+
 def _sections(found: Anatomy, prose: Prose) -> Iterator[Section]:
     for label, model in found.models.items():
-        for pattern in [each for each in model.patterns if each.picture is not None][:_DRAWN]:
-            figure = residuals_figures.pattern_figure(pattern)
-            yield prose.section(pattern.family, figure, model=label, channel=pattern.channel, words=_sentence(pattern))
+        yield from pattern_sections(label, model, _DRAWN)
     if any(model.left_to_learn for model in found.models.values()):
         yield prose.section("left", residuals_figures.left_to_learn_figure(found), learn_table(found))
     curves = {label: model.autocorrelation for label, model in found.models.items()}

@@ -32,6 +32,8 @@ def season_report(reviews: Sequence[Review], alarms: Sequence[Alarm], protocol: 
         sections.append(prose.section("coefficients", coefficients(reviews, alarms)))
     if any(each.causes for each in reviews):
         sections.append(prose.section("causes", causes(reviews)))
+    if any(each.patterns for each in reviews):
+        sections.append(prose.section("patterns", table=_pattern_table(reviews)))
     failed = [f"{each.session}: {words}." for each in reviews for words in each.failures]
     if failed:
         sections.append(prose.section("not_done", failures=" ".join(failed)))
@@ -82,6 +84,16 @@ def session_table(reviews: Sequence[Review], alarms: Sequence[Alarm]) -> Table:
             lambda each: ", ".join(cause.effect for cause in each.causes) or each.verdict or None,
         ),
         (Column("alarms", brief=True), lambda each: sum(alarm.review is each for alarm in alarms)),
+    )
+
+
+def _pattern_table(reviews: Sequence[Review]) -> Table:
+    """One row per pattern that a session's diagnosed car leaves."""
+    return Table.of(
+        [(each.session, pattern) for each in reviews for pattern in each.patterns],
+        (Column("session"), lambda row: row[0]),
+        (Column("share", "% of squared error"), lambda row: 100 * row[1].share),
+        (Column("pattern"), lambda row: row[1].words),
     )
 
 

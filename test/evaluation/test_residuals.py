@@ -11,14 +11,18 @@ import dynssm_ros
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.evaluation.residuals.anatomy import ModelAnatomy, anatomy, model_anatomy
+from dynssm_ros.evaluation.residuals.diagnosed import left_by
 from dynssm_ros.evaluation.residuals.evidence import chances, holm
 from dynssm_ros.evaluation.residuals.learner import left_to_learn
 from dynssm_ros.evaluation.residuals.regimes import situations
 from dynssm_ros.evaluation.residuals.sizes import quantum
+from dynssm_ros.identification.result.diagnosis import Diagnosis
+from dynssm_ros.reporting.diagnosis_report import diagnosis_report
+from dynssm_ros.reporting.diagnosis_words import as_text
 from dynssm_ros.reporting.evaluation_report import summary_table
 from dynssm_ros.runtime.registry import load_model
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle import Vehicle, load_vehicle
 
 NOISE = (0.005, 0.005, 0.02)
 
@@ -105,6 +109,27 @@ def test_chances_of_sums_without_a_mean_are_uniform() -> None:
     found = chances(sums)
     assert np.mean(found < 0.05) < 0.06
     assert np.mean(found < 0.001) < 0.002
+
+
+def test_a_diagnosed_car_leaves_no_pattern_but_one_that_no_effect_has(
+    lagging: tuple[Recording, Vehicle, Diagnosis],
+) -> None:
+    found = lagging[2]
+    clean = left_by(found)
+    assert clean is not None
+    assert clean.patterns == ()
+    log, data = found.recordings.recording, found.windows.data
+    rows = data.rows.copy()
+    rows[1] += 0.1 * (np.arange(len(log)) % 25 == 7)
+    spoilt = replace(found, windows=replace(found.windows, data=replace(data, rows=rows)))
+    left = left_by(spoilt)
+    assert left is not None
+    assert {(each.channel, each.family, each.size["period_s"]) for each in left.patterns} == {("v_y", "time", 1.0)}
+    told = [line for line in as_text(spoilt, left).splitlines() if left.patterns[0].words in line]
+    assert len(told) == 1
+    page = diagnosis_report(spoilt, left)
+    assert page.sections[1].title == "What is left, v_y: in time"
+    assert [each.name for each in page.verdicts].count("step") == min(3, len(left.patterns))
 
 
 def test_holm_rejects_as_long_as_each_is_below_its_level() -> None:

@@ -18,8 +18,9 @@ BLOCK_S = 3.0
 """Length of the blocks of time that count as independent (s): actuators, filters and noise forget within one."""
 DRIVEN_SIGNALS = WINDOW_COLUMNS[:5]
 """State and feedback, by which a prediction is driven."""
-_SMALL, _AT_ONCE = 1e-3, 4096
-"""Change of a signal, in its standard deviations, that gives its derivative; windows that exist at a time."""
+SMALL_CHANGE = 1e-3
+"""Change of a signal, in its standard deviations, that gives its derivative."""
+_AT_ONCE = 4096  # windows that exist at a time
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def derivatives(physics: WindowModel, recording: Recording, rows: Indices) -> Ve
     """How the predicted state depends on each of :data:`DRIVEN_SIGNALS` of the last row, by differences, ``(N, 3, 5)``."""
     out = np.empty((len(rows), 3, len(DRIVEN_SIGNALS)))
     for k in range(len(DRIVEN_SIGNALS)):
-        step = _SMALL * (float(np.std(recording.rows(rows)[:, k])) or 1.0)
+        step = SMALL_CHANGE * (float(np.std(recording.rows(rows)[:, k])) or 1.0)
         for start in range(0, len(rows), _AT_ONCE):
             part = slice(start, start + _AT_ONCE)
             windows = np.repeat(recording.windows(rows[part], physics.H)[None], 2, axis=0).copy()

@@ -1,0 +1,74 @@
+"""What a diagnosed car leaves: the anatomy of the one-step errors of the recalibrated car with its named causes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.evaluation.residuals.anatomy import ModelAnatomy, model_anatomy
+from dynssm_ros.evaluation.residuals.errors import BLOCK_S, DRIVEN_SIGNALS, SMALL_CHANGE, OneStepErrors
+from dynssm_ros.evaluation.residuals.evidence import FEWEST_BLOCKS
+from dynssm_ros.evaluation.residuals.regimes import situations
+from dynssm_ros.extras import missing_libraries
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.recordings import RecordingSet
+from dynssm_ros.identification.problem.windows import SimulationWindows
+from dynssm_ros.identification.result.diagnosis import EXTENDED, Diagnosis
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.signal_map import STATE_SIGNALS
+
+
+def left_by(diagnosis: Diagnosis) -> ModelAnatomy | None:
+    """Takes the errors of the extended car apart, single steps from each row that was fitted, stepped as the data ask for.
+
+    Boosted trees are asked where scikit-learn is installed.
+
+    Returns:
+        ``None`` if the fitted rows are less than 24 s.
+    """
+    windows = diagnosis.windows
+    rows = np.unique(windows.starts[:, None] + np.arange(windows.steps))
+    if len(rows) * windows.data.T_s < FEWEST_BLOCKS * BLOCK_S:
+        return None
+    single = replace(windows, starts=rows, steps=1, every=1, filtered=False)
+    log = _one_after_the_other(diagnosis.recordings)
+    errors = OneStepErrors(
+        EXTENDED,
+        log,
+        rows,
+        single.errors(diagnosis.car)[:, 0],
+        diagnosis.recordings.lines[0] if windows.data.on_one_lap else None,
+        diagnosis.vehicle.constants.wheelbase,
+    )
+    slopes = _derivatives(single, diagnosis.car)
+    return model_anatomy(errors, situations(errors), slopes, learn=not missing_libraries("residuals"))
+
+
+def _derivatives(single: SimulationWindows, car: CarEstimate) -> Vector:
+    """How the next state depends on each of :data:`DRIVEN_SIGNALS`, an input's change being an old one, ``(N, 3, 5)``."""
+    rows = single.data.rows
+    out = np.empty((len(single), 3, len(DRIVEN_SIGNALS)))
+    for k in range(len(DRIVEN_SIGNALS)):
+        step = SMALL_CHANGE * (float(np.std(rows[k])) or 1.0)
+        ends = []
+        for change in (-step, step):
+            moved = rows.copy()
+            moved[k] += change
+            ends.append(replace(single, data=replace(single.data, rows=moved)).errors(car)[:, 0])
+        out[:, :, k] = (ends[1] - ends[0]) / (2 * step)
+    for k in range(len(STATE_SIGNALS)):
+        out[:, k, k] += 1.0  # the measured state moved too
+    return out
+
+
+def _one_after_the_other(recordings: RecordingSet) -> Recording:
+    """The recordings with stamps that rise, moved by whole seconds so that the phase of the second stays."""
+    log, second = recordings.recording, 1_000_000_000
+    time = log.time.copy()
+    for first in np.flatnonzero(np.diff(recordings.number)) + 1:
+        gap = int(time[first] - time[first - 1])
+        if gap <= 0:
+            time[recordings.number == recordings.number[first]] += (round(BLOCK_S) - gap // second) * second
+    return replace(log, time=time)
