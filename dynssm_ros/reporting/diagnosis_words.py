@@ -122,10 +122,11 @@ def _recalibration_in_words(diagnosis: Diagnosis) -> str:
         return (
             f"Coefficients that moved by more than three standard deviations, with little effect on the error: {moved}."
         )
-    named = "; ".join(_shift_in_words(one) for one in found.coefficients[:_MOST_COEFFICIENTS])
-    left = len(found.coefficients) - _MOST_COEFFICIENTS
+    first, *others = found.coefficients
+    named = [_shift_in_words(first), *(f"{one.name} ({_change(one.given, one.value)})" for one in others)]
+    left = len(named) - _MOST_COEFFICIENTS
     return (
-        f"The file is off in {named}{f'; and {left} more' if left > 0 else ''}. Recalibrated, "
+        f"The file is off in {', '.join(named[:_MOST_COEFFICIENTS])}{f' and {left} more' if left > 0 else ''}. Recalibrated, "
         f"{percent(found.explains)} of the error on held-out laps is gone."
     )
 
@@ -159,11 +160,11 @@ def hiding_in_words(diagnosis: Diagnosis) -> list[str]:
     if found is None or not found.candidates:
         return []
     each = "; ".join(
-        f"{one.effect} ({', '.join(f'{name} {text(value)}' for name, value in one.values.items())}), told from "
-        f"{text(diagnosis.minimum_detectable[one.effect])} on"
+        f"{one.effect} ({', '.join(f'{name} {text(value)}' for name, value in one.values.items())}; named from "
+        f"{text(diagnosis.minimum_detectable[one.effect])} off neutral on)"
         for one in found.candidates
     )
-    return [f"With the coefficients of the file the same errors could be, too small to be told from them: {each}."]
+    return [f"If the file's coefficients are right, the cause may be one that is too small to be named: {each}."]
 
 
 def recordings_of(cause: Cause) -> str:

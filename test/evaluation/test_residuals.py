@@ -15,7 +15,7 @@ from dynssm_ros.evaluation.residuals.diagnosed import left_by
 from dynssm_ros.evaluation.residuals.evidence import chances, holm
 from dynssm_ros.evaluation.residuals.learner import left_to_learn
 from dynssm_ros.evaluation.residuals.regimes import situations
-from dynssm_ros.evaluation.residuals.sizes import quantum
+from dynssm_ros.evaluation.residuals.sizes import quantum, speeds_of
 from dynssm_ros.identification.result.diagnosis import Diagnosis
 from dynssm_ros.reporting.diagnosis_report import diagnosis_report
 from dynssm_ros.reporting.diagnosis_words import as_text
@@ -76,6 +76,32 @@ def test_spikes_are_counted(healthy: Recording) -> None:
     (found,) = [each for each in spikes if each.channel == "omega"]
     assert found.size["events"] == pytest.approx(25, abs=3)
     assert found.share > 0.3
+
+
+def test_speeds_at_which_large_errors_come_are_named_as_ranges_and_none_by_chance(healthy: Recording) -> None:
+    clean = taken_apart(healthy).errors
+    v_x, rng = clean.driven[:, 0], np.random.default_rng(4)
+    low, high = np.percentile(v_x, [40, 60])
+    within, anywhere = np.flatnonzero((v_x > low) & (v_x < high)), np.arange(len(v_x))
+    told = []
+    for rows in (within, anywhere):
+        large = np.zeros(len(v_x), bool)
+        large[rng.choice(rows, 40, replace=False)] = True
+        told.append(speeds_of(clean, large))
+    (named,), chance = told[0][:1], told[1]
+    assert low - 0.1 < named[0] < named[1] < high + 0.1
+    assert chance == ()
+
+
+def test_a_drive_in_other_steps_than_the_file_names_the_integrator_and_no_delay() -> None:
+    drive = dynssm_ros.simulate("orca", "club", duration=60.0, noise=NOISE, seed=3, plant="rk4")
+    found = taken_apart(dynssm_ros.recorded(drive)).patterns
+    told, *others = found
+    assert others == []
+    assert (told.kind, told.channel, told.size) == ("integrator", "omega", {"integrator": "rk4"})
+    assert told.share > 0.9
+    assert told.picture is not None
+    assert told.picture.y[1] < told.picture.y[0]
 
 
 def test_a_learner_finds_what_no_test_looks_for(healthy: Recording) -> None:

@@ -18,8 +18,8 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.evaluation.metrics import by_channel, rmse
 from dynssm_ros.evaluation.open_loop import check_fit, window_and_speed
-from dynssm_ros.evaluation.residuals.delays import delays
-from dynssm_ros.evaluation.residuals.errors import BLOCK_S, OneStepErrors, derivatives, one_step_errors
+from dynssm_ros.evaluation.residuals.delays import delays, other_steps
+from dynssm_ros.evaluation.residuals.errors import BLOCK_S, OneStepErrors, PhysicsResponse, one_step_errors
 from dynssm_ros.evaluation.residuals.evidence import FALSE_ALARMS, FEWEST_BLOCKS, holm
 from dynssm_ros.evaluation.residuals.learner import LeftToLearn, learner_patterns, left_to_learn
 from dynssm_ros.evaluation.residuals.patterns import Pattern
@@ -126,7 +126,7 @@ def anatomy(
     Args:
         recording: with the commands in use.
         models: by the name to show; not empty.
-        physics: single-track model of the car, by which delays and rounded signals are judged; without it they are not.
+        physics: single-track model of the car, by which delays, steps and rounded signals are judged; or they are not.
         name: of the recording, for people.
         min_speed: stretches below are left out (m/s); if ``None``, the largest ``minimum_speed`` of the models' cars.
         line: closed line along which the place on the lap is counted; the first full lap if ``None``.
@@ -147,7 +147,7 @@ def anatomy(
         )
     line = first_lap(recording) if line is None else line
     found: dict[str, ModelAnatomy] = {}
-    slopes = None if physics is None else derivatives(physics, recording, rows)
+    response = None if physics is None else PhysicsResponse.of(physics, recording, rows)
     sorted_by: list[Situation] = []
     for k, (label, model) in enumerate(models.items()):
         if progress is not None:
@@ -155,29 +155,36 @@ def anatomy(
         wheelbase = None if model.vehicle is None else model.vehicle.constants.wheelbase
         errors = one_step_errors(model, recording, rows, line=line, wheelbase=wheelbase)
         sorted_by = sorted_by or situations(errors)
-        found[label] = model_anatomy(errors, sorted_by, slopes, learn=learn, models=len(models))
+        found[label] = model_anatomy(errors, sorted_by, response, learn=learn, models=len(models))
     return Anatomy(name or ", ".join(recording.info.source), recording, found)
 
 
 def model_anatomy(
     errors: OneStepErrors,
     sorted_by: Sequence[Situation],
-    slopes: Vector | None = None,
+    physics: PhysicsResponse | None = None,
     *,
     learn: bool = True,
     models: int = 1,
 ) -> ModelAnatomy:
     """Takes the errors of one model apart; see :func:`anatomy`.
 
+    Where the data clearly ask for another integrator this is the first pattern, and the others are of errors with it.
+
     Args:
         errors: of the model.
         sorted_by: the quantities of :func:`situations`.
-        slopes: how the predicted state depends on the last row's signals, as of :func:`derivatives`; without them
-            delays and rounded signals are not judged.
+        physics: how its predictions would change; without it delays, steps and rounded signals are not judged.
         learn: whether boosted trees are asked.
         models: that are looked at together, among which the chance of a false alarm is shared.
     """
+    slopes = None if physics is None else physics.slopes
     level = FALSE_ALARMS / (models * len(STATE_SIGNALS))
+    if physics is not None and (steps := other_steps(errors, physics, level / len(STATE_SIGNALS))) is not None:
+        assert physics.otherwise is not None
+        closer = replace(errors, values=errors.values + physics.otherwise)
+        rest = model_anatomy(closer, sorted_by, PhysicsResponse(physics.slopes), learn=learn, models=models)
+        return replace(rest, patterns=(steps, *rest.patterns))
     learned = left_to_learn(errors) if learn else {}
     by_learner = learner_patterns(learned)
     faults = list(signal_faults(errors, slopes))
@@ -193,7 +200,7 @@ def model_anatomy(
         beside = [each for each in (*faults, *by_learner) if each.channel == channel]
         others = len(beside) + _OF_SIZE
         for _ in range(_MOST):
-            looked = list(_tried(errors, values, c, sorted_by, slopes))
+            looked = list(_tried(errors, values, c, sorted_by, physics))
             tests = max(tests, len(looked) + others)
             sure = _beyond_chance(looked, level, float(np.sum(values**2)) / total, others)
             before = [each.size.get("period_s") for each in found]
@@ -234,10 +241,10 @@ def _beyond_chance(looked: Sequence[Pattern], level: float, left: float, others:
 
 
 def _tried(
-    errors: OneStepErrors, values: Vector, channel: int, sorted_by: Sequence[Situation], slopes: Vector | None
+    errors: OneStepErrors, values: Vector, channel: int, sorted_by: Sequence[Situation], physics: PhysicsResponse | None
 ) -> Iterator[Pattern]:
     name = STATE_SIGNALS[channel]
     yield from periods(errors, values, name)
     yield from regimes(errors, values, name, list(sorted_by))
-    if slopes is not None:
-        yield from delays(errors, values, channel, slopes)
+    if physics is not None:
+        yield from delays(errors, values, channel, physics.slopes)

@@ -1,4 +1,4 @@
-"""Patterns of delay: errors that vanish if an input acts later, or earlier, than the model has it."""
+"""Patterns of delay: errors that vanish if an input acts later or earlier, or if the model is stepped otherwise."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.evaluation.residuals.errors import OneStepErrors
+from dynssm_ros.evaluation.residuals.errors import OneStepErrors, PhysicsResponse
 from dynssm_ros.evaluation.residuals.evidence import chances, limited, share_explained, sums_of_blocks
 from dynssm_ros.evaluation.residuals.patterns import Pattern, Picture
+from dynssm_ros.signals.recording import COLUMN_UNITS
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 _LAGS_S = (-0.2, 0.5)
@@ -17,6 +18,8 @@ _LAGS_S = (-0.2, 0.5)
 _DRAWS = 100
 _GAIN = (0.2, 2.0)
 """Of the change that a delay makes by the physics, which must be in the errors: another pattern has another size."""
+_STEPS_GAIN = (0.7, 1.3)
+"""The same of the change by another integrator, which has no size of its own: 0.9 to 1.0 where drives had it."""
 
 
 def delays(errors: OneStepErrors, values: Vector, channel: int, slopes: Vector) -> Iterator[Pattern]:
@@ -66,6 +69,47 @@ def delays(errors: OneStepErrors, values: Vector, channel: int, slopes: Vector) 
             name, "delay", f"{signal}_delay", told, share_explained(values, apart), p, 2,
             {"delay_s": round(value, 6), "low_s": round(low, 6), "high_s": round(high, 6)}, fitted, picture,
         )  # fmt: skip
+
+
+def other_steps(errors: OneStepErrors, physics: PhysicsResponse, level: float) -> Pattern | None:
+    """The difference that another integrator makes, in the channel where it is most of the errors.
+
+    It has to explain errors of all channels together and, of one, to be about as large as it should be and no delay.
+
+    Args:
+        errors: of the model.
+        physics: its predictions by the other integrator.
+        level: chance of a false alarm.
+    """
+    if physics.otherwise is None:
+        return None
+    change, square = -physics.otherwise, errors.values**2
+    gone = square - (errors.values - change) ** 2
+    if not np.any(change) or not np.all(square.any(axis=0)):
+        return None
+    share = gone.sum(axis=0) / square.sum(axis=0)
+    gain = (errors.values * change).sum(axis=0) / np.maximum((change**2).sum(axis=0), 1e-300)
+    whole = gone @ (1.0 / square.mean(axis=0))
+    together, *p = chances(np.stack([sums_of_blocks(each, errors.block) for each in (whole, *gone.T)], axis=1))
+    like = (gain >= _STEPS_GAIN[0]) & (gain <= _STEPS_GAIN[1]) & (share > 0) & (np.array(p) < level)
+    if whole.sum() <= 0 or together > level or not like.any():
+        return None
+    c = int(np.argmax(np.where(like, share, -np.inf)))
+    late = (each.share for each in delays(errors, errors.values[:, c], c, physics.slopes))
+    if share[c] < max(late, default=0.0):
+        return None
+    name, (own, other) = STATE_SIGNALS[c], physics.integrators
+    told = (
+        f"{name} errs as {own} steps differ from {other} ones (calibrate with --integrator {other}); "
+        f"the rest is with {other}"
+    )
+    size = np.sqrt([square[:, c].mean(), ((errors.values - change)[:, c] ** 2).mean()])
+    drawn = Picture(
+        "bars", np.arange(2.0), size, "", f"RMS of {name} ({COLUMN_UNITS[name]})", None, (own, other), (1, 1)
+    )
+    return Pattern(
+        name, "delay", "integrator", told, float(share[c]), float(p[c]), 1, {"integrator": other}, None, drawn
+    )
 
 
 def _shares(cross: Vector, square: Vector, total: Vector, weight: Vector) -> Vector:

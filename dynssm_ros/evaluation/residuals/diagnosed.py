@@ -8,7 +8,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.residuals.anatomy import ModelAnatomy, model_anatomy
-from dynssm_ros.evaluation.residuals.errors import BLOCK_S, DRIVEN_SIGNALS, SMALL_CHANGE, OneStepErrors
+from dynssm_ros.evaluation.residuals.errors import BLOCK_S, DRIVEN_SIGNALS, SMALL_CHANGE, OneStepErrors, PhysicsResponse
 from dynssm_ros.evaluation.residuals.evidence import FEWEST_BLOCKS
 from dynssm_ros.evaluation.residuals.regimes import situations
 from dynssm_ros.extras import missing_libraries
@@ -42,8 +42,8 @@ def left_by(diagnosis: Diagnosis) -> ModelAnatomy | None:
         diagnosis.recordings.lines[0] if windows.data.on_one_lap else None,
         diagnosis.vehicle.constants.wheelbase,
     )
-    slopes = _derivatives(single, diagnosis.car)
-    return model_anatomy(errors, situations(errors), slopes, learn=not missing_libraries("residuals"))
+    response = PhysicsResponse(_derivatives(single, diagnosis.car))
+    return model_anatomy(errors, situations(errors), response, learn=not missing_libraries("residuals"))
 
 
 def _derivatives(single: SimulationWindows, car: CarEstimate) -> Vector:

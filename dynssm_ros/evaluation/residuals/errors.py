@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.metrics import Tick, drive_through, predict_rows, silent
+from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.vehicle.integrators import Integrator
 
 BLOCK_S = 3.0
 """Length of the blocks of time that count as independent (s): actuators, filters and noise forget within one."""
@@ -21,6 +24,7 @@ DRIVEN_SIGNALS = WINDOW_COLUMNS[:5]
 SMALL_CHANGE = 1e-3
 """Change of a signal, in its standard deviations, that gives its derivative."""
 _AT_ONCE = 4096  # windows that exist at a time
+_SUBSTEPS = 4  # of Runge-Kutta within a sampling time
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,37 @@ class OneStepErrors:
         segment = self.recording.segment
         first, after = (np.searchsorted(segment, segment[self.rows], side=side) for side in ("left", "right"))
         return first, after - 1
+
+
+class PhysicsResponse(NamedTuple):
+    """How the physics' predictions of rows would change.
+
+    Attributes:
+        slopes: of the predicted state, by each of :data:`DRIVEN_SIGNALS` of the last row, shape ``(N, 3, 5)``.
+        integrators: by which they are stepped, and which other one is compared; empty without.
+        otherwise: predictions by the other integrator less these, shape ``(N, 3)``.
+    """
+
+    slopes: Vector
+    integrators: tuple[Integrator, ...] = ()
+    otherwise: Vector | None = None
+
+    @classmethod
+    def of(cls, physics: WindowModel, recording: Recording, rows: Indices) -> PhysicsResponse:
+        """Of a model's predictions after windows that end at ``rows``; of a vehicle file's also by the other integrator."""
+        slopes = derivatives(physics, recording, rows)
+        if physics.vehicle is None:
+            return cls(slopes)
+        own = physics.vehicle.model_integrator
+        other: Integrator = "rk4" if own == "euler" else "euler"
+        stepped = SingleTrack(physics.vehicle, other, _SUBSTEPS if other == "rk4" else 1)
+        if stepped.H != physics.H:
+            return cls(slopes)
+        return cls(slopes, (own, other), _predicted(stepped, recording, rows) - _predicted(physics, recording, rows))
+
+
+def _predicted(model: WindowModel, recording: Recording, rows: Indices) -> Vector:
+    return np.concatenate([each.state for each in predict_rows(model, recording, rows)])
 
 
 def one_step_errors(

@@ -24,7 +24,7 @@ _BY_CHANCE = 2.0 * float(stats.norm.sf(4.3))
 _SURE, _FEWEST_SPIKES = 1e-6, 6  # chance below which speeds of large errors are told; spikes that may have a period
 _APART_S = 0.1  # spikes nearer to each other are one event
 _CLUSTERED = 2.0  # times more large errors than on average, from which on a speed is named
-_SPEEDS = 30  # ranges of speed in which large errors are counted
+_SPEEDS, _WIDEST = 30, 4  # bins of speed in which large errors are counted; most that are named as one range
 _LEVELS, _HELD, _ON_STEPS = 400, 0.2, 0.98
 """Most values of a signal in steps; share of its rows that keep the value before; share of levels that are whole steps."""
 _REPEATED = 0.02  # share of rows
@@ -64,7 +64,7 @@ def spikes(errors: OneStepErrors, values: Vector, c: int, slopes: Vector | None)
     share = float(np.sum(values[far] ** 2) / max(np.sum(values**2), 1e-300))
     rows, unit = float(np.mean(far)), COLUMN_UNITS[channel]
     worst = np.abs(values) >= np.sort(np.abs(values))[-max(1, round(WORST * len(values)))]
-    speeds = _speeds(errors, worst) if p < _SURE else ()
+    speeds = speeds_of(errors, worst) if p < _SURE else ()
     where = f", most at {_listed(speeds)} m/s" if speeds else ""
     lasted = errors.seconds[-1] - errors.seconds[0]
     told = (
@@ -111,23 +111,29 @@ def _by_speed(errors: OneStepErrors) -> tuple[Vector, Indices]:
     return edges, np.clip(np.digitize(v_x, edges) - 1, 0, len(edges) - 2)
 
 
-def _speeds(errors: OneStepErrors, large: Mask) -> tuple[tuple[float, float], ...]:
-    """Ranges of speed in which large errors come more often than elsewhere, one after the other counted as one."""
+def speeds_of(errors: OneStepErrors, large: Mask) -> tuple[tuple[float, float], ...]:
+    """Ranges of speed in which large errors come more often than elsewhere; none if the strongest may be chance.
+
+    The strongest is named first, then those that do not overlap with what is named.
+    """
     edges, kind = _by_speed(errors)
     kinds = len(edges) - 1
     at = np.flatnonzero(large)
     events = at[np.diff(errors.seconds[at], prepend=-np.inf) > _APART_S]
     count = np.bincount(kind[events], minlength=kinds)
     usual = np.bincount(kind, minlength=kinds) / len(kind)
-    named = (count > _CLUSTERED * usual * len(events)) & (stats.binom.sf(count - 1, len(events), usual) < 0.01)
-    out: list[tuple[float, float]] = []
-    for k in np.flatnonzero(named).tolist():
-        low, high = float(edges[k]), float(edges[k + 1])
-        if out and np.isclose(out[-1][1], low):
-            out[-1] = (out[-1][0], high)
-        else:
-            out.append((low, high))
-    return tuple(out)
+    ranges = [(low, low + width) for width in range(1, _WIDEST + 1) for low in range(kinds - width + 1)]
+    within, expected = (np.array([x[low:high].sum() for low, high in ranges]) for x in (count, usual))
+    chance = np.where(
+        within > _CLUSTERED * expected * len(events), stats.binom.sf(within - 1, len(events), expected), 1.0
+    )
+    named, bins = np.zeros(kinds, bool), np.arange(kinds)
+    if chance.min() * len(ranges) < 0.01:
+        for k in np.argsort(chance)[: np.count_nonzero(chance < 0.01)].tolist():
+            inside = (bins >= ranges[k][0]) & (bins < ranges[k][1])
+            named |= inside & (not named[inside].any())
+    ends = np.flatnonzero(np.diff(np.pad(named, 1).astype(np.int8)))
+    return tuple((float(edges[low]), float(edges[high])) for low, high in zip(ends[::2], ends[1::2], strict=True))
 
 
 def _spike_period(errors: OneStepErrors, values: Vector, channel: str, at: Indices) -> Iterator[Pattern]:
