@@ -27,6 +27,7 @@ def compiled():
         f"{NAME}._compiled",
         [file],
         define_macros=[("SOURCE", f'"{digest}"')],
+        libraries=["m"],
         extra_compile_args=["-O3", "-fno-math-errno", "-ffp-contract=off"],  # numpy's roundings
         optional=True,
     )

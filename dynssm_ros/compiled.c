@@ -1,4 +1,4 @@
-/* Loops of the predictor's step over arrays that Python has allocated. dynssm_ros/compiled.py opens it; each function has its
+/* Loops of the predictor's step, and of the simulations of a fit, over arrays that Python has allocated. dynssm_ros/compiled.py opens it; each function has its
    counterpart in numpy, to which a test holds it. The car's equations are not here: they come as a tape of operations
    (dynssm_ros/vehicle/tape.py). */
 #include <math.h>
@@ -55,9 +55,37 @@ typedef struct {
         smallest_noise, limit;
 } Layer;
 
+typedef struct {
+    Tape settle; /* signals, parameters -> effect states */
+    Tape step;   /* signals, effect states, parameters -> state and effect states at the next row */
+    int64_t signals; /* the measured state, both inputs, what effects read beside them */
+    int64_t states, parameters;
+    const int64_t *signal_places; /* (signals, 2): where the first row's number lies, numbers between rows */
+    const int64_t *settling;      /* the same with the inputs' feedback, under which effect states settle */
+    const int64_t *parameter_places; /* (parameters, 3): where the first one lies, numbers between cars and windows */
+    int64_t cars, windows;
+    const int64_t *starts; /* (windows) rows */
+    int64_t begin, steps, every; /* rows from the starts at which a simulation begins and ends; which rows are kept */
+    double taken; /* share of the measured row that the state takes until the start */
+    double *next; /* (CHANNELS + states, LANES) */
+} Simulation;
+
 const char *dynssm_source(void) { return SOURCE; }
 
+/* glibc has elementary functions of several numbers at once, right to four units in the last digit. So that a number does not
+   depend on its lane, operations are executed for whole groups of lanes, though nobody reads the rest. */
+#define GROUP 4
+#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__) && __GLIBC_PREREQ(2, 35)
+#define WIDE __attribute__((target_clones("avx2", "default")))
+#define AT_ONCE(...) extern double __VA_ARGS__ __attribute__((simd("notinbranch")));
+AT_ONCE(sin(double)) AT_ONCE(cos(double)) AT_ONCE(tan(double)) AT_ONCE(atan(double)) AT_ONCE(atan2(double, double))
+AT_ONCE(tanh(double)) AT_ONCE(exp(double)) AT_ONCE(hypot(double, double)) AT_ONCE(pow(double, double))
+#else
+#define WIDE
+#endif
+
 #define EACH(expression)                         \
+    _Pragma("GCC ivdep")                         \
     for (int64_t i = 0; i < lanes; i++) {        \
         const double a = x[i], b = y[i];         \
         (void)b;                                 \
@@ -65,7 +93,8 @@ const char *dynssm_source(void) { return SOURCE; }
     }                                            \
     break
 
-static void run(const Tape *tape, int64_t lanes) {
+WIDE static void run(const Tape *tape, int64_t wanted) {
+    const int64_t lanes = (wanted + GROUP - 1) / GROUP * GROUP;
     const int32_t *code = tape->code;
     for (int64_t k = 0; k < tape->operations; k++, code += 4) {
         double *z = tape->work + (int64_t)code[1] * LANES;
@@ -347,6 +376,70 @@ void dynssm_sample(const int64_t *places, int64_t count, const double *grid, con
                 const double slope = (v[j + 1] - v[j]) / (t[j + 1] - t[j]);
                 columns[k] = slope * (x - t[j]) + v[j];
             }
+        }
+    }
+}
+
+/* Puts the signals from number `first` on, `k` rows after the starts of some lanes, into a tape. */
+static void read_signals(const Simulation *s, const int64_t *places, double *work, int64_t first, const int64_t *starts,
+                         int64_t lanes, int64_t k) {
+    for (int64_t j = first; j < s->signals; j++) {
+        const double *values = (const double *)(intptr_t)places[2 * j];
+        const int64_t apart = places[2 * j + 1];
+        for (int64_t i = 0; i < lanes; i++) work[j * LANES + i] = values[(starts[i] + k) * apart];
+    }
+}
+
+static void read_parameters(const Simulation *s, double *work, const int64_t *cars, const int64_t *windows, int64_t lanes) {
+    for (int64_t j = 0; j < s->parameters; j++) {
+        const int64_t *place = s->parameter_places + 3 * j;
+        const double *values = (const double *)(intptr_t)place[0];
+        for (int64_t i = 0; i < lanes; i++) work[j * LANES + i] = values[cars[i] * place[1] + windows[i] * place[2]];
+    }
+}
+
+/* Simulates each car from each start; the kept rows go to out (cars, windows, steps / every, CHANNELS), whose cars are `apart`
+   numbers apart. What SimulationWindows computes in numpy. */
+void dynssm_simulate(const Simulation *s, double *out, int64_t apart) {
+    const Tape *settle = &s->settle, *step = &s->step;
+    const int64_t results = CHANNELS + s->states, kept = s->steps / s->every * CHANNELS;
+    int64_t cars[LANES], windows[LANES], starts[LANES];
+    double *work = step->work, *own = work + s->signals * LANES;
+    for (int64_t lane = 0; lane < s->cars * s->windows; lane += LANES) {
+        const int64_t left = s->cars * s->windows - lane, lanes = left < LANES ? left : LANES;
+        for (int64_t i = 0; i < lanes; i++) {
+            cars[i] = (lane + i) / s->windows;
+            windows[i] = (lane + i) % s->windows;
+            starts[i] = s->starts[windows[i]];
+        }
+        if (s->states) {
+            read_signals(s, s->settling, settle->work, 0, starts, lanes, s->begin);
+            read_parameters(s, settle->work + s->signals * LANES, cars, windows, lanes);
+            run(settle, lanes);
+            for (int64_t j = 0; j < s->states; j++)
+                memcpy(own + j * LANES, settle->work + (int64_t)settle->outputs[j] * LANES, LANES * sizeof(double));
+        }
+        read_parameters(s, own + s->states * LANES, cars, windows, lanes);
+        read_signals(s, s->signal_places, work, 0, starts, lanes, s->begin);
+        for (int64_t k = s->begin; k < s->steps; k++) {
+            read_signals(s, s->signal_places, work, CHANNELS, starts, lanes, k);
+            if (k <= 0)
+                for (int64_t c = 0; c < CHANNELS; c++) {
+                    const double *measured = (const double *)(intptr_t)s->signal_places[2 * c];
+                    double *led = work + c * LANES;
+                    for (int64_t i = 0; i < lanes; i++)
+                        led[i] += s->taken * (measured[(starts[i] + k) * s->signal_places[2 * c + 1]] - led[i]);
+                }
+            run(step, lanes);
+            for (int64_t j = 0; j < results; j++) /* a result may lie where another one goes */
+                memcpy(s->next + j * LANES, work + (int64_t)step->outputs[j] * LANES, LANES * sizeof(double));
+            memcpy(work, s->next, CHANNELS * LANES * sizeof(double));
+            memcpy(own, s->next + CHANNELS * LANES, s->states * LANES * sizeof(double));
+            if (k >= 0 && (k + 1) % s->every == 0)
+                for (int64_t i = 0; i < lanes; i++) {
+                    double *there = out + cars[i] * apart + windows[i] * kept + k / s->every * CHANNELS;
+                    for (int64_t c = 0; c < CHANNELS; c++) there[c] = work[c * LANES + i];
+                }
         }
     }
 }

@@ -1,4 +1,4 @@
-"""The compiled loops of the predictor's step: where they were built, they are used; else numpy computes the same.
+"""The compiled loops of the predictor's step and of a fit's simulations. Where they were not built, numpy computes the same.
 
 ``pip`` and ``colcon`` build ``compiled.c`` where a C compiler is, and go on without one where none is. A library of another
 version of that file is not used. ``DYNSSM_COMPILED=0`` in the environment switches it off.
@@ -27,6 +27,7 @@ _FUNCTIONS = {
     "dynssm_along": "ppppippppp",
     "dynssm_rollout": "ppippp",
     "dynssm_sample": "pippip",
+    "dynssm_simulate": "ppi",
 }
 """The library's functions with their arguments: p a structure or the first number of an array, i a count."""
 _SOURCE = Path(__file__).with_suffix(".c")
@@ -145,4 +146,18 @@ class LayerStructure(Structure):
             "retained forget recently outlier quantile missed_grows hit_shrinks widest largest smallest_recent "
             "smallest_noise limit",
         ),
+    ]
+
+
+class SimulationStructure(Structure):
+    """``Simulation`` of ``compiled.c``."""
+
+    _fields_ = [
+        ("settle", TapeStructure),
+        ("step", TapeStructure),
+        *_fields("signals states parameters", "signal_places settling parameter_places"),
+        *_fields("cars windows", "starts"),
+        *_fields("begin steps every"),
+        *_fields("", "", "taken"),
+        *_fields("", "next"),
     ]

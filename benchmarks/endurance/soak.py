@@ -80,7 +80,7 @@ class Soaked:
     violations: dict[str, str] = field(default_factory=dict)  # what must not happen, in words, the first of each kind
 
 
-class _RaceCar:
+class _Drive:
     """The traffic on the bus, and what is known of it."""
 
     def __init__(self, model: Path, collector: Collector, rate: float, seed: int, spoilt: float) -> None:
@@ -187,7 +187,7 @@ def soak(
     card = open_artifact(models[0]).card
     run, done, held = LiveRun(round(card.sampling_time * 1e9)), Soaked(), list[tuple[float, int]]()
     with predictor_process(models[0], {}, os.environ.copy()) as process, collecting(run) as collector:
-        drive = _RaceCar(models[0], collector, rate, seed, spoilt)
+        drive = _Drive(models[0], collector, rate, seed, spoilt)
         drive.wait_for_answer(run, process)
         swapper = _Swapper(collector, models, swap_every)
         begin = time.monotonic()
@@ -237,7 +237,7 @@ def _holds(pid: int) -> tuple[float, int]:
     return pages * os.sysconf("SC_PAGE_SIZE") / _MB, len(os.listdir(f"/proc/{pid}/fd"))
 
 
-def _judge(run: LiveRun, drive: _RaceCar, done: Soaked) -> None:
+def _judge(run: LiveRun, drive: _Drive, done: Soaked) -> None:
     done.predictions = sum(stamp - run.T_s in run.sent for stamp in run.predicted)
     done.lost = run.lost
     done.passed_over = len(run.missing()) - done.lost

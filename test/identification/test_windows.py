@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dynssm_ros import compiled
 from dynssm_ros.identification.problem.car import CarEstimate, prior_std
 from dynssm_ros.identification.problem.fit import IdentificationProblem, position, with_values
 from dynssm_ros.identification.problem.noise import Noise, NoiseResponse, fit_noise, weights
@@ -18,6 +19,9 @@ from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle
+from dynssm_ros.vehicle.effects import EFFECTS
+from dynssm_ros.vehicle.effects.base import CONTEXT_UNITS
+from dynssm_ros.vehicle.integrators import Integrator
 
 AV21 = load_vehicle("av21")
 LAG = {"steering_lag": {"time_constant": 0.1}}
@@ -243,3 +247,25 @@ def test_a_lag_is_seen_through_actuators_that_are_sampled_slowly(hold: Hold) -> 
         assert found == pytest.approx(0.1, abs=0.015)
     else:
         assert found < 0.075
+
+
+@pytest.mark.skipif(compiled.LIBRARY is None, reason="the compiled loops were not built")
+@pytest.mark.parametrize(("integrator", "hold"), [("euler", "zero"), ("rk4", "first")])
+def test_compiled_simulations_of_all_effects_are_numpys(
+    monkeypatch: pytest.MonkeyPatch, acting: Callable[..., dict[str, float]], integrator: Integrator, hold: Hold
+) -> None:
+    some, rng = windows(AV21, (0.02, 0.03, 0.004), duration=4.0), np.random.default_rng(0)
+    place = {name: rng.uniform(0.1, 1.0, len(some.data.time)) for name in CONTEXT_UNITS}
+    some = replace(
+        some, data=replace(some.data, context=place), integrator=integrator, hold=hold, substeps=2, every=3,
+        filtered=integrator == "rk4",
+    )  # fmt: skip
+    car = CarEstimate.of(AV21)
+    for name in EFFECTS:
+        cars = [replace(car, moved=rng.normal(0.0, 0.2, 18)).with_effect(name, acting(name, s)) for s in (0.1, 0.2)]
+        errors = some.errors_of(cars), some.errors_of([cars[0].with_effect(name, acting(name), only_in=(1,))])
+        with monkeypatch.context() as without:
+            without.setattr(compiled, "LIBRARY", None)
+            by_numpy = some.errors_of(cars), some.errors_of([cars[0].with_effect(name, acting(name), only_in=(1,))])
+        for found, expected in zip(errors, by_numpy, strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11 * some.spread.max(), err_msg=name)

@@ -16,6 +16,7 @@ from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarBatch, CarEstimate
+from dynssm_ros.identification.problem.compiled_simulation import simulate
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import Hold
@@ -73,6 +74,11 @@ class RecordedRows:
                 at, values = np.stack([begins, ends], axis=1), np.stack([held[ends - 1], held[ends]], axis=1)
                 held[:] = np.interp(rows, at.ravel(), values.ravel())
         return lines
+
+    @cached_property
+    def lines_between(self) -> Vector:
+        """What :attr:`lines` are from a row to the next on average, shape ``(2, N)``."""
+        return np.asarray((self.lines + np.hstack([self.lines[:, 1:], self.lines[:, -1:]])) / 2)
 
 
 @dataclass(frozen=True)
@@ -170,16 +176,23 @@ class SimulationWindows:
         """
         out = np.empty((len(cars), len(self), self.steps // self.every, 3))
         for block in self.blocks():
-            self.select(block)._simulate(cars, context, out[:, block])
+            some = self.select(block)
+            some._simulate(CarBatch.of(cars, some.number), context, out[:, block])
         limit = tuning.WILD * self.spread
         out -= self.target
         return np.asarray(np.clip(np.nan_to_num(out, copy=False, nan=1e9, posinf=1e9, neginf=-1e9), -limit, limit))
 
-    def _simulate(self, cars: Sequence[CarEstimate], context: dict[str, float] | None, out: Vector) -> None:
-        fleet = CarBatch.of(cars, self.number)
+    def _simulate(self, fleet: CarBatch, context: dict[str, float] | None, out: Vector) -> None:
+        """Writes the states of the rows that are compared, shape ``(P, W, K, 3)``."""
         car = self._bound(fleet)
         shift = -self.warm if car.effect_states or self.filtered else 0
         taken = 1.0 - np.exp(-self.data.T_s / tuning.OBSERVER_S) if self.filtered else 1.0
+        rows, beside, kept = self.data.rows, self._signals(car, context), self.every
+        if simulate(
+            self._bound, fleet, rows, self._acting, beside,
+            out=out, starts=self.starts, begin=shift, every=kept, taken=taken,
+        ):  # fmt: skip
+            return
         first = self.data.rows[:, self.starts + shift]
         here = self._read(car, shift, context)
         state = State(*first[:3])
@@ -196,18 +209,21 @@ class SimulationWindows:
 
     def transitions(self, car: CarEstimate) -> Vector:
         """Derivatives of each compared row by the one before, along the measured rows, shape ``(W, K, 3, 3)``."""
-        fleet = CarBatch.of([car], self.number)
+        rows = (self.starts[:, None] + np.arange(self.steps)).ravel()
+        single = replace(self, starts=rows, steps=1, every=1, filtered=False)
+        fleet = CarBatch.of([car], single.number)
         fleet = fleet._replace(effects=tuple(effect for effect in fleet.effects if not effect.carries))
-        bound, theta = self._bound(fleet), fleet.theta
-        out = np.empty((len(self), self.steps, 3, 3))
-        for k in range(self.steps):
-            state = State(*self.data.rows[:3, self.starts + k])
-            base, _ = self._step(bound, theta, state, {}, k)
-            for j in range(3):
-                h = 1e-4 * self.spread[j]
-                there = State(*(v + h * (i == j) for i, v in enumerate(state)))
-                moved, _ = self._step(bound, theta, there, {}, k)
-                out[:, k, :, j] = np.stack([(a - b) / h for a, b in zip(moved, base, strict=True)], axis=-1)
+
+        def stepped(add: Vector) -> Vector:
+            moved = self.data.rows.copy()
+            moved[:3] += add[:, None]
+            there = np.empty((1, len(rows), 1, 3))
+            replace(single, data=replace(self.data, rows=moved))._simulate(fleet, None, there)
+            return there[0, :, 0]
+
+        h = 1e-4 * self.spread
+        base = stepped(np.zeros(3))
+        out = np.stack([(stepped(add) - base) / add.sum() for add in np.diag(h)], axis=-1)
         steps = np.clip(np.nan_to_num(out), -10.0, 10.0).reshape(len(self), -1, self.every, 3, 3)
         through = steps[:, :, 0]
         for k in range(1, self.every):
@@ -229,18 +245,24 @@ class SimulationWindows:
         context: Mapping[str, float] | None = None,
     ) -> tuple[State, dict[str, Vector]]:
         """One step from the rows ``k`` after the starts."""
-        now = self.starts + k
-        if self.hold == "first":
-            applied = Applied(*(self.data.lines[:, now] + self.data.lines[:, now + 1]) / 2)
-        else:
-            applied = Applied(*self.data.applied[:, now])
+        applied = Applied(*self._acting[:, self.starts + k])
         return car.step(state, applied, theta, effect_states, context=self._read(car, k, context))
+
+    @property
+    def _acting(self) -> Vector:
+        """Throttle and steering from each row to the next, shape ``(2, N)``."""
+        return self.data.lines_between if self.hold == "first" else self.data.applied
+
+    def _signals(self, car: CarModel, context: Mapping[str, float] | None) -> dict[str, Any]:
+        """The other signals that effects of the car read, by row; ``context`` replaces them."""
+        signals = self.data.context
+        needs = dict.fromkeys(name for effect in car.effects for name in effect.needs if name in signals)
+        return {name: (context or {}).get(name, signals[name]) for name in needs}
 
     def _read(self, car: CarModel, k: int, context: Mapping[str, float] | None) -> dict[str, Any]:
         """The other signals that effects of the car read, ``k`` rows after the starts; ``context`` replaces them."""
-        given, signals = context or {}, self.data.context
-        at = {name: self.starts + k for effect in car.effects for name in effect.needs if name in signals}
-        return {name: given[name] if name in given else signals[name][rows] for name, rows in at.items()}
+        read = self._signals(car, context)
+        return {name: value[self.starts + k] if np.ndim(value) else value for name, value in read.items()}
 
     def _bound(self, fleet: CarBatch) -> CarModel:
         return CarModel(
