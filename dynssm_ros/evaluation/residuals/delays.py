@@ -8,7 +8,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.residuals.errors import OneStepErrors, PhysicsResponse
-from dynssm_ros.evaluation.residuals.evidence import chances, limited, share_explained, sums_of_blocks
+from dynssm_ros.evaluation.residuals.evidence import chances, limited, regression, share_explained, sums_of_blocks
 from dynssm_ros.evaluation.residuals.patterns import Pattern, Picture
 from dynssm_ros.signals.recording import COLUMN_UNITS
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
@@ -18,8 +18,11 @@ _LAGS_S = (-0.2, 0.5)
 _DRAWS = 100
 _GAIN = (0.2, 2.0)
 """Of the change that a delay makes by the physics, which must be in the errors: another pattern has another size."""
-_STEPS_GAIN = (0.7, 1.3)
-"""The same of the change by another integrator, which has no size of its own: 0.9 to 1.0 where drives had it."""
+_LIKE_A_DELAY = 0.8  # of what the best delay explains, which fits two numbers; 0.89 where another integrator was right
+_LATELY = (0, 2, 5, 10)  # rows before, of whose inputs the change by another integrator follows
+_STEPS_GAIN = (0.65, 1.35)
+"""The same of the change by another integrator, which has no size of its own: 0.7 to 1.0 where drives had it, 1.4 to 2.0 of
+omega where the steering was a sample or two late."""
 
 
 def delays(errors: OneStepErrors, values: Vector, channel: int, slopes: Vector) -> Iterator[Pattern]:
@@ -74,7 +77,8 @@ def delays(errors: OneStepErrors, values: Vector, channel: int, slopes: Vector) 
 def other_steps(errors: OneStepErrors, physics: PhysicsResponse, level: float) -> Pattern | None:
     """The difference that another integrator makes, in the channel where it is most of the errors.
 
-    It has to explain errors of all channels together and, of one, to be about as large as it should be and no delay.
+    It has to explain errors of all channels together, to be about as large as it should be in each channel where it is sure,
+    and to be no delay. Its size is that of the part that follows from the inputs: noise of the state is in both.
 
     Args:
         errors: of the model.
@@ -88,15 +92,19 @@ def other_steps(errors: OneStepErrors, physics: PhysicsResponse, level: float) -
     if not np.any(change) or not np.all(square.any(axis=0)):
         return None
     share = gone.sum(axis=0) / square.sum(axis=0)
-    gain = (errors.values * change).sum(axis=0) / np.maximum((change**2).sum(axis=0), 1e-300)
-    whole = gone @ (1.0 / square.mean(axis=0))
-    together, *p = chances(np.stack([sums_of_blocks(each, errors.block) for each in (whole, *gone.T)], axis=1))
-    like = (gain >= _STEPS_GAIN[0]) & (gain <= _STEPS_GAIN[1]) & (share > 0) & (np.array(p) < level)
-    if whole.sum() <= 0 or together > level or not like.any():
+    driven = np.stack([regression(column, _driving(errors), errors.block)[0] for column in change.T], axis=1)
+    both = (errors.values * driven).sum(axis=0), (change * driven).sum(axis=0)
+    gain = both[0] / np.maximum(both[1], 1e-300)
+    tested = (gone @ (1.0 / square.mean(axis=0)), *(errors.values * driven).T)
+    together, *p = chances(np.stack([sums_of_blocks(each, errors.block) for each in tested], axis=1))
+    sure = np.array(p) < level
+    right = (gain >= _STEPS_GAIN[0]) & (gain <= _STEPS_GAIN[1])
+    like = sure & right & (share > 0)
+    if tested[0].sum() <= 0 or together > level or not like.any() or (sure & ~right).any():
         return None
     c = int(np.argmax(np.where(like, share, -np.inf)))
     late = (each.share for each in delays(errors, errors.values[:, c], c, physics.slopes))
-    if share[c] < max(late, default=0.0):
+    if share[c] < _LIKE_A_DELAY * max(late, default=0.0):
         return None
     name, (own, other) = STATE_SIGNALS[c], physics.integrators
     told = (
@@ -110,6 +118,13 @@ def other_steps(errors: OneStepErrors, physics: PhysicsResponse, level: float) -
     return Pattern(
         name, "delay", "integrator", told, float(share[c]), float(p[c]), 1, {"integrator": other}, None, drawn
     )
+
+
+def _driving(errors: OneStepErrors) -> Vector:
+    """What the inputs were of late at the speed of then, ``(N, k)``."""
+    speed = errors.driven[:, 0] / max(float(np.mean(errors.driven[:, 0])), 1e-9)
+    late = [errors.before(column, lag) for column in errors.inputs.values() for lag in _LATELY]
+    return np.stack([np.ones(len(errors)), *(column * speed**power for column in late for power in range(3))], axis=1)
 
 
 def _shares(cross: Vector, square: Vector, total: Vector, weight: Vector) -> Vector:
