@@ -1,0 +1,359 @@
+"""What a network beside the online layer could earn on laps and logs that were left out, and from which inputs.
+
+    python -m benchmarks.network [--out out/network] [--only putnam] [--data DIR]
+
+Each fold leaves out a lap of Putnam Park or a development log of the 1:10 car. The car is calibrated and the layer fitted on
+the rest. There layers that did not know a stretch drive along it, and learners are fitted to what these leave of increments.
+On the left-out drive a learner's prediction is added to the physics, and the layer learns what is then left.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from torch import nn
+
+from benchmarks.matrix.scored_cells import RACER
+from benchmarks.page import table
+from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.files import write_json
+from dynssm_ros.identification.result.calibration import calibrate
+from dynssm_ros.learning.dataset import normalisation
+from dynssm_ros.learning.earned_layer import LayerBase
+from dynssm_ros.learning.models.base import OnlineConfig
+from dynssm_ros.learning.models.physics import PhysicsConfig
+from dynssm_ros.learning.online import LayerDrive, fit_layer
+from dynssm_ros.runtime.along import Along
+from dynssm_ros.runtime.features import INPUT_CHANGE, LayerFeatures
+from dynssm_ros.runtime.online import CHANNELS, Learned, OnlineLayer, Seen
+from dynssm_ros.runtime.path_judge import PathJudge
+from dynssm_ros.runtime.rollout import RolloutCorrection, path_errors, roll_out
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.inputs import applied_inputs
+from dynssm_ros.signals.recording import Recording, concatenate
+from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
+from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
+
+HORIZONS_S = (0.3, 0.6, 1.5)
+THROTTLES = np.array([-0.4, -0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
+"""Throttle fractions about which a force may bend."""
+_WIDTHS = np.maximum(np.abs(THROTTLES) / 2, 0.01)
+_GATES_S = (28.6, 248.9, 409.0, np.inf)  # of Putnam Park's laps
+_SETTLED_S = 16.0  # before it the log's heading settles
+_DART = {
+    "free": "dart/free_driving_1002", "circles_1211": "dart_season/circles_0904_1211",
+    "circles_1554": "dart_season/circles_0909_1554", "ramp": "dart_season/circles_fast_ramp_0927_1818",
+}  # fmt: skip
+_HISTORY_S = 0.64
+_STRIDE_S = 0.2  # between starts of paths
+_LIMIT = 4.0  # of inputs, whose usual size is one, and of corrections in their standard deviations
+
+Predict = Callable[[Vector], Vector]
+"""From inputs ``(N, n)`` to what is left of increments, ``(N, 3)``, in their standard deviations."""
+Look = Callable[[Vector, Seen], Vector]
+"""From windows ``(N, H, 7)`` and what the layer sees of them to inputs ``(N, n)``."""
+
+
+class Fold(NamedTuple):
+    """A training, and the drive that it is scored on."""
+
+    name: str
+    vehicle: str
+    training: Recording
+    left_out: Recording
+
+
+def folds(data: Path) -> Iterator[Fold]:
+    """All of them; marked test logs are in none."""
+    putnam = _extracted(data / "av21" / "putnam_park_run4_2", "av21", 25.0)
+    seconds = (putnam.time - putnam.time[0]) / 1e9
+    for lap, (begin, end) in enumerate(pairwise(_GATES_S), 1):
+        inside = (seconds >= begin) & (seconds < end)
+        yield Fold(f"putnam_{lap}", "av21", putnam.select((seconds >= _SETTLED_S) & ~inside), putnam.select(inside))
+    logs = {name: _extracted(data / bag, "default", 50.0) for name, bag in _DART.items()}
+    for left, log in logs.items():
+        rest = concatenate([other for name, other in logs.items() if name != left])
+        yield Fold(f"dart_{left}", RACER, rest, log)
+
+
+def _extracted(bag: Path, signals: str, rate: float) -> Recording:
+    return extract([bag], load_signal_map(signals).with_commands("none"), rate)
+
+
+def throttle_steps(windows: Vector) -> Vector:
+    """Steps of the applied throttle of the last row about :data:`THROTTLES`, ``(N, 12)``."""
+    applied, _ = applied_inputs(np.moveaxis(windows[:, -1], -1, 0))
+    steps: Vector = np.tanh((applied[:, None] - THROTTLES) / _WIDTHS)
+    return steps
+
+
+class StepsInLayer:
+    """What a layer sees that has the throttle's steps among its features."""
+
+    def __init__(self, features: LayerFeatures) -> None:
+        self._features = features
+        self.layout, self.vehicle, self.stepping = features.layout, features.vehicle, features.stepping
+        self.names = (*features.names, *(f"throttle about {value:g}" for value in THROTTLES))
+
+    def seen(self, windows: Vector) -> Seen:
+        """As :meth:`LayerFeatures.seen`."""
+        seen = self._features.seen(windows)
+        steps = np.repeat(throttle_steps(windows)[:, None], CHANNELS, axis=1)
+        return Seen(np.concatenate([seen.features, steps], axis=2), seen.physics)
+
+
+@dataclass(frozen=True)
+class Study:
+    """A fold with its calibrated car and its layer."""
+
+    fold: Fold
+    base: LayerBase
+
+    @classmethod
+    def of(cls, fold: Fold, out: Path) -> Study:
+        """Calibrates the car; one that lies in ``out`` is taken."""
+        file = out / f"{fold.name}.yaml"
+        if not file.is_file():
+            car = load_vehicle(fold.vehicle)
+            save_vehicle(calibrate(fold.training, car, min_speed=car.minimum_speed).vehicle, file)
+        car = load_vehicle(file)
+        H = max(1, round(_HISTORY_S / car.sampling_time))
+        ends = fold.training.window_ends(H, min_speed=car.minimum_speed)
+        scale = normalisation(fold.training, ends)
+        return cls(fold, LayerBase(car, PhysicsConfig(nominal="calibrated"), scale, H, OnlineConfig()))
+
+    @property
+    def car(self) -> Vehicle:
+        return self.base.vehicle
+
+    def drive(self, log: Recording, ends: Indices, features: LayerFeatures) -> LayerDrive:
+        """A log as a layer sees it."""
+        return LayerDrive(lambda block: features.seen(log.windows(ends[block], self.base.H)), log, ends, ends[:0])
+
+    def fitted(self, features: LayerFeatures) -> tuple[OnlineLayer, list[tuple[LayerDrive, OnlineLayer]]]:
+        """The layer of the training, and its stretches, each with a layer that did not know it."""
+        log = self.fold.training
+        ends = log.window_ends(self.base.H, min_speed=self.car.minimum_speed)
+        drives = [self.drive(log, some, features) for some in np.array_split(ends, self.base.config.folds)]
+        found = fit_layer(drives, features, self.base.normalisation, self.base.config)
+        return found.layer, [(drive, each.layer) for drive, each in zip(drives, found.left_out, strict=True)]
+
+    def everything(self, windows: Vector, seen: Seen) -> Vector:
+        """All that the layer sees."""
+        return limited(seen.features.reshape(len(windows), -1))
+
+    def operating_point(self, windows: Vector, seen: Seen) -> Vector:
+        """State, inputs and their last three changes, and the throttle's steps."""
+        mean, std = np.array(self.base.normalisation.input_mean[:5]), np.array(self.base.normalisation.input_std[:5])
+        applied = windows[:, -4:, 3:5] + windows[:, -4:, 5:]
+        level = (np.concatenate([windows[:, -1, :3], applied[:, -1]], axis=1) - mean) / std
+        changes = (np.diff(applied, axis=1) / (INPUT_CHANGE * std[3:])).reshape(len(windows), -1)
+        return np.concatenate([limited(level), limited(changes), throttle_steps(windows)], axis=1)
+
+    def with_increments(self, windows: Vector, seen: Seen) -> Vector:
+        """The operating point and the last three measured increments."""
+        moved = np.diff(windows[:, -4:, :CHANNELS], axis=1) / np.array(self.base.normalisation.increment_scale)
+        return np.concatenate([self.operating_point(windows, seen), limited(moved.reshape(len(windows), -1))], axis=1)
+
+
+def limited(values: Vector) -> Vector:
+    """Squeezed to the range that trainings have seen."""
+    inside: Vector = _LIMIT * np.tanh(values / _LIMIT)
+    return inside
+
+
+def left_by(layer: OnlineLayer, drive: LayerDrive) -> Vector:
+    """What a layer that learns along a drive leaves of its increments, ``(N, 3)``, in units of s_delta."""
+    seen, (rows, increments) = drive.see(slice(None)), drive.measured(slice(None))
+    learned = Along(layer).over(seen, rows, increments, drive.ends)
+    left: Vector = (increments - layer.increments(seen.features, learned.weights)) / layer.scale
+    return left
+
+
+def ridge(X: Vector, Y: Vector) -> Predict:
+    """Ridge regression; a thirtieth of an input's usual square as its weight's penalty."""
+    mean = X.mean(axis=0)
+    Z = X - mean
+    W = np.linalg.solve(Z.T @ Z / len(Z) + 0.03 * np.eye(Z.shape[1]), Z.T @ np.clip(Y, -3, 3) / len(Z))
+    return lambda x: np.asarray((x - mean) @ W)
+
+
+def trees(X: Vector, Y: Vector) -> Predict:
+    """Boosted trees for each channel."""
+    from sklearn.ensemble import HistGradientBoostingRegressor
+
+    settings: dict[str, Any] = {
+        "max_iter": 60, "max_leaf_nodes": 12, "learning_rate": 0.08, "min_samples_leaf": 60, "l2_regularization": 1.0,
+    }  # fmt: skip
+    fitted = [HistGradientBoostingRegressor(**settings, random_state=0).fit(X, np.clip(y, -3, 3)) for y in Y.T]
+    return lambda x: np.stack([each.predict(x) for each in fitted], axis=1)
+
+
+class Network(nn.Module):
+    """A linear map and, beside it, 16 hidden units."""
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(inputs, CHANNELS)
+        self.hidden = nn.Sequential(nn.Linear(inputs, 16), nn.SiLU(), nn.Linear(16, CHANNELS))
+        for last in (self.linear, cast(nn.Linear, self.hidden[-1])):
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Inputs ``(N, n)`` to a bounded correction ``(N, 3)``."""
+        return _LIMIT * torch.tanh((self.linear(x) + self.hidden(x)) / _LIMIT)
+
+
+def network(X: Vector, Y: Vector) -> Predict:
+    """:class:`Network`, trained one step ahead."""
+    torch.manual_seed(0)
+    inputs, wanted = (torch.tensor(each, dtype=torch.float32) for each in (X, Y))
+    model, epochs, size = Network(X.shape[1]), 15, 128
+    optimiser = torch.optim.AdamW(model.parameters(), lr=0.004, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, epochs * -(-len(X) // size))
+    for _ in range(epochs):
+        for batch in torch.split(torch.randperm(len(X)), size):
+            loss = nn.functional.huber_loss(model(inputs[batch]), wanted[batch], delta=2.0)
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+            schedule.step()
+
+    def predict(x: Vector) -> Vector:
+        with torch.no_grad():
+            found: Vector = model(torch.tensor(x, dtype=torch.float32)).double().numpy()
+        return found
+
+    return predict
+
+
+class Scored(NamedTuple):
+    """Errors on the left-out drive."""
+
+    rmse: Vector  # one step, (3,)
+    distances: Vector  # mean distance of paths, (starts, horizons) (m)
+
+
+def score(
+    study: Study, features: LayerFeatures, layer: OnlineLayer, trusted: Vector, learner: Look | None = None
+) -> Scored:
+    """Drives along the left-out log; ``learner``: adds ``(N, 3)`` (m/s, m/s, rad/s) to the physics."""
+    log, H, T_s = study.fold.left_out, study.base.H, study.car.sampling_time
+    ends = log.window_ends(H, min_speed=study.car.minimum_speed)
+    windows = log.windows(ends, H)
+    seen, (rows, increments) = features.seen(windows), study.drive(log, ends, features).measured(slice(None))
+    left = increments - (0.0 if learner is None else learner(windows, seen))
+    known = Along(layer).over(seen, rows, left, ends)._replace(trusted=trusted)
+    errors = left - layer.increments(seen.features, known.weights)
+    steps = round(max(HORIZONS_S) / T_s)
+    starts = log.window_ends(H, steps, study.car.minimum_speed)[:: max(1, round(_STRIDE_S / T_s))]
+    correction = RolloutCorrection(layer, known.at(np.searchsorted(ends, starts)))
+
+    def step(windows: Vector) -> Vector:
+        seen, k = features.seen(windows), correction.steps
+        moved = windows[:, -1, :CHANNELS] + correction.increments(seen)
+        if learner is None:
+            return moved
+        share = min(max(2.0 - k * T_s / PATH_HORIZON_S, 0.0), 1.0)  # as the layer's correction
+        acts = correction.learned.trusted[:, None] if k else 1.0
+        return np.asarray(moved + share * acts * learner(windows, seen))
+
+    predicted = log.windows(starts, H, steps)
+    distances = path_errors(predicted[:, H - 1 : H, :3], roll_out(step, predicted, H), predicted[:, H:, :3], T_s)
+    until = [round(horizon / T_s) for horizon in HORIZONS_S]
+    return Scored(np.sqrt(np.mean(errors**2, axis=0)), np.stack([distances[:, :k].mean(axis=1) for k in until], axis=1))
+
+
+def judged(study: Study, features: LayerFeatures, layer: OnlineLayer) -> Vector:
+    """Where on the left-out drive the paths of the layer alone are believed."""
+    log, H = study.fold.left_out, study.base.H
+    ends = log.window_ends(H, min_speed=study.car.minimum_speed)
+    drive = study.drive(log, ends, features)
+    seen, windows = drive.see(slice(None)), log.windows(ends, H)
+    known: Learned = Along(layer).over(seen, *drive.measured(slice(None)), ends)
+    return PathJudge(layer, features.seen, features).along(windows, ends, known, seen)
+
+
+def ratios(ours: Scored, alone: Scored) -> list[float]:
+    """Errors over those of the layer alone: one step, geometric mean over the channels, and paths."""
+    step = float(np.exp(np.mean(np.log(ours.rmse / alone.rmse))))
+    return [step, *(ours.distances.mean(axis=0) / alone.distances.mean(axis=0)).tolist()]
+
+
+def scored(study: Study) -> dict[str, list[float]]:
+    """:func:`ratios` of all learners."""
+    features = study.base.features(False)
+    layer, stretches = study.fitted(features)
+    trusted = judged(study, features, layer)
+    alone = score(study, features, layer, trusted)
+    left = np.concatenate([left_by(each, drive) for drive, each in stretches])
+    size = left.std(axis=0)
+    found = {}
+    looks = {"all features": study.everything, "operating point": study.operating_point}
+    cases = [(name, look, fit) for name, look in looks.items() for fit in (ridge, trees, network)]
+    for name, look, fit in [*cases, ("operating point, increments", study.with_increments, network)]:
+        H, log = study.base.H, study.fold.training
+        inputs = [look(log.windows(drive.ends, H), drive.see(slice(None))) for drive, _ in stretches]
+        predict = fit(np.concatenate(inputs), left / size)
+        learner = _learner(look, predict, size * layer.scale)
+        found[f"{fit.__name__}, {name}"] = ratios(score(study, features, layer, trusted, learner), alone)
+    steps = cast(LayerFeatures, StepsInLayer(features))
+    found["layer with the throttle's steps"] = ratios(score(study, steps, study.fitted(steps)[0], trusted), alone)
+    return found
+
+
+def _learner(look: Look, predict: Predict, size: Vector) -> Look:
+    return lambda windows, seen: np.asarray(predict(look(windows, seen)) * size)
+
+
+def main() -> None:
+    """Scores the folds and prints the tables; what is done is kept in ``--out``."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("out/network"))
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--only", default="", help="folds whose names begin so")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    known: dict[str, dict[str, list[float]]] = {}
+    for fold in folds(arguments.data):
+        file = arguments.out / f"{fold.name}.json"
+        if not file.is_file() and fold.name.startswith(arguments.only):
+            write_json(file, scored(Study.of(fold, arguments.out)))
+        if file.is_file():
+            known[fold.name] = json.loads(file.read_text(encoding="utf-8"))
+    print(tables(known))
+
+
+def tables(known: dict[str, dict[str, list[float]]]) -> str:
+    """One step and path over :data:`HORIZONS_S` of each learner, by group of folds, and the path over 0.6 s by fold."""
+    parts = []
+    names = list(next(iter(known.values())))
+    for group in dict.fromkeys(name.partition("_")[0] for name in known):
+        of = {fold: content for fold, content in known.items() if fold.startswith(group)}
+        rows = []
+        for name in names:
+            logs = np.log([content[name] for content in of.values()])
+            rows.append([name, *(f"{value:.3f}" for value in (*np.exp(logs.mean(axis=0)), *np.exp(logs[:, 2])))])
+        heads = [
+            group,
+            "one step",
+            *(f"path {horizon:g} s" for horizon in HORIZONS_S),
+            *(f"0.6 s: {fold}" for fold in of),
+        ]
+        parts.append(table(heads, rows))
+    return "\n\n".join(parts)
+
+
+if __name__ == "__main__":
+    main()

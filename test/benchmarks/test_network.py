@@ -1,0 +1,65 @@
+"""What a network beside the online layer could earn: the learners find a planted bend, and the ratios are what they say."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import network
+from benchmarks.network import Fold, Scored, Study, ratios, tables, throttle_steps
+from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle import Vehicle, save_vehicle
+
+
+@pytest.mark.parametrize("fit", [network.ridge, network.trees, network.network])
+def test_learners_find_a_planted_bend(fit: Any) -> None:
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(0)
+    windows = np.zeros((1600, 1, 7))
+    windows[:, 0, 3] = rng.uniform(-0.3, 0.3, 1600)
+    windows[:, 0, 5] = rng.uniform(-0.1, 0.1, 1600)  # what is applied is the sum
+    applied = windows[:, 0, 3] + windows[:, 0, 5]
+    bend = np.stack([np.maximum(applied, 0.0) / 0.1, np.where(np.abs(applied) < 0.05, 1.0, 0.0), 0.0 * applied], axis=1)
+    wanted = bend - bend.mean(axis=0) + 0.3 * rng.standard_normal(bend.shape)
+    X = throttle_steps(windows)
+    predict = fit(X[:1200], wanted[:1200])
+    left = wanted[1200:] - predict(X[1200:])
+    assert (left.std(axis=0)[:2] < 0.4).all()
+    assert left.std(axis=0)[2] < 0.33, "nothing is found in noise"
+
+
+def test_ratios_are_of_one_step_and_of_paths() -> None:
+    alone = Scored(np.array([1.0, 2.0, 3.0]), np.array([[1.0, 2.0, 4.0], [3.0, 2.0, 4.0]]))
+    ours = Scored(np.array([0.5, 2.0, 6.0]), np.array([[1.0, 1.0, 4.0], [1.0, 1.0, 8.0]]))
+    np.testing.assert_allclose(ratios(ours, alone), [1.0, 0.5, 0.5, 1.5])
+    text = tables({"putnam_1": {"ridge": [1.0, 0.9, 0.8, 0.7]}, "putnam_2": {"ridge": [1.0, 0.9, 0.2, 0.7]}})
+    assert "| ridge | 1.000 | 0.900 | 0.400 | 0.700 | 0.800 | 0.200 |" in text
+
+
+def test_a_learner_that_adds_nothing_changes_nothing_and_the_truth_leaves_less(
+    drive: Any, orca: Vehicle, tmp_path: Path
+) -> None:
+    noise = (0.003, 0.003, 0.02)
+    training, left_out = (drive(orca, 800, seed=seed, noise=noise) for seed in (0, 1))
+    steady = np.where(np.arange(len(left_out)) % 20 < 10, 0.01, -0.01)  # pushes of v_x that no layer follows at once
+    columns = left_out.columns | {"v_x": left_out["v_x"] + np.cumsum(steady)}
+    left_out = Recording(left_out.info, left_out.time, left_out.segment, columns)
+    save_vehicle(orca, tmp_path / "f.yaml")
+    study = Study.of(Fold("f", "orca", training, left_out), tmp_path)
+    features = study.base.features(False)
+    layer, stretches = study.fitted(features)
+    assert len(stretches) == study.base.config.folds
+    trusted = network.judged(study, features, layer)
+    alone = network.score(study, features, layer, trusted)
+    nothing = network.score(study, features, layer, trusted, lambda windows, seen: np.zeros((len(windows), 3)))
+    np.testing.assert_array_equal(alone.rmse, nothing.rmse)
+    np.testing.assert_array_equal(alone.distances, nothing.distances)
+    ends = left_out.window_ends(study.base.H, min_speed=orca.minimum_speed)
+    at = {row.tobytes(): steady[end + 1] for row, end in zip(left_out.matrix[ends], ends, strict=True)}
+
+    def truth(windows: np.ndarray, seen: object) -> np.ndarray:
+        return np.stack([[at.get(window[-1].tobytes(), 0.0), 0.0, 0.0] for window in windows])
+
+    assert network.score(study, features, layer, trusted, truth).rmse[0] < 0.7 * alone.rmse[0]
