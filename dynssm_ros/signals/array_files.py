@@ -20,6 +20,8 @@ from dynssm_ros.signals.recover import largest_unpacked
 
 Arrays = dict[str, npt.NDArray[Any]]
 _WIDEST = 64  # vectors of a matrix
+OBJECT = ("s0", "s1", "s2", "arr")
+"""Fields of what scipy reads of an object of MATLAB."""
 _HDF5 = b"MATLAB 7.3"
 
 
@@ -95,7 +97,7 @@ def vectors(found: dict[str, Any]) -> tuple[Arrays, dict[str, str]]:
         values = np.asarray(value)
         if isinstance(value, str):
             left_out[name] = value[:80]
-        elif values.dtype.names and values.dtype.names == ("s0", "s1", "s2", "arr"):
+        elif values.dtype.names and values.dtype.names == OBJECT:
             left_out[name] = "an object of MATLAB, such as a table; save it as s = table2struct(T, 'ToScalar', true)"
         elif values.dtype.names and values.dtype.kind == "V" and values.size > 1 and values.dtype.hasobject is False:
             arrays |= {

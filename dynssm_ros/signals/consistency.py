@@ -16,9 +16,16 @@ from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.liveness import check_liveness
 from dynssm_ros.signals.motion import check_direction, check_path_speed, check_side_slip, check_turning
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.signals.spans import Drive
+from dynssm_ros.signals.sensor_consistency import SENSED
+from dynssm_ros.signals.spans import Drive, Signal
 from dynssm_ros.signals.timing import check_times
 
+CLOCKS: dict[str, tuple[Signal, ...]] = {
+    "inputs_clock": ("steering", "throttle"), "steering_clock": ("steering",), "throttle_clock": ("throttle",),
+}  # fmt: skip
+"""Findings of clocks, and the signals that are stamped by them."""
+OF_LOG = (*CLOCKS, *SENSED)
+"""Findings that a log tells, and a recording of it no more."""
 _LEAST_S = 10.0
 """Seconds of a recording, below which nothing is said."""
 _MOST_ROWS, _STRETCHES = 30_000, 8
@@ -26,7 +33,7 @@ _MOST_ROWS, _STRETCHES = 30_000, 8
 
 
 def checked(recording: Recording, wheelbase: float | None = None) -> Recording:
-    """The recording with what :func:`contradictions` finds in it."""
+    """The recording with what :func:`contradictions` finds in it, and what its log alone told before."""
     info = recording.info.model_copy(update={"findings": contradictions(recording, wheelbase)})
     return replace(recording, info=info)
 
@@ -39,18 +46,21 @@ def contradictions(recording: Recording, wheelbase: float | None = None) -> tupl
         wheelbase: of the car (m), with which the scale of the steering is known.
 
     Returns:
-        A finding for each fault, those first that others depend on; empty where nothing contradicts.
+        A finding for each fault, those first that others depend on; empty where nothing contradicts. Of a recording that
+        was checked before, what its log alone can tell is among them: clocks that are apart, and sensors.
     """
-    if recording.duration < _LEAST_S:
-        return ()
-    drive = Drive.of(_parts(recording))
-    found = check_liveness(drive)
+    of_log = tuple(each for each in recording.info.findings if each.what in OF_LOG)
+    if recording.duration < _LEAST_S or {each.what for each in of_log} & set(SENSED):
+        return of_log  # of sensors that are wrong velocities are, and what follows from them
+    drive = _on_one_clock(Drive.of(_parts(recording)), of_log)
+    found = [*of_log, *check_liveness(drive)]
     dead = {each.what for each in found}
-    if not drive.speed.max() > 0:
+    if not len(drive) or not drive.speed.max() > 0:
         return tuple(found)
     more, drive = check_times(drive)
     found += more
-    moves = drive.position is not None and "pose_constant" not in dead and bool(np.ptp(np.abs(drive.position)) > 0)
+    position = None if dead & {"pose_constant", "theta_constant"} else drive.position
+    moves = position is not None and bool(np.ptp(np.abs(position)) > 0)
     alternative = None
     if moves:
         more, drive, alternative = _poses(drive, "omega_constant" not in dead)
@@ -64,6 +74,14 @@ def contradictions(recording: Recording, wheelbase: float | None = None) -> tupl
             more = [each for each in more if each.what != "steering_scale"]
         found += more
     return (*found, *(check_throttle(drive) if recording.info.set_point == "throttle" else ()))
+
+
+def _on_one_clock(drive: Drive, findings: tuple[Finding, ...]) -> Drive:
+    """The drive with inputs at the time of the odometry, where their clocks are known to be apart."""
+    for each in findings:
+        if each.what in CLOCKS:
+            drive = drive.earlier(-round(each.size / drive.T_s), *CLOCKS[each.what])
+    return drive
 
 
 def _parts(recording: Recording) -> Recording:

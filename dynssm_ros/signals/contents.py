@@ -23,7 +23,11 @@ from dynssm_ros.signals.table_clock import Clock
 from dynssm_ros.signals.tables import LogTable
 
 ODOMETRY = "nav_msgs/msg/Odometry"
-TWIST = {"v_x": "twist.twist.linear.x", "v_y": "twist.twist.linear.y", "omega": "twist.twist.angular.z"}
+TWISTS = {
+    ODOMETRY: "twist.twist",
+    "geometry_msgs/msg/TwistWithCovarianceStamped": "twist.twist",
+    "geometry_msgs/msg/TwistStamped": "twist",
+}
 POSES = {
     ODOMETRY: "pose.pose",
     "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
@@ -157,7 +161,8 @@ def _possible(values: Vector) -> Vector:
 def _numbers(message: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, float]]:
     """The numbers in a message by the paths of a signal map; of poses and odometry those that signals are made of."""
     if depth == 0 and message.__msgtype__ in POSES:
-        paths = pose_fields(message.__msgtype__) | (TWIST if message.__msgtype__ == ODOMETRY else {})
+        paths = pose_fields(message.__msgtype__)
+        paths |= twist_fields(message.__msgtype__) if message.__msgtype__ in TWISTS else {}
         for path in paths.values():
             value = compile_field(path)(message)
             if value is not None:
@@ -180,6 +185,12 @@ def _numbers(message: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[s
                     yield from _numbers(one, f"{at}.", depth + 1)
                 elif isinstance(one, (int, float, np.number)):
                     yield at, float(one)
+
+
+def twist_fields(msgtype: str) -> dict[str, str]:
+    """Where ``v_x``, ``v_y`` and ``omega`` are in a message that has a twist."""
+    twist = TWISTS[msgtype]
+    return {"v_x": f"{twist}.linear.x", "v_y": f"{twist}.linear.y", "omega": f"{twist}.angular.z"}
 
 
 def pose_fields(msgtype: str) -> dict[str, str]:

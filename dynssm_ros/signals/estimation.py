@@ -209,6 +209,19 @@ def located(values: Mapping[str, float], plane: Plane | None) -> Mapping[str, fl
     return {**values, "x": x, "y": y}
 
 
+def positions_of(streams: Mapping[str, tuple[Stamps, Vector]]) -> tuple[Stamps, Vector, Vector] | None:
+    """Stamps, x and y (m) of the positions or fixes of a log, each ``(N,)``; ``None`` where there are none."""
+    plane = _plane(streams, Estimation())
+    names = ("x", "y") if plane is None else ("latitude", "longitude")
+    if not set(names) <= set(streams):
+        return None
+    (stamps, first), (others, second) = streams[names[0]], streams[names[1]]
+    both, k, n = np.intersect1d(stamps, others, return_indices=True)
+    pairs = zip(first[k].tolist(), second[n].tolist(), strict=True)
+    x, y = np.array([plane.at(*pair) if plane else pair for pair in pairs]).reshape(-1, 2).T
+    return both, x, y
+
+
 def noise_notes(streams: Mapping[str, tuple[Stamps, Vector]], settings: Estimation) -> list[str]:
     """Where gyro or accelerometers are noisier than ``settings`` say, by second differences of their samples."""
     notes = []

@@ -6,6 +6,7 @@ from array import array
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,12 +16,22 @@ from dynssm_ros.signals.bags import Bag
 from dynssm_ros.signals.consistency import checked
 from dynssm_ros.signals.decoding import LOG_TIME, decoders, frames_told, header_stamp_ns, stamped_by, to_si
 from dynssm_ros.signals.estimation import MEASURED, estimated, noise_notes
+from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import V_Y_DEVIATION, Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
 from dynssm_ros.signals.rest_value import rest_value
+from dynssm_ros.signals.sensor_consistency import sensor_findings
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, SENSORS, SPEED_SIGNALS, STATE_SIGNALS, SignalMap, yaw_of
-from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, frames_note, log_time_note
+from dynssm_ros.signals.stamps import (
+    Lateness,
+    clean,
+    clock_findings,
+    clock_notes,
+    clocks_apart,
+    frames_note,
+    log_time_note,
+)
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import LogTable
 from dynssm_ros.signals.velocities import velocities_along
@@ -63,7 +74,7 @@ def _extract(
     """The recording of one log, whose notes begin with ``note``."""
     with open_log(path) as log:
         signal_map, lack = _with_commands_of(log, signal_map)
-        streams, stamped, notes = read_streams(log, signal_map, drop_bad, progress)
+        streams, stamped, notes, findings = read_streams(log, signal_map, drop_bad, progress)
     streams, rests = _with_brakes_at_rest(streams, signal_map)
     notes = [*([note] if note else []), *notes, *lack, *rests]
     if signal_map.velocities is not None:
@@ -71,6 +82,7 @@ def _extract(
         notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")
     deviations: dict[str, float] = {}
     if signal_map.estimation is not None:
+        findings += sensor_findings(streams, signal_map)
         streams, deviations, told = estimated_velocities(streams, signal_map, str(path))
         notes += told
     held = held_signals(signal_map, streams, 1e9 / rate)
@@ -85,6 +97,7 @@ def _extract(
         stamped=stamped,
         standard_deviations=deviations,
         notes=tuple(notes),
+        findings=findings,
     )
     return resample(streams, rate, signal_map.max_gap, signal_map.commands, info)
 
@@ -196,26 +209,34 @@ def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: f
     return held
 
 
+class LogStreams(NamedTuple):
+    """What was read of a log."""
+
+    streams: dict[str, Stream]  # by signal
+    stamped: dict[str, str]  # by what those of a bag are stamped
+    notes: list[str]  # what was recovered or dropped
+    findings: tuple[Finding, ...]  # clocks that are apart
+
+
 def read_streams(
     log: Bag | LogTable, signal_map: SignalMap, drop_bad: bool = False, progress: Progress | None = None
-) -> tuple[dict[str, Stream], dict[str, str], list[str]]:
+) -> LogStreams:
     """Reads the samples of every mapped signal; memory holds these and one message, or the columns, at a time.
 
     Stamps are those of headers or of the messages themselves, and log times only where there is neither; of tables
     those of their time column.
 
-    Returns:
-        The streams by signal name, by what those of a bag are stamped, and notes on what was recovered or dropped.
-
     Raises:
         BagError: a topic, field or column is missing, or samples are bad and ``drop_bad`` is off.
     """
     stamped: dict[str, str] = {}
+    findings: tuple[Finding, ...] = ()
+    told: list[str] = []
     if isinstance(log, LogTable):
-        found, notes = _table_streams(log, signal_map, drop_bad), list(log.notes)
+        found = _table_streams(log, signal_map, drop_bad)
     else:
-        found, stamped, told = _bag_streams(log, signal_map, progress)
-        notes = [*log.notes, *told]
+        found, stamped, told, findings = _bag_streams(log, signal_map, progress)
+    notes = [*log.notes, *told]
     streams: dict[str, Stream] = {}
     for name, source in signal_map.active_signals().items():
         place = f"column '{source.column}'" if source.column else f"topic {source.recorded}"
@@ -229,17 +250,16 @@ def read_streams(
             continue
         counted = 1 if isinstance(log, LogTable) else log.counts[source.recorded]
         lack = f"has no good sample of '{source.field}'" if dropped else f"never carries '{source.field}'"
+        lack += ", as its quaternions are not of length 1" if dropped and source.field.startswith("yaw(") else ""
         lack = "has no good value" if source.column else lack
         if name not in POSE_SIGNALS or not counted:
             raise BagError(f"{log.path}: {place} {lack if counted else 'has no messages'}, needed for {name}")
         notes.append(f"{name}: {place} {lack}; left out")
-    return streams, stamped, notes
+    return LogStreams(streams, stamped, notes, findings)
 
 
-def _bag_streams(
-    bag: Bag, signal_map: SignalMap, progress: Progress | None
-) -> tuple[dict[str, Stream], dict[str, str], list[str]]:
-    """The samples of every mapped signal, as they came, by what each topic is stamped, and notes on stamps and frames."""
+def _bag_streams(bag: Bag, signal_map: SignalMap, progress: Progress | None) -> LogStreams:
+    """The samples of every mapped signal, as they came, with notes on stamps and frames."""
     by_topic = decoders(signal_map)
     for topic, decoder in by_topic.items():
         bag.require(topic, decoder.msgtype)
@@ -278,7 +298,8 @@ def _bag_streams(
     streams = {
         name: samples.stream(name, round(source.delay * 1e9), source.recorded in by_log_time) for name, source in active
     }
-    return streams, {name: stamped[source.recorded] for name, source in active}, notes
+    findings = clock_findings(clocks_apart(lateness, signal_map.odometry_topic), signal_map)
+    return LogStreams(streams, {name: stamped[source.recorded] for name, source in active}, notes, findings)
 
 
 def _table_streams(table: LogTable, signal_map: SignalMap, drop_bad: bool) -> dict[str, Stream]:

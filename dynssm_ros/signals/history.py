@@ -15,6 +15,7 @@ import numpy as np
 from dynssm_ros import compiled
 from dynssm_ros.arrays import Vector
 from dynssm_ros.compiled import address
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, model_inputs
 from dynssm_ros.signals.signal_map import ROUNDING, SENSORS, STATE_SIGNALS, SignalMap
 
@@ -153,6 +154,12 @@ class History:
         self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
         self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
         sources = signal_map.signals
+        for name, source in signal_map.active_signals().items():
+            if not 0.0 <= source.delay < 1.0:
+                raise ConfigurationError(
+                    f"signal map {signal_map.name}: signals.{name}.delay: {source.delay:g} s; live expected at least 0 and "
+                    "below 1"
+                )
         self._delays = {name: sources[name].delay * 1e9 if name in inputs else 0.0 for name in self._buffers}
         self._max_gap = float(signal_map.max_gap_ns)
         self._max_age = max_age * 1e9

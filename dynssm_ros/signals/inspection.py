@@ -17,20 +17,25 @@ from dynssm_ros.signals.contents import TopicContent, contents_of_bag, contents_
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.logs import open_log
+from dynssm_ros.signals.recording import RecordingInfo
 from dynssm_ros.signals.signal_map import (
     SIGNALS,
     STATE_SIGNALS,
+    UNITS,
     SignalMap,
     TimeColumn,
     command_signals,
     required_signals,
     set_point_of,
 )
-from dynssm_ros.signals.suggestions import Suggestion, suggest
+from dynssm_ros.signals.steering_scale import Suggestion
+from dynssm_ros.signals.suggestions import suggest
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import LogTable
 
 _FASTEST_HZ = 50.0  # at which a log is extracted to compare its signals
+_OF_CURVATURE = ("pose_speed", "omega", "v_x", "twist", "speed", "gyro", "odometry")
+"""How findings begin after which nothing is known of the curvature."""
 _WINDOW = 0.1  # s, of poses from which velocities follow
 
 
@@ -118,17 +123,36 @@ def inspect(path: str | Path, wheelbase: float | None = None, progress: Progress
     notes += [f"{name}: {one.reason}" for name, one in topics.items() if one.reason]
     signals = suggest(topics, wheelbase, notes, is_table=time is not None)
     found = Inspection(Path(path).name, (end - begin) / 1e9, topics, signals, tuple(notes), time)
-    return replace(found, findings=_contradictions(path, found, wheelbase))
+    return found if found.missing else _compared(path, found, wheelbase)
 
 
-def _contradictions(path: str | Path, found: Inspection, wheelbase: float | None) -> tuple[Finding, ...]:
-    """Contradictions between the signals of a log by the suggested signal map; none where it cannot be extracted."""
-    if found.missing:
-        return ()
-    rate = found.signals["v_x" if "v_x" in found.signals else "x"].topic.rate
+def _compared(path: str | Path, found: Inspection, wheelbase: float | None) -> Inspection:
+    """With what the signals of a log, by the suggested signal map, contradict, and what is noted when they are extracted.
+
+    A steering's scale follows from speed and yaw rate: where these are wrong, it is left to the comparison.
+    """
     try:
-        signal_map = SignalMap.model_validate(yaml.safe_load(found.signal_map())).with_commands("none")
-        rate = min(max(rate, 1.0), _FASTEST_HZ)
-        return extract([path], signal_map, rate, drop_bad=True, wheelbase=wheelbase).info.findings
-    except (UserError, ValidationError):
-        return ()
+        info = _extracted(path, found, wheelbase)
+        scaled = found.signals["steering_feedback"]
+        if "curvature" in scaled.note and any(each.what.startswith(_OF_CURVATURE) for each in info.findings):
+            plain = replace(scaled, scale=1.0, unit=scaled.topic.unit if scaled.topic.unit in UNITS else "1", note="")
+            found = replace(found, signals=found.signals | {"steering_feedback": plain})
+            info = _extracted(path, found, wheelbase)
+    except (UserError, ValidationError) as error:
+        told = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        return replace(found, notes=(*found.notes, f"its signals could not be compared: {told}"))
+    said = tuple(note for note in info.notes if not _is_known(note, found))
+    return replace(found, findings=info.findings, notes=(*found.notes, *said))
+
+
+def _extracted(path: str | Path, found: Inspection, wheelbase: float | None) -> RecordingInfo:
+    """What is noted of the recording that the suggested signal map gives."""
+    rate = found.signals["v_x" if "v_x" in found.signals else "x"].topic.rate
+    signal_map = SignalMap.model_validate(yaml.safe_load(found.signal_map())).with_commands("none")
+    rate = min(max(rate, 1.0), _FASTEST_HZ)
+    return extract([path], signal_map, rate, drop_bad=True, wheelbase=wheelbase).info
+
+
+def _is_known(note: str, found: Inspection) -> bool:
+    """Whether a note of an extraction is among those of an inspection, or follows from its signal map."""
+    return note in found.notes or note.startswith("v_x, v_y, omega: from poses")

@@ -14,6 +14,8 @@ _SWING, _SWINGS = 0.3, 4
 """Change of the speed, as a share of the largest, and how often it goes up and down by that."""
 _CLIPPED_SHARE, _CLIPPED_S = 0.01, 0.2
 """Share of rows at the very largest value, and the time at a stretch, that no sensor shows that is not clipped."""
+_FROZEN_S = 1.0
+"""Time at a stretch for which no odometry of a driving car repeats itself; slow ones are interpolated between samples."""
 _STEP = 0.3
 """Step of a signal in units of its standard deviation, from which on it is coarse."""
 _SPIKE, _SPIKE_SHARE = 15.0, 0.05
@@ -24,11 +26,11 @@ _SPIKES, _SPIKES_SHARE = 5, 0.01
 
 def check_liveness(drive: Drive) -> list[Finding]:
     """Constants, clipping, coarse steps and spikes."""
-    found = [*_constants(drive)]
-    dead = {each.what.removesuffix("_constant") for each in found}
+    found = [*_constants(drive), *_frozen(drive)]
+    dead = _names(found)
     for name, values in (("v_x", drive.velocity.real), ("v_y", drive.velocity.imag), ("omega", drive.omega)):
         if name not in dead and varies(values):
-            found += _clipped(name, values, drive) or _coarse(name, values) or _spikes(name, values, drive)
+            found += _coarse(name, values) or _clipped(name, values, drive) or _spikes(name, values, drive)
     return found
 
 
@@ -49,7 +51,14 @@ def _constants(drive: Drive) -> list[Finding]:
         found.append(_constant("throttle", float(drive.throttle[0]), f"gains and loses speed {swings} times", swings))
     if drive.position is not None and drive.speed.min(initial=1.0) > 0 and np.ptp(np.abs(drive.position)) == 0:
         found.append(_constant("pose", 0.0, "drives", float(drive.speed.mean())))
+    heading = drive.theta
+    if heading is not None and np.ptp(heading) == 0 and turns > _TURNS_RAD_S and "pose" not in _names(found):
+        found.append(_constant("theta", float(heading[0]), "turns", turns))
     return found
+
+
+def _names(found: list[Finding]) -> set[str]:
+    return {each.what.removesuffix("_constant") for each in found}
 
 
 _REMEDIES = {
@@ -57,6 +66,7 @@ _REMEDIES = {
     "v_y": "nothing measures it: give `velocities:` with the pose, or leave v_y out for the estimator",
     "steering": "steering_feedback: map the measured or commanded angle",
     "throttle": "throttle_feedback: map what drives the car",
+    "theta": "leave x, y, theta out, or map what measures the heading",
     "pose": "leave x, y, theta out, or map the localisation",
 }
 
@@ -67,6 +77,28 @@ def _constant(name: str, value: float, though: str, size: float) -> Finding:
         what=f"{name}_constant", told=told, size=size, low=size, high=size, expected="a signal that lives",
         remedy=_REMEDIES[name],
     )  # fmt: skip
+
+
+def _frozen(drive: Drive) -> list[Finding]:
+    """An odometry that repeats itself while the inputs go on."""
+    values = [drive.velocity.real, drive.velocity.imag, drive.omega]
+    values += [] if drive.position is None else [drive.position.real, drive.position.imag]
+    same = np.logical_and.reduce([np.diff(each, prepend=np.nan) == 0 for each in values])
+    same &= (drive.speed >= drive.least_speed) & (drive.speed > 0) & (np.diff(drive.segment, prepend=-1) == 0)
+    moves = (np.diff(drive.steering, prepend=0.0) != 0) | (np.diff(drive.throttle, prepend=0.0) != 0)
+    stays = _longest_run(same) * drive.T_s
+    if stays < _FROZEN_S or not (same & moves).any():
+        return []
+    share = float(same.mean())
+    told = (
+        f"the odometry repeats itself in {100 * share:.2g} % of the rows, up to {stays:.3g} s, while the inputs go on"
+    )
+    return [
+        Finding(
+            what="odometry_frozen", told=told, size=share, low=share, high=share, expected="an odometry that lives",
+            remedy="find why it stops (sensor, filter, network), or leave those rows out",
+        )
+    ]  # fmt: skip
 
 
 def _turn_rate(drive: Drive) -> Vector:

@@ -34,6 +34,8 @@ _RELATED = 0.5
 """Explained share, from which on two signals count as related."""
 _TURNING_RAD_S = 0.02
 """Root mean square yaw rate, below which nothing is said of turning."""
+_AHEAD_RAD = 0.35
+"""Angle between the car's axis and its mean velocity that cars have; they drift by more for moments only."""
 _SCATTER, _ALIGNED, _CLEARER = 0.02, 0.15, 4.0
 """Circular variance of the angle between path and velocity: up to which it is constant, up to which a frame may explain it,
 and how many times less than in the other frame it must be."""
@@ -111,19 +113,38 @@ def _turning(drive: Drive) -> _Turning:
     assert drive.position is not None
     spans = drive.spans(_TURN_S)
     heading = _ratio(spans.change(drive.theta), spans.integral(drive.omega), spans)
-    along = course_spans(drive)
-    if len(along) < 2:
-        return _Turning(heading, None, None)
-    moved = along.change(drive.position)
-    next_to = np.flatnonzero(along.start[1:] == along.end[:-1])
-    course = np.angle(moved[next_to + 1] * moved[next_to].conj())
-    half = (along.end[0] - along.start[0]) // 2
-    between = Spans(drive, along.start[next_to] + half, along.start[next_to + 1] + half)
+    course, between = _course(drive)
     return _Turning(
         heading,
         _ratio(course, between.integral(drive.omega), between),
         _ratio(course, between.change(drive.theta), between),
     )
+
+
+def _course(drive: Drive) -> tuple[Vector, Spans]:
+    """By how much the course turns from one span to the next, and the spans between their middles."""
+    along = course_spans(drive)
+    if len(along) < 2:
+        return np.empty(0), along.where(np.zeros(len(along), dtype=bool))
+    moved = along.change(drive.position)
+    next_to = np.flatnonzero(along.start[1:] == along.end[:-1])
+    half = (along.end[0] - along.start[0]) // 2
+    between = Spans(drive, along.start[next_to] + half, along.start[next_to + 1] + half)
+    return np.angle(moved[next_to + 1] * moved[next_to].conj()), between
+
+
+def check_course(drive: Drive) -> Checked:
+    """Turning of the path against omega where no heading is measured: sign and scale."""
+    course, between = _course(drive)
+    fit = _ratio(course, between.integral(drive.omega), between)
+    if fit is None or not is_turning(drive):
+        return [], drive
+    found = []
+    if not _is_one(_positive(fit), 2 * YAW_TOLERANCE):
+        found.append(_omega_scale(fit, "turning of the path over omega"))
+    if fit.values[0] < 0:
+        found.append(_sign(fit, "omega_sign", "course"))
+    return found, drive.changed(omega=drive.omega * float(fit.values[0])) if found else drive
 
 
 def _ratio(values: Vector, of: Vector, spans: Spans) -> Fitted | None:
@@ -175,6 +196,7 @@ def check_turning(drive: Drive, steering_sign: int) -> Checked:
 
 _SIGNS = {
     "omega": ("omega over the turning of theta and of the path", "omega: scale: -1"),
+    "course": ("turning of the path over omega", "omega: scale: -1"),
     "theta": (
         "d theta/dt over omega",
         "theta: scale: -1 (with x east and y north a compass heading is also turned: offset: 1.571)",
@@ -198,22 +220,54 @@ def _sign(fit: Fitted | None, what: str, which: str) -> Finding:
 
 
 def _turning_scales(turning: _Turning, drive: Drive) -> Checked:
-    """A scale of omega or theta that the course contradicts."""
+    """Scales of omega and theta that they, or the course, contradict: often one, both where both are in degrees."""
     heading, course, both = turning
-    if heading is None or _is_one(_positive(heading), YAW_TOLERANCE):
+    if heading is None and course is None:
         return [], drive
-    ratio = abs(float(heading.values[0]))
+    if heading is None or _is_one(_positive(heading), YAW_TOLERANCE):
+        if course is None or both is None or not (_is_in_degrees(course) and _is_in_degrees(both)):
+            return [], drive
+        of_omega = _omega_scale(course, "turning of the path over omega").model_copy(
+            update={"remedy": "omega: unit: deg/s"}
+        )
+        of_theta = _theta_scale(both, of_course=True).model_copy(update={"remedy": "theta: unit: deg"})
+        return [of_omega, of_theta], drive.changed(
+            omega=drive.omega * of_omega.size,
+            theta=drive.theta / of_theta.size,  # type: ignore[operator]
+        )
     theta_is_right = both is not None and _is_one(_positive(both), 2 * YAW_TOLERANCE)
     omega_is_right = course is not None and _is_one(_positive(course), 2 * YAW_TOLERANCE)
-    low, high = sorted(map(abs, heading.interval()))
-    told = f"d theta/dt over omega is {number(ratio)}"
     if omega_is_right and not theta_is_right:
-        remedy = f"theta: {in_unit(1.0 / ratio, 'deg')}"
-        found = Finding(what="theta_scale", told=told, size=ratio, low=low, high=high, expected="1", remedy=remedy)
-        return [found], drive.changed(theta=drive.theta / ratio)  # type: ignore[operator]
-    remedy = f"omega: {in_unit(ratio, 'deg/s')}"
-    found = Finding(what="omega_scale", told=told, size=ratio, low=low, high=high, expected="1", remedy=remedy)
-    return [found], drive.changed(omega=drive.omega * ratio)
+        of_theta = _theta_scale(heading)
+        return [of_theta], drive.changed(theta=drive.theta / of_theta.size)  # type: ignore[operator]
+    of_omega = _omega_scale(heading, "d theta/dt over omega")
+    return [of_omega], drive.changed(omega=drive.omega * of_omega.size)
+
+
+def _is_in_degrees(by_course: Fitted) -> bool:
+    """Whether what the turning of the path is divided by counts degrees."""
+    return _is_one(_positive(by_course), 2 * YAW_TOLERANCE * UNITS["deg"], UNITS["deg"])
+
+
+def _omega_scale(fit: Fitted, told: str) -> Finding:
+    """A scale of omega by what its right value is divided by it."""
+    ratio, (low, high) = abs(float(fit.values[0])), sorted(map(abs, fit.interval()))
+    return Finding(
+        what="omega_scale", told=f"{told} is {number(ratio)}", size=ratio, low=low, high=high, expected="1",
+        remedy=f"omega: {in_unit(ratio, 'deg/s')}",
+    )  # fmt: skip
+
+
+def _theta_scale(fit: Fitted, *, of_course: bool = False) -> Finding:
+    """A scale of theta by its rate over omega, or by that ``of_course`` over its rate."""
+    ratio, (low, high) = abs(float(fit.values[0])), sorted(map(abs, fit.interval()))
+    told = "d theta/dt over omega"
+    if of_course:
+        ratio, low, high, told = 1.0 / ratio, 1.0 / high, 1.0 / low, "d theta/dt over the turning of the path"
+    return Finding(
+        what="theta_scale", told=f"{told} is {number(ratio)}", size=ratio, low=low, high=high, expected="1",
+        remedy=f"theta: {in_unit(1.0 / ratio, 'deg')}",
+    )  # fmt: skip
 
 
 def _positive(fit: Fitted) -> Fitted:
@@ -262,6 +316,14 @@ def _turned(mean: complex, error: Vector, spans: Spans, drive: Drive) -> Checked
             remedy="v_x: scale: -1 (or theta: offset: 3.142, if the car drove backwards)",
         )  # fmt: skip
         return [found], drive.changed(velocity=-drive.velocity.conj())
+    aside = complex(np.mean(_unit(drive.velocity[drive.speed >= drive.least_speed])))
+    if abs(np.angle(aside)) > _AHEAD_RAD and abs(np.angle(aside * np.exp(1j * angle))) < _AHEAD_RAD:
+        beside = number(float(np.angle(aside)))
+        found = Finding(
+            what="twist_turned", told=f"{told}, and v_x, v_y point {beside} rad beside the car's axis",
+            size=angle, low=low, high=high, unit="rad", expected="0: x forward, y left", remedy=_turned_remedy(angle),
+        )  # fmt: skip
+        return [found], drive.changed(velocity=drive.velocity * np.exp(1j * angle))
     found = Finding(
         what="theta_offset", told=told, size=angle, low=low, high=high, unit="rad", expected="0",
         remedy=f"theta: offset: {number(angle)}",
@@ -269,7 +331,20 @@ def _turned(mean: complex, error: Vector, spans: Spans, drive: Drive) -> Checked
     return [found], drive.changed(theta=drive.theta + angle)  # type: ignore[operator]
 
 
-def _unit(values: Vector) -> Vector:
+def _turned_remedy(angle: float) -> str:
+    """What to write where a twist is to be turned by an angle (rad)."""
+    quarter = abs(abs(angle) - math.pi / 2) < _ANGLE_TOLERANCE_RAD
+    if not quarter:
+        return f"turn v_x, v_y by {number(angle)} rad in the odometry, or `velocities:` from the poses"
+    x, y = (
+        ("scale: -1 of the field of v_y", "that of v_x")
+        if angle > 0
+        else ("the field of v_y", "scale: -1 of that of v_x")
+    )
+    return f"v_x: {x}, v_y: {y}"
+
+
+def _unit(values: Any) -> Any:
     return values / np.maximum(np.abs(values), 1e-12)
 
 

@@ -66,6 +66,18 @@ def uniform_grid(anchor: Stamps, period: float, max_gap: int) -> Stamps:
     return grid
 
 
+def unwrapped(angle: Vector) -> Vector:
+    """An angle (rad) without jumps by whole turns, ``(N,)``.
+
+    One in degrees that nobody said is in degrees stays one, so that it can be told: its turns are of 360.
+    """
+    if len(angle) < 2:
+        return angle
+    low, high = np.percentile(angle, [0.5, 99.5])
+    is_in_degrees = high - low > 2 * np.pi and float(np.abs(np.diff(angle)).max()) > np.pi
+    return np.unwrap(angle, period=360.0 if is_in_degrees else 2 * np.pi)
+
+
 def resample(
     streams: Mapping[str, Stream], rate: float, max_gap: float, commands: Commands, info: RecordingInfo
 ) -> Recording:
@@ -90,7 +102,7 @@ def resample(
     sampled: dict[str, Vector] = {}
     stretches: list[npt.NDArray[np.int32]] = []
     for name, stream in streams.items():
-        smooth = Stream(stream.stamps, np.unwrap(stream.values)) if name == "theta" else stream
+        smooth = Stream(stream.stamps, unwrapped(stream.values)) if name == "theta" else stream
         hold: Hold = "zero" if name in info.held else "first"
         sampled[name], stretch = sample(smooth, grid, bridged, hold, round(ROUNDING * period))
         stretches.append(stretch)

@@ -108,7 +108,9 @@ class Source(StrictModel):
     unit: str = Field(default="1", description=f"of the field, or of what its curve gives: {' '.join(UNITS)}")
     scale: float = 1.0
     offset: float = 0.0
-    delay: float = Field(default=0.0, ge=0, lt=1.0, description="by which stamps are late (s)")
+    delay: float = Field(
+        default=0.0, gt=-100.0, lt=100.0, description="by which stamps are late (s); live only 0 to below 1"
+    )
     hold: Hold | None = Field(
         default=None,
         description="between samples: zero, the last one; first, a line to the next, which a live node does not know. null: "

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.resampling import unwrapped
 
 SIGMAS = 1.96
 """Standard deviations of a 95 % interval."""
@@ -53,7 +54,7 @@ class Drive:
         """The signals of a recording."""
         position = theta = None
         if recording.has_pose:
-            position, theta = recording["x"] + 1j * recording["y"], np.unwrap(recording["theta"])
+            position, theta = recording["x"] + 1j * recording["y"], unwrapped(recording["theta"])
         velocity = recording["v_x"] + 1j * recording["v_y"]
         return cls(
             recording.T_s, recording.segment, velocity, recording["omega"], recording["r_fb"], recording["delta_fb"],

@@ -12,8 +12,10 @@ import numpy.typing as npt
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import BagError
+from dynssm_ros.signals import findings
+from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.resampling import Stamps, Stream
-from dynssm_ros.signals.signal_map import JUMP_NS
+from dynssm_ros.signals.signal_map import JUMP_NS, SignalMap
 
 _LARGEST = 1e12  # in any unit; coordinates of maps in mm are 1e10
 _SEVERAL = 0.1  # of the steps go back, from which on several publishers are likelier than a fault
@@ -112,19 +114,51 @@ def clock_notes(topics: Mapping[str, Lateness], reference: str) -> list[str]:
     own = topics.get(reference)
     if own is None or not len(own.late):
         return []
-    found = []
+    found, apart = [], clocks_apart(topics, reference)
     for name, topic in topics.items():
-        if name == reference or not len(topic.late):
-            continue
-        apart = float(np.median(topic.late) - np.median(own.late))
-        drift = _change(topic) - _change(own)
+        drift = _change(topic) - _change(own) if name != reference and len(topic.late) else 0.0
         if abs(drift) > _DRIFT:
             found.append(f"{name} is stamped by a clock that drifts by {abs(drift):.2g} s against {reference}'s")
-        elif abs(apart) > _APART:
-            way = "before" if apart > 0 else "after"
-            known = next((f" ({told})" for s, told in _KNOWN.items() if abs(abs(apart) - s) < _APART), "")
-            found.append(f"{name} is stamped {abs(apart):.3g} s {way} {reference}: another clock?{known}")
+        elif name in apart:
+            found.append(f"{name} is stamped {_told_apart(apart[name], reference)}")
     return found
+
+
+def clocks_apart(topics: Mapping[str, Lateness], reference: str) -> dict[str, float]:
+    """By how much topics are stamped before the topic ``reference`` (s), where that is another clock and none that drifts."""
+    own = topics.get(reference)
+    if own is None or not len(own.late):
+        return {}
+    apart = {
+        name: float(np.median(topic.late) - np.median(own.late))
+        for name, topic in topics.items()
+        if name != reference and len(topic.late) and abs(_change(topic) - _change(own)) <= _DRIFT
+    }
+    return {name: seconds for name, seconds in apart.items() if abs(seconds) > _APART}
+
+
+def clock_findings(apart: Mapping[str, float], signal_map: SignalMap) -> tuple[Finding, ...]:
+    """What :func:`clocks_apart` found of the topics of steering and throttle, one finding where both are off alike."""
+    found: list[Finding] = []
+    for name, signal in (("steering", "steering_feedback"), ("throttle", f"{signal_map.set_point}_feedback")):
+        seconds = apart.get(signal_map.signals[signal].recorded)
+        if seconds is None:
+            continue
+        if found and abs(found[0].size - seconds) < _APART:
+            return (found[0].model_copy(update={"what": "inputs_clock"}),)
+        found.append(
+            Finding(
+                what=f"{name}_clock", told=f"{signal} is stamped {_told_apart(seconds, signal_map.odometry_topic)}",
+                size=seconds, low=seconds - _APART, high=seconds + _APART, unit="s", expected=f"within {_APART:g} s",
+                remedy=f"synchronise the clocks, or {signal}: delay: {findings.number(-seconds)} in this log",
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+def _told_apart(seconds: float, reference: str) -> str:
+    known = next((f" ({told})" for s, told in _KNOWN.items() if abs(abs(seconds) - s) < _APART), "")
+    return f"{abs(seconds):.3g} s {'before' if seconds > 0 else 'after'} {reference}: another clock?{known}"
 
 
 def _change(topic: Lateness) -> float:

@@ -1,26 +1,21 @@
-"""Which fields of topics, or columns, the signals of a signal map may be: names suggest it, values correct it.
-
-A steering signal is compared with the curvature that is driven, so that degrees, steering-wheel angles and swapped signs
-are seen.
-"""
+"""Which fields of topics, or columns, the signals of a signal map may be: names suggest it, values correct it."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.signals.actuation import SCALES, UNDERSTEER, believable, understeer
 from dynssm_ros.signals.columns import heading
-from dynssm_ros.signals.contents import ODOMETRY, POSES, TWIST, TopicContent, pose_fields, spread
+from dynssm_ros.signals.contents import ODOMETRY, POSES, TWISTS, TopicContent, pose_fields, spread, twist_fields
 from dynssm_ros.signals.decoding import LOG_TIME
 from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.sensor_topics import COLUMNS, of_use, sensors
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals, set_point_of, yaw_of
-from dynssm_ros.signals.spans import blocks
 from dynssm_ros.signals.stamps import clock_notes, frames_note, log_time_note
+from dynssm_ros.signals.steering_scale import Suggestion, scaled_steering
 
 _MOTION = {
     "v_y": (r"(^|_)(v|vel|velocity|linear)_?(y|lat\w*)$|^v?_?lat\w*_(vel\w*|speed)$|^vlat|quergeschw",),
@@ -60,30 +55,14 @@ _OTHER = re.compile(
     r"|covariance|stamp|warn|error|source|mode",
     re.IGNORECASE,
 )
-_RADIANS, _SHARE = 1.6, 1.5  # larger values are no road-wheel angle in rad, and no throttle between -1 and 1
-_AGREES = 0.5  # correlation with the curvature, from which on a scale is told
+_SHARE = 1.5  # larger values are no throttle between -1 and 1
+_ONE_TO_ONE = 0.3  # by which a set-point may change more or less than the speed
+_AGREES = 0.5  # correlation with the speed, from which on it may be one
+_PULSES = (900.0, 2100.0)  # us, of servos: 1500 is neutral, 500 more is full
 _POSES_HZ = 20.0  # of a localisation, from which on a window of 0.1 s has poses enough for velocities
 _TURN = 0.1  # rad, of a heading that changes
 _FASTEST = 110.0  # m/s
 _MOST = {"omega": 15.0, "theta": 60.0}  # range in rad/s, and in rad, from which on degrees are likelier
-_DRIVING = 0.3  # of the largest speed, from which on curvature is compared
-
-
-@dataclass(frozen=True)
-class Suggestion:
-    """Where a signal may come from."""
-
-    topic: TopicContent
-    field: str
-    scale: float = 1.0
-    note: str = ""
-    unit: str = "1"
-    offset: float = 0.0
-
-    @property
-    def values(self) -> Vector:
-        """The signal at the topic's samples, shape ``(N,)``."""
-        return self.scale * UNITS[self.unit] * self.topic.values[self.field] + self.offset
 
 
 def suggest(
@@ -94,11 +73,12 @@ def suggest(
     used = {one.field for one in motion.values()} if is_table else set()
     others = {name: one for name, one in topics.items() if name not in used}
     signals = motion | _with_set_point(_actuators(others), _speed_set_points(others), notes)
+    signals = _set_point_by_speed(signals, notes)
     if not set(command_signals(set_point_of(signals))) <= set(signals):  # of no use alone
         signals = {name: source for name, source in signals.items() if not name.endswith("_command")}
     for name in ("steering_feedback", "steering_command"):
         if name in signals:
-            signals[name] = _scaled_steering(signals[name], signals, wheelbase)
+            signals[name] = scaled_steering(signals[name], signals, wheelbase)
     notes += _stamps(signals)
     return signals
 
@@ -123,6 +103,14 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
             others = [name for name in fitting if name != best and not re.search(patterns[0], names[best])]
             if others:
                 found[signal] = replace(found[signal], note=f"or {', '.join(dict.fromkeys(others))}")
+    if "v_x" not in found:
+        taken = {one.field for one in found.values()}
+        by_unit = [name for name in names if columns[name].unit in _FITTING["m/s"] and name not in taken]
+        if by_unit:
+            best = max(by_unit, key=lambda name: spread(columns[name].values[name]))
+            found["v_x"] = replace(
+                _with_unit(Suggestion(columns[best], best), "m/s"), note="taken for the speed by its unit"
+            )
     if "theta" not in found and (yaw := _yaw_of_columns(columns)):
         found["theta"] = yaw
     if not {"x", "y", "theta"} <= set(found):
@@ -141,10 +129,18 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
         notes.append(f"{found['v_y'].field}: v_y is constant, so that nothing is known of how the car slides{_LEAVE}")
     if "v_x" in found and float(np.nanmax(np.abs(found["v_x"].values), initial=0.0)) > _FASTEST:
         found["v_x"] = replace(found["v_x"], note="too fast for m/s: find its unit")
+    if "theta" in found and found["theta"].unit == "1" and _wraps_at_360(found["theta"].values):
+        found["theta"] = replace(found["theta"], unit="deg", note="taken for degrees: it wraps by 360")
     for name in ("omega", "theta"):
         if name in found and found[name].unit == "1" and spread(found[name].values) > _MOST[name]:
             found[name] = replace(found[name], note="large for rad: deg?")
     return found
+
+
+def _wraps_at_360(values: Vector) -> bool:
+    """Whether a heading jumps by about 360 and keeps within that."""
+    known = values[np.isfinite(values)]
+    return spread(known) <= 361.0 and float(np.abs(np.diff(known)).max(initial=0.0)) > 300.0
 
 
 def _sensor_columns(columns: dict[str, TopicContent], found: dict[str, Suggestion]) -> dict[str, Suggestion]:
@@ -194,48 +190,74 @@ def _with_unit(suggestion: Suggestion, quantity: str) -> Suggestion:
 
 
 def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Suggestion]:
-    """The odometry that moves most often, if there is one."""
-    odometries = [topic for topic in topics.values() if topic.msgtype == ODOMETRY and topic.values]
-    moving = [topic for topic in odometries if spread(topic.values[TWIST["v_x"]]) > 0]
+    """The odometry that moves most often, else the twist that does, if there is one."""
+    moving = _with_velocities(topics)
     if not moving:
-        poses = [topic for topic in topics.values() if topic.msgtype in POSES and _moves(topic)]
-        if not poses and (found := sensors(topics)):
-            lack = "" if "a_y" in found else "; it has no accelerometer, and v_y is that of a steady turn"
-            notes.append(
-                f"nothing measures v_y; it is estimated from {', '.join(found)} (estimation: give rear_axle, m from the "
-                f"centre of gravity){lack}"
-            )
-            return {signal: Suggestion(*place) for signal, place in found.items()}
-        if not poses:
-            notes.append(
-                "nothing tells where the car is or how fast; find a topic with v_x, v_y and omega, or with poses"
-            )
-            return {}
-        best = max(poses, key=lambda topic: topic.count)
-        notes.append(f"no topic has velocities; they follow from the poses of {best.name}")
-        return {signal: Suggestion(best, path) for signal, path in pose_fields(best.msgtype).items()}
+        return _without_velocities(topics, notes)
     best = max(moving, key=lambda topic: topic.count)
     if len(moving) > 1:
-        notes.append(f"several odometries move: {', '.join(topic.name for topic in moving)}; taken is {best.name}")
-    omega = best.values[TWIST["omega"]]
-    turning = [topic for topic in topics.values() if topic.msgtype in POSES and _moves(topic) and _turns(topic)]
+        kind = "odometries" if best.msgtype == ODOMETRY else "twists"
+        notes.append(f"several {kind} move: {', '.join(topic.name for topic in moving)}; taken is {best.name}")
+    twist = twist_fields(best.msgtype)
+    omega = best.values[twist["omega"]]
+    poses = [topic for topic in topics.values() if topic.msgtype in POSES and _moves(topic)]
+    turning = [topic for topic in poses if _turns(topic)]
     if spread(omega) == 0 and turning:
         pose = max(turning, key=lambda topic: (topic is not best, topic.count))
         notes.append(
             f"{best.name}: omega is constant {float(omega[0]):g} while the car turns; velocities follow from the poses of "
             f"{pose.name}"
         )
-        return {signal: Suggestion(pose, path) for signal, path in pose_fields(pose.msgtype).items()}
-    if spread(best.values[TWIST["v_y"]]) == 0:
+        return _fields(pose, pose_fields(pose.msgtype))
+    if spread(best.values[twist["v_y"]]) == 0:
         told = f"{best.name}: v_y is constant, so that nothing is known of how the car slides"
         localised = [topic for topic in turning if topic.msgtype != ODOMETRY and topic.rate >= _POSES_HZ]
         if localised:
             pose = max(localised, key=lambda topic: topic.count)
             notes.append(f"{told}; velocities follow from the poses of {pose.name}")
-            return {signal: Suggestion(pose, path) for signal, path in pose_fields(pose.msgtype).items()}
+            return _fields(pose, pose_fields(pose.msgtype))
         notes.append(f"{told}{_LEAVE}")
-    fields = TWIST | pose_fields(ODOMETRY) if _moves(best) else TWIST
-    return {signal: Suggestion(best, path) for signal, path in fields.items()}
+    beside = [best] if best.msgtype == ODOMETRY else poses
+    placed = max((topic for topic in beside if _moves(topic)), key=lambda topic: topic.count, default=None)
+    return _fields(best, twist) | (_fields(placed, pose_fields(placed.msgtype)) if placed else {})
+
+
+def _with_velocities(topics: dict[str, TopicContent]) -> list[TopicContent]:
+    """The odometries that move, else the twists that move and turn and are no commands."""
+    twists = [
+        topic
+        for topic in topics.values()
+        if topic.msgtype in TWISTS and topic.values and spread(topic.values[twist_fields(topic.msgtype)["v_x"]]) > 0
+    ]
+    odometries = [topic for topic in twists if topic.msgtype == ODOMETRY]
+    return odometries or [
+        topic
+        for topic in twists
+        if spread(topic.values[twist_fields(topic.msgtype)["omega"]]) > 0 and not _COMMAND.search(topic.name)
+    ]
+
+
+def _without_velocities(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Suggestion]:
+    """Poses or sensors that velocities follow from."""
+    poses = [topic for topic in topics.values() if topic.msgtype in POSES and _moves(topic)]
+    if poses:
+        best = max(poses, key=lambda topic: topic.count)
+        notes.append(f"no topic has velocities; they follow from the poses of {best.name}")
+        return _fields(best, pose_fields(best.msgtype))
+    found = sensors(topics)
+    if not found:
+        notes.append("nothing tells where the car is or how fast; find a topic with v_x, v_y and omega, or with poses")
+        return {}
+    lack = "" if "a_y" in found else "; it has no accelerometer, and v_y is that of a steady turn"
+    notes.append(
+        f"nothing measures v_y; it is estimated from {', '.join(found)} (estimation: give rear_axle, m from the "
+        f"centre of gravity){lack}"
+    )
+    return {signal: Suggestion(*place) for signal, place in found.items()}
+
+
+def _fields(topic: TopicContent, fields: dict[str, str]) -> dict[str, Suggestion]:
+    return {signal: Suggestion(topic, path) for signal, path in fields.items()}
 
 
 def _moves(topic: TopicContent) -> bool:
@@ -314,12 +336,31 @@ def _with_set_point(
     return without | {name: replace(each, note="a set-point") for name, each in asked.items()}
 
 
+def _set_point_by_speed(signals: dict[str, Suggestion], notes: list[str]) -> dict[str, Suggestion]:
+    """The signals with a speed set-point instead of a throttle that is larger than one can be and follows the speed."""
+    one = signals.get("throttle_feedback")
+    if one is None or "v_x" not in signals or spread(signals["v_x"].values) == 0:
+        return signals
+    asked = replace(one, scale=1.0, offset=0.0, note="a set-point: it follows v_x")
+    values, v_x = asked.values, np.interp(one.topic.time, signals["v_x"].topic.time, signals["v_x"].values)
+    if not np.isfinite(values).all() or not _SHARE < np.abs(values).max(initial=0.0) < _FASTEST or spread(values) == 0:
+        return signals
+    if np.corrcoef(values, v_x)[0, 1] < _AGREES or abs(float(np.polyfit(v_x, values, 1)[0]) - 1.0) > _ONE_TO_ONE:
+        return signals
+    kept = {name: each for name, each in signals.items() if not name.startswith(("throttle", "brake"))}
+    if "throttle_command" in signals:
+        kept["speed_command"] = replace(signals["throttle_command"], scale=1.0, offset=0.0)
+    return _with_set_point(kept, {"speed_feedback": asked}, notes)
+
+
 def _scaled(actuator: str, suggestion: Suggestion) -> Suggestion:
     """Pedals between 0 and 1; the steering is scaled by the curvature."""
     values = suggestion.values
     largest = float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else 0.0
     if actuator == "steering" or largest <= _SHARE:
         return suggestion
+    if actuator == "throttle" and _PULSES[0] <= np.nanmin(values) and largest <= _PULSES[1]:
+        return replace(suggestion, scale=1 / 500, offset=-3.0, note="taken for servo pulses: 1500 is neutral")
     if actuator == "throttle" and largest <= 100.0 * _SHARE:
         return replace(suggestion, scale=0.01, note="taken for percent")
     note = f"up to {largest:.4g} in the log, which is taken for full {actuator}"
@@ -331,50 +372,6 @@ def _at_rest(brake: Suggestion) -> Suggestion:
     limit = rest_value(brake.values)
     note = f"up to {limit:.4g} nobody brakes: offset"
     return replace(brake, offset=-limit, note=f"{brake.note}; {note}" if brake.note else note) if limit else brake
-
-
-def _scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], wheelbase: float | None) -> Suggestion:
-    """The steering in rad at the road wheel, as far as the curvature that it drives tells."""
-    suggestion = replace(suggestion, scale=1.0)
-    seen, values = _curvature_per_unit(suggestion, signals), suggestion.values
-    if seen is None:
-        large = float(np.nanmax(np.abs(values), initial=0.0)) > _RADIANS
-        note = "too large for rad at the road wheel: find its scale" if large else suggestion.note
-        return replace(suggestion, scale=1.0, note=note)
-    slope, low, high = seen
-    told = f"the curvature follows it with {slope:.4g} 1/m per unit, understeer taken off"
-    if wheelbase is None:
-        return replace(suggestion, scale=1.0, note=f"{told}: the scale is about that times the wheelbase")
-    if low * wheelbase < SCALES[1] and high * wheelbase > SCALES[0]:
-        return replace(suggestion, scale=1.0)
-    return replace(suggestion, scale=slope * wheelbase, note=f"{told}; measure the scale at the wheel")
-
-
-def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) -> tuple[float, float, float] | None:
-    """Change of ``omega / v_x`` (1/m) per unit of the signal in a slow car, and its least and largest value.
-
-    Understeer is fitted with it where speeds differ enough, else it is what cars have. ``None`` where the two do not go
-    together.
-    """
-    if "v_x" not in signals or "omega" not in signals:
-        return None
-    at = suggestion.topic.time
-    values = suggestion.values
-    v_x, omega = (np.interp(at, signals[name].topic.time, signals[name].values) for name in ("v_x", "omega"))
-    fast = (v_x > _DRIVING * v_x.max(initial=0.0)) & np.isfinite(values) & (v_x > 0)
-    if fast.sum() < 3 or spread(values[fast]) == 0 or spread(omega[fast]) == 0:
-        return None
-    curvature = omega[fast] / v_x[fast]
-    if abs(np.corrcoef(values[fast], curvature)[0, 1]) < _AGREES:
-        return None
-    slope = float(np.polyfit(values[fast], curvature, 1)[0])
-    sign, speed = float(np.sign(slope)), v_x[fast]
-    fit = understeer(sign * values[fast], curvature, speed, block=blocks(len(speed)))
-    if fit is not None and fit.share > _AGREES:
-        low, high = believable(fit, float(np.mean(speed**2)))
-        if 0 < low <= high:
-            return sign / float(fit.values[1]), *sorted((sign / low, sign / high))  # type: ignore[return-value]
-    return slope, *sorted(slope * (1.0 + share) for share in UNDERSTEER)  # type: ignore[return-value]
 
 
 def _stamps(signals: dict[str, Suggestion]) -> list[str]:

@@ -150,8 +150,7 @@ def _input_findings(off: Sequence[tuple[str, Lag]]) -> list[Finding]:
             f" (explained {number(lag.share)}, {number(max(lag.near, 0.0))} as recorded)"
         )
         signal = f"{name}_feedback"
-        delay = 0 < -lag.value < 1.0
-        remedy = f"{signal}: delay: {number(-lag.value)}" if delay else f"correct the stamps of {signal}"
+        remedy = f"{signal}: delay: {number(-lag.value)}, or correct its stamps"
         found.append(
             _lag_finding(f"{name}_time", told, lag, f"{_EXPECTED_S[0]:g} to {_EXPECTED_S[1]:g} s", remedy)
         )  # fmt: skip

@@ -66,7 +66,7 @@ def test_where_v_y_is_estimated_it_predicts_from_the_causal_estimate(small_model
     predictor, rows = Predictor(OnnxModel(open_artifact(small_model)), estimating), []
     with open_bag(laps_bag) as bag:
         rows = [predictor.row[:3].copy() for answer in replay(bag, predictor) if isinstance(answer.outcome, Prediction)]
-        streams, _, _ = read_streams(bag, estimating)
+        streams = read_streams(bag, estimating).streams
     assert estimating.estimation is not None
     samples = {name: (one.stamps, one.values) for name, one in streams.items()}
     batch = estimated(samples, estimating.estimation, estimating.max_gap_ns, both_sides=False).states

@@ -13,6 +13,7 @@ from dynssm_ros.api.inputs import opened
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import DataWarning, RecordingError
 from dynssm_ros.signals.consistency import checked, contradictions
+from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.spans import fitted
 from dynssm_ros.signals.standard import recording_to_bag
@@ -103,6 +104,28 @@ def turned(angle: float) -> Changed:
     return lambda drive: with_columns(drive, theta=drive["theta"] + angle)
 
 
+def side_on(angle: float) -> Changed:
+    """A sensor of velocity that is mounted turned."""
+
+    def change(drive: Recording) -> Recording:
+        velocity = (drive["v_x"] + 1j * drive["v_y"]) * np.exp(1j * angle)
+        return with_columns(drive, v_x=velocity.real, v_y=velocity.imag)
+
+    return change
+
+
+def frozen(drive: Recording) -> Recording:
+    """An odometry that says the same for a quarter of the drive."""
+    at = np.where(np.arange(len(drive)) >= 0.75 * len(drive), round(0.75 * len(drive)), np.arange(len(drive)))
+    return with_columns(drive, **{name: drive[name][at] for name in ("x", "y", "theta", "v_x", "v_y", "omega")})
+
+
+def in_degrees(drive: Recording) -> Recording:
+    """Heading and yaw rate in degrees, the heading within a turn."""
+    theta = (drive["theta"] + np.pi) % (2 * np.pi) - np.pi
+    return with_columns(drive, theta=DEGREE * theta, omega=DEGREE * drive["omega"])
+
+
 def compass(drive: Recording) -> Recording:
     """A heading that counts clockwise from north."""
     return with_columns(drive, theta=np.pi / 2 - drive["theta"])
@@ -162,6 +185,9 @@ def test_what_healthy_logs_show_has_no_finding(change: Changed) -> None:
         ("pose_time", -2.0, early(2.0, "x", "y", "theta")),
         ("pose_time", 1.0, early(-1.0, "x", "y", "theta")),
         ("twist_time", 2.0, early(2.0, "v_x", "v_y", "omega")),
+        ("twist_turned", np.pi / 2, side_on(-np.pi / 2)),
+        ("twist_turned", -0.8, side_on(0.8)),
+        ("odometry_frozen", 0.25, frozen),
         ("steering_offset", 0.1, lambda drive: with_columns(drive, delta_fb=drive["delta_fb"] + 0.1)),
         ("throttle_never_used", 0.0075, resting(0.0075)),
         ("throttle_never_used", 0.02, resting(0.02)),
@@ -188,6 +214,7 @@ def test_a_fault_is_found_with_its_size(what: str, size: float, change: Changed)
         ("throttle_scale", times(r_fb=0.01)),
         ("throttle_setpoint", set_point),
         ("omega_constant", constant("omega")),
+        ("theta_constant", constant("theta")),
         ("v_y_constant", constant("v_y")),
         ("steering_constant", constant("delta_fb", 0.1)),
         ("throttle_constant", constant("r_fb")),
@@ -203,6 +230,20 @@ def test_a_compass_heading_is_a_sign_and_an_offset() -> None:
     found = {each.what: each.size for each in contradictions(compass(driven()))}
     assert list(found) == ["theta_sign", "theta_offset"]
     assert found["theta_offset"] == pytest.approx(np.pi / 2, abs=0.02)
+
+
+def test_a_heading_and_a_yaw_rate_in_degrees_are_both_told() -> None:
+    found = {each.what: each.size for each in contradictions(in_degrees(driven()), WHEELBASE)}
+    assert found == {"omega_scale": pytest.approx(1 / DEGREE, rel=0.05), "theta_scale": pytest.approx(DEGREE, rel=0.05)}
+
+
+def test_clocks_that_are_known_to_be_apart_are_no_lag_as_well() -> None:
+    drive = early(3.0, "r_fb", "delta_fb")(driven())
+    apart = Finding(
+        what="inputs_clock", told="", size=3.0, low=2.8, high=3.2, unit="s", expected="0", remedy="synchronise"
+    )  # fmt: skip
+    known = replace(drive, info=drive.info.model_copy(update={"findings": (apart,)}))
+    assert checked(checked(known, WHEELBASE), WHEELBASE).info.findings == (apart,)
 
 
 def test_half_the_path_speed_and_a_heading_that_turns_against_omega_are_two_findings() -> None:

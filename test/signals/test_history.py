@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
-from dynssm_ros.errors import RecordingError
+from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import RecordingInfo
@@ -448,3 +448,11 @@ def test_a_publisher_on_another_clock_does_not_cost_the_window() -> None:
 def test_every_reason_says_itself_in_words() -> None:
     assert len({refusal.value for refusal in Refusal}) == len(Refusal)
     assert all(" " in refusal.value for refusal in Refusal)
+
+
+@pytest.mark.parametrize("delay", [-0.1, 1.0, 18.0])
+def test_delays_that_only_a_log_can_have_are_refused_live(delay: float) -> None:
+    content = DEFAULT.model_dump()
+    content["signals"]["steering_feedback"]["delay"] = delay
+    with pytest.raises(ConfigurationError, match=r"steering_feedback\.delay: .* live expected at least 0"):
+        History(SignalMap.model_validate(content), 0.02, 5)

@@ -13,12 +13,13 @@ from dynssm_ros.errors import BagError
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inspection import Inspection, inspect
-from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
+from dynssm_ros.signals.signal_map import UNITS, SignalMap, load_signal_map
 from dynssm_ros.vehicle import Vehicle
 
 START = 1_700_000_000_000_000_000
 ODOMETRY, FEEDBACK = messages.ODOMETRY_TOPIC, messages.FEEDBACK_TOPIC
 WHEELBASE = 0.3
+STAMPED = "geometry_msgs/msg/TwistStamped"
 
 
 def suggested(found: Inspection) -> SignalMap:
@@ -71,10 +72,82 @@ def test_degrees_swapped_signs_and_steering_wheels_are_seen_by_the_curvature(
 ) -> None:
     bag = make_bag(bends(scale=scale))
     found = inspect(bag, WHEELBASE).signals["steering_feedback"]
-    assert found.scale == pytest.approx(unit, rel=0.05)
+    assert found.scale * UNITS[found.unit] == pytest.approx(unit, rel=0.05)
     assert "curvature" in found.note
     unknown = inspect(bag).signals["steering_feedback"]
     assert (unknown.scale, "times the wheelbase" in unknown.note) == (1.0, True)
+
+
+def moved(change: Any) -> list[Any]:
+    """Bends whose odometry a function of the message changes."""
+    return [(*one[:3], change(one[3]) or one[3]) if one[0] == ODOMETRY else one for one in bends()]
+
+
+def to_the_right(message: Any) -> None:
+    """The odometry with y to the right."""
+    message.twist.twist.linear.y *= -1
+    message.twist.twist.angular.z *= -1
+    message.pose.pose.position.y *= -1
+
+
+def in_km_h(message: Any) -> None:
+    """The velocity in km/h, and a pose that says so."""
+    message.twist.twist.linear.x *= 3.6
+    message.twist.twist.linear.y *= 3.6
+
+
+@pytest.fixture
+def driven_bag(make_bag: Any) -> Any:
+    """Makes a bag of bends with poses that are integrated, its odometry changed."""
+
+    def make(change: Any) -> Path:
+        records, place, theta = bends(), 0j, 0.0
+        for _, _, _, message in records[::2]:
+            twist, pose = message.twist.twist, message.pose.pose
+            pose.position.x, pose.position.y = place.real, place.imag
+            pose.orientation.z, pose.orientation.w = np.sin(theta / 2), np.cos(theta / 2)
+            place += complex(twist.linear.x, twist.linear.y) * np.exp(1j * theta) / 50
+            theta += twist.angular.z / 50
+            change(message)
+        return Path(make_bag(records))
+
+    return make
+
+
+def test_opposite_signs_are_turned_without_a_scale_and_both_remedies_told(make_bag: Any) -> None:
+    found = inspect(make_bag(moved(to_the_right)), WHEELBASE).signals["steering_feedback"]
+    assert (found.scale, found.unit) == (-1.0, "1")
+    assert "unless omega, v_y, y and theta count to the right" in found.note
+
+
+def test_a_speed_of_another_unit_is_a_finding_and_no_scale_of_the_steering(driven_bag: Any) -> None:
+    found = inspect(driven_bag(in_km_h), WHEELBASE)
+    assert [each.what for each in found.findings] == ["pose_speed"]
+    assert found.signals["steering_feedback"].scale == 1.0
+
+
+def test_a_twist_beside_a_pose_is_taken_and_a_commanded_one_is_not(make_bag: Any, typestore: Any) -> None:
+    types, records = typestore.types, []
+    for one in bends():
+        if one[0] != ODOMETRY:
+            records.append(one)
+            continue
+        head, twist = one[3].header, one[3].twist.twist
+        records.append(("/car/twist", STAMPED, one[2], types[STAMPED](head, twist)))
+        records.append(("/cmd_vel_stamped", STAMPED, one[2], types[STAMPED](head, twist)))
+        records.append(
+            (
+                "/pose",
+                "geometry_msgs/msg/PoseStamped",
+                one[2],
+                types["geometry_msgs/msg/PoseStamped"](head, one[3].pose.pose),
+            )
+        )
+    found = inspect(make_bag(records))
+    assert found.missing == ()
+    assert {name: found.signals[name].topic.name for name in ("v_x", "omega", "x")} == {
+        "v_x": "/car/twist", "omega": "/car/twist", "x": "/pose",
+    }  # fmt: skip
 
 
 def test_a_road_wheel_angle_in_rad_is_taken_as_it_is(make_bag: Any) -> None:

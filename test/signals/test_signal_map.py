@@ -79,7 +79,7 @@ def test_the_av21_scales_turn_wheel_degrees_and_kilopascals_into_radians_and_fra
         ("signals.v_x.curve", [[0.0, 1.0], [0.0, 2.0]], ["signals.v_x.curve", "rising field values"]),
         ("signals.v_x.hold", "second", ["signals.v_x.hold", "'second'"]),
         ("signals.v_x.delay", 0.1, ["signals.v_x.delay", "expected none"]),
-        ("signals.steering_feedback.delay", -0.1, ["signals.steering_feedback.delay", "-0.1"]),
+        ("signals.steering_feedback.delay", -100.0, ["signals.steering_feedback.delay", "-100"]),
         ("signals.v_x.gain", 2.0, ["signals.v_x.gain", "2.0"]),
         ("signals.v_x.field", ..., ["signals.v_x", "field is missing"]),
         ("commands", "telepathy", ["commands", "'telepathy'", "lookahead"]),

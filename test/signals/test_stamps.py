@@ -128,7 +128,10 @@ def test_odometry_on_another_clock_is_told_by_extract_and_inspect(
         drive(450 if abs(ahead) > 2 else 50, rate=10.0), ODOMETRY, lambda _, stamp: stamp + round(ahead * SECOND)
     )
     bag = make_bag(records)
-    notes = extract([bag], DEFAULT, 25.0).info.notes
+    info = extract([bag], DEFAULT, 25.0).info
+    notes = info.notes
+    (clock,) = [each for each in info.findings if each.what.endswith("clock")]
+    assert (clock.what, clock.size) == ("inputs_clock", pytest.approx(ahead, abs=0.01))
     assert any(f"{FEEDBACK} is stamped {abs(ahead):.3g} s" in note and told in note for note in notes)
     assert [note for note in inspect(bag).notes if "is stamped" in note] == [
         note for note in notes if "is stamped" in note

@@ -181,3 +181,41 @@ def test_what_no_signal_can_be_disturbs_no_suggestion(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r"is larger than any signal|is not finite"):
         extract([tmp_path / "odd.parquet"], suggested(found[1]), 50.0)
     assert len(extract([tmp_path / "odd.parquet"], suggested(found[1]), 50.0, drop_bad=True)) > 950
+
+
+def test_units_without_words_and_headings_in_degrees_are_told_by_their_values(tmp_path: Path) -> None:
+    t = np.arange(1500) / 50
+    omega, v = 0.6 + 0.5 * np.sin(t), 12.0 + 3.0 * np.sin(t / 3)
+    theta = np.cumsum(omega) / 50
+    place = np.cumsum(v * np.exp(1j * theta)) / 50
+    heading = np.degrees(theta) % 360.0
+    pulses = 1500.0 + 400.0 * np.sin(t)
+    path = tmp_path / "log.csv"
+    head = "t,east,north,yaw,v_Fzg [km/h],vy,yaw_rate,throttle_us,steer"
+    np.savetxt(
+        path, np.stack([t, place.real, place.imag, heading, 3.6 * v, 0 * t + 0.01 * omega, omega, pulses, 0.1 * omega], 1),
+        delimiter=",", header=head, comments="",
+    )  # fmt: skip
+    found = inspect(path)
+    signals = found.signals
+    assert signals["theta"].unit == "deg"
+    assert (signals["v_x"].field, signals["v_x"].unit) == ("v_Fzg [km/h]", "km/h")
+    np.testing.assert_allclose(signals["throttle_feedback"].values, 0.8 * np.sin(t), atol=1e-6)
+    recording = extract([path], suggested(found), 50.0)
+    np.testing.assert_allclose(recording["v_x"], v, atol=1e-6)
+    np.testing.assert_allclose(recording["theta"] - recording["theta"][0], theta - theta[0], atol=1e-6)
+
+
+def test_a_throttle_that_follows_the_speed_one_to_one_is_a_set_point(tmp_path: Path) -> None:
+    t = np.arange(1500) / 50
+    v = 3.0 + np.sin(t / 3)
+    path = tmp_path / "log.csv"
+    np.savetxt(
+        path, np.stack([t, v, 0.01 * np.sin(t), np.sin(t), v + 0.2 * np.cos(t / 3), 0.1 * np.sin(t)], 1),
+        delimiter=",", header="t,vx,vy,yaw_rate,throttle,steer", comments="",
+    )  # fmt: skip
+    found = inspect(path)
+    assert found.signals["speed_feedback"].field == "throttle"
+    assert "throttle_feedback" not in found.signals
+    assert found.missing == ()
+    assert any("set-point of the speed" in note for note in found.notes)

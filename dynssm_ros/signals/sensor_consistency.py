@@ -1,0 +1,146 @@
+"""Whether speed, gyro, accelerometers and fixes can be right together, before velocities are estimated from them.
+
+What drives a path of fixes is compared with speed and gyro. Then the accelerometers are: ``a_y`` with ``v_x omega``, ``a_x``
+with the change of ``v_x``. Which of the units that people mix up explain both ratios is named, if few do.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.signals.estimation import positions_of
+from dynssm_ros.signals.findings import Finding, number
+from dynssm_ros.signals.motion import check_course, check_path_speed
+from dynssm_ros.signals.resampling import Stream
+from dynssm_ros.signals.signal_map import UNITS, SignalMap
+from dynssm_ros.signals.spans import Drive, Fitted, fitted, varies
+
+SENSED = ("speed_scale", "gyro_scale", "gyro_sign", "a_x_scale", "a_y_scale", "a_x_sign", "a_y_sign")
+"""Findings of this module."""
+_LEAST_S, _SPAN_S = 10.0, 0.4
+_MOST_ROWS = 30_000
+_TOLERANCE = 0.3
+"""Of the ratio of accelerations: bodies roll and pitch, which adds up to 0.1 g per g, and sensors are off the middle."""
+_RELATED = 0.5
+"""Explained share, from which on an acceleration counts as that of the car."""
+_FACTORS = {"v_x": ("m/s", "km/h", "mph"), "omega": ("rad/s", "deg/s"), "a": ("m/s^2", "g")}
+"""Units that are mixed up."""
+_CAUSES = {"a_x": "d v_x/dt", "a_y": "v_x omega"}
+
+
+def sensor_findings(streams: Mapping[str, Stream], signal_map: SignalMap) -> tuple[Finding, ...]:
+    """Contradictions between the signals that velocities are estimated from; ``streams`` by signal, in SI units."""
+    if not {"v_x", "omega"} <= set(streams) or len(streams["omega"].stamps) < 2:
+        return ()
+    drive, accelerations = _drive(streams, signal_map)
+    if len(drive) * drive.T_s < _LEAST_S or not drive.speed.max() > 0:
+        return ()
+    found: list[Finding] = []
+    if drive.position is not None and np.ptp(np.abs(drive.position)) > 0:
+        more, drive = check_path_speed(drive)
+        found += [_renamed(each, "speed_scale", "v_x") for each in more]
+        more, drive = check_course(drive)
+        found += [_renamed(each, each.what.replace("omega", "gyro"), "omega") for each in more]
+    return (*found, *_accelerations(drive, accelerations, by_path=drive.position is not None))
+
+
+def _renamed(finding: Finding, what: str, signal: str) -> Finding:
+    """A finding of odometry, of a sensor."""
+    remedy = finding.remedy.replace("v_x, v_y", signal).partition(", or x, y")[0]
+    told = finding.told.replace("hypot(v_x, v_y)", signal).replace("x, y", "the fixes")
+    return finding.model_copy(update={"what": what, "remedy": remedy, "told": told})
+
+
+def _drive(streams: Mapping[str, Stream], signal_map: SignalMap) -> tuple[Drive, dict[str, Vector]]:
+    """Speed, gyro and the positions of fixes at the stamps of the gyro, and the accelerations there."""
+    stamps = streams["omega"].stamps
+    step = max(1, -(-len(stamps) // _MOST_ROWS))
+    first, last = (edge(one.stamps[0 if edge is max else -1] for one in streams.values()) for edge in (max, min))
+    rows = np.flatnonzero((stamps >= first) & (stamps <= last))[::step]
+    at = stamps[rows]
+
+    def sampled(stream: Stream) -> Vector:
+        return np.interp(at, stream.stamps, stream.values)
+
+    position = None
+    fixes = positions_of({name: (one.stamps, one.values) for name, one in streams.items()})
+    if fixes is not None and len(fixes[0]):
+        fixed, x, y = fixes
+        position = np.asarray(np.interp(at, fixed, x) + 1j * np.interp(at, fixed, y), np.complex128)
+    apart = np.diff(at, prepend=at[:1])
+    segment = np.cumsum(apart > signal_map.max_gap_ns + step * np.median(apart)).astype(np.int32)
+    zeros = np.zeros(len(at))
+    drive = Drive(
+        float(np.median(np.diff(at))) / 1e9 if len(at) > 1 else 1.0, segment, sampled(streams["v_x"]).astype(np.complex128),
+        sampled(streams["omega"]), zeros, zeros, position,
+    )  # fmt: skip
+    return drive, {name: sampled(streams[name]) for name in ("a_x", "a_y") if name in streams}
+
+
+def _accelerations(drive: Drive, measured: Mapping[str, Vector], *, by_path: bool) -> list[Finding]:
+    """Ratios of accelerations that are not 1, with the units that explain them."""
+    ratios: dict[str, Fitted] = {}
+    spans = drive.spans(_SPAN_S)
+    if len(spans) < 40:
+        return []
+    v_x = drive.velocity.real
+    caused = {"a_x": spans.change(v_x) / spans.seconds, "a_y": spans.mean(v_x * drive.omega)}
+    for name, values in measured.items():
+        if varies(values) and varies(caused[name]):
+            seen = spans.mean(values)
+            fit = fitted(np.stack([caused[name], np.ones(len(spans))], axis=1), seen, spans.block)
+            if fit is not None and fit.share > _RELATED:
+                ratios[name] = fit
+    sizes = {name: float(fit.values[0]) for name, fit in ratios.items()}
+    found = [_sign(name, fit) for name, fit in ratios.items() if fit.values[0] < 0]
+    if all(_is_near(abs(size), 1.0) for size in sizes.values()):
+        return found
+    wrong = _units(sizes, by_path=by_path)
+    name = next(name for name, size in sizes.items() if not _is_near(abs(size), 1.0))
+    return [*found, *(_scale(name, ratios[name], quantity, unit) for quantity, unit in wrong.items())]
+
+
+def _is_near(ratio: float, expected: float) -> bool:
+    return abs(math.log(max(ratio, 1e-12) / expected)) < _TOLERANCE
+
+
+def _units(sizes: Mapping[str, float], *, by_path: bool) -> dict[str, str]:
+    """Units by quantity, the fewest that explain the ratios; of those that the path does not tell. Else of ``a`` none."""
+    free = {name: units[:1] if by_path and name != "a" else units for name, units in _FACTORS.items()}
+    best: dict[str, str] | None = None
+    for units in itertools.product(*free.values()):
+        v_x, omega, a = (UNITS[unit] for unit in units)
+        expected = {"a_x": v_x / a, "a_y": v_x * omega / a}
+        wrong = {name: unit for name, unit in zip(free, units, strict=True) if unit != _FACTORS[name][0]}
+        fits = all(_is_near(abs(size), expected[name]) for name, size in sizes.items())
+        if fits and (best is None or len(wrong) < len(best)):
+            best = wrong
+    return best if best is not None else {"a": ""}
+
+
+def _sign(name: str, fit: Fitted) -> Finding:
+    low, high = fit.interval()
+    ratio, other = float(fit.values[0]), ", or omega's" if name == "a_y" else ""
+    return Finding(
+        what=f"{name}_sign", told=f"{name} over {_CAUSES[name]} is {number(ratio)}", size=ratio, low=low, high=high,
+        expected="1: x forward, y left", remedy=f"{name}: scale: -1{other}",
+    )  # fmt: skip
+
+
+def _scale(name: str, fit: Fitted, quantity: str, unit: str) -> Finding:
+    """A quantity that is in another unit, or an acceleration of a scale that is none of a unit."""
+    ratio, (low, high) = abs(float(fit.values[0])), sorted(map(abs, fit.interval()))
+    what = {"v_x": "speed_scale", "omega": "gyro_scale", "a": f"{name}_scale"}[quantity]
+    signal = {"a": "a_x, a_y"}.get(quantity, quantity)
+    remedy = (
+        f"{signal}: unit: {unit}" if unit else f"{name}: scale: {number(1 / ratio)}, or find what {_CAUSES[name]} lacks"
+    )
+    return Finding(
+        what=what, told=f"{name} over {_CAUSES[name]} is {number(ratio)}", size=UNITS[unit] if unit else 1 / ratio,
+        low=1 / high if not unit else UNITS[unit], high=1 / low if not unit else UNITS[unit], expected="1", remedy=remedy,
+    )  # fmt: skip

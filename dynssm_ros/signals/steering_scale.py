@@ -1,0 +1,91 @@
+"""What a steering signal is to be scaled with: it is compared with the curvature that is driven, so that degrees,
+steering-wheel angles and swapped signs are seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dynssm_ros.arrays import Vector
+from dynssm_ros.signals.actuation import SCALES, UNDERSTEER, believable, understeer
+from dynssm_ros.signals.contents import TopicContent, spread
+from dynssm_ros.signals.signal_map import UNITS
+from dynssm_ros.signals.spans import blocks
+
+_RADIANS = 1.6  # larger values are no road-wheel angle in rad
+_AGREES = 0.5  # correlation with the curvature, from which on a scale is told
+_DEGREES = (0.67, 1.5)  # share of what degrees need, within which a steering is taken for them
+_DRIVING = 0.3  # of the largest speed, from which on curvature is compared
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Where a signal may come from."""
+
+    topic: TopicContent
+    field: str
+    scale: float = 1.0
+    note: str = ""
+    unit: str = "1"
+    offset: float = 0.0
+
+    @property
+    def values(self) -> Vector:
+        """The signal at the topic's samples, shape ``(N,)``."""
+        return self.scale * UNITS[self.unit] * self.topic.values[self.field] + self.offset
+
+
+def scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], wheelbase: float | None) -> Suggestion:
+    """The steering in rad at the road wheel, as far as the curvature that it drives tells."""
+    suggestion = replace(suggestion, scale=1.0)
+    seen, values = _curvature_per_unit(suggestion, signals), suggestion.values
+    if seen is None:
+        large = float(np.nanmax(np.abs(values), initial=0.0)) > _RADIANS
+        note = "too large for rad at the road wheel: find its scale" if large else suggestion.note
+        return replace(suggestion, scale=1.0, note=note)
+    slope, low, high = seen
+    told = f"the curvature follows it with {slope:.4g} 1/m per unit, understeer taken off"
+    if wheelbase is None:
+        return replace(suggestion, scale=1.0, note=f"{told}: the scale is about that times the wheelbase")
+    low, high = low * wheelbase, high * wheelbase
+    sign, least, most = (1.0, low, high) if slope > 0 else (-1.0, -high, -low)
+    other = replace(suggestion, scale=sign, note=told)
+    if sign < 0:
+        other = replace(
+            other, note=f"{told}: turned, unless omega, v_y, y and theta count to the right: scale: -1 of those"
+        )
+    if least < SCALES[1] and most > SCALES[0]:
+        return other if sign < 0 else replace(suggestion, scale=1.0)
+    degree = UNITS["deg"]
+    if suggestion.unit == "1" and least < _DEGREES[1] * degree and most > _DEGREES[0] * degree:
+        return replace(other, unit="deg")
+    return replace(other, scale=slope * wheelbase, note=f"{other.note}; measure the scale at the wheel")
+
+
+def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) -> tuple[float, float, float] | None:
+    """Change of ``omega / v_x`` (1/m) per unit of the signal in a slow car, and its least and largest value.
+
+    Understeer is fitted with it where speeds differ enough, else it is what cars have. ``None`` where the two do not go
+    together.
+    """
+    if "v_x" not in signals or "omega" not in signals:
+        return None
+    at = suggestion.topic.time
+    values = suggestion.values
+    v_x, omega = (np.interp(at, signals[name].topic.time, signals[name].values) for name in ("v_x", "omega"))
+    fast = (v_x > _DRIVING * v_x.max(initial=0.0)) & np.isfinite(values) & (v_x > 0)
+    if fast.sum() < 3 or spread(values[fast]) == 0 or spread(omega[fast]) == 0:
+        return None
+    curvature = omega[fast] / v_x[fast]
+    if abs(np.corrcoef(values[fast], curvature)[0, 1]) < _AGREES:
+        return None
+    slope = float(np.polyfit(values[fast], curvature, 1)[0])
+    sign, speed = float(np.sign(slope)), v_x[fast]
+    fit = understeer(sign * values[fast], curvature, speed, block=blocks(len(speed)))
+    if fit is not None and fit.share > _AGREES:
+        low, high = believable(fit, float(np.mean(speed**2)))
+        if 0 < low <= high:
+            return sign / float(fit.values[1]), *sorted((sign / low, sign / high))  # type: ignore[return-value]
+    return slope, *sorted(slope * (1.0 + share) for share in UNDERSTEER)  # type: ignore[return-value]
