@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -18,6 +19,7 @@ _NO_SPEED = re.compile(
     r"cmd|command|target|desired|set_?point|drive\.|motor|engine|rpm|angular|limit|covariance|wind|steer|gps|gnss",
     re.IGNORECASE,
 )
+_REAR = re.compile(r"rear|(^|[_\[])r[lr]\b|hinten|(^|[_\[])h[lr]\b", re.IGNORECASE)
 _WHEEL = re.compile(r"wheel|rear|front|left|right", re.IGNORECASE)
 
 COLUMNS = {
@@ -30,8 +32,8 @@ COLUMNS = {
 """Words in headings of tables, in lower case and apart by underscores."""
 
 T = TypeVar("T")
-Place = tuple[TopicContent, str]
-"""A topic and a field of it."""
+Place = tuple[TopicContent, str, float]
+"""A topic, a field of it, and its scale."""
 
 
 def sensors(topics: Mapping[str, TopicContent]) -> dict[str, Place]:
@@ -45,19 +47,28 @@ def sensors(topics: Mapping[str, TopicContent]) -> dict[str, Place]:
             one for one in topics.values() if one.msgtype == msgtype and _changes(one, next(iter(fields.values())))
         ]
         if fitting:
-            best = max(fitting, key=lambda one: one.count)
-            found |= {signal: (best, field) for signal, field in fields.items() if _changes(best, field)}
+            busiest = max(fitting, key=lambda one: one.count)
+            found |= {signal: (busiest, field, 1.0) for signal, field in fields.items() if _changes(busiest, field)}
     speeds = [
-        (one, field)
+        (one, field, 1.0)
         for one in topics.values()
         for field in one.values
         if one.msgtype not in (IMU, FIX) and _is_speed(one, field) and _changes(one, field)
     ]
     if speeds:
-        found["v_x"] = max(
-            speeds, key=lambda place: (bool(_WHEEL.search(f"{place[0].name}.{place[1]}")), place[0].count)
-        )
+        best = max(speeds, key=lambda place: (bool(_WHEEL.search(f"{place[0].name}.{place[1]}")), place[0].count))
+        found["v_x"] = _of_rear_axle(best, [place for place in speeds if place[0] is best[0]])
     return of_use(found)
+
+
+def _of_rear_axle(place: Place, beside: list[Place]) -> Place:
+    """The mean of both rear wheels where the topic has them, as one wheel is faster or slower in a bend; else the place."""
+    topic, rear = place[0], [field for _, field, _ in beside if _REAR.search(field)]
+    if len(rear) != 2:
+        return place
+    field = " + ".join(rear)
+    total = topic.values[rear[0]] + topic.values[rear[1]]
+    return replace(topic, values=topic.values | {field: total}), field, 0.5
 
 
 def of_use(sensed: Mapping[str, T], known: Collection[str] = ()) -> dict[str, T]:

@@ -65,6 +65,29 @@ def test_without_accelerometers_and_fixes_v_y_is_that_of_a_steady_turn(make_bag:
     assert any("it has no accelerometer" in note for note in found.notes)
 
 
+def test_the_speed_is_the_mean_of_the_rear_wheels(make_bag: Any, typestore: Any, tmp_path: Path) -> None:
+    joints, found = typestore.types[messages.JOINT_STATE], []
+    names = ["front_left", "front_right", "rear_left", "rear_right"]
+    for record in records(typestore, fixes=False):
+        topic, _, stamp, message = record
+        if topic == "/wheel_speed":
+            v, half = message.data, 0.3 * np.sin((stamp - START) / 1e9)
+            head = typestore.types["std_msgs/msg/Header"](
+                typestore.types["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9), ""
+            )
+            wheels = joints(head, names, np.empty(0), np.array([v - half, v + half] * 2), np.empty(0))
+            found.append(("/wheel_speeds", messages.JOINT_STATE, stamp, wheels))
+        else:
+            found.append(record)
+    bag = make_bag(found)
+    v_x = inspect(bag).signals["v_x"]
+    assert (v_x.field, v_x.scale) == ("velocity[rear_left] + velocity[rear_right]", 0.5)
+    (tmp_path / "map.yaml").write_text(inspect(bag).signal_map(), encoding="utf-8")
+    recording = extract([bag], load_signal_map(tmp_path / "map.yaml"), 50.0)
+    t = (recording.time - START) / 1e9
+    np.testing.assert_allclose(recording["v_x"], 15 + 4 * np.sin(t / 3), atol=0.1)
+
+
 @pytest.mark.parametrize("speed", ["/motor/speed", "/wind_speed", "/cmd/speed"])
 def test_other_speeds_are_not_taken(make_bag: Any, typestore: Any, speed: str) -> None:
     found = inspect(make_bag(records(typestore, speed=speed)))
