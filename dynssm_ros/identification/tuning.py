@@ -5,7 +5,7 @@ named and how many are invented; *time*: it saves time alone. Thresholds of evid
 has some. Guards against division by zero are not tuned and stay where they are.
 """
 
-from scipy import stats
+from scipy import special
 
 # What is known before
 MASS_STD = 0.01  # of the mass, where the vehicle file does not say: a workshop's scales [test_known_before, causes]
@@ -91,7 +91,7 @@ TEMPERING_CHANGE = 0.1  # of the logarithm of the inflation, from which the data
 SMALL_SHARE = 0.06  # of each channel's squared error on left-out parts, below which a cause is small [test_diagnose]
 NEGLIGIBLE_SHARE = 0.01  # of an error: too little to count for or against a car [test_diagnose, test_formula]
 NOTICEABLE_SHARE = 0.05  # of a channel's error on held-out laps, from which a coefficient is off [test_recalibration]
-MOVED_TOGETHER = float(stats.chi2.isf(2.0 * stats.norm.sf(SURE_STD), 18))  # SURE_STD of 18 values [test_diagnose]
+MOVED_TOGETHER = float(special.chdtri(18, 2.0 * special.ndtr(-SURE_STD)))  # SURE_STD of 18 values [test_diagnose]
 NOTED_CHANGE = 0.1  # of an effect's size between two ways to hold inputs, that a note is worth
 
 # What is left
