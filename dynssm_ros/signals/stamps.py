@@ -138,19 +138,24 @@ def clocks_apart(topics: Mapping[str, Lateness], reference: str) -> dict[str, fl
 
 
 def clock_findings(apart: Mapping[str, float], signal_map: SignalMap) -> tuple[Finding, ...]:
-    """What :func:`clocks_apart` found of the topics of steering and throttle, one finding where both are off alike."""
+    """What :func:`clocks_apart` found of the topics of steering and throttle, one finding where both are off alike.
+
+    What the ``delay`` of a signal in the map takes off already is none.
+    """
     found: list[Finding] = []
     for name, signal in (("steering", "steering_feedback"), ("throttle", f"{signal_map.set_point}_feedback")):
-        seconds = apart.get(signal_map.signals[signal].recorded)
-        if seconds is None:
+        source = signal_map.signals[signal]
+        seconds = apart.get(source.recorded, -source.delay) + source.delay
+        if abs(seconds) <= _APART:
             continue
         if found and abs(found[0].size - seconds) < _APART:
-            return (found[0].model_copy(update={"what": "inputs_clock"}),)
+            remedy = f"{found[0].remedy}, {signal} likewise"
+            return (found[0].model_copy(update={"what": "inputs_clock", "remedy": remedy}),)
         found.append(
             Finding(
                 what=f"{name}_clock", told=f"{signal} is stamped {_told_apart(seconds, signal_map.odometry_topic)}",
                 size=seconds, low=seconds - _APART, high=seconds + _APART, unit="s", expected=f"within {_APART:g} s",
-                remedy=f"synchronise the clocks, or {signal}: delay: {findings.number(-seconds)} in this log",
+                remedy=f"synchronise the clocks, or {signal}: delay: {findings.number(source.delay - seconds)} in this log",
             )
         )  # fmt: skip
     return tuple(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +133,14 @@ def test_odometry_on_another_clock_is_told_by_extract_and_inspect(
     notes = info.notes
     (clock,) = [each for each in info.findings if each.what.endswith("clock")]
     assert (clock.what, clock.size) == ("inputs_clock", pytest.approx(ahead, abs=0.01))
+    content = DEFAULT.model_dump()
+    for name in ("throttle_feedback", "steering_feedback"):
+        content["signals"][name]["delay"] = -ahead
+    said = re.search(r"steering_feedback: delay: (\S+)", clock.remedy)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(-ahead, abs=0.05)
+    mended = extract([bag], SignalMap.model_validate(content), 25.0).info
+    assert not [each for each in mended.findings if each.what.endswith("clock")]
     assert any(f"{FEEDBACK} is stamped {abs(ahead):.3g} s" in note and told in note for note in notes)
     assert [note for note in inspect(bag).notes if "is stamped" in note] == [
         note for note in notes if "is stamped" in note
