@@ -67,6 +67,16 @@ def test_an_estimate_that_is_pulled_back_each_second_is_found(healthy: Recording
     assert found[0].share > 0.4
 
 
+def test_lines_that_are_near_each_other_are_told_as_one_period(healthy: Recording) -> None:
+    clean = taken_apart(healthy).errors
+    values, t = clean.values.copy(), clean.seconds
+    values[:, 1] += values[:, 1].std() * (np.sin(2 * np.pi * t / 0.217) + 0.7 * np.sin(2 * np.pi * t / 0.228))
+    found = model_anatomy(replace(clean, values=values), situations(clean), learn=False).patterns
+    first, *others = [each.size["period_s"] for each in found if "period_s" in each.size]
+    assert first == pytest.approx(0.217, rel=0.01)
+    assert not any(0.9 < period / first < 1.1 for period in others)
+
+
 def test_spikes_are_counted(healthy: Recording) -> None:
     rng = np.random.default_rng(1)
     omega = healthy["omega"].copy()

@@ -36,6 +36,7 @@ LEAST_SHARE = 0.005
 """Share of a channel's squared error from which on a pattern is reported: less is a quarter of a percent of the RMSE."""
 _MOST = 6  # patterns of a channel
 _AS_GOOD = 0.9  # of the largest share, from which on the pattern with the fewest fitted numbers is taken
+_NEAR = 0.1  # of a period that was found, within which another is the same one, which came and went
 _OF_SIZE = 2  # tests of spikes
 _EXACT = 1e-5  # of the increments: errors below are rounding
 _AUTOCORRELATION_S = 2.0
@@ -203,8 +204,8 @@ def model_anatomy(
             looked = list(_tried(errors, values, c, sorted_by, physics))
             tests = max(tests, len(looked) + others)
             sure = _beyond_chance(looked, level, float(np.sum(values**2)) / total, others)
-            before = [each.size.get("period_s") for each in found]
-            sure = [each for each in sure if each.size.get("period_s", 0.0) not in before]
+            before = np.array([each.size["period_s"] for each in found if "period_s" in each.size])
+            sure = [each for each in sure if not np.isclose(each.size.get("period_s", 0.0), before, _NEAR, 0.0).any()]
             if not sure:
                 break
             most = max(each.share for each in sure)
