@@ -2,18 +2,19 @@
 
     python -m benchmarks.network [--out out/network] [--only putnam] [--data DIR]
 
-Each fold leaves out a lap of Putnam Park or a development log of the 1:10 car. The car is calibrated and the layer fitted on
-the rest. There layers that did not know a stretch drive along it, and learners are fitted to what these leave of increments.
-On the left-out drive a learner's prediction is added to the physics, and the layer learns what is then left.
+Each fold leaves out a lap of Putnam Park or a development log of the 1:10 car, or is a simulated cell of the generalisation
+matrix. The car is calibrated and the layer fitted on the rest. There layers that did not know a stretch drive along it, and
+learners are fitted to what these leave of increments. On the left-out drive a learner's prediction is added to the physics,
+and the layer learns what is then left.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -21,7 +22,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from benchmarks.matrix.scored_cells import RACER
+from benchmarks.matrix.scored_cells import RACER, Cell, simulated_cells, test_drive, training_drive
 from benchmarks.page import table
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.files import write_json
@@ -32,27 +33,28 @@ from dynssm_ros.learning.models.base import OnlineConfig
 from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.online import LayerDrive, fit_layer
 from dynssm_ros.runtime.along import Along
-from dynssm_ros.runtime.features import INPUT_CHANGE, LayerFeatures
+from dynssm_ros.runtime.features import INPUT_CHANGE, LayerFeatures, throttle_steps
 from dynssm_ros.runtime.online import CHANNELS, Learned, OnlineLayer, Seen
 from dynssm_ros.runtime.path_judge import PathJudge
 from dynssm_ros.runtime.rollout import RolloutCorrection, path_errors, roll_out
 from dynssm_ros.signals.extraction import extract
-from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
 HORIZONS_S = (0.3, 0.6, 1.5)
-THROTTLES = np.array([-0.4, -0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
-"""Throttle fractions about which a force may bend."""
-_WIDTHS = np.maximum(np.abs(THROTTLES) / 2, 0.01)
 _GATES_S = (28.6, 248.9, 409.0, np.inf)  # of Putnam Park's laps
 _SETTLED_S = 16.0  # before it the log's heading settles
 _DART = {
     "free": "dart/free_driving_1002", "circles_1211": "dart_season/circles_0904_1211",
     "circles_1554": "dart_season/circles_0909_1554", "ramp": "dart_season/circles_fast_ramp_0927_1818",
 }  # fmt: skip
+_SIMULATED = (
+    "orca-rk4-usual-none", "orca-double_track-usual-grip", "av21-rk4-usual-grip", "av21-double_track-usual-none",
+    "racer-rk4-usual-mass", "racer-double_track-usual-bank",
+)  # fmt: skip
+"""Development cells of the generalisation matrix, with noise: nothing bends in these cars, and some have changed."""
 _HISTORY_S = 0.64
 _STRIDE_S = 0.2  # between starts of paths
 _LIMIT = 4.0  # of inputs, whose usual size is one, and of corrections in their standard deviations
@@ -72,43 +74,35 @@ class Fold(NamedTuple):
     left_out: Recording
 
 
-def folds(data: Path) -> Iterator[Fold]:
-    """All of them; marked test logs are in none."""
-    putnam = _extracted(data / "av21" / "putnam_park_run4_2", "av21", 25.0)
-    seconds = (putnam.time - putnam.time[0]) / 1e9
-    for lap, (begin, end) in enumerate(pairwise(_GATES_S), 1):
-        inside = (seconds >= begin) & (seconds < end)
-        yield Fold(f"putnam_{lap}", "av21", putnam.select((seconds >= _SETTLED_S) & ~inside), putnam.select(inside))
+def folds(data: Path) -> dict[str, Callable[[], Fold]]:
+    """What makes each fold, by name; marked test logs and test cells are in none."""
+    laps = {f"putnam_{lap}": partial(_lap, lap, data) for lap in range(1, len(_GATES_S))}
+    logs = {f"dart_{name}": partial(_log, name, data) for name in _DART}
+    cells = {f"simulated_{cell.name}": partial(_cell, cell) for cell in simulated_cells() if cell.name in _SIMULATED}
+    return {**laps, **logs, **cells}
+
+
+def _lap(lap: int, data: Path) -> Fold:
+    log = _extracted(data / "av21" / "putnam_park_run4_2", "av21", 25.0)
+    seconds = (log.time - log.time[0]) / 1e9
+    inside = (seconds >= _GATES_S[lap - 1]) & (seconds < _GATES_S[lap])
+    return Fold(f"putnam_{lap}", "av21", log.select((seconds >= _SETTLED_S) & ~inside), log.select(inside))
+
+
+def _log(left: str, data: Path) -> Fold:
     logs = {name: _extracted(data / bag, "default", 50.0) for name, bag in _DART.items()}
-    for left, log in logs.items():
-        rest = concatenate([other for name, other in logs.items() if name != left])
-        yield Fold(f"dart_{left}", RACER, rest, log)
+    return Fold(f"dart_{left}", RACER, concatenate([log for name, log in logs.items() if name != left]), logs[left])
+
+
+def _cell(cell: Cell) -> Fold:
+    training, test = (
+        concatenate(drives) for drives in (training_drive(cell.training, Path()), test_drive(cell, Path()))
+    )
+    return Fold(f"simulated_{cell.name}", cell.training.vehicle, training, test)
 
 
 def _extracted(bag: Path, signals: str, rate: float) -> Recording:
     return extract([bag], load_signal_map(signals).with_commands("none"), rate)
-
-
-def throttle_steps(windows: Vector) -> Vector:
-    """Steps of the applied throttle of the last row about :data:`THROTTLES`, ``(N, 12)``."""
-    applied, _ = applied_inputs(np.moveaxis(windows[:, -1], -1, 0))
-    steps: Vector = np.tanh((applied[:, None] - THROTTLES) / _WIDTHS)
-    return steps
-
-
-class StepsInLayer:
-    """What a layer sees that has the throttle's steps among its features."""
-
-    def __init__(self, features: LayerFeatures) -> None:
-        self._features = features
-        self.layout, self.vehicle, self.stepping = features.layout, features.vehicle, features.stepping
-        self.names = (*features.names, *(f"throttle about {value:g}" for value in THROTTLES))
-
-    def seen(self, windows: Vector) -> Seen:
-        """As :meth:`LayerFeatures.seen`."""
-        seen = self._features.seen(windows)
-        steps = np.repeat(throttle_steps(windows)[:, None], CHANNELS, axis=1)
-        return Seen(np.concatenate([seen.features, steps], axis=2), seen.physics)
 
 
 @dataclass(frozen=True)
@@ -307,7 +301,7 @@ def scored(study: Study) -> dict[str, list[float]]:
         predict = fit(np.concatenate(inputs), left / size)
         learner = _learner(look, predict, size * layer.scale)
         found[f"{fit.__name__}, {name}"] = ratios(score(study, features, layer, trusted, learner), alone)
-    steps = cast(LayerFeatures, StepsInLayer(features))
+    steps = study.base._replace(config=OnlineConfig(throttle_steps=True)).features(False)
     found["layer with the throttle's steps"] = ratios(score(study, steps, study.fitted(steps)[0], trusted), alone)
     return found
 
@@ -326,12 +320,12 @@ def main() -> None:
     torch.set_num_threads(1)
     arguments.out.mkdir(parents=True, exist_ok=True)
     known: dict[str, dict[str, list[float]]] = {}
-    for fold in folds(arguments.data):
-        file = arguments.out / f"{fold.name}.json"
-        if not file.is_file() and fold.name.startswith(arguments.only):
-            write_json(file, scored(Study.of(fold, arguments.out)))
+    for name, fold in folds(arguments.data).items():
+        file = arguments.out / f"{name}.json"
+        if not file.is_file() and name.startswith(arguments.only):
+            write_json(file, scored(Study.of(fold(), arguments.out)))
         if file.is_file():
-            known[fold.name] = json.loads(file.read_text(encoding="utf-8"))
+            known[name] = json.loads(file.read_text(encoding="utf-8"))
     print(tables(known))
 
 

@@ -30,10 +30,11 @@ typedef struct {
 
 typedef struct {
     Car car;
-    int64_t rows, recent, input_lags, errors, network, n;
+    int64_t rows, recent, input_lags, errors, network, throttles, n;
     const int64_t *places; /* (CHANNELS, n) */
     const double *mean, *std, *scale, *input_scale;
-    double *moved; /* (LANES, errors + 1, CHANNELS) */
+    const double *throttle, *throttle_width; /* of steps (throttles) */
+    double *moved;                           /* (LANES, errors + 1, CHANNELS) */
     double *found; /* all features of a window, before they are placed */
 } Features;
 
@@ -204,7 +205,9 @@ static void seen(const Features *f, const double *window, const double *moved, c
     }
     if (network)
         for (int64_t c = 0; c < CHANNELS; c++) *at++ = network[c] / f->scale[c];
-    *at = 1.0;
+    *at++ = 1.0;
+    for (int64_t k = 0; k < f->throttles; k++)
+        *at++ = tanh((last[3] + last[5] - f->throttle[k]) / f->throttle_width[k]);
     for (int64_t k = 0; k < CHANNELS * f->n; k++) features[k] = f->found[f->places[k]];
 }
 

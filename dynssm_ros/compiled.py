@@ -121,7 +121,10 @@ class FeaturesStructure(Structure):
 
     _fields_ = [
         ("car", CarStructure),
-        *_fields("rows recent input_lags errors network n", "places mean std scale input_scale moved found"),
+        *_fields(
+            "rows recent input_lags errors network throttles n",
+            "places mean std scale input_scale throttle throttle_width moved found",
+        ),
     ]
 
 

@@ -118,11 +118,13 @@ def test_rollouts_are_the_same_with_and_without(
     assert plain is not None
     vehicle = orca.with_effect(effect, acting(effect)) if effect else model.vehicle
     mean, std = np.array(scales.input_mean), np.array(scales.input_std)
+    layout = plain.layout._replace(throttle=effect == "tire_relaxation")
     features = LayerFeatures(
-        plain.layout, vehicle, mean=mean, std=std, increment_scale=np.array(scales.increment_scale),
+        layout, vehicle, mean=mean, std=std, increment_scale=np.array(scales.increment_scale),
         integrator="rk4", substeps=1,
     )  # fmt: skip
-    layer = replace(model.online, vehicle=vehicle, least=0.05)
+    prior = np.pad(model.online.mean, [(0, 0), (0, len(layout.names) - len(plain.names))], constant_values=0.1)
+    layer = replace(model.online, mean=prior, vehicle=vehicle, least=0.05)
     rng, N, steps = np.random.default_rng(2), 70, 20
     rows = mean + std * np.cumsum(rng.normal(size=(N, model.H + steps, 7)) / 10, axis=1)
     rows[::9, :, :3] = 0.0
@@ -193,6 +195,8 @@ def test_a_layout_is_known_by_its_names() -> None:
         FeatureLayout(10, 2, 3, 30, False),
         FeatureLayout(2, 0, 1, 4, True),
         FeatureLayout(1, 3, 2, 7, False),
+        FeatureLayout(10, 2, 3, 30, False, True),
+        FeatureLayout(1, 0, 1, 2, True, True),
     ):
         assert FeatureLayout.of(layout.names, layout.errors) == layout
     with pytest.raises(ArtifactError, match=r"online layer: features .*; expected "):

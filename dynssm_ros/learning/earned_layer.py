@@ -62,6 +62,7 @@ class LayerBase(NamedTuple):
             min(config.input_lags, most),
             min(errors, most),
             network,
+            config.throttle_steps,
         )
         integrator, substeps = self.physics.stepping(self.vehicle)
         return LayerFeatures(

@@ -26,6 +26,18 @@ INPUT_CHANGE = 0.1
 """What an input changes in a step, about, as a share of its standard deviation."""
 
 
+THROTTLES: Vector = np.array([-0.4, -0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
+"""Fractions of the throttle about which a force may bend: where a car's brakes take over from its engine."""
+THROTTLE_WIDTHS: Vector = np.maximum(np.abs(THROTTLES) / 2, 0.01)
+
+
+def throttle_steps(windows: Vector) -> Vector:
+    """Smooth steps of the applied throttle of windows' last rows ``(N, H, 7)`` about :data:`THROTTLES`, ``(N, 12)``."""
+    applied = windows[:, -1, 3] + windows[:, -1, 5]
+    steps: Vector = np.tanh((applied[:, None] - THROTTLES) / THROTTLE_WIDTHS)
+    return steps
+
+
 class FeatureLayout(NamedTuple):
     """Which features a channel has."""
 
@@ -34,6 +46,7 @@ class FeatureLayout(NamedTuple):
     input_lags: int  # changes of throttle and steering
     errors: int  # rows over which the physics' error is averaged
     network: bool  # whether the network's increment is one
+    throttle: bool = False  # whether steps of the throttle are
 
     @classmethod
     def of(cls, names: tuple[str, ...], errors: int) -> FeatureLayout:
@@ -47,8 +60,9 @@ class FeatureLayout(NamedTuple):
             return sum(name.startswith(beginning) for name in names)
 
         layout = cls(
-            count("increment, "), count("increment of the next, "), count("change of r, "), errors, "network" in names
-        )
+            count("increment, "), count("increment of the next, "), count("change of r, "), errors, "network" in names,
+            count("throttle about ") > 0,
+        )  # fmt: skip
         if layout.names != names:
             raise ArtifactError(f"online layer: features {', '.join(names)}; expected {', '.join(layout.names)}")
         return layout
@@ -69,13 +83,14 @@ class FeatureLayout(NamedTuple):
             *(f"increment, {k + 1} steps ago" for k in lags),
             *(f"increment of the {which}, {k + 1} steps ago" for k in others for which in ("next", "one after")),
             *changes, *STATE_SIGNALS, "r_fb", "delta_fb", MEAN_ERROR, "one",
+            *(f"throttle about {value:g}" for value in THROTTLES if self.throttle),
         )  # fmt: skip
 
     @property
     def places(self) -> Indices:
         """Where the features of each channel stand among those of all, ``(3, n)``."""
-        names = ("physics", "increments", "changes", "level", "error", "network", "one")
-        sizes = (CHANNELS, CHANNELS * self.recent, 2 * self.input_lags, 5, CHANNELS, CHANNELS * self.network)
+        names = ("physics", "increments", "changes", "level", "error", "network", "one", "throttle")
+        sizes = (CHANNELS, CHANNELS * self.recent, 2 * self.input_lags, 5, CHANNELS, CHANNELS * self.network, 1)
         at = dict(zip(names, accumulate(sizes, initial=0), strict=True))
         rows = []
         for c in range(CHANNELS):
@@ -89,6 +104,7 @@ class FeatureLayout(NamedTuple):
                 *(at["changes"] + 2 * (self.input_lags - 1 - k) + u for k in range(self.input_lags) for u in range(2)),
                 *(at["level"] + k for k in range(5)),
                 at["error"] + c, at["one"],
+                *(at["throttle"] + k for k in range(len(THROTTLES)) if self.throttle),
             ])  # fmt: skip
         return np.array(rows, dtype=np.intp)
 
@@ -173,7 +189,10 @@ class LayerFeatures:
         if layout.network:
             assert network is not None
             parts.append(network / self._scale)
-        found = np.concatenate([*parts, np.ones((count, 1))], axis=1)
+        parts.append(np.ones((count, 1)))
+        if layout.throttle:
+            parts.append(throttle_steps(windows))
+        found = np.concatenate(parts, axis=1)
         return Seen(found[:, self._places], physics)
 
     def structure(self, rows: int) -> compiled.FeaturesStructure | None:
@@ -187,6 +206,7 @@ class LayerFeatures:
                     car=car, rows=rows, recent=layout.recent, input_lags=layout.input_lags, errors=layout.errors,
                     network=layout.network, n=len(self.names), places=self._places.astype(np.int64), mean=self._mean,
                     std=self._std, scale=self._scale, input_scale=self._input_scale,
+                    throttles=len(THROTTLES) * layout.throttle, throttle=THROTTLES, throttle_width=THROTTLE_WIDTHS,
                     moved=np.zeros((compiled.LANES, layout.errors + 1, CHANNELS)),
                     found=np.zeros(CHANNELS * len(self.names)),
                 )  # fmt: skip

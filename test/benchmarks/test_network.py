@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from benchmarks import network
-from benchmarks.network import Fold, Scored, Study, ratios, tables, throttle_steps
+from benchmarks.network import Fold, Scored, Study, ratios, tables
+from dynssm_ros.runtime.features import throttle_steps
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle, save_vehicle
 

@@ -69,6 +69,10 @@ class OnlineConfig(StrictModel):
     lags: int = Field(default=10, ge=1, description="measured increments of the channel itself, back from the last")
     other_lags: int = Field(default=2, ge=0, description="the same of the other channels")
     input_lags: int = Field(default=3, ge=1, description="changes of throttle and steering")
+    throttle_steps: bool = Field(
+        default=False,
+        description="also smooth steps of the throttle about twelve fractions, for forces that bend there: engine, brakes",
+    )
     error_average: float = Field(default=0.6, gt=0, description="the physics' mean error is that over so long (s)")
     memory: float = Field(
         default=1000.0, gt=0, description="time constant with which weights return to their prior (s)"
