@@ -195,6 +195,7 @@ def test_a_case_is_driven_diagnosed_and_read_back(tmp_path: Path) -> None:
     assert (tmp_path / "drives" / f"{outcome_file(case, tmp_path).stem}.parquet").is_file()
 
 
+@pytest.mark.slow
 def test_doit_goes_on_with_what_is_done_and_writes_the_page(tmp_path: Path) -> None:
     for case, named in zip(cases(0, 2), (("steering_offset",), ()), strict=True):
         outcome = Outcome(case.name, tuple(case.hidden), named, bool(named), bool(named), True if named else None)

@@ -121,6 +121,7 @@ def test_the_page_says_how_near_the_noise_of_the_sensors_the_errors_are():
     assert Cell(Training("dart-free", "racer"), "circles").noise is None
 
 
+@pytest.mark.slow
 def test_a_cell_from_laps_to_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     short = {"orca": replace(CARS["orca"], seconds=(20.0, 6.0))}
     monkeypatch.setattr(of_cells, "CARS", short)

@@ -66,6 +66,7 @@ def test_it_drives_in_the_simulator_as_the_diagnosis_simulates_it(extended: Vehi
     assert (errors < 1e-3 * np.abs(some.errors(CarEstimate.of(load_vehicle("orca")))).max(axis=(0, 1))).all()
 
 
+@pytest.mark.slow
 def test_it_trains_a_model_and_the_node_predicts_with_it(
     extended: Vehicle, bag: Path, recording: Recording, small_model: Path, tmp_path: Path
 ) -> None:

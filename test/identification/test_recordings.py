@@ -72,6 +72,7 @@ def test_what_the_vehicle_left_out_is_held_out_and_noted(days: list[Recording]) 
     assert "as when the vehicle was calibrated" in together.split
 
 
+@pytest.mark.slow
 def test_a_short_recording_is_not_drowned_by_a_long_one() -> None:
     together = RecordingSet.of([recorded(300.0, 1), recorded(40.0, 2)], 0.25)
     fitted = fit_windows(together.recording, together.rows(), 0.4, 0.0, together.held_out)

@@ -76,6 +76,7 @@ def test_a_pair_is_found_the_stronger_first_and_with_its_sizes() -> None:
     assert all(one.confirmation is not None and one.confirmation.holds for one in found.chosen)
 
 
+@pytest.mark.slow
 def test_a_search_that_begins_anew_finds_what_one_without_the_effect_does(monkeypatch: pytest.MonkeyPatch) -> None:
     searching, fresh = (search(steering_offset={"offset": 0.03}, drive_gain={"factor": 1.15}) for _ in range(2))
     first = searching.run().chosen[0].candidate.effect

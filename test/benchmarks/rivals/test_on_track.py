@@ -23,6 +23,7 @@ MakeConfig = Callable[..., ModelConfig]
 ON_TRACK = {"kind": "on_track", "history": 0.08, "physics": {"nominal": "vehicle", "integrator": "euler"}}
 
 
+@pytest.mark.slow
 def test_tyres_that_the_file_has_wrong_are_found(
     make_fitted: MakeConfig, drive: Callable[..., Recording], orca: Vehicle, tmp_path: Path
 ) -> None:
