@@ -45,7 +45,7 @@ EXTRAS = {
     # what a diagnosis leaves, as a formula
     "formula": ["scikit-learn>=1.4"],
     # what boosted trees can still learn of the errors of a model, and the tests of its other patterns
-    "residuals": ["scikit-learn>=1.4", "scipy>=1.12"],
+    "residuals": ["scikit-learn>=1.4", "scipy>=1.12", "threadpoolctl>=3.1"],
     # seasons of logs on several processes
     "scale": ["joblib>=1.4"],
     # settings of models that are searched for

@@ -15,7 +15,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "report": ("matplotlib", "plotly", "jinja2", "scipy"),
     "matlab": ("scipy",),
     "formula": ("sklearn",),
-    "residuals": ("sklearn", "scipy"),
+    "residuals": ("sklearn", "scipy", "threadpoolctl"),
     "scale": ("joblib",),
     "sweep": ("optuna",),
     "ray": ("joblib", "ray"),
