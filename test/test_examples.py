@@ -34,6 +34,7 @@ def test_the_hidden_cause_is_found() -> None:
     assert abs(cause.values["offset"] - 0.03) < 3 * cause.std["offset"] + 0.003
 
 
+@pytest.mark.slow
 @pytest.mark.live
 @pytest.mark.timeout(300)
 def test_an_mpc_of_ones_own_follows_the_line_on_published_coefficients() -> None:

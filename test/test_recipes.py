@@ -78,6 +78,7 @@ def test_a_new_model_is_trained_exported_evaluated_and_predicts(tmp_path: Path) 
     np.testing.assert_allclose(OnnxModel(artifact).predict(window).state[0] - window[0, -1, :3], expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_new_plant_is_driven_and_its_own_model_knows_it() -> None:
     plain, heavy = (
         dynssm_ros.simulate("orca", "club", duration=5.0, plant=p, variation=0.0) for p in ("rk4", "heavy_foot")

@@ -243,6 +243,7 @@ def test_calibration_starts_mid_range_and_finds_the_simulated_car(quick_run):
     assert results.comparisons[0].rmse("mid_range")[0].mean > 1e-3
 
 
+@pytest.mark.slow
 def test_a_test_part_is_scored_and_nothing_else(quick_run):
     root, results = quick_run
     track = results.comparisons[0]

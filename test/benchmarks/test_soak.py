@@ -34,6 +34,7 @@ def test_a_swap_that_is_refused_is_seen(small_model: Path, tmp_path: Path) -> No
     assert done.swaps == 0
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_it_measured(small_model: Path, tmp_path: Path) -> None:
     file = tmp_path / "soak.json"
     with pytest.raises(SystemExit) as ended:

@@ -146,7 +146,7 @@ def test_what_does_not_fit_is_one_line_and_leaves_nothing(
 
 @pytest.mark.parametrize(
     "command",
-    ["calibrate", "train", *(pytest.param(each, marks=pytest.mark.slow) for each in ("evaluate", "diagnose"))],
+    ["train", *(pytest.param(each, marks=pytest.mark.slow) for each in ("calibrate", "evaluate", "diagnose"))],
 )
 def test_rows_that_the_car_cannot_have_driven_are_named_in_a_line(
     dynssm: Run, laps: Path, tmp_path: Path, command

@@ -64,6 +64,7 @@ def test_writes_report_results_and_table(dynssm, recording, tmp_path):
     assert "report.html" in shown
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_figures")
 def test_several_processes_find_what_one_finds(dynssm, laps, small_model, tmp_path):
     models = ("--model", "persistence", "--model", small_model, "--model", "single_track", "--vehicle", "orca")

@@ -228,7 +228,8 @@ def test_lines_from_sample_to_sample_begin_a_sample_before_the_row_that_changes(
     np.testing.assert_array_equal(two.lines, data.lines)
 
 
-@pytest.mark.parametrize("hold", [pytest.param("zero", marks=pytest.mark.slow), "first"])
+@pytest.mark.slow
+@pytest.mark.parametrize("hold", ["zero", "first"])
 def test_a_lag_is_seen_through_actuators_that_are_sampled_slowly(hold: Hold) -> None:
     """What a driver does between two samples is nearer to a line than to the older one, which is 0.05 s old in the mean."""
     car = load_vehicle("orca").with_effect("steering_lag", {"time_constant": 0.1})

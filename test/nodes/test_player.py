@@ -96,6 +96,7 @@ def test_a_bag_of_types_that_are_not_installed_names_the_way_out(putnam: Path) -
     assert "dynssm extract" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_predictor_that_is_held_up_for_two_seconds_and_listens_reliably_loses_nothing_and_goes_on_with_the_newest(
     small_model: Path, laps_bag: Path
 ) -> None:

@@ -38,7 +38,7 @@ def model(putnam: Path, kept: Callable[[str, Callable[[Path], None]], Path]) -> 
 @pytest.mark.parametrize(
     ("rate", "speed", "seconds", "in_step"),
     [
-        (25.0, 4.0, 32.0, True),
+        pytest.param(25.0, 4.0, 32.0, True, marks=pytest.mark.slow),
         pytest.param(25.0, 1.0, 8.0, False, marks=IN_REAL_TIME),
         pytest.param(100.0, 1.0, 8.0, False, marks=IN_REAL_TIME),
         pytest.param(100.0, 4.0, 24.0, False, marks=IN_REAL_TIME),  # 400 messages a second take a core of their own

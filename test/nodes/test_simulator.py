@@ -219,6 +219,7 @@ def test_a_car_that_was_held_up_drives_nothing_that_its_driver_could_not_answer(
     assert pit.wait_for(lambda: any(float(values.get(held_up, 0)) > 1.25 for _, _, values in pit.run.diagnostics))
 
 
+@pytest.mark.slow
 def test_in_lockstep_time_waits_for_the_command_that_is_due_and_goes_on_without_a_driver(start_pit: StartPit) -> None:
     pit = start_pit("driver:=external", "lockstep:=true", "rate:=5.0", "watchdog:=0.5")
     assert pit.wait_for(lambda: bool(pit.odometry)), "nobody drives yet: it does not wait"

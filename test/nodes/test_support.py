@@ -20,6 +20,7 @@ from dynssm_ros.signals.standard import recording_to_bag
 pytestmark = [pytest.mark.live, pytest.mark.timeout(240)]
 
 
+@pytest.mark.slow
 def test_a_player_that_waits_for_a_message_far_away_ends_at_once(laps_bag: Path, tmp_path: Path) -> None:
     laps = extract([laps_bag], load_signal_map("default"), 50.0)
     seconds = np.where(np.arange(len(laps.time)) > 0, 10**4, 0)  # after the first row comes a long pause

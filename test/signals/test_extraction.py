@@ -362,6 +362,7 @@ def test_memory_does_not_grow_with_topics_that_are_not_mapped(make_bag: Any, dri
     assert beside - alone < 6_000_000, "30 MB of images lie in this bag"
 
 
+@pytest.mark.slow
 def test_memory_grows_with_the_signals_only(make_bag: Any, drive: Any) -> None:
     """A step is 1050 bytes of messages and 10 samples of 16 bytes."""
     steps = (1000, 4000)  # both longer than a chunk; far apart, as a peak varies by some 40 kB from run to run
