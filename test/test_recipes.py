@@ -55,6 +55,7 @@ def test_a_new_effect_is_simulated_and_diagnosed(tmp_path: Path) -> None:
     assert dynssm_ros.load_vehicle(tmp_path / "car.yaml").effects == found.vehicle.effects
 
 
+@pytest.mark.slow
 def test_a_new_effect_acts_in_calibration_training_and_racing(tmp_path: Path) -> None:
     car = dynssm_ros.load_vehicle("orca").with_effect("brake_drag", {"coefficient": 0.03})
     laps = dynssm_ros.recorded(dynssm_ros.simulate(car, "club", duration=30.0))

@@ -72,7 +72,7 @@ def some_windows(recording: Recording, count: int, H: int = 4) -> torch.Tensor:
     )[0]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind == "deep")) for kind in KINDS])
 def test_the_deployed_graph_is_the_trained_model(
     trained: Callable[[str], Trained], laps: Recording, tmp_path: Path, kind: str
 ) -> None:
