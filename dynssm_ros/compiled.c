@@ -74,14 +74,18 @@ typedef struct {
 const char *dynssm_source(void) { return SOURCE; }
 
 /* glibc has elementary functions of several numbers at once, right to four units in the last digit. So that a number does not
-   depend on its lane, operations are executed for whole groups of lanes, though nobody reads the rest. */
+   depend on its lane, operations are executed for whole groups of lanes there, though nobody reads the rest. */
+#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__)
+#if __GLIBC_PREREQ(2, 35)
 #define GROUP 4
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__) && __GLIBC_PREREQ(2, 35)
 #define WIDE __attribute__((target_clones("avx2", "default")))
 #define AT_ONCE(...) extern double __VA_ARGS__ __attribute__((simd("notinbranch")));
 AT_ONCE(sin(double)) AT_ONCE(cos(double)) AT_ONCE(tan(double)) AT_ONCE(atan(double)) AT_ONCE(atan2(double, double))
 AT_ONCE(tanh(double)) AT_ONCE(exp(double)) AT_ONCE(hypot(double, double)) AT_ONCE(pow(double, double))
-#else
+#endif
+#endif
+#ifndef WIDE
+#define GROUP 1
 #define WIDE
 #endif
 
