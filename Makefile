@@ -66,7 +66,7 @@ clean: ## remove what was built, the environment too
 	rm -rf $(VENV) build dist install log out *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find dynssm_ros benchmarks examples test launch -name __pycache__ -prune -exec rm -rf {} +
 
-$(STAMP): setup.py constraints.txt pyproject.toml
+$(STAMP): setup.py constraints.txt pyproject.toml dynssm_ros/compiled.c
 	@if ! $(BIN)/python -m pip --version > /dev/null 2>&1; then
 	  find_python() {
 	    for candidate in $(PYTHON); do
