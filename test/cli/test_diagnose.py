@@ -100,7 +100,9 @@ def test_reference_and_suspect_are_compared(dynssm: Run, offset: tuple[Path, Pat
     arguments = ["--vehicle", offset[1], "--out", tmp_path / "out", "--integrator", "euler", *FEW]
     status, out, _ = dynssm("diagnose", "--reference", tmp_path / "before.parquet", "--suspect", offset[0], *arguments)
     assert status == 0
-    assert out.startswith("The simulation lacks: steering_offset (only in steering_offset/euler/road_course/25Hz/2).\n")
+    assert out.startswith(
+        "cause: The simulation lacks: steering_offset (only in steering_offset/euler/road_course/25Hz/2).\n"
+    )
     (cause,) = json.loads((tmp_path / "out" / "results.json").read_text())["causes"]
     assert cause["only_in"] == ["steering_offset/euler/road_course/25Hz/2"]
     (effect,) = load_vehicle(tmp_path / "out" / "vehicle.yaml").effects

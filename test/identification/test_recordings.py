@@ -262,4 +262,5 @@ def test_what_a_session_has_is_named_with_it(driven: Drive) -> None:
 @pytest.mark.slow
 def test_three_healthy_days_of_unlike_noise_are_right(driven: Drive) -> None:
     found = diagnose([driven({}, seed) for seed in (9406, 9407, 9408)], vehicle_file(Case({}, 9400)), integrator="rk4")
-    assert (found.verdict, found.causes) == ("none", ())
+    # the file knows the car to 2 %
+    assert (found.verdict, found.causes) == ("recalibrate", ())

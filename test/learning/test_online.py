@@ -64,7 +64,9 @@ def test_memory_of_a_training_grows_with_the_rows_of_the_laps_alone(laps, orca, 
         tracemalloc.stop()
         return highest
 
-    less, more = (concatenate([laps] * -(-rows // len(laps))) for rows in (5000, 10000))  # more than a block
+    less, more = (
+        concatenate([laps] * -(-rows // len(laps))) for rows in (12000, 24000)
+    )  # of each part more than a block
     peak(laps)
     a_row = (peak(more) - peak(less)) / (len(more) - len(less))
     assert a_row < 8 * 45, "bytes; the row itself has 13 numbers, what the layer sees of a window 3 x 30"
