@@ -19,15 +19,17 @@ LATE_OR_ELSEWHERE = {"odometry_lever_arm", "odometry_delay", "yaw_rate_lag", "st
 
 
 @pytest.fixture
-def recording(putnam: Path, monkeypatch: pytest.MonkeyPatch) -> Recording:
-    # fewer simulations than those of a diagnosis proper tell the same, in less time
-    monkeypatch.setattr(tuning, "MAX_WINDOWS", 200)
+def recording(putnam: Path) -> Recording:
     return extract([putnam], load_signal_map("av21"), 25.0)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_where_nothing_is_known_yaw_is_found_to_come_late(recording: Recording) -> None:
+def test_where_nothing_is_known_yaw_is_found_to_come_late(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # fewer simulations than those of a diagnosis proper tell the same, in less time
+    monkeypatch.setattr(tuning, "MAX_WINDOWS", 200)
     seen = recording.split_last(0.25)[0]
     car = calibrate(seen, load_vehicle("av21").unmeasured(), integrator="rk4", starts=1).vehicle
     found = diagnose(recording, car, horizon=0.6, integrator="rk4")
