@@ -218,12 +218,8 @@ def evaluate(
     steps = horizon_steps(horizon_s, recording.T_s)
     H, speed = window_and_speed(models.values(), min_speed)
     rows = recording.window_ends(H, 1, speed)
-    starts = recording.window_ends(H, steps, speed)[::stride]
-    if len(starts) == 0:
-        raise RecordingError(
-            f"recording {name or ', '.join(recording.info.source)} ({split}): no stretch of {H + steps} rows "
-            f"(window {H}, horizon {steps}) without a gap at {speed:g} m/s or more among its {len(recording)} rows"
-        )
+    name = name or ", ".join(recording.info.source)
+    starts = _rollout_starts(recording, H, steps, speed, told=f"{name} ({split})")[::stride]
     regimes = driving_regimes(recording.rows(rows), recording.info.set_point)
     drawn = _drawn_starts(recording, rows, steps)
     score_of = partial(_score, recording=recording, rows=rows, regimes=regimes, starts=starts, drawn=drawn, steps=steps)
@@ -234,7 +230,7 @@ def evaluate(
     }
     return Evaluation(
         recording=recording,
-        name=name or ", ".join(recording.info.source),
+        name=name,
         split=split,
         min_speed=speed,
         rows=rows,
@@ -243,6 +239,21 @@ def evaluate(
         scores=scores,
         line=first_lap(recording) if line is None else line,
     )
+
+
+def _rollout_starts(recording: Recording, H: int, steps: int, speed: float, *, told: str) -> Indices:
+    """Rows after which rollouts of ``steps`` can start.
+
+    Raises:
+        RecordingError: there is none; the recording goes by what is ``told`` of it.
+    """
+    starts = recording.window_ends(H, steps, speed)
+    if len(starts) == 0:
+        raise RecordingError(
+            f"recording {told}: no stretch of {H + steps} rows (window {H}, horizon {steps}) without a gap at {speed:g} m/s "
+            f"or more among its {len(recording)} rows"
+        )
+    return starts
 
 
 def _drawn_starts(recording: Recording, rows: Indices, steps: int) -> Indices:

@@ -44,11 +44,11 @@ def scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], whee
     if seen is None:
         large = float(np.nanmax(np.abs(values), initial=0.0)) > _RADIANS
         note = "too large for rad at the road wheel: find its scale" if large else suggestion.note
-        return replace(suggestion, scale=1.0, note=note)
+        return replace(suggestion, note=note)
     slope, low, high = seen
     told = f"the curvature follows it with {slope:.4g} 1/m per unit, understeer taken off"
     if wheelbase is None:
-        return replace(suggestion, scale=1.0, note=f"{told}: the scale is about that times the wheelbase")
+        return replace(suggestion, note=f"{told}: the scale is about that times the wheelbase")
     low, high = low * wheelbase, high * wheelbase
     sign, least, most = (1.0, low, high) if slope > 0 else (-1.0, -high, -low)
     other = replace(suggestion, scale=sign, note=told)
@@ -57,7 +57,7 @@ def scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], whee
             other, note=f"{told}: turned, unless omega, v_y, y and theta count to the right: scale: -1 of those"
         )
     if least < SCALES[1] and most > SCALES[0]:
-        return other if sign < 0 else replace(suggestion, scale=1.0)
+        return other if sign < 0 else suggestion
     degree = UNITS["deg"]
     if suggestion.unit == "1" and least < _DEGREES[1] * degree and most > _DEGREES[0] * degree:
         return replace(other, unit="deg")

@@ -193,29 +193,14 @@ def model_anatomy(
     patterns: list[Pattern] = []
     tests = 0
     for c, channel in enumerate(STATE_SIGNALS):
-        values = errors.values[:, c].copy()
-        if rmse(values[:, None])[0] < _EXACT * scale[c]:
+        if rmse(errors.values[:, c, None])[0] < _EXACT * scale[c]:
             continue
-        total = float(np.sum(values**2))
-        found: list[Pattern] = []
         beside = [each for each in (*faults, *by_learner) if each.channel == channel]
-        others = len(beside) + _OF_SIZE
-        for _ in range(_MOST):
-            looked = list(_tried(errors, values, c, sorted_by, physics))
-            tests = max(tests, len(looked) + others)
-            sure = _beyond_chance(looked, level, float(np.sum(values**2)) / total, others)
-            before = np.array([each.size["period_s"] for each in found if "period_s" in each.size])
-            sure = [each for each in sure if not np.isclose(each.size.get("period_s", 0.0), before, _NEAR, 0.0).any()]
-            if not sure:
-                break
-            most = max(each.share for each in sure)
-            best = min((each for each in sure if each.share >= _AS_GOOD * most), key=lambda each: each.terms)
-            found.append(best)
-            if best.fitted is not None:
-                values -= best.fitted
-        left = float(np.sum(values**2)) / total
+        fitted, values, most = _fitted(errors, c, sorted_by, physics, level=level, others=len(beside) + _OF_SIZE)
+        tests = max(tests, most)
+        left = float(np.sum(values**2) / np.sum(errors.values[:, c] ** 2))
         of_size = list(spikes(errors, values, c, slopes))
-        patterns += [*found, *_beyond_chance(of_size, level, left, tests), *_beyond_chance(beside, level, 1.0, tests)]
+        patterns += [*fitted, *_beyond_chance(of_size, level, left, tests), *_beyond_chance(beside, level, 1.0, tests)]
     lags = round(_AUTOCORRELATION_S / errors.T_s)
     return ModelAnatomy(
         errors,
@@ -225,6 +210,45 @@ def model_anatomy(
         {channel: autocorrelation(errors.values[:, c], errors.run, lags) for c, channel in enumerate(STATE_SIGNALS)},
         tests,
     )
+
+
+def _fitted(
+    errors: OneStepErrors,
+    c: int,
+    sorted_by: Sequence[Situation],
+    physics: PhysicsResponse | None,
+    *,
+    level: float,
+    others: int,
+) -> tuple[list[Pattern], Vector, int]:
+    """Patterns of a channel that are fitted one after the other, the largest first; what they leave, and most tests at once.
+
+    Args:
+        errors: of the model.
+        c: number of the channel.
+        sorted_by: the quantities of :func:`situations`.
+        physics: how its predictions would change, if that is known.
+        level: chance of a false alarm among all tests of the channel.
+        others: tests that are made beside.
+    """
+    values = errors.values[:, c].copy()
+    total = float(np.sum(values**2))
+    found: list[Pattern] = []
+    tests = 0
+    for _ in range(_MOST):
+        looked = list(_tried(errors, values, c, sorted_by, physics))
+        tests = max(tests, len(looked) + others)
+        sure = _beyond_chance(looked, level, float(np.sum(values**2)) / total, others)
+        before = np.array([each.size["period_s"] for each in found if "period_s" in each.size])
+        sure = [each for each in sure if not np.isclose(each.size.get("period_s", 0.0), before, _NEAR, 0.0).any()]
+        if not sure:
+            break
+        most = max(each.share for each in sure)
+        best = min((each for each in sure if each.share >= _AS_GOOD * most), key=lambda each: each.terms)
+        found.append(best)
+        if best.fitted is not None:
+            values -= best.fitted
+    return found, values, tests
 
 
 def _beyond_chance(looked: Sequence[Pattern], level: float, left: float, others: int) -> list[Pattern]:

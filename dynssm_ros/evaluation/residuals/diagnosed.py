@@ -29,10 +29,10 @@ def left_by(diagnosis: Diagnosis) -> ModelAnatomy | None:
         ``None`` if the fitted rows are less than 24 s.
     """
     windows = diagnosis.windows
-    rows = np.unique(windows.starts[:, None] + np.arange(windows.steps))
+    rows = np.unique(windows.passed)
     if len(rows) * windows.data.T_s < FEWEST_BLOCKS * BLOCK_S:
         return None
-    single = replace(windows, starts=rows, steps=1, every=1, filtered=False)
+    single = windows.single_steps(rows)
     log = _one_after_the_other(diagnosis.recordings)
     errors = OneStepErrors(
         EXTENDED,

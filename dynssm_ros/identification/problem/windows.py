@@ -142,7 +142,16 @@ class SimulationWindows:
     @property
     def driven(self) -> Vector:
         """Mean of each model input along each simulation, shape ``(7, W)``."""
-        return np.asarray(self.data.rows[:, self.starts[:, None] + np.arange(self.steps)].mean(axis=2))
+        return np.asarray(self.data.rows[:, self.passed].mean(axis=2))
+
+    @property
+    def passed(self) -> Indices:
+        """Rows from which each simulation steps, shape ``(W, steps)``."""
+        return self.starts[:, None] + np.arange(self.steps)
+
+    def single_steps(self, rows: Indices) -> SimulationWindows:
+        """Steps of one sampling time, each from a measured row ``(M,)``."""
+        return replace(self, starts=rows, steps=1, every=1, filtered=False)
 
     @cached_property
     def time(self) -> Vector:
@@ -209,15 +218,14 @@ class SimulationWindows:
 
     def transitions(self, car: CarEstimate) -> Vector:
         """Derivatives of each compared row by the one before, along the measured rows, shape ``(W, K, 3, 3)``."""
-        rows = (self.starts[:, None] + np.arange(self.steps)).ravel()
-        single = replace(self, starts=rows, steps=1, every=1, filtered=False)
+        single = self.single_steps(self.passed.ravel())
         fleet = CarBatch.of([car], single.number)
         fleet = fleet._replace(effects=tuple(effect for effect in fleet.effects if not effect.carries))
 
         def stepped(add: Vector) -> Vector:
             moved = self.data.rows.copy()
             moved[:3] += add[:, None]
-            there = np.empty((1, len(rows), 1, 3))
+            there = np.empty((1, len(single), 1, 3))
             replace(single, data=replace(self.data, rows=moved))._simulate(fleet, None, there)
             return there[0, :, 0]
 
@@ -272,11 +280,10 @@ class SimulationWindows:
 
 def step_errors(windows: SimulationWindows, car: CarEstimate) -> StepErrors:
     """Errors of single steps of a car from the rows that simulations pass, each from the measured row."""
-    rows = np.unique(windows.starts[:, None] + np.arange(windows.steps))
-    single = replace(windows, starts=rows, steps=1, every=1, filtered=False)
-    data = windows.data
+    rows, data = np.unique(windows.passed), windows.data
+    errors = windows.single_steps(rows).errors(car)[:, 0]
     context = {name: values[rows] for name, values in data.context.items()}
-    return StepErrors(data.rows[:, rows], context, -single.errors(car)[:, 0], data.number[rows], data.T_s)
+    return StepErrors(data.rows[:, rows], context, -errors, data.number[rows], data.T_s)
 
 
 def recorded_rows(recording: Recording, context: dict[str, Vector]) -> RecordedRows:
