@@ -19,10 +19,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynssm_ros import compiled
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.signals.inputs import applied_inputs
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.compiled_car import CompiledCar
 from dynssm_ros.vehicle.integrators import Integrator
 
 SPREAD: dict[str, float] = {
@@ -110,6 +112,7 @@ class CoefficientEstimator:
         self._usual = errors
         self._prior = np.concatenate([np.ones(n), errors.slow])
         self._forget = min(1.0, block / _NOISE_MEMORY_S)
+        self._compiled = CompiledCar.of(self._car, self.rows)
         self._evidence_kept = math.exp(-block / _EVIDENCE_MEMORY_S)
         self.reset()
 
@@ -122,6 +125,7 @@ class CoefficientEstimator:
         self.evidence = 0.0
         """Logarithm of the likelihood ratio of a changed car and the calibrated one."""
         self._block: list[Vector] = []
+        self._whole: Vector | None = None
         self._changed()
 
     @property
@@ -152,15 +156,23 @@ class CoefficientEstimator:
         self.__dict__.pop("std", None)
 
     def step(self, row: Vector, increment: Vector) -> None:
-        """Takes a measured row ``(7,)`` and the measured increment ``(3,)`` to the next (m/s, m/s, rad/s)."""
+        """Takes a measured row ``(7,)`` and the measured increment ``(3,)`` to the next (m/s, m/s, rad/s).
+
+        A block that it completes counts from :meth:`finish` on.
+        """
+        self.finish()
         if not len(self.adapted):
             return
         self._block.append(np.concatenate([row, increment]))
         if len(self._block) == self.rows:
-            block = np.array(self._block)
+            self._whole = np.array(self._block)
             self._block = []
-            if np.isfinite(block).all():
-                self._update(block[:, :7], block[:, 7:])
+
+    def finish(self) -> None:
+        """Learns from the block that is complete. The next step does it else, so that a prediction need not wait for it."""
+        whole, self._whole = self._whole, None
+        if whole is not None and np.isfinite(whole).all():
+            self._update(whole[:, :7], whole[:, 7:])
 
     def usual_errors(self, laps: Iterable[tuple[Indices, Measured]]) -> BlockErrors:
         """What is usual of the calibrated car, from laps that it was calibrated on.
@@ -185,6 +197,7 @@ class CoefficientEstimator:
 
     def kept(self) -> dict[str, Vector]:
         """What was learned, by name."""
+        self.finish()
         return {
             "changes": self._x, "covariance": self._P, "error": self._error, "error_covariance": self._error_P,
             "noise": self._noise, "evidence": np.array([self.evidence]),
@@ -192,6 +205,7 @@ class CoefficientEstimator:
 
     def restore(self, kept: Mapping[str, Vector]) -> None:
         """Goes on from what :meth:`kept` gave."""
+        self._whole = None
         self._x, self._P = kept["changes"].copy(), kept["covariance"].copy()
         self._error, self._error_P = kept["error"].copy(), kept["error_covariance"].copy()
         self._noise, self.evidence = kept["noise"].copy(), float(kept["evidence"][0])
@@ -200,6 +214,7 @@ class CoefficientEstimator:
 
     def interrupt(self) -> None:
         """The next row does not follow on the last one: the block that was begun is dropped."""
+        self.finish()
         self._block = []
 
     def _update(self, rows: Vector, increments: Vector) -> None:
@@ -251,6 +266,8 @@ class CoefficientEstimator:
 
     def _mean_increments(self, rows: Vector, cars: Vector) -> Vector:
         """Mean increments over ``rows`` ``(L, 7)`` of cars with coefficients ``(P, 17)``: ``(P, 3)``."""
+        if self._compiled is not None and compiled.LIBRARY is not None and len(rows) == self.rows:
+            return np.array([self._compiled.over(rows, theta).mean(axis=0) for theta in cars])
         now = np.broadcast_to(rows.T[:, None], (rows.shape[1], len(cars), len(rows)))
         with np.errstate(all="ignore"):
             moved = self._car.over(

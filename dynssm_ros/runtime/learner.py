@@ -101,6 +101,11 @@ class OnlineLearner:
         self.judge_paths()
         return self._correction.believed(self._judge.trusted)
 
+    def finish(self) -> None:
+        """Does what can wait until the prediction is out; the next row does it else."""
+        self.state.coefficients.finish()
+        self.judge_paths()
+
     def judge_paths(self) -> None:
         """Takes the paths that are under way to the row that was learned last.
 

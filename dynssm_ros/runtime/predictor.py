@@ -168,7 +168,7 @@ class Predictor:
     def finish(self) -> None:
         """Does what can wait until the prediction is out; the next one or a horizon does it else."""
         if self._learner is not None:
-            self._learner.judge_paths()
+            self._learner.finish()
 
     def save_online(self, path: Path) -> None:
         """Writes what was learned online, so that another stint can start with it; nothing without an online layer."""
@@ -214,6 +214,8 @@ class Predictor:
 
     def predict(self, stamp: int, values: dict[str, float], frames: Frames | None = None) -> Prediction | Refusal:
         """Takes the odometry sample ``values`` at ``stamp`` (ns) and predicts the instant ``stamp + T_s``."""
+        if self._learner is not None:
+            self._learner.state.coefficients.finish()
         refusal = self.observe(stamp, values, frames)
         if refusal is not None:
             return refusal

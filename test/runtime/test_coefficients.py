@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import dynssm_ros
+from dynssm_ros import compiled
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
@@ -130,3 +131,35 @@ def test_effect_states_are_carried_through_a_block():
     path = follow(estimator(car=car), laps(1.0, 5), 3.0)
     assert np.isfinite(path).all()
     assert np.abs(changed(path[-1])).max() > 0.0
+
+
+def test_a_complete_block_counts_once_it_is_asked_for_or_the_next_row_comes():
+    recording = laps(front_grip=(("factor", 0.8),))
+    one, other = estimator(), estimator()
+    paths = [[], []]
+    for k in range(200):
+        for found, path in zip((one, other), paths, strict=True):
+            found.step(recording.matrix[k], recording.matrix[k + 1, :3] - recording.matrix[k, :3])
+            path.append(found.theta)
+        if k % 3:
+            other.finish()
+    np.testing.assert_array_equal(*paths)
+    changes = np.flatnonzero(np.any(np.diff(paths[0], axis=0), axis=1)) + 1
+    assert len(changes)
+    assert not (changes % one.rows).any(), "with the row after the last of a block"
+    one.finish()
+    other.interrupt()
+    np.testing.assert_array_equal(one.theta, other.theta)
+
+
+@pytest.mark.parametrize("effects", [(), (("steering_lag", (("time_constant", 0.05),)),)])
+def test_blocks_are_the_same_with_and_without_the_compiled_loop(effects, library, monkeypatch):
+    monkeypatch.setattr(compiled, "LIBRARY", library)
+    car = ORCA
+    for name, values in effects:
+        car = car.with_effect(name, dict(values))
+    found, rows = estimator(car=car), laps(1.0, 5).matrix
+    cars = car.nominal * np.random.default_rng(0).uniform(0.8, 1.2, (5, 17))
+    fast = found._mean_increments(rows[: found.rows], cars)
+    monkeypatch.setattr(compiled, "LIBRARY", None)
+    np.testing.assert_allclose(fast, found._mean_increments(rows[: found.rows], cars), rtol=1e-10, atol=1e-13)
