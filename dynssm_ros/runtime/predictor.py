@@ -30,7 +30,7 @@ from dynssm_ros.runtime.trial import require_same_use
 from dynssm_ros.signals.decoding import Frames
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
-from dynssm_ros.signals.signal_map import SignalMap
+from dynssm_ros.signals.signal_map import CONTEXT_SIGNALS, SignalMap
 from dynssm_ros.vehicle import State, Vehicle
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose, advance_pose
 
@@ -305,7 +305,7 @@ class Predictor:
 
 
 def live_signal_map(model: OnnxModel, signal_map: SignalMap) -> SignalMap:
-    """The signal map with the commands that the model was trained with.
+    """The signal map with the commands that the model was trained with, of signals that a model needs.
 
     Raises:
         ArtifactError: the model was trained with ``lookahead``, which does not exist live.
@@ -322,7 +322,7 @@ def live_signal_map(model: OnnxModel, signal_map: SignalMap) -> SignalMap:
             f"{model.artifact.path}: trained with commands 'lookahead', which look into the future and do not exist "
             "live; train with --commands none or topics"
         )
-    return signal_map.with_commands(model.commands)
+    return signal_map.without(CONTEXT_SIGNALS).with_commands(model.commands)
 
 
 def _finite(values: Iterable[float]) -> bool:

@@ -22,7 +22,16 @@ from dynssm_ros.signals.recording import V_Y_DEVIATION, Recording, RecordingInfo
 from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
 from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.sensor_consistency import sensor_findings
-from dynssm_ros.signals.signal_map import POSE_SIGNALS, SENSORS, SPEED_SIGNALS, STATE_SIGNALS, SignalMap, yaw_of
+from dynssm_ros.signals.signal_map import (
+    CONTEXT_SIGNALS,
+    POSE_SIGNALS,
+    SENSORS,
+    STATE_SIGNALS,
+    STEPPED_SIGNALS,
+    SignalMap,
+    Source,
+    yaw_of,
+)
 from dynssm_ros.signals.stamps import (
     Lateness,
     clean,
@@ -73,7 +82,7 @@ def _extract(
 ) -> Recording:
     """The recording of one log, whose notes begin with ``note``."""
     with open_log(path) as log:
-        signal_map, lack = _with_commands_of(log, signal_map)
+        signal_map, lack = _without_lacking_context(log, *_with_commands_of(log, signal_map))
         streams, stamped, notes, findings = read_streams(log, signal_map, drop_bad, progress)
     streams, rests = _with_brakes_at_rest(streams, signal_map)
     notes = [*([note] if note else []), *notes, *lack, *rests]
@@ -121,14 +130,27 @@ def _with_commands_of(log: Bag | LogTable, signal_map: SignalMap) -> tuple[Signa
     if signal_map.commands != "topics":
         return signal_map, []
     sources = [signal_map.signals[name] for name in signal_map.command_signals]
-    if isinstance(log, LogTable):
-        missing = [f"column '{one.column}'" for one in sources if one.column and one.column not in log.headings]
-    else:
-        missing = [f"topic {one.recorded}" for one in sources if not one.column and not log.counts.get(one.recorded)]
+    missing = [_lacking(log, one) for one in sources if _lacking(log, one)]
     if not missing:
         return signal_map, []
     told = " and ".join(dict.fromkeys(missing))
     return signal_map.with_commands("none"), [f"no commands in the log ({told}); commands: none"]
+
+
+def _without_lacking_context(
+    log: Bag | LogTable, signal_map: SignalMap, notes: list[str]
+) -> tuple[SignalMap, list[str]]:
+    """The map without gear or engine speed where the log lacks them, and a note on each."""
+    lacking = {name: _lacking(log, signal_map.signals[name]) for name in CONTEXT_SIGNALS if name in signal_map.signals}
+    told = [f"{name}: no {what} in the log; left out" for name, what in lacking.items() if what]
+    return signal_map.without([name for name, what in lacking.items() if what]), [*notes, *told]
+
+
+def _lacking(log: Bag | LogTable, source: Source) -> str:
+    """The topic or column of a signal if the log does not have it, else nothing."""
+    if isinstance(log, LogTable):
+        return f"column '{source.column}'" if source.column and source.column not in log.headings else ""
+    return f"topic {source.recorded}" if not source.column and not log.counts.get(source.recorded) else ""
 
 
 def pose_velocities(streams: Mapping[str, Stream], window: float, where: str) -> dict[str, Stream]:
@@ -203,7 +225,7 @@ def held_signals(signal_map: SignalMap, streams: Mapping[str, Stream], period: f
         stamps = streams[name].stamps if name in streams else np.empty(0, np.int64)
         between = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
         slow = between > SLOW * period and name not in (*STATE_SIGNALS, *POSE_SIGNALS)
-        usual = "zero" if slow or name in SPEED_SIGNALS else "first"
+        usual = "zero" if slow or name in STEPPED_SIGNALS else "first"
         if (source.hold or usual) == "zero":
             held[name] = between / 1e9
     return held
@@ -252,7 +274,7 @@ def read_streams(
         lack = f"has no good sample of '{source.field}'" if dropped else f"never carries '{source.field}'"
         lack += ", as its quaternions are not of length 1" if dropped and source.field.startswith("yaw(") else ""
         lack = "has no good value" if source.column else lack
-        if name not in POSE_SIGNALS or not counted:
+        if name not in (*POSE_SIGNALS, *CONTEXT_SIGNALS) or not counted:
             raise BagError(f"{log.path}: {place} {lack if counted else 'has no messages'}, needed for {name}")
         notes.append(f"{name}: {place} {lack}; left out")
     return LogStreams(streams, stamped, notes, findings)

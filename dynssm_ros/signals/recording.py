@@ -40,6 +40,7 @@ _OFF_GRID = 0.01  # of T_s that rows may be off their grid
 COLUMN_UNITS = {
     "v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "r_fb": "1", "delta_fb": "rad", "r_cmd": "1", "delta_cmd": "rad",
     "x": "m", "y": "m", "theta": "rad", "v_y_std": "m/s",
+    "gear": "1", "engine_speed": "rad/s",
 }  # fmt: skip
 
 
@@ -83,8 +84,9 @@ class Recording:
         info: sampling time, source and history.
         time: header-stamp time of each row (int64 ns), shape ``(N,)``; uniform inside a segment.
         segment: number of the gap-free stretch a row belongs to, non-decreasing, shape ``(N,)``.
-        columns: ``WINDOW_COLUMNS`` and, where known, the pose ``x y theta`` (m, m, rad unwrapped) and the
-            standard deviation ``v_y_std`` of an estimated ``v_y`` (m/s), each ``(N,)``.
+        columns: ``WINDOW_COLUMNS`` and, where known, the pose ``x y theta`` (m, m, rad unwrapped), the
+            standard deviation ``v_y_std`` of an estimated ``v_y`` (m/s), ``gear`` and ``engine_speed`` (rad/s), each
+            ``(N,)``.
     """
 
     info: RecordingInfo

@@ -12,7 +12,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.signals.inputs import lookahead_commands, model_inputs
 from dynssm_ros.signals.recording import V_Y_DEVIATION, Recording, RecordingInfo
-from dynssm_ros.signals.signal_map import POSE_SIGNALS, ROUNDING, STATE_SIGNALS, Commands, Hold
+from dynssm_ros.signals.signal_map import CONTEXT_SIGNALS, POSE_SIGNALS, ROUNDING, STATE_SIGNALS, Commands, Hold
 
 Stamps = npt.NDArray[np.int64]
 SLOW = 1.5
@@ -83,8 +83,9 @@ def resample(
 ) -> Recording:
     """Brings all signals onto a grid of ``rate`` Hz that starts at the first ``v_x`` stamp.
 
-    Rows that some signal does not cover are left out; where rows are missing or a signal has a gap, a new segment
-    begins. Angles are unwrapped before they are interpolated. Brakes are merged and commands become increments here.
+    Rows that some signal does not cover are left out; gear and engine speed go on over their gaps. Where rows are missing or
+    a signal has a gap, a new segment begins. Angles are unwrapped before they are interpolated. Brakes are merged and
+    commands become increments here.
 
     Args:
         streams: by signal name.
@@ -105,7 +106,7 @@ def resample(
         smooth = Stream(stream.stamps, unwrapped(stream.values)) if name == "theta" else stream
         hold: Hold = "zero" if name in info.held else "first"
         sampled[name], stretch = sample(smooth, grid, bridged, hold, round(ROUNDING * period))
-        stretches.append(stretch)
+        stretches += [stretch] if name not in CONTEXT_SIGNALS else []
     numbers = np.stack(stretches)
     rows = np.flatnonzero((numbers >= 0).all(axis=0))
     if len(rows) == 0:
@@ -119,7 +120,7 @@ def resample(
     sampled = {name: values[rows] for name, values in sampled.items()}
     inputs = model_inputs(sampled)
     columns = {name: sampled[name] for name in STATE_SIGNALS} | inputs._asdict()
-    columns |= {name: sampled[name] for name in (*POSE_SIGNALS, V_Y_DEVIATION) if name in sampled}
+    columns |= {name: sampled[name] for name in (*POSE_SIGNALS, V_Y_DEVIATION, *CONTEXT_SIGNALS) if name in sampled}
     if commands == "lookahead":
         columns["r_cmd"] = lookahead_commands(inputs.r_fb, segment)
         columns["delta_cmd"] = lookahead_commands(inputs.delta_fb, segment)

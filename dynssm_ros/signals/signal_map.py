@@ -35,6 +35,10 @@ STANDARD_MAPS: dict[SetPoint, str] = {"throttle": "default", "speed": "default_s
 SPEED_SIGNALS = ("speed_feedback", "speed_command")
 SENSORS = ("a_x", "a_y", "latitude", "longitude", "v_east", "v_north")
 """From which velocities are estimated; no columns of a recording."""
+CONTEXT_SIGNALS = ("gear", "engine_speed")
+"""What a recording keeps beside, for diagnosis and the anatomy of errors; no model and no node needs it."""
+STEPPED_SIGNALS = (*SPEED_SIGNALS, "gear")
+"""Those that stay until the next sample, however fast they come."""
 SIGNALS = (
     *REQUIRED_SIGNALS,
     *POSE_SIGNALS,
@@ -43,6 +47,7 @@ SIGNALS = (
     "brake_command",
     *SPEED_SIGNALS,
     *SENSORS,
+    *CONTEXT_SIGNALS,
 )
 
 Hold = Literal["zero", "first"]
@@ -55,7 +60,7 @@ JUMP_NS = 500_000_000
 UNITS = {
     "m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kt": 1852 / 3600, "ft/s": 0.3048, "rad": 1.0, "deg": math.pi / 180,
     "rad/s": 1.0, "deg/s": math.pi / 180, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "%": 0.01, "1": 1.0,
-    "m/s^2": 1.0, "g": 9.80665,
+    "m/s^2": 1.0, "g": 9.80665, "rpm": math.pi / 30,
 }  # fmt: skip
 """Units of fields and columns, and what one is in SI units."""
 TIME_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1, "days": 86_400_000_000_000}
@@ -114,7 +119,8 @@ class Source(StrictModel):
     hold: Hold | None = Field(
         default=None,
         description="between samples: zero, the last one; first, a line to the next, which a live node does not know. null: "
-        "zero for set-points, and for actuators and commands that come more slowly than the rows of a recording, else first",
+        "zero for set-points and gears, and for actuators and commands that come more slowly than the rows of a recording, "
+        "else first",
     )
 
     @model_validator(mode="after")
@@ -309,6 +315,10 @@ class SignalMap(StrictModel):
             return self
         content = self.model_dump() | {"commands": commands}
         return configuration.validate(SignalMap, content, f"signal map {self.name}")
+
+    def without(self, names: Collection[str]) -> SignalMap:
+        """The same map without some signals that are not required."""
+        return self.model_copy(update={"signals": {k: v for k, v in self.signals.items() if k not in names}})
 
     def active_signals(self) -> dict[str, Source]:
         """The signals that are read: commands only where ``commands: topics``, sensors where velocities are estimated."""

@@ -205,3 +205,21 @@ def test_errors_of_which_nothing_can_be_fitted_have_no_period(healthy: Recording
     wild = np.random.default_rng(seed).standard_t(1.2, clean.values.shape)
     found = model_anatomy(replace(clean, values=wild), situations(clean), learn=False).patterns
     assert {each.kind for each in found} <= {"spikes"}
+
+
+def test_errors_in_a_gear_and_after_its_changes_are_told(healthy: Recording) -> None:
+    gear = 1.0 + (healthy["v_x"] > np.median(healthy["v_x"]))
+    clean = taken_apart(with_column(healthy, "gear", gear)).errors
+    for planted, kind, words in (
+        (gear[clean.rows] == 2, "gear", "in gear 2"),
+        (
+            np.diff(gear, prepend=1.0)[clean.rows] > 0,
+            "time_since_a_change_up_of_the_gear",
+            "0 to 0.1 s after a change up",
+        ),
+    ):
+        values = clean.values.copy()
+        values[planted, 0] -= 0.02
+        found = model_anatomy(replace(clean, values=values), situations(clean), learn=False).patterns[0]
+        assert (found.channel, found.kind) == ("v_x", kind)
+        assert words in found.words

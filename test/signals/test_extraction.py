@@ -405,3 +405,26 @@ def test_the_orca_run_is_extracted_to_the_inputs_that_drove_it(orca_bag: Path) -
     np.testing.assert_allclose(recording.matrix[:, :3], run["dstates"][3:6, :n].T, atol=1e-9)
     np.testing.assert_allclose(recording.matrix[:, 3:5] + recording.matrix[:, 5:], run["inputs"][:, :n].T, atol=1e-9)
     assert n == 1000
+
+
+def test_gear_and_engine_speed_are_kept_over_gaps_and_left_out_where_a_log_lacks_them(
+    make_bag: Any, drive: Any
+) -> None:
+    joints = {
+        name: {"topic": "/engine", "type": messages.JOINT_STATE, "field": f"position[{name}]"} for name in ("gear",)
+    }
+    joints["engine_speed"] = joints["gear"] | {"field": "position[speed]", "unit": "rpm"}
+    content = DEFAULT.model_dump()
+    content["signals"] |= joints
+    signal_map = SignalMap.model_validate(content)
+    engine = [
+        ("/engine", messages.JOINT_STATE, START + at, messages.joint_state(START + at, {"gear": gear, "speed": 300.0}))
+        for at, gear in ((SECOND // 2, 1.0), (3 * SECOND // 2, 2.0))
+    ]
+    recording = extract([make_bag([*drive(200), *engine])], signal_map, 50.0)
+    assert len(recording) == 100, "a second without a message is no gap of the others"
+    assert recording["gear"].tolist() == [1.0 + (t >= 1.5 - 1e-9) for t in seconds(recording)]
+    np.testing.assert_allclose(recording["engine_speed"], 10 * np.pi)
+    without = extract([make_bag(drive(200), name="without")], signal_map, 50.0)
+    assert "gear" not in without.columns
+    assert [note for note in without.info.notes if "gear" in note] == ["gear: no topic /engine in the log; left out"]

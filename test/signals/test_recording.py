@@ -64,7 +64,10 @@ def test_the_file_says_the_unit_of_every_column(tmp_path: Path) -> None:
     recording([0, 0]).save(tmp_path / "r.parquet")
     schema = pq.read_schema(tmp_path / "r.parquet")
     units = {name: schema.field(name).metadata[b"unit"].decode() for name in schema.names}
-    assert units | {"v_y_std": "m/s"} == COLUMN_UNITS | {"time": "ns", "segment": ""}
+    assert units | {"v_y_std": "m/s", "gear": "1", "engine_speed": "rad/s"} == COLUMN_UNITS | {
+        "time": "ns",
+        "segment": "",
+    }
 
 
 def test_a_folder_that_looks_like_a_partition_adds_no_column(tmp_path: Path) -> None:

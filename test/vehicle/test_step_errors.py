@@ -75,3 +75,15 @@ def test_the_speeds_of_a_gear_change_are_found_where_there_is_one() -> None:
     assert found is not None
     assert found == pytest.approx((16.0, 13.0), abs=1.0)
     assert [shift_speeds(accelerating(0.0, seed)) for seed in range(6)] == [None] * 6
+
+
+def test_changes_that_a_gear_sensor_or_the_engine_speed_tells_are_the_ones_tried() -> None:
+    drive = accelerating(0.02, 1)
+    v_x = drive.rows[0]
+    gear = 1.0 + changed_above(v_x, 10.0, 9.0) + changed_above(v_x, 16.0, 13.0)
+    engine = v_x * np.array([0.0, 40.0, 25.0, 16.0])[gear.astype(int)] * (1.0 + 0.01 * np.sin(np.arange(len(v_x))))
+    for context in ({"gear": gear}, {"engine_speed": engine}):
+        found = shift_speeds(drive._replace(context=context))
+        assert found == pytest.approx((16.0, 13.0), abs=0.15)  # by the rows of the changes, and not by a grid
+    assert shift_speeds(accelerating(0.0, 1)._replace(context={"gear": gear})) is None
+    assert shift_speeds(drive._replace(context={"gear": np.ones(len(v_x))})) is None, "one gear, as its sensor says"

@@ -21,6 +21,7 @@ from dynssm_ros.evaluation.residuals.evidence import (
 from dynssm_ros.evaluation.residuals.patterns import Pattern, Picture
 from dynssm_ros.signals.recording import COLUMN_UNITS
 from dynssm_ros.track.lap_position import track_position
+from dynssm_ros.vehicle.gears import gear_of
 
 _BINS, _PLACES, _HEADINGS, _TIMES = 10, 24, 8, 8
 _SMOOTH_ROWS, _CHANGE_S = 3, 0.2
@@ -71,6 +72,7 @@ def situations(errors: OneStepErrors) -> list[Situation]:
         _bins("lateral acceleration", lateral, "m/s²", _BINS),
         _bins("longitudinal acceleration", (v_x - long_ago) / (rows * T_s), "m/s²", _BINS),
     ]
+    found += _gears(errors)
     back = max(1, round(_RATE_S / T_s))
     for (name, column), unit in zip(errors.inputs.items(), ("1/s", "rad/s"), strict=True):
         change = column[errors.rows] - errors.before(column, back)
@@ -207,13 +209,32 @@ def _since_step(errors: OneStepErrors, column: Vector, back: int) -> tuple[Vecto
     if spread <= 0 or not 0 < stepped.mean() < 0.3:
         return None
     starts = np.flatnonzero(stepped & ~np.concatenate([[False], stepped[:-1]]))
+    since, at = _since(errors, starts)
+    return since, np.sign(change[at])
+
+
+def _since(errors: OneStepErrors, starts: Indices) -> tuple[Vector, Indices]:
+    """Time since the last of the rows ``starts`` in the same segment (s), infinite before, and that row, ``(N,)`` each."""
     last = np.searchsorted(starts, errors.rows, side="right") - 1
     at = starts[np.maximum(last, 0)]
     same = (last >= 0) & (errors.recording.segment[at] == errors.recording.segment[errors.rows])
-    return np.where(same, (errors.rows - at) * errors.T_s, np.inf), np.sign(change[at])
+    return np.where(same, (errors.rows - at) * errors.T_s, np.inf), at
 
 
-def _after(name: str, since: Vector, sign: Vector) -> Situation:
+def _gears(errors: OneStepErrors) -> Iterator[Situation]:
+    """The gear, and the time since it changed up or down, where the recording tells it."""
+    gear = gear_of(errors.recording.columns, errors.recording["v_x"])
+    if gear is None:
+        return
+    numbers, kind = np.unique(gear[errors.rows], return_inverse=True)
+    yield Situation("gear", kind.astype(np.intp), tuple(f"in gear {number}" for number in numbers))
+    change = np.diff(gear, prepend=gear[:1])
+    for way, starts in (("up", np.flatnonzero(change > 0)), ("down", np.flatnonzero(change < 0))):
+        if len(starts):
+            yield _after(f"a change {way} of the gear", _since(errors, starts)[0])
+
+
+def _after(name: str, since: Vector, sign: Vector | None = None) -> Situation:
     kind = np.digitize(since, _SINCE_S) - 1
     last = len(_SINCE_S) - 1
     labels = tuple(f"{a:g} to {b:g} s after {name}" for a, b in pairwise(_SINCE_S))

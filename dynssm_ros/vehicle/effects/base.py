@@ -30,11 +30,12 @@ from dynssm_ros.vehicle.single_track import (
 
 CONTEXT_UNITS: dict[str, str] = {
     "t": "s", "clock": "s", "s": "m", "lap_length": "m", "bend": "1", "x": "m", "y": "m", "theta": "rad", "roll": "rad",
+    "gear": "1", "engine_speed": "rad/s",
 }  # fmt: skip
 """The signals beside state and inputs that effects may read: time since the start of the drive or recording, time of the
 day (UTC) by the stamps, position along the track's centre line (which may count on over the laps), the length of a lap, and
 how sharply the line bends there (from -1 to the right to 1 to the left, its sharpest places), pose, measured roll of the car
-(positive with the left side up)."""
+(positive with the left side up), gear and speed of the engine."""
 
 PLACE = ("s", "lap_length", "bend")
 LAP = PLACE[:2]

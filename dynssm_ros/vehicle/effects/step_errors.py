@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.vehicle.gears import changes_into, gear_of
 
 _MOST = 4.0  # standard deviations that one error counts for, at most: what recurs is told from what is large once
 _LEVEL_ROWS = 7  # whose median is the level that an error is compared with
@@ -29,6 +30,7 @@ _ALIKE = 0.97  # of the best, from which on a rounder period is taken
 
 _SPEEDS, _SPEED_RANGE = 40, (0.05, 0.95)  # that are tried as those of a gear change, of the speeds under throttle
 _HYSTERESIS = (0.03, 0.1, 0.2, 0.3)  # of the speed for the change up, by which the one for the change down is less
+_APART = 0.03  # of the speed for the change up, by which a measured one down is less at least
 _SHIFTS, _GAP_ROWS = 4, 3  # changes, at least; rows after one in which the force may have a gap
 _TOGETHER_S = 0.2  # over which errors are summed up
 _SHIFT_CHANCE = (
@@ -172,6 +174,7 @@ def changed_above(speed: Vector, up: float, down: float) -> Vector:
 def shift_speeds(steps: StepErrors) -> tuple[float, float] | None:
     """Speeds (m/s) above and below which the drive force changes, upwards and downwards; ``None`` if it does not change.
 
+    Tried are the usual speeds of the changes into each gear where the recording tells the gear, else a grid of speeds.
     Compared is what a smooth function of speed and throttle leaves of the errors in v_x, with and without a force that is
     another one above the speeds, and a gap in it where they are passed.
     """
@@ -198,17 +201,38 @@ def shift_speeds(steps: StepErrors) -> tuple[float, float] | None:
     if len(driving) < 2 * _SPEEDS or not left > 0.0:
         return None
     best, found = _SHIFT_CHANCE, None
-    for up in np.unique(np.quantile(driving, np.linspace(*_SPEED_RANGE, _SPEEDS))):
-        for share in _HYSTERESIS:
-            gear = changed_above(v_x, float(up), float(up * (1.0 - share)))
-            passed = np.abs(np.diff(gear, prepend=gear[0]))
-            gap = sum(np.concatenate([np.zeros(k), passed[: len(passed) - k]]) for k in range(_GAP_ROWS))
-            if not _SHIFTS <= passed.sum() <= len(gear) / (4 * _GAP_ROWS):
-                continue
-            force = summed(np.stack([driven * gear, driven * gap], axis=1))
-            force = force - basis @ (basis.T @ force)
-            taken = float(error @ force @ np.linalg.lstsq(force.T @ force, force.T @ error, rcond=1e-9)[0])
-            sure = len(error) * float(np.log(left / max(left - taken, 1e-9 * left)))
-            if sure > best:
-                best, found = sure, (float(up), float(up * (1.0 - share)))
+    told = _told_speeds(steps)
+    for up, down in _grid_of_speeds(driving) if told is None else told:
+        gear = changed_above(v_x, up, down)
+        passed = np.abs(np.diff(gear, prepend=gear[0]))
+        gap = sum(np.concatenate([np.zeros(k), passed[: len(passed) - k]]) for k in range(_GAP_ROWS))
+        if not _SHIFTS <= passed.sum() <= len(gear) / (4 * _GAP_ROWS):
+            continue
+        force = summed(np.stack([driven * gear, driven * gap], axis=1))
+        force = force - basis @ (basis.T @ force)
+        taken = float(error @ force @ np.linalg.lstsq(force.T @ force, force.T @ error, rcond=1e-9)[0])
+        sure = len(error) * float(np.log(left / max(left - taken, 1e-9 * left)))
+        if sure > best:
+            best, found = sure, (up, down)
+    return found
+
+
+def _grid_of_speeds(driving: Vector) -> list[tuple[float, float]]:
+    """Speeds for the change up and down that a gear may have, of those under throttle."""
+    ups = np.unique(np.quantile(driving, np.linspace(*_SPEED_RANGE, _SPEEDS)))
+    return [(float(up), float(up * (1.0 - share))) for up in ups for share in _HYSTERESIS]
+
+
+def _told_speeds(steps: StepErrors) -> list[tuple[float, float]] | None:
+    """Median speeds of the measured changes into each gear, up and down; ``None`` where no gear is told."""
+    v_x = steps.rows[0]
+    gear = gear_of(steps.context, v_x)
+    if gear is None:
+        return None
+    found = []
+    for number in np.unique(gear)[1:].tolist():
+        changes = changes_into(gear, v_x, number)
+        if len(changes.up) and len(changes.down):
+            up = float(np.median(changes.up))
+            found.append((up, min(float(np.median(changes.down)), (1.0 - _APART) * up)))
     return found
