@@ -1,16 +1,19 @@
 """What a network beside the online layer could earn on laps and logs that were left out, and from which inputs.
 
     python -m benchmarks.network [--out out/network] [--only putnam] [--data DIR]
+    python -m benchmarks.network --steps [--test] [--only cell] [--data DIR]
 
 Each fold leaves out a lap of Putnam Park or a development log of the 1:10 car, or is a simulated cell of the generalisation
 matrix. The car is calibrated and the layer fitted on the rest. There layers that did not know a stretch drive along it, and
 learners are fitted to what these leave of increments. On the left-out drive a learner's prediction is added to the physics,
-and the layer learns what is then left.
+and the layer learns what is then left. ``--steps`` scores the layer with the throttle's steps alone, on all simulated cells
+with the usual noise and on further logs of the 1:10 car: those for development, or with ``--test`` those for publishing.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -72,6 +75,8 @@ class Fold(NamedTuple):
     vehicle: str
     training: Recording
     left_out: Recording
+    trained: str = ""
+    """Name of the training, if others share it."""
 
 
 def folds(data: Path) -> dict[str, Callable[[], Fold]]:
@@ -98,7 +103,28 @@ def _cell(cell: Cell) -> Fold:
     training, test = (
         concatenate(drives) for drives in (training_drive(cell.training, Path()), test_drive(cell, Path()))
     )
-    return Fold(f"simulated_{cell.name}", cell.training.vehicle, training, test)
+    return Fold(f"simulated_{cell.name}", cell.training.vehicle, training, test, cell.training.name)
+
+
+def further_folds(data: Path, test: bool) -> dict[str, Callable[[], Fold]]:
+    """Simulated cells with the usual noise, and logs of the 1:10 car's season that no fold of :func:`folds` has."""
+    cells = [cell for cell in simulated_cells() if cell.is_test == test and "-usual-" in cell.name]
+    season = sorted(path.name for path in (data / "dart_season").iterdir() if path.is_dir())
+    known = {Path(bag).name for bag in _DART.values()}
+    logs = [name for name in season if name not in known and (_digest(name) % 3 == 0) == test]
+    simulated = {f"cell_{cell.name}": partial(_cell, cell) for cell in cells}
+    return {**simulated, **{f"season_{name}": partial(_season_log, name, data) for name in logs}}
+
+
+def _digest(name: str) -> int:
+    """By which the data's README divides logs into those for development and those for tests."""
+    return int(hashlib.sha256(name.encode()).hexdigest(), 16)
+
+
+def _season_log(name: str, data: Path) -> Fold:
+    logs = [_extracted(data / bag, "default", 50.0) for bag in _DART.values()]
+    log = _extracted(data / "dart_season" / name, "default", 50.0)
+    return Fold(f"season_{name}", RACER, concatenate(logs), log, "season")
 
 
 def _extracted(bag: Path, signals: str, rate: float) -> Recording:
@@ -115,7 +141,7 @@ class Study:
     @classmethod
     def of(cls, fold: Fold, out: Path) -> Study:
         """Calibrates the car; one that lies in ``out`` is taken."""
-        file = out / f"{fold.name}.yaml"
+        file = out / f"{fold.trained or fold.name}.yaml"
         if not file.is_file():
             car = load_vehicle(fold.vehicle)
             save_vehicle(calibrate(fold.training, car, min_speed=car.minimum_speed).vehicle, file)
@@ -306,6 +332,16 @@ def scored(study: Study) -> dict[str, list[float]]:
     return found
 
 
+def steps_scored(study: Study) -> dict[str, list[float]]:
+    """:func:`ratios` of the layer with the throttle's steps; each layer judges its own paths."""
+    found = []
+    for config in (study.base.config, OnlineConfig(throttle_steps=True)):
+        features = study.base._replace(config=config).features(False)
+        layer = study.fitted(features)[0]
+        found.append(score(study, features, layer, judged(study, features, layer)))
+    return {"layer with the throttle's steps": ratios(found[1], found[0])}
+
+
 def _learner(look: Look, predict: Predict, size: Vector) -> Look:
     return lambda windows, seen: np.asarray(predict(look(windows, seen)) * size)
 
@@ -316,17 +352,35 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/network"))
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--only", default="", help="folds whose names begin so")
+    parser.add_argument("--steps", action="store_true", help="the throttle's steps alone, on further cells and logs")
+    parser.add_argument("--test", action="store_true", help="with --steps: on what is for publishing only")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    out = arguments.out / ("steps_test" if arguments.test else "steps") if arguments.steps else arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    wanted = further_folds(arguments.data, arguments.test) if arguments.steps else folds(arguments.data)
     known: dict[str, dict[str, list[float]]] = {}
-    for name, fold in folds(arguments.data).items():
-        file = arguments.out / f"{name}.json"
+    for name, fold in wanted.items():
+        file = out / f"{name}.json"
         if not file.is_file() and name.startswith(arguments.only):
-            write_json(file, scored(Study.of(fold(), arguments.out)))
+            study = Study.of(fold(), out)
+            write_json(file, steps_scored(study) if arguments.steps else scored(study))
         if file.is_file():
             known[name] = json.loads(file.read_text(encoding="utf-8"))
-    print(tables(known))
+    print(extremes(known) if arguments.steps else tables(known))
+
+
+def extremes(known: dict[str, dict[str, list[float]]]) -> str:
+    """Of the throttle's steps: geometric means of the ratios in each group of folds, the least and the largest."""
+    rows = []
+    for group in dict.fromkeys(name.partition("_")[0] for name in known):
+        of = {fold: next(iter(content.values())) for fold, content in known.items() if fold.startswith(group)}
+        for k, what in enumerate(("one step", *(f"path {horizon:g} s" for horizon in HORIZONS_S))):
+            ranked = sorted(of, key=lambda fold: of[fold][k])
+            ends = [f"{of[fold][k]:.3f} ({fold.partition('_')[2]})" for fold in (ranked[0], ranked[-1])]
+            mean = float(np.exp(np.mean(np.log([ratio[k] for ratio in of.values()]))))
+            rows.append([group, str(len(of)), what, f"{mean:.3f}", *ends])
+    return table(["of", "folds", "error", "mean", "least", "largest"], rows)
 
 
 def tables(known: dict[str, dict[str, list[float]]]) -> str:

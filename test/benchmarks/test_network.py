@@ -39,6 +39,18 @@ def test_ratios_are_of_one_step_and_of_paths() -> None:
     assert "| ridge | 1.000 | 0.900 | 0.400 | 0.700 | 0.800 | 0.200 |" in text
 
 
+def test_the_least_and_the_largest_ratios_are_named() -> None:
+    known = {f"cell_{name}": {"steps": [value, 1.0, 1.0, 1.0]} for name, value in (("a", 0.5), ("b", 2.0), ("c", 1.0))}
+    assert "| cell | 3 | one step | 1.000 | 0.500 (a) | 2.000 (b) |" in network.extremes(known)
+
+
+def test_development_and_test_folds_are_apart(data: Path) -> None:
+    develop, test = (set(network.further_folds(data, marked)) for marked in (False, True))
+    assert not develop & test
+    assert {"season_circles_0904_1237", "season_steering_identification_0925_0957"} <= test, "as the data's README says"
+    assert "season_circles_0904_1100" in develop
+
+
 def test_a_learner_that_adds_nothing_changes_nothing_and_the_truth_leaves_less(
     drive: Any, orca: Vehicle, tmp_path: Path
 ) -> None:
