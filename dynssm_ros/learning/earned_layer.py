@@ -48,12 +48,17 @@ class LayerBase(NamedTuple):
         """What the layer sees, with a network's prediction or without.
 
         Raises:
-            ConfigurationError: the window has too few rows.
+            ConfigurationError: the window has too few rows, or the car has no throttle whose steps could be a feature.
         """
         config, scale, most = self.config, self.normalisation, self.H - 1
         if most < _FEWEST_ROWS - 1:
             raise ConfigurationError(
                 f"online: a window of {self.H} rows; expected at least {_FEWEST_ROWS} to see how it changes"
+            )
+        if config.throttle_steps and (what := self.vehicle.inputs.set_point) != "throttle":
+            raise ConfigurationError(
+                f"online: throttle_steps: true, but vehicle {self.vehicle.name} has inputs.set_point: {what}; "
+                "expected throttle"
             )
         errors = steps_of(config.error_average, self.vehicle.sampling_time)
         layout = FeatureLayout(

@@ -6,16 +6,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.evaluation.open_loop import evaluate
+from dynssm_ros.learning.earned_layer import LayerBase
 from dynssm_ros.learning.export import save_artifact
+from dynssm_ros.learning.models.base import OnlineConfig
+from dynssm_ros.learning.models.physics import PhysicsConfig
 from dynssm_ros.learning.models.registry import load_model_config
 from dynssm_ros.learning.stages import train
+from dynssm_ros.runtime.artifact import Normalisation
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.features import THROTTLES, throttle_steps
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
-from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
+from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle, load_vehicle
 from dynssm_ros.vehicle.kinematics import SCALAR
 
 NOISE = (0.001, 0.001, 0.01)
@@ -73,3 +78,12 @@ def test_steps_are_of_the_applied_throttle_and_close_to_each_other_about_zero() 
     np.testing.assert_allclose(found[1], found[2])
     assert np.abs(found[1] - found[0]).max() > 0.7
     assert np.abs(throttle_steps(1e9 * np.ones((1, 2, 7)))).max() == pytest.approx(1.0)
+
+
+def test_a_car_that_is_commanded_by_a_speed_has_none() -> None:
+    car = load_vehicle("f1tenth")
+    one = (1.0, 1.0, 1.0)
+    scale = Normalisation(input_mean=(0.0,) * 7, input_std=(1.0,) * 7, state_scale=one, increment_scale=one)
+    base = LayerBase(car, PhysicsConfig(), scale, 30, OnlineConfig(throttle_steps=True))
+    with pytest.raises(ConfigurationError, match=r"throttle_steps: true, but vehicle f1tenth has .*set_point: speed"):
+        base.features(False)
