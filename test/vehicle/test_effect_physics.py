@@ -317,6 +317,21 @@ def test_a_locked_differential_pushes_no_harder_than_the_tyres_grip() -> None:
     assert plain.M_z - q.M_z == pytest.approx(friction * 0.55 * WHEELBASE, rel=1e-6)
 
 
+@pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
+def test_a_drive_map_is_a_table_over_throttle_and_speed(share: float) -> None:
+    bent = {"half": 0.8, "middle": 1.2, "half_at_top": 0.7, "brake": 1.3, "top": 40.0}
+    for v_x, over_speed in ((4.0, 1.072), (20.0, 1.2), (40.0, 1.0), (50.0, 1.0)):
+        state, applied = State(v_x, 0.0, 0.0), Applied(share, 0.0)
+        fast = min(v_x / 40.0, 1.0)
+        expected = over_speed * (1 - 0.4 * (1 - share)) * (1 - 0.6 * (1 - share) * fast)
+        plain = act(state, applied)
+        assert act(state, applied, drive_map=bent).F_d == pytest.approx(expected * plain.F_d, rel=1e-6)
+    state, brakes = State(30.0, 0.4, 0.2), Applied(-share, 0.05)
+    plain, mapped = act(state, brakes), act(state, brakes, drive_map=bent)
+    assert mapped.F_d == pytest.approx(1.3 * plain.F_d)
+    assert mapped.F_rx - plain.F_rx == pytest.approx(0.3 * plain.F_d)
+
+
 def test_a_gear_changes_the_drive_and_not_the_brakes() -> None:
     shift = {"factor": 0.7, "gap": 0.4, "up": 40.0, "down": 35.0, "time_constant": 0.2}
     assert act(gear_shift=shift).F_rx == PLAIN.F_rx  # below

@@ -198,6 +198,7 @@ def test_the_library_is_complete() -> None:
         "mass", "yaw_inertia", "front_grip", "rear_grip", "downforce", "load_transfer", "tire_relaxation",
         "combined_slip", "road_bank", "road_grade", "crosswind", "grip_drift", "grip_patch", "locked_differential",
         "load_sensitivity", "grip", "steering_curve", "throttle_dead_band", "power_limit", "front_drive", "gear_shift",
+        "drive_map",
         "odometry_lever_arm", "odometry_misalignment", "odometry_delay", "odometry_correction", "yaw_rate_bias",
         "yaw_rate_lag",
     }  # fmt: skip

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from dynssm_ros.vehicle.effects.step_errors import StepErrors, changed_above, recurring_step, shift_speeds
+from dynssm_ros.vehicle.effects.step_errors import StepErrors, bent_drive, changed_above, recurring_step, shift_speeds
 
 
 def steps(errors: np.ndarray, T_s: float, begin: float = 6400.0) -> StepErrors:
@@ -87,3 +89,23 @@ def test_changes_that_a_gear_sensor_or_the_engine_speed_tells_are_the_ones_tried
         assert found == pytest.approx((16.0, 13.0), abs=0.15)  # by the rows of the changes, and not by a grid
     assert shift_speeds(accelerating(0.0, 1)._replace(context={"gear": gear})) is None
     assert shift_speeds(drive._replace(context={"gear": np.ones(len(v_x))})) is None, "one gear, as its sensor says"
+
+
+@pytest.mark.parametrize("bent", [lambda r, v: r * (1 - r), lambda r, v: r * v * (24.0 - v) / 144.0])
+def test_a_drive_that_bends_over_throttle_or_speed_tells_the_top_speed(bent: Callable[..., np.ndarray]) -> None:
+    drive = accelerating(0.0, 1)
+    errors = drive.errors.copy()
+    errors[:, 0] += 0.02 * bent(np.maximum(drive.rows[3], 0.0), drive.rows[0])
+    assert bent_drive(drive._replace(errors=errors)) == pytest.approx(24.0, abs=0.5)
+    assert [bent_drive(accelerating(0.0, seed)) for seed in range(6)] == [None] * 6
+
+
+def test_brakes_of_another_scale_than_the_drive_tell_the_top_speed() -> None:
+    drive = accelerating(0.0, 1)
+    rows = drive.rows.copy()
+    rows[3] -= 0.5
+    errors = drive.errors.copy()
+    errors[:, 0] += 0.03 * np.minimum(rows[3], 0.0)
+    assert bent_drive(drive._replace(rows=rows, errors=errors)) is not None
+    rows[3] = -0.1
+    assert bent_drive(drive._replace(rows=rows, errors=errors)) is None, "nothing is driven"

@@ -70,12 +70,12 @@ def register_effect(effect: type[Effect]) -> type[Effect]:
 for _effect in (
     actuators.SteeringOffset, actuators.SteeringGain, actuators.SteeringCurve, actuators.SteeringLag,
     actuators.ThrottleDeadBand, actuators.ThrottleLag, longitudinal.Drag, longitudinal.RollingResistance,
-    longitudinal.DriveGain, longitudinal.PowerLimit, inertia.Mass, inertia.YawInertia, tyres.Grip, tyres.FrontGrip,
-    tyres.RearGrip, loads.Downforce, loads.LoadSensitivity, loads.LoadTransfer, tyres.TireRelaxation,
-    tyres.CombinedSlip, environment.RoadBank, environment.RoadGrade, environment.Crosswind, tyres.GripDrift,
-    tyres.GripPatch, drivetrain.FrontDrive, drivetrain.GearShift, drivetrain.LockedDifferential, measurement.OdometryLeverArm,
-    measurement.OdometryMisalignment, measurement.OdometryDelay, measurement.OdometryCorrection, measurement.YawRateBias,
-    measurement.YawRateLag,
+    longitudinal.DriveGain, longitudinal.PowerLimit, longitudinal.DriveMap, inertia.Mass, inertia.YawInertia,
+    tyres.Grip, tyres.FrontGrip, tyres.RearGrip, loads.Downforce, loads.LoadSensitivity, loads.LoadTransfer,
+    tyres.TireRelaxation, tyres.CombinedSlip, environment.RoadBank, environment.RoadGrade, environment.Crosswind,
+    tyres.GripDrift, tyres.GripPatch, drivetrain.FrontDrive, drivetrain.GearShift, drivetrain.LockedDifferential,
+    measurement.OdometryLeverArm, measurement.OdometryMisalignment, measurement.OdometryDelay,
+    measurement.OdometryCorrection, measurement.YawRateBias, measurement.YawRateLag,
 ):  # fmt: skip
     register_effect(_effect)
 

@@ -44,7 +44,7 @@ class LockedDifferential(Effect):
 
     NAME = "locked_differential"
     SUMMARY = "The rear wheels turn at one speed, so in a bend they push the car straight."
-    ADVICE = "Check or soften the differential's lock; expect understeer at low speed and account for it."
+    ADVICE = "Check or soften the differential's lock; expect understeer at low speed."
     MANOEUVRE = "tight corners at low speed without throttle"
     PARAMETERS = {
         "stiffness": Parameter("1", 0.0, 60.0, 0.0),
@@ -74,7 +74,7 @@ class GearShift(Effect):
 
     NAME = "gear_shift"
     SUMMARY = "The drive force changes with the gear, and has a gap while the gear changes."
-    ADVICE = "Take the gear ratios and the speeds of the changes into the model; smooth or shorten the gap of a change."
+    ADVICE = "Take gear ratios and speeds of changes into the model; shorten their gap."
     MANOEUVRE = "accelerating and coasting through the speeds at which the gear changes, again and again"
     PARAMETERS = {
         "factor": Parameter("1", 0.4, 1.8, 1.0),

@@ -36,6 +36,8 @@ _TOGETHER_S = 0.2  # over which errors are summed up
 _SHIFT_CHANCE = (
     20.0  # of twice the log-likelihood: the best of 160 pairs of speeds reached 12 in nine drives without gears
 )
+_FASTEST = 0.98  # quantile of the speeds under throttle that counts as the top speed
+_BENT_CHANCE = 25.0  # of twice the log-likelihood of five columns, which chance exceeds in one drive of 7000
 
 
 class StepErrors(NamedTuple):
@@ -171,6 +173,62 @@ def changed_above(speed: Vector, up: float, down: float) -> Vector:
     return np.asarray(told[last])
 
 
+class _DriveErrors(NamedTuple):
+    """Errors in v_x of a drive, in sums over some rows in which most of the noise of the measured states cancels."""
+
+    v_x: Vector  # of each row (m/s), ``(N,)``
+    driven: Vector  # throttle that drives, ``(N,)``
+    braked: Vector  # throttle that brakes, not above 0, ``(N,)``
+    together: int  # rows of a sum
+    error: Vector  # sums, limited, less what the basis explains, ``(M,)``
+    basis: Vector  # orthonormal columns of what is no news, ``(M, k)``
+
+    @classmethod
+    def of(cls, steps: StepErrors, bent: bool) -> _DriveErrors | None:
+        """No news is what the car's coefficients explain, and what else is smooth if ``bent``; ``None`` without errors."""
+        v_x, r = steps.rows[0], steps.rows[3] + steps.rows[5]
+        driven, braked, v = np.maximum(r, 0.0), np.minimum(r, 0.0), v_x / max(float(np.abs(v_x).max()), 1e-9)
+        together = max(1, round(_TOGETHER_S / steps.T_s))
+        smooth = [np.ones_like(v), v**2, r, r * v]
+        smooth += [v, driven, driven * v, driven * v**2, driven**2] if bent else []
+        columns = np.stack(smooth, axis=1)
+        columns += 1e-9 * np.random.default_rng(0).standard_normal(columns.shape)  # of full rank whatever was driven
+        basis, error = np.linalg.qr(_summed(columns, together))[0], _summed(steps.errors[:, :1], together)[:, 0]
+        error = error - basis @ (basis.T @ error)
+        limit = _MOST * 1.4826 * np.median(np.abs(error))
+        error = np.clip(error, -limit, limit)
+        error = error - basis @ (basis.T @ error)
+        return cls(v_x, driven, braked, together, error, basis) if float(error @ error) > 0.0 else None
+
+    def sure(self, columns: Vector) -> float:
+        """Twice the log-likelihood that forces ``(N, j)`` add."""
+        force = _summed(columns, self.together)
+        force = force - self.basis @ (self.basis.T @ force)
+        along = force.T @ self.error
+        left, taken = (
+            float(self.error @ self.error),
+            float(along @ np.linalg.lstsq(force.T @ force, along, rcond=1e-9)[0]),
+        )
+        return len(self.error) * float(np.log(left / max(left - taken, 1e-9 * left)))
+
+
+def _summed(columns: Vector, together: int) -> Vector:
+    """Sums of so many rows each of columns ``(N, k)``."""
+    whole = len(columns) // together * together
+    return np.asarray(columns[:whole].reshape(-1, together, columns.shape[1]).sum(axis=1))
+
+
+def bent_drive(steps: StepErrors) -> float | None:
+    """The largest speed (m/s) under throttle if errors in v_x bend over throttle or speed, or differ under the brakes."""
+    drive = _DriveErrors.of(steps, bent=False)
+    if drive is None or not drive.driven.any():
+        return None
+    top = float(np.quantile(drive.v_x[drive.driven > 0.0], _FASTEST))
+    v, driven, braked = drive.v_x / max(top, 1e-9), drive.driven, drive.braked
+    bent = np.stack([driven**2, driven**2 * v, driven * v**2, braked, braked * v], axis=1)
+    return float(f"{top:.2g}") if drive.sure(bent) > _BENT_CHANCE else None
+
+
 def shift_speeds(steps: StepErrors) -> tuple[float, float] | None:
     """Speeds (m/s) above and below which the drive force changes, upwards and downwards; ``None`` if it does not change.
 
@@ -178,40 +236,18 @@ def shift_speeds(steps: StepErrors) -> tuple[float, float] | None:
     Compared is what a smooth function of speed and throttle leaves of the errors in v_x, with and without a force that is
     another one above the speeds, and a gap in it where they are passed.
     """
-    v_x, r = steps.rows[0], steps.rows[3] + steps.rows[5]
-    driven, braked, v = np.maximum(r, 0.0), np.minimum(r, 0.0), v_x / max(float(np.abs(v_x).max()), 1e-9)
-    together = max(
-        1, round(_TOGETHER_S / steps.T_s)
-    )  # rows, over whose sum most of the noise of the measured states cancels
-
-    def summed(columns: Vector) -> Vector:
-        whole = len(columns) // together * together
-        return np.asarray(columns[:whole].reshape(-1, together, columns.shape[1]).sum(axis=1))
-
-    smooth = np.stack(
-        [np.ones_like(v), v, v**2, driven, driven * v, driven * v**2, driven**2, braked, braked * v], axis=1
-    )
-    smooth += 1e-9 * np.random.default_rng(0).standard_normal(smooth.shape)  # of full rank whatever was driven
-    basis, error = np.linalg.qr(summed(smooth))[0], summed(steps.errors[:, :1])[:, 0]
-    error = error - basis @ (basis.T @ error)
-    limit = _MOST * 1.4826 * np.median(np.abs(error))
-    error = np.clip(error, -limit, limit)
-    error = error - basis @ (basis.T @ error)
-    left, driving = float(error @ error), v_x[driven > 0.0]
-    if len(driving) < 2 * _SPEEDS or not left > 0.0:
+    drive = _DriveErrors.of(steps, bent=True)
+    if drive is None or np.count_nonzero(drive.driven) < 2 * _SPEEDS:
         return None
     best, found = _SHIFT_CHANCE, None
     told = _told_speeds(steps)
-    for up, down in _grid_of_speeds(driving) if told is None else told:
-        gear = changed_above(v_x, up, down)
+    for up, down in _grid_of_speeds(drive.v_x[drive.driven > 0.0]) if told is None else told:
+        gear = changed_above(drive.v_x, up, down)
         passed = np.abs(np.diff(gear, prepend=gear[0]))
         gap = sum(np.concatenate([np.zeros(k), passed[: len(passed) - k]]) for k in range(_GAP_ROWS))
         if not _SHIFTS <= passed.sum() <= len(gear) / (4 * _GAP_ROWS):
             continue
-        force = summed(np.stack([driven * gear, driven * gap], axis=1))
-        force = force - basis @ (basis.T @ force)
-        taken = float(error @ force @ np.linalg.lstsq(force.T @ force, force.T @ error, rcond=1e-9)[0])
-        sure = len(error) * float(np.log(left / max(left - taken, 1e-9 * left)))
+        sure = drive.sure(np.stack([drive.driven * gear, drive.driven * gap], axis=1))
         if sure > best:
             best, found = sure, (up, down)
     return found
