@@ -1,7 +1,7 @@
 """How often the anatomy of errors finds something in healthy drives, and whether it finds what was planted.
 
     python -m benchmarks.residuals healthy --count 100 [--seed 0] [--rls]
-    python -m benchmarks.residuals planted --count 10 [--seed 0]
+    python -m benchmarks.residuals planted --count 10 [--seed 0] [--only "force by gear"]
     python -m benchmarks.residuals time [--seconds 600]
 
 A healthy drive is of a car that is just what its file says, stepped as the model steps, whose sensors have white or coloured
@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,6 +30,8 @@ from dynssm_ros.evaluation.residuals.patterns import Pattern
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.simulation.laps import SimulationError
+from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle.effects.step_errors import changed_above
 
 ROOT = Path(__file__).parents[1]
 _CARS = {  # tracks' scale, noise of v_x, v_y (m/s), omega (rad/s)
@@ -142,6 +144,23 @@ def _heading(given: Drive, size: float, rng: np.random.Generator) -> tuple[Drive
     return _pushed(given, "v_y", -size * given.noise[1] * np.sin(theta)), "wind"
 
 
+def _wheel(given: Drive, size: float, rng: np.random.Generator) -> tuple[Drive, str]:
+    """The speed sensor's ring is out of round: v_x errs with each turn of the wheels."""
+    log = given.recording
+    length = float(rng.uniform(0.5, 1.4)) * load_vehicle(given.car).constants.wheelbase
+    turned = 2 * np.pi * np.cumsum(log["v_x"]) * log.T_s / length
+    return _changed(given, v_x=log["v_x"] + size * given.noise[0] * np.sin(turned)), f"{length:.3g} m"
+
+
+def _gears(given: Drive, size: float, rng: np.random.Generator) -> tuple[Drive, str]:
+    """A drive force that is less in the upper of two gears, of which a sensor tells."""
+    log = given.recording
+    up = float(np.percentile(log["v_x"], rng.uniform(40, 60)))
+    gear = 1.0 + changed_above(log["v_x"], up, 0.93 * up)
+    force = np.where((gear == 2) & (log["r_fb"] + log["r_cmd"] > 0), -size * given.noise[0], 0.0)
+    return _changed(_pushed(given, "v_x", force), gear=gear), f"{up:.3g} m/s"
+
+
 Plant = Callable[[Drive, float, np.random.Generator], tuple[Drive, str]]
 PLANTS: dict[str, tuple[Plant, str, tuple[str, ...]]] = {  # what is planted, in which channel, kinds that name it
     "correction of v_y": (_correction, "v_y", ("period", "echo", "period_of_size", "period_of_spikes")),
@@ -150,6 +169,8 @@ PLANTS: dict[str, tuple[Plant, str, tuple[str, ...]]] = {  # what is planted, in
     "steering in steps": (_steps, "", ("quantised",)),
     "resistance by speed": (_speed, "v_x", ("speed", "speed_and_pedal", "speed_and_bend")),
     "force by heading": (_heading, "v_y", ("heading", "place_on_the_lap")),
+    "wheels out of round": (_wheel, "v_x", ("wheel_synchronous",)),
+    "force by gear": (_gears, "v_x", ("gear",)),
 }
 
 
@@ -176,10 +197,12 @@ def healthy(seed: int, count: int, rls: bool) -> str:
     return head + (table(["seed", "car", "channel", "pattern", "share"], rows) if rows else "")
 
 
-def planted(seed: int, count: int) -> str:
+def planted(seed: int, count: int, only: Sequence[str] = ()) -> str:
     """Counts plants that are found, and for how many of them the largest pattern of the channel is the right one."""
     rows = []
     for name, (plant, channel, kinds) in PLANTS.items():
+        if only and name not in only:
+            continue
         tally: dict[str, list[tuple[bool, bool]]] = {"barely": [], "clearly": []}
         for k in range(seed, seed + count):
             rng = np.random.default_rng([k, len(name)])
@@ -237,13 +260,16 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rls", action="store_true", help="also of rls, which takes longer")
+    parser.add_argument(
+        "--only", action="append", default=[], choices=list(PLANTS), help="of the plants; repeat for more"
+    )
     parser.add_argument("--seconds", type=float, default=600.0, help="length of the drive that is timed (s)")
     given = parser.parse_args()
     warnings.simplefilter("ignore", DataWarning)
     if given.what == "healthy":
         print(healthy(given.seed, given.count, given.rls))
     elif given.what == "planted":
-        print(planted(given.seed, given.count))
+        print(planted(given.seed, given.count, given.only))
     else:
         print(times(given.seconds))
 

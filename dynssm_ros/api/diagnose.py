@@ -14,7 +14,7 @@ from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.integrators import Integrator
 
 if TYPE_CHECKING:
-    from dynssm_ros.identification.result.diagnosis import Diagnosis
+    from dynssm_ros.evaluation.residuals.diagnosed import ExaminedDiagnosis
 
 
 class DiagnoseSettings(CommandsSettings, WorkerSettings):
@@ -49,8 +49,8 @@ def diagnose(
     settings: DiagnoseSettings,
     suspect: Log | Sequence[Log] = (),
     on_progress: OnProgress | None = None,
-) -> Diagnosis:
-    """Finds out what the simulation gets wrong about measured laps, and why.
+) -> ExaminedDiagnosis:
+    """Finds out what the simulation gets wrong about measured laps, and why, and what the answer leaves.
 
     Args:
         recordings: of one car. What only one of several has is named with it.
@@ -67,13 +67,16 @@ def diagnose(
         ['steering_offset']
     """
     require("diagnose", "train")
+    from dynssm_ros.evaluation.residuals.diagnosed import ExaminedDiagnosis
     from dynssm_ros.identification.result.diagnose import diagnose
 
-    s, car = settings, vehicle_of(vehicle)
+    s, car, tell = settings, vehicle_of(vehicle), on_progress or (lambda words: None)
     line = None if s.track is None else track_of(s.track).centre
     data, changed = ([log.with_commands(s.commands) for log in opened(logs, car)] for logs in (recordings, suspect))
     with connected(s.workers) as pool:
-        return diagnose(
+        found = diagnose(
             data, car, horizon=s.horizon, holdout=s.holdout, min_speed=s.min_speed, integrator=s.integrator, line=line,
-            on_progress=on_progress or (lambda words: None), exclude=s.exclude, suspect=changed, pool=pool,
+            on_progress=tell, exclude=s.exclude, suspect=changed, pool=pool,
         )  # fmt: skip
+    tell("looking at what is left")
+    return ExaminedDiagnosis.of(found)

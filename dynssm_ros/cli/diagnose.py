@@ -41,7 +41,6 @@ def diagnose(
 ) -> None:
     """Find out what the simulation gets wrong about measured laps, and why; write the vehicle file that has it."""
     require("diagnose", "train", "report")
-    from dynssm_ros.evaluation.residuals.diagnosed import left_by
     from dynssm_ros.reporting.diagnosis_report import diagnosis_report
     from dynssm_ros.reporting.diagnosis_words import as_text
 
@@ -51,15 +50,12 @@ def diagnose(
         steps = itertools.count(1)
         result = api.diagnose(
             given, vehicle, settings=settings, suspect=suspect or (),
-            on_progress=lambda words: progress(min(next(steps), 39), 40, words),
+            on_progress=lambda words: progress(min(next(steps), 40), 40, words),
         )  # fmt: skip
-        progress(40, 40, "looking at what is left")
-        left = left_by(result)
     path = out / "vehicle.yaml"
     about = f"{result.car.vehicle.name}, extended by a diagnosis of {result.protocol['Recording']}: {result.verdict}."
     save_vehicle(result.vehicle, path, about)
-    diagnosis_report(result, left).save(out / "report.html")
-    patterns = [] if left is None else [pattern.to_json() for pattern in left.patterns]
-    write_results(result.to_json(str(path)) | {"patterns": patterns}, out, json)
-    say(as_text(result, left))
+    diagnosis_report(result, result.anatomy).save(out / "report.html")
+    write_results(result.to_json(str(path)), out, json)
+    say(as_text(result, result.anatomy))
     say(f"{path} written; {out / 'report.html'}: figures and how to read them")

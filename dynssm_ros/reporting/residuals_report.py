@@ -55,6 +55,7 @@ def pattern_table(found: Anatomy) -> Table:
         (Column("channel", brief=True), lambda row: row[1].channel),
         (Column("share", "% of squared error", brief=True), lambda row: 100 * row[1].share),
         (Column("pattern", brief=True), lambda row: row[1].words),
+        (Column("what to do"), lambda row: row[1].advice),
         (Column("chance"), lambda row: f"{row[1].p:.1g}"),
         caption="Share: what a pattern takes away once the larger ones of its channel that can be fitted are taken off.",
     )
@@ -103,7 +104,8 @@ def pattern_sections(label: str, model: ModelAnatomy, most: int) -> Iterator[Sec
     prose = Prose("residuals")
     for pattern in [each for each in model.patterns if each.picture is not None][:most]:
         figure = residuals_figures.pattern_figure(pattern)
-        yield prose.section(pattern.family, figure, model=label, channel=pattern.channel, words=sentence(pattern))
+        words = f"{sentence(pattern)}. {pattern.advice}".removesuffix(".").rstrip(". ")
+        yield prose.section(pattern.family, figure, model=label, channel=pattern.channel, words=words)
 
 
 def _sections(found: Anatomy, prose: Prose) -> Iterator[Section]:

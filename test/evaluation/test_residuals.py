@@ -11,9 +11,10 @@ import dynssm_ros
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import RecordingError
 from dynssm_ros.evaluation.residuals.anatomy import ModelAnatomy, anatomy, model_anatomy
-from dynssm_ros.evaluation.residuals.diagnosed import left_by
+from dynssm_ros.evaluation.residuals.diagnosed import ExaminedDiagnosis, left_by
 from dynssm_ros.evaluation.residuals.evidence import chances, holm
 from dynssm_ros.evaluation.residuals.learner import left_to_learn
+from dynssm_ros.evaluation.residuals.patterns import ADVICE, Pattern
 from dynssm_ros.evaluation.residuals.regimes import situations
 from dynssm_ros.evaluation.residuals.sizes import quantum, speeds_of
 from dynssm_ros.identification.result.diagnosis import Diagnosis
@@ -163,6 +164,11 @@ def test_a_diagnosed_car_leaves_no_pattern_but_one_that_no_effect_has(
     assert {(each.channel, each.family, each.size["period_s"]) for each in left.patterns} == {("v_y", "time", 1.0)}
     told = [line for line in as_text(spoilt, left).splitlines() if left.patterns[0].words in line]
     assert len(told) == 1
+    examined = ExaminedDiagnosis.of(spoilt)
+    assert [each.words for each in examined.patterns] == [each.words for each in left.patterns]
+    assert [each["words"] for each in examined.to_json("car.yaml")["patterns"]] == [
+        each.words for each in left.patterns
+    ]
     page = diagnosis_report(spoilt, left)
     assert page.sections[1].title == "What is left, v_y: in time"
     assert [each.name for each in page.verdicts].count("step") == min(3, len(left.patterns))
@@ -223,3 +229,21 @@ def test_errors_in_a_gear_and_after_its_changes_are_told(healthy: Recording) -> 
         found = model_anatomy(replace(clean, values=values), situations(clean), learn=False).patterns[0]
         assert (found.channel, found.kind) == ("v_x", kind)
         assert words in found.words
+
+
+@pytest.mark.parametrize("length", [0.05, 0.08])
+def test_errors_that_come_with_the_way_are_those_of_the_wheels(healthy: Recording, length: float) -> None:
+    turned = 2 * np.pi * np.cumsum(healthy["v_x"]) * healthy.T_s / length
+    found = taken_apart(with_column(healthy, "v_x", healthy["v_x"] + 0.005 * np.sin(turned))).patterns[0]
+    assert (found.channel, found.kind) == ("v_x", "wheel_synchronous")
+    assert found.size["period_m"] == pytest.approx(length, rel=0.01)
+    assert "circumference" in found.advice
+    assert found.to_json()["advice"] == found.advice
+
+
+def test_a_pattern_that_a_team_can_act_on_says_how() -> None:
+    kinds = {"period", "period_of_size", "period_of_spikes", "echo", "wheel_synchronous", "spikes", "quantised", "repeated",
+             "clipped", "steering_delay", "throttle_delay", "integrator", "gear", "speed", "heading"}  # fmt: skip
+    assert kinds <= set(ADVICE)
+    assert Pattern("v_x", "where", "speed", "", 0.1, 0.0).advice
+    assert not Pattern("v_y", "where", "speed", "", 0.1, 0.0).advice, "no drive force pushes sideways"

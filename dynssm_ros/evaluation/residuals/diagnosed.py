@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.evaluation.residuals.anatomy import ModelAnatomy, model_anatomy
-from dynssm_ros.evaluation.residuals.errors import BLOCK_S, DRIVEN_SIGNALS, SMALL_CHANGE, OneStepErrors, PhysicsResponse
+from dynssm_ros.evaluation.residuals.errors import BLOCK_S, OneStepErrors, PhysicsResponse, central_differences
 from dynssm_ros.evaluation.residuals.evidence import FEWEST_BLOCKS
+from dynssm_ros.evaluation.residuals.patterns import Pattern
 from dynssm_ros.evaluation.residuals.regimes import situations
 from dynssm_ros.extras import missing_libraries
 from dynssm_ros.identification.problem.car import CarEstimate
@@ -18,6 +20,33 @@ from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.identification.result.diagnosis import EXTENDED, Diagnosis
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
+
+
+@dataclass(frozen=True)
+class ExaminedDiagnosis(Diagnosis):
+    """A diagnosis with what its extended car leaves.
+
+    Attributes:
+        anatomy: of the errors of single steps; ``None`` if the fitted rows are less than 24 s.
+    """
+
+    anatomy: ModelAnatomy | None = None
+
+    @classmethod
+    def of(cls, diagnosis: Diagnosis) -> ExaminedDiagnosis:
+        """The diagnosis with :func:`left_by` it."""
+        return cls(
+            **{each.name: getattr(diagnosis, each.name) for each in fields(Diagnosis)}, anatomy=left_by(diagnosis)
+        )
+
+    @property
+    def patterns(self) -> tuple[Pattern, ...]:
+        """That the errors have, the largest share first."""
+        return () if self.anatomy is None else self.anatomy.patterns
+
+    def to_json(self, vehicle_path: str) -> dict[str, Any]:
+        """As :meth:`Diagnosis.to_json`, with the patterns."""
+        return super().to_json(vehicle_path) | {"patterns": [pattern.to_json() for pattern in self.patterns]}
 
 
 def left_by(diagnosis: Diagnosis) -> ModelAnatomy | None:
@@ -49,15 +78,13 @@ def left_by(diagnosis: Diagnosis) -> ModelAnatomy | None:
 def _derivatives(single: SimulationWindows, car: CarEstimate) -> Vector:
     """How the next state depends on each of :data:`DRIVEN_SIGNALS`, an input's change being an old one, ``(N, 3, 5)``."""
     rows = single.data.rows
-    out = np.empty((len(single), 3, len(DRIVEN_SIGNALS)))
-    for k in range(len(DRIVEN_SIGNALS)):
-        step = SMALL_CHANGE * (float(np.std(rows[k])) or 1.0)
-        ends = []
-        for change in (-step, step):
-            moved = rows.copy()
-            moved[k] += change
-            ends.append(replace(single, data=replace(single.data, rows=moved)).errors(car)[:, 0])
-        out[:, :, k] = (ends[1] - ends[0]) / (2 * step)
+
+    def moved(k: int, change: float) -> Vector:
+        there = rows.copy()
+        there[k] += change
+        return replace(single, data=replace(single.data, rows=there)).errors(car)[:, 0]
+
+    out = central_differences(moved, rows.std(axis=1))
     for k in range(len(STATE_SIGNALS)):
         out[:, k, k] += 1.0  # the measured state moved too
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -166,14 +167,25 @@ def one_step_errors(
 
 def derivatives(physics: WindowModel, recording: Recording, rows: Indices) -> Vector:
     """How the predicted state depends on each of :data:`DRIVEN_SIGNALS` of the last row, by differences, ``(N, 3, 5)``."""
-    out = np.empty((len(rows), 3, len(DRIVEN_SIGNALS)))
-    for k in range(len(DRIVEN_SIGNALS)):
-        step = SMALL_CHANGE * (float(np.std(recording.rows(rows)[:, k])) or 1.0)
+
+    def moved(k: int, change: float) -> Vector:
+        parts = []
         for start in range(0, len(rows), _AT_ONCE):
-            part = slice(start, start + _AT_ONCE)
-            windows = np.repeat(recording.windows(rows[part], physics.H)[None], 2, axis=0).copy()
-            windows[0, :, -1, k] -= step
-            windows[1, :, -1, k] += step
-            low, high = (physics.predict(each).state for each in windows)
-            out[part, :, k] = (high - low) / (2 * step)
-    return out
+            windows = recording.windows(rows[start : start + _AT_ONCE], physics.H)
+            windows[:, -1, k] += change
+            parts.append(physics.predict(windows).state)
+        return np.concatenate(parts)
+
+    return central_differences(moved, recording.rows(rows).std(axis=0))
+
+
+def central_differences(moved: Callable[[int, float], Vector], spread: Vector) -> Vector:
+    """How predictions depend on each of :data:`DRIVEN_SIGNALS`, ``(N, 3, 5)``.
+
+    Args:
+        moved: the predictions ``(N, 3)`` if a signal, by its number, is larger by a change.
+        spread: standard deviations of the signals, ``(5,)`` or more; 0 where one does not move.
+    """
+    steps = [SMALL_CHANGE * (float(each) or 1.0) for each in spread[: len(DRIVEN_SIGNALS)]]
+    slopes = [(moved(k, step) - moved(k, -step)) / (2 * step) for k, step in enumerate(steps)]
+    return np.stack(slopes, axis=-1)

@@ -10,6 +10,27 @@ from dynssm_ros.arrays import Vector
 Family = Literal["time", "size", "where", "delay", "learner"]
 
 
+_RECURRING = "Find what runs at that period: a sensor or filter that corrects the estimate, a task that comes late."
+_GEARS = "Take gears and the gap of a change into the model (effect gear_shift)."
+_LATE = "Check the actuator and the stamps; take the delay into the signal map or an effect (*_lag, odometry_delay)."
+_WORLD = "It stays with the road or the hall: bank, grade, wind, cameras, or the floor."
+_SPIKES = "Look at the raw samples there: drop-outs of a sensor, or gears at the speeds named."
+_FORCE = "Look for a resistance or a drive force that the car has there (effects drag, drive_map, gear_shift)."
+ADVICE = {
+    "period": _RECURRING, "period_of_size": _RECURRING, "period_of_spikes": _RECURRING,
+    "echo": "Compare the time with the length of a filter or with the period of a sensor.",
+    "wheel_synchronous": "Compare the way with the wheels' circumference: balance them, check rims and wheel-speed sensors.",
+    "spikes": _SPIKES, "repeated": "Record the sensor at its own rate.",
+    "quantised": "Take the signal with more digits.", "clipped": "Widen the range of the sensor or of its message.",
+    "steering_delay": _LATE, "throttle_delay": _LATE, "integrator": "Calibrate with that integrator.",
+    "gear": _GEARS, "time_since_a_change_up_of_the_gear": _GEARS, "time_since_a_change_down_of_the_gear": _GEARS,
+    "heading": _WORLD, "place_on_the_lap": _WORLD,
+    "speed": _FORCE, "throttle": _FORCE, "speed_and_pedal": _FORCE,
+}  # fmt: skip
+"""What a team would do about a kind of pattern; others have none."""
+_ALONG = (_GEARS, _FORCE)  # of v_x alone
+
+
 @dataclass(frozen=True)
 class Picture:
     """What a small figure of a pattern shows.
@@ -61,9 +82,15 @@ class Pattern:
     fitted: Vector | None = field(default=None, repr=False)
     picture: Picture | None = field(default=None, repr=False)
 
+    @property
+    def advice(self) -> str:
+        """What a team would do about it; empty if nothing is known."""
+        found = ADVICE.get(self.kind, "")
+        return "" if found in _ALONG and self.channel != "v_x" else found
+
     def to_json(self) -> dict[str, Any]:
         """For ``results.json``."""
         return {
-            "channel": self.channel, "family": self.family, "kind": self.kind, "words": self.words,
+            "channel": self.channel, "family": self.family, "kind": self.kind, "words": self.words, "advice": self.advice,
             "share": round(self.share, 6), "p": self.p, **self.size,
         }  # fmt: skip

@@ -57,7 +57,7 @@ def periods(errors: OneStepErrors, values: Vector, channel: str) -> Iterator[Pat
         if line is not None:
             length = line[0] * 0.05 * wheelbase
             told = f"comes back every {length:.3g} m of the way, as wheels turn"
-            yield _sine(errors, values, way / length, channel, line[1], "wheel", told, {"period_m": length})
+            yield _sine(errors, values, way / length, channel, line[1], "wheel_synchronous", told, {"period_m": length})
 
 
 def _clock(errors: OneStepErrors, values: Vector, y: Vector, channel: str) -> Iterator[Pattern]:
