@@ -74,6 +74,7 @@ class SingleTrackPlant:
         first: acts before the vehicle's own effects.
         last: acts after them.
         line: centre line of the track; ``None`` if there is none.
+        step: longest Runge-Kutta step (s).
 
     Raises:
         ConfigurationError: an effect needs a signal that there is not.
@@ -89,6 +90,7 @@ class SingleTrackPlant:
         first: Sequence[StageEffect] = (),
         last: Sequence[StageEffect] = (),
         line: ClosedLine | None = None,
+        step: float = RK4_STEP,
     ) -> None:
         self.state = state
         self._vehicle = vehicle
@@ -98,7 +100,7 @@ class SingleTrackPlant:
         physics = [effect for effect in effects if not effect.SENSOR]
         acting: tuple[StageEffect, ...] = (_Odometer(), *first, *physics, *last, *sensors)
         delay = sum(effect.reading_delay for effect in effects)
-        substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / RK4_STEP - 1e-9)
+        substeps = 1 if integrator == "euler" else math.ceil(vehicle.sampling_time / step - 1e-9)
         self._pieces = substeps if delay > 0 else 1  # a late reading falls between two steps
         T_s, substeps = vehicle.sampling_time / self._pieces, substeps // self._pieces
         self._car = CarModel(
@@ -192,7 +194,10 @@ class PlantType:
         self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], line: ClosedLine | None
     ) -> Plant:
         """A car of that kind; see :class:`SingleTrackPlant` for the arguments and errors."""
-        return SingleTrackPlant(vehicle, self.integrator, pose, state, first=self.first(vehicle), last=last, line=line)
+        return SingleTrackPlant(
+            vehicle, self.integrator, pose, state,
+            first=self.first(vehicle), last=last, line=line, step=self.step(vehicle),
+        )  # fmt: skip
 
 
 class Rk4Plant(PlantType):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros import compiled
+from dynssm_ros.identification.problem import compiled_simulation
 from dynssm_ros.identification.problem.car import CarEstimate, prior_std
 from dynssm_ros.identification.problem.fit import IdentificationProblem, position, with_values
 from dynssm_ros.identification.problem.noise import Noise, NoiseResponse, fit_noise, weights
@@ -22,6 +23,7 @@ from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 from dynssm_ros.vehicle.effects.base import CONTEXT_UNITS
 from dynssm_ros.vehicle.integrators import Integrator
+from dynssm_ros.vehicle.tape import trace
 
 AV21 = load_vehicle("av21")
 LAG = {"steering_lag": {"time_constant": 0.1}}
@@ -270,3 +272,25 @@ def test_compiled_simulations_of_all_effects_are_numpys(
             by_numpy = some.errors_of(cars), some.errors_of([cars[0].with_effect(name, acting(name), only_in=(1,))])
         for found, expected in zip(errors, by_numpy, strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11 * some.spread.max(), err_msg=name)
+
+
+@pytest.mark.skipif(compiled.LIBRARY is None, reason="the compiled loops were not built")
+def test_equations_are_traced_once_for_cars_that_differ_in_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled_simulation, "_KNOWN", {})
+    some, car = windows(AV21, duration=4.0), CarEstimate.of(AV21)
+    one, other = (car.with_effect("steering_lag", {"time_constant": value}) for value in (0.05, 0.1))
+    absent = car.with_effect("steering_lag", {"time_constant": 0.0})
+    other = replace(other, moved=np.full(18, 0.1))
+    expected = some.errors(one), some.errors(other)
+    with monkeypatch.context() as without:
+        without.setattr(compiled, "LIBRARY", None)
+        by_numpy = some.errors(other)
+    monkeypatch.setattr(compiled_simulation, "trace", None)  # none is traced any more
+    np.testing.assert_array_equal(some.errors_of([one, other]), expected)
+    np.testing.assert_allclose(expected[1], by_numpy, rtol=1e-11, atol=1e-11)
+    asked: list[int] = []
+    monkeypatch.setattr(
+        compiled_simulation, "trace", lambda function, inputs: asked.append(inputs) or trace(function, inputs)
+    )
+    some.errors(absent)
+    assert asked, "without the lag it has other equations"

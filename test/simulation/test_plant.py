@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from dynssm_ros.simulation import plant as plant_module
 from dynssm_ros.simulation.plant import Pose, SingleTrackPlant
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, State, load_vehicle
@@ -12,8 +11,8 @@ from dynssm_ros.vehicle.single_track import StageEffect
 START = Pose(1.0, -2.0, 0.4), State(2.0, 0.05, 1.0)
 
 
-def run(vehicle, kind, steps=10, pose=START[0], state=START[1]):
-    car = SingleTrackPlant(vehicle, kind, pose, state)
+def run(vehicle, kind, steps=10, pose=START[0], state=START[1], **options):
+    car = SingleTrackPlant(vehicle, kind, pose, state, **options)
     for k in range(steps):
         car.advance(Applied(0.5, 0.1 + 0.01 * k))
     return np.array([*car.pose, *car.state])
@@ -46,13 +45,12 @@ def coarse(name, sampling_time):
     return load_vehicle(name).model_copy(update={"sampling_time": sampling_time})
 
 
-def test_rk4_is_of_fourth_order_in_state_and_pose(monkeypatch):
+def test_rk4_is_of_fourth_order_in_state_and_pose():
     av21 = coarse("av21", 0.04)
     fast = Pose(0.0, 0.0, 0.1), State(30.0, 0.2, 0.1)
 
     def final(step):
-        monkeypatch.setattr(plant_module, "RK4_STEP", step)
-        return run(av21, "rk4", 5, *fast)
+        return run(av21, "rk4", 5, *fast, step=step)
 
     exact = final(0.000625)
     coarser, finer = final(0.02) - exact, final(0.01) - exact
