@@ -10,9 +10,10 @@ import math
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.signals.findings import Finding, number
 from dynssm_ros.signals.motion import Checked, is_turning
+from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.spans import SIGMAS, Drive, Fitted, blocks, fitted, varies
 from dynssm_ros.signals.timing import acceleration
 
@@ -29,6 +30,8 @@ SCALES = (0.5, 2.0)
 """Steering scales that are left alone: hidden gains of a steering, a wrong wheelbase and tyres at their limit are within."""
 _OFFSET_RAD = 0.04
 """Straight-ahead steering that is left alone: servos are trimmed worse than that by nobody; banked roads need 0.02."""
+_LEAST_REST, _RESTS_S, _STANDS = 0.03, 1.0, 0.05
+"""Rest value of a throttle that is told; for how long the car rests with it (s); share of its speed at which it stands."""
 
 
 def steering_fit(drive: Drive) -> Fitted | None:
@@ -49,12 +52,22 @@ def understeer(steering: Vector, curvature: Vector, speed: Vector, *, block: Ind
 
     ``block`` numbers neighbours. ``None`` where the rows do not determine it.
     """
-    lateral = np.abs(curvature) * speed**2
-    gentle = lateral <= _GENTLE * np.percentile(lateral, 99)
-    if gentle.sum() < max(_ENOUGH_SPANS, 0.2 * len(lateral)):
-        gentle = np.ones(len(lateral), dtype=bool)
-    at, v = curvature[gentle], speed[gentle]
-    return fitted(np.stack([np.ones(len(at)), at, v**2 * at], axis=1), steering[gentle], block[gentle])
+    some = gentle(curvature * speed**2)
+    at, v = curvature[some], speed[some]
+    return fitted(np.stack([np.ones(len(at)), at, v**2 * at], axis=1), steering[some], block[some])
+
+
+def gentle(lateral: Vector) -> Mask:
+    """Spans whose lateral acceleration ``(n,)`` is small, as far as tyres are linear; all where few are, ``(n,)``."""
+    size = np.abs(lateral)
+    found = np.asarray(size <= _GENTLE * np.percentile(size, 99))
+    return found if found.sum() >= max(_ENOUGH_SPANS, 0.2 * len(size)) else np.ones(len(size), dtype=bool)
+
+
+def turns_both_ways(drive: Drive) -> bool:
+    """Whether left and right bends are driven, each for a tenth of the time."""
+    right, left = np.percentile(drive.omega[drive.speed >= drive.least_speed], [10.0, 90.0])
+    return bool(right < 0.0 < left)
 
 
 def steering_sign(drive: Drive) -> tuple[int, Fitted | None]:
@@ -146,8 +159,7 @@ def _scale_remedy(scale: float) -> str:
 def _offset(drive: Drive, fit: Fitted) -> list[Finding]:
     """Steering at which the car goes straight, if that is not about 0; told where it turned to both sides."""
     offset, (low, high) = float(fit.values[0]), fit.interval(0)
-    right, left = np.percentile(drive.omega[drive.speed >= drive.least_speed], [10.0, 90.0])
-    if (low < _OFFSET_RAD and high > -_OFFSET_RAD) or not right < 0.0 < left:
+    if (low < _OFFSET_RAD and high > -_OFFSET_RAD) or not turns_both_ways(drive):
         return []
     return [
         Finding(
@@ -174,7 +186,7 @@ def check_throttle(drive: Drive) -> list[Finding]:
                 expected="a fraction whose full throttle is 1", remedy="throttle_feedback: scale: so that full is 1",
             )
         ]  # fmt: skip
-    return _throttle_sign(drive, a, known) or _never_used(r[known], a[known])
+    return _throttle_sign(drive, a, known) or _never_used(r[known], a[known]) or _resting(drive, a)
 
 
 def _throttle_range(drive: Drive, known: Vector, largest: float) -> Finding:
@@ -207,6 +219,28 @@ def _never_used(r: Vector, a: Vector) -> list[Finding]:
             what="throttle_never_used", told=f"r_fb is at most {number(rest)} although the car accelerates", size=-rest,
             low=-rest, high=-rest, expected="above 0 where the car accelerates",
             remedy=remedy if rest < 0 else "throttle_feedback: map what drives the car",
+        )
+    ]  # fmt: skip
+
+
+def _resting(drive: Drive, a: Vector) -> list[Finding]:
+    """A throttle whose rest value is not 0: at it the car stands or rolls out."""
+    r = drive.throttle
+    limit = rest_value(r[r >= 0.0])
+    at = (r > 0.0) & (r <= limit)
+    rolling = a[at & np.isfinite(a)]
+    standing = at & (drive.speed < _STANDS * float(np.percentile(drive.speed, 95)))
+    if limit < _LEAST_REST or (len(rolling) + standing.sum()) * drive.T_s < _RESTS_S:
+        return []
+    if len(rolling) and float(np.percentile(rolling, 75)) > 0.0:
+        return []
+    rest, (low, high) = float(np.median(r[at])), np.percentile(r[at], [2.5, 97.5]).tolist()
+    does = "stands" if standing.sum() > len(rolling) else "rolls out"
+    return [
+        Finding(
+            what="throttle_rest", told=f"the car {does} at r_fb = {number(rest)}, its least value", size=rest, low=low,
+            high=high, expected="0 where nothing drives",
+            remedy=f"throttle_feedback: offset: {number(-rest)}, or a curve with a dead band",
         )
     ]  # fmt: skip
 

@@ -13,10 +13,11 @@ import numpy as np
 
 from dynssm_ros.signals.actuation import check_steering, check_throttle, steering_sign
 from dynssm_ros.signals.findings import Finding
+from dynssm_ros.signals.lever import check_lever
 from dynssm_ros.signals.liveness import check_liveness
 from dynssm_ros.signals.motion import check_direction, check_path_speed, check_side_slip, check_turning
-from dynssm_ros.signals.recording import Recording
-from dynssm_ros.signals.sensor_consistency import SENSED
+from dynssm_ros.signals.recording import Recording, RecordingInfo
+from dynssm_ros.signals.sensor_consistency import BESIDE, SENSED
 from dynssm_ros.signals.spans import Drive, Signal
 from dynssm_ros.signals.timing import check_times
 
@@ -26,6 +27,8 @@ CLOCKS: dict[str, tuple[Signal, ...]] = {
 """Findings of clocks, and the signals that are stamped by them."""
 OF_LOG = (*CLOCKS, *SENSED)
 """Findings that a log tells, and a recording of it no more."""
+_OF_VELOCITIES = ("pose_speed", "omega_", "v_x_", "v_y_", "twist_", "odometry_")
+"""How findings of measured velocities begin."""
 _LEAST_S = 10.0
 """Seconds of a recording, below which nothing is said."""
 _MOST_ROWS, _STRETCHES = 30_000, 8
@@ -50,8 +53,21 @@ def contradictions(recording: Recording, wheelbase: float | None = None) -> tupl
         was checked before, what its log alone can tell is among them: clocks that are apart, and sensors.
     """
     of_log = tuple(each for each in recording.info.findings if each.what in OF_LOG)
-    if recording.duration < _LEAST_S or {each.what for each in of_log} & set(SENSED):
+    if recording.duration < _LEAST_S or {each.what for each in of_log} & set(_velocities_from(recording.info)):
         return of_log  # of sensors that are wrong velocities are, and what follows from them
+    beside = tuple(each for each in of_log if each.what in BESIDE)
+    found = _of_recording(recording, tuple(each for each in of_log if each not in beside), wheelbase)
+    wrong = any(each.what.startswith(_OF_VELOCITIES) for each in found)
+    return found if wrong else (*beside, *found)  # what is beside wrong velocities need not be wrong
+
+
+def _velocities_from(info: RecordingInfo) -> tuple[str, ...]:
+    """Findings of sensors that the velocities of a recording come from."""
+    return SENSED if info.standard_deviations else tuple(each for each in SENSED if each not in BESIDE)
+
+
+def _of_recording(recording: Recording, of_log: tuple[Finding, ...], wheelbase: float | None) -> tuple[Finding, ...]:
+    """What contradicts within a recording, after what its log told."""
     drive = _on_one_clock(Drive.of(_parts(recording)), of_log)
     found = [*of_log, *check_liveness(drive)]
     dead = {each.what for each in found}
@@ -73,6 +89,8 @@ def contradictions(recording: Recording, wheelbase: float | None = None) -> tupl
         if alternative is not None and not _is_scaled(check_steering(alternative(drive), wheelbase)[0]):
             more = [each for each in more if each.what != "steering_scale"]
         found += more
+        if wheelbase is not None and not recording.info.standard_deviations and len(found) == len(of_log):
+            found += check_lever(drive, wheelbase)
     return (*found, *(check_throttle(drive) if recording.info.set_point == "throttle" else ()))
 
 

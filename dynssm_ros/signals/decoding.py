@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,17 +36,16 @@ def to_si(source: Source) -> Callable[[Any], Any]:
 
 
 class TopicDecoder:
-    """Reads all signals of ``signal_map`` that one topic carries out of its messages."""
+    """Reads all signals that one topic carries, by their ``sources``, out of its messages."""
 
-    def __init__(self, topic: str, msgtype: str, signal_map: SignalMap) -> None:
+    def __init__(self, topic: str, msgtype: str, sources: Mapping[str, Source]) -> None:
         self.topic = topic
         self.msgtype = msgtype
-        sources = (source.topic for source in signal_map.active_signals().values() if source.recorded == topic)
-        self.subscribed = next(sources, topic)
+        self.subscribed = next((source.topic for source in sources.values() if source.recorded == topic), topic)
         """The name as the map has it: relative ones are in the namespace of a node."""
         self._readings = [
             _Reading(name, source, compile_field(source.field), to_si(source))
-            for name, source in signal_map.active_signals().items()
+            for name, source in sources.items()
             if source.recorded == topic
         ]
 
@@ -85,7 +84,7 @@ class _PoseDecoder(TopicDecoder):
     """Adds the velocities that follow from the poses so far."""
 
     def __init__(self, topic: str, msgtype: str, signal_map: SignalMap, window: float) -> None:
-        super().__init__(topic, msgtype, signal_map)
+        super().__init__(topic, msgtype, signal_map.active_signals())
         self._velocities = LiveVelocities(window)
 
     def decode(self, message: Any, stamp: int | None = None) -> dict[str, float]:
@@ -98,7 +97,7 @@ class _SensorDecoder(TopicDecoder):
     """Gives what the motion is estimated from to the estimation; its result comes with the topic of ``omega``."""
 
     def __init__(self, topic: str, msgtype: str, signal_map: SignalMap, estimation: LiveEstimation) -> None:
-        super().__init__(topic, msgtype, signal_map)
+        super().__init__(topic, msgtype, signal_map.active_signals())
         self._estimation = estimation
         self._tells = topic == signal_map.odometry_topic
 
@@ -124,8 +123,10 @@ def live_decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
     return found
 
 
-def decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
+def decoders(signal_map: SignalMap, compared: Mapping[str, Source] | None = None) -> dict[str, TopicDecoder]:
     """A decoder for each topic of the map, actuators first so that a node serves them before the odometry.
+
+    Signals that are ``compared`` alone are read beside those that are used.
 
     Raises:
         ConfigurationError: the map is of a table.
@@ -134,9 +135,10 @@ def decoders(signal_map: SignalMap) -> dict[str, TopicDecoder]:
         raise ConfigurationError(
             f"signal map {signal_map.name}: names columns of a table; expected the topics of a car or a bag"
         )
-    types = {source.recorded: source.type for source in signal_map.active_signals().values()}
+    sources = signal_map.active_signals() | dict(compared or {})
+    types = {source.recorded: source.type for source in sources.values()}
     order = sorted(types, key=lambda topic: topic == signal_map.odometry_topic)
-    return {topic: TopicDecoder(topic, types[topic], signal_map) for topic in order}
+    return {topic: TopicDecoder(topic, types[topic], sources) for topic in order}
 
 
 def header_stamp_ns(message: Any) -> int | None:

@@ -23,6 +23,7 @@ from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
 from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.sensor_consistency import sensor_findings
 from dynssm_ros.signals.signal_map import (
+    COMPARED,
     CONTEXT_SIGNALS,
     POSE_SIGNALS,
     SENSORS,
@@ -90,10 +91,11 @@ def _extract(
         streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
         notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")
     deviations: dict[str, float] = {}
+    findings += sensor_findings(streams, signal_map)
     if signal_map.estimation is not None:
-        findings += sensor_findings(streams, signal_map)
         streams, deviations, told = estimated_velocities(streams, signal_map, str(path))
         notes += told
+    streams = {name: one for name, one in streams.items() if name not in COMPARED}
     held = held_signals(signal_map, streams, 1e9 / rate)
     info = RecordingInfo(
         sampling_time=1 / rate,
@@ -254,13 +256,14 @@ def read_streams(
     stamped: dict[str, str] = {}
     findings: tuple[Finding, ...] = ()
     told: list[str] = []
+    compared = _compared(log, signal_map)
     if isinstance(log, LogTable):
-        found = _table_streams(log, signal_map, drop_bad)
+        found = _table_streams(log, signal_map, compared, drop_bad)
     else:
-        found, stamped, told, findings = _bag_streams(log, signal_map, progress)
+        found, stamped, told, findings = _bag_streams(log, signal_map, compared, progress)
     notes = [*log.notes, *told]
     streams: dict[str, Stream] = {}
-    for name, source in signal_map.active_signals().items():
+    for name, source in (signal_map.active_signals() | compared).items():
         place = f"column '{source.column}'" if source.column else f"topic {source.recorded}"
         hopeless = name in POSE_SIGNALS and len(found[name].values) > 0 and not np.isfinite(found[name].values).any()
         where = f"{log.path}: {place}: {name}" + (f" = {source.field}" if source.field.startswith("yaw(") else "")
@@ -280,9 +283,21 @@ def read_streams(
     return LogStreams(streams, stamped, notes, findings)
 
 
-def _bag_streams(bag: Bag, signal_map: SignalMap, progress: Progress | None) -> LogStreams:
+def _compared(log: Bag | LogTable, signal_map: SignalMap) -> dict[str, Source]:
+    """Signals that are only compared with measured velocities, as far as the log has them."""
+    active = signal_map.active_signals()
+    return {
+        name: source
+        for name, source in signal_map.signals.items()
+        if name in COMPARED and name not in active and not _lacking(log, source)
+    }
+
+
+def _bag_streams(
+    bag: Bag, signal_map: SignalMap, compared: Mapping[str, Source], progress: Progress | None
+) -> LogStreams:
     """The samples of every mapped signal, as they came, with notes on stamps and frames."""
-    by_topic = decoders(signal_map)
+    by_topic = decoders(signal_map, compared)
     for topic, decoder in by_topic.items():
         bag.require(topic, decoder.msgtype)
     samples, stamped = _Samples(), dict.fromkeys(by_topic, "")
@@ -316,7 +331,7 @@ def _bag_streams(bag: Bag, signal_map: SignalMap, progress: Progress | None) -> 
         lateness[topic] = Lateness(logged[order] / 1e9, (logged[order] - stamps[order]) / 1e9)
         notes += frames_note(topic, frames[topic])
     notes += clock_notes(lateness, signal_map.odometry_topic)
-    active = signal_map.active_signals().items()
+    active = (signal_map.active_signals() | compared).items()
     streams = {
         name: samples.stream(name, round(source.delay * 1e9), source.recorded in by_log_time) for name, source in active
     }
@@ -324,14 +339,16 @@ def _bag_streams(bag: Bag, signal_map: SignalMap, progress: Progress | None) -> 
     return LogStreams(streams, {name: stamped[source.recorded] for name, source in active}, notes, findings)
 
 
-def _table_streams(table: LogTable, signal_map: SignalMap, drop_bad: bool) -> dict[str, Stream]:
+def _table_streams(
+    table: LogTable, signal_map: SignalMap, compared: Mapping[str, Source], drop_bad: bool
+) -> dict[str, Stream]:
     """The cells of every mapped column that have a value, as they came."""
     if not signal_map.is_of_table:
         raise BagError(
             f"{table.path}: a table, and signal map {signal_map.name} names topics; expected one with columns (`dynssm "
             f"inspect` suggests it)"
         )
-    active = signal_map.active_signals()
+    active = signal_map.active_signals() | dict(compared)
     columns = table.read([column for source in active.values() for column in source.columns])
     clock = clock_of(table, signal_map.time)
     streams = {}

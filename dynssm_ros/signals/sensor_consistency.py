@@ -1,52 +1,68 @@
-"""Whether speed, gyro, accelerometers and fixes can be right together, before velocities are estimated from them.
+"""Whether the sensors of a log can be right together, also those that are only compared with measured velocities.
 
-What drives a path of fixes is compared with speed and gyro. Then the accelerometers are: ``a_y`` with ``v_x omega``, ``a_x``
-with the change of ``v_x``. Which of the units that people mix up explain both ratios is named, if few do.
+What drives a path of fixes is compared with speed and gyro. Then the accelerometers are: ``a_y`` with ``v_x omega`` and the
+change of ``v_y``, ``a_x`` with the change of ``v_x``. Which of the units that people mix up explain both ratios is named, if
+few do. Speeds of wheels are compared with ``v_x``.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.estimation import positions_of
 from dynssm_ros.signals.findings import Finding, number
-from dynssm_ros.signals.motion import check_course, check_path_speed
+from dynssm_ros.signals.motion import check_course, check_path_speed, in_unit
 from dynssm_ros.signals.resampling import Stream
-from dynssm_ros.signals.signal_map import UNITS, SignalMap
-from dynssm_ros.signals.spans import Drive, Fitted, fitted, varies
+from dynssm_ros.signals.signal_map import COMPARED, UNITS, SignalMap
+from dynssm_ros.signals.spans import Drive, Fitted, Spans, fitted, varies
 
-SENSED = ("speed_scale", "gyro_scale", "gyro_sign", "a_x_scale", "a_y_scale", "a_x_sign", "a_y_sign")
+BESIDE = ("a_x_scale", "a_y_scale", "a_x_sign", "a_y_sign", "wheel_speed_scale", "wheel_speed_sign")
+"""Findings of what no velocity comes from where all of them are measured."""
+SENSED = ("speed_scale", "gyro_scale", "gyro_sign", *BESIDE)
 """Findings of this module."""
-_LEAST_S, _SPAN_S = 10.0, 0.4
+_LEAST_S, _SPAN_S, _FEWEST_SPANS = 10.0, 0.4, 40
 _MOST_ROWS = 30_000
 _TOLERANCE = 0.3
 """Of the ratio of accelerations: bodies roll and pitch, which adds up to 0.1 g per g, and sensors are off the middle."""
 _RELATED = 0.5
 """Explained share, from which on an acceleration counts as that of the car."""
+_SLIP = 0.1
+"""Share by which driven wheels turn faster than the car, at most, over most of a drive."""
 _FACTORS = {"v_x": ("m/s", "km/h", "mph"), "omega": ("rad/s", "deg/s"), "a": ("m/s^2", "g")}
 """Units that are mixed up."""
-_CAUSES = {"a_x": "d v_x/dt", "a_y": "v_x omega"}
+_CAUSES = {"a_x": "d v_x/dt", "a_y": "v_x omega", "wheel_speed": "v_x"}
 
 
 def sensor_findings(streams: Mapping[str, Stream], signal_map: SignalMap) -> tuple[Finding, ...]:
-    """Contradictions between the signals that velocities are estimated from; ``streams`` by signal, in SI units."""
+    """Contradictions between velocities and the sensors beside them; ``streams`` by signal, in SI units.
+
+    Poses beside measured velocities are compared with the recording, not here.
+    """
+    sensed = [name for name in COMPARED if name in streams]
     if not {"v_x", "omega"} <= set(streams) or len(streams["omega"].stamps) < 2:
         return ()
-    drive, accelerations = _drive(streams, signal_map)
+    estimates = "v_y" not in streams
+    if not (estimates or sensed):
+        return ()
+    drive, compared = _drive(streams, signal_map, sensed)
     if len(drive) * drive.T_s < _LEAST_S or not drive.speed.max() > 0:
         return ()
     found: list[Finding] = []
-    if drive.position is not None and np.ptp(np.abs(drive.position)) > 0:
+    if estimates and drive.position is not None and np.ptp(np.abs(drive.position)) > 0:
         more, drive = check_path_speed(drive)
         found += [_renamed(each, "speed_scale", "v_x") for each in more]
         more, drive = check_course(drive)
         found += [_renamed(each, each.what.replace("omega", "gyro"), "omega") for each in more]
-    return (*found, *_accelerations(drive, accelerations, by_path=drive.position is not None))
+    spans = drive.spans(_SPAN_S)
+    if len(spans) < _FEWEST_SPANS:
+        return tuple(found)
+    found += _accelerations(spans, compared, by_path=drive.position is not None)
+    return (*found, *_wheels(spans, compared.get("wheel_speed")))
 
 
 def _renamed(finding: Finding, what: str, signal: str) -> Finding:
@@ -56,8 +72,10 @@ def _renamed(finding: Finding, what: str, signal: str) -> Finding:
     return finding.model_copy(update={"what": what, "remedy": remedy, "told": told})
 
 
-def _drive(streams: Mapping[str, Stream], signal_map: SignalMap) -> tuple[Drive, dict[str, Vector]]:
-    """Speed, gyro and the positions of fixes at the stamps of the gyro, and the accelerations there."""
+def _drive(
+    streams: Mapping[str, Stream], signal_map: SignalMap, sensed: Sequence[str]
+) -> tuple[Drive, dict[str, Vector]]:
+    """Velocities, gyro and positions at the stamps of the gyro, and what else is ``sensed`` there."""
     stamps = streams["omega"].stamps
     step = max(1, -(-len(stamps) // _MOST_ROWS))
     first, last = (edge(one.stamps[0 if edge is max else -1] for one in streams.values()) for edge in (max, min))
@@ -75,25 +93,23 @@ def _drive(streams: Mapping[str, Stream], signal_map: SignalMap) -> tuple[Drive,
     apart = np.diff(at, prepend=at[:1])
     segment = np.cumsum(apart > signal_map.max_gap_ns + step * np.median(apart)).astype(np.int32)
     zeros = np.zeros(len(at))
+    across = sampled(streams["v_y"]) if "v_y" in streams else zeros
     drive = Drive(
-        float(np.median(np.diff(at))) / 1e9 if len(at) > 1 else 1.0, segment, sampled(streams["v_x"]).astype(np.complex128),
+        float(np.median(np.diff(at))) / 1e9 if len(at) > 1 else 1.0, segment, sampled(streams["v_x"]) + 1j * across,
         sampled(streams["omega"]), zeros, zeros, position,
     )  # fmt: skip
-    return drive, {name: sampled(streams[name]) for name in ("a_x", "a_y") if name in streams}
+    return drive, {name: sampled(streams[name]) for name in sensed}
 
 
-def _accelerations(drive: Drive, measured: Mapping[str, Vector], *, by_path: bool) -> list[Finding]:
+def _accelerations(spans: Spans, measured: Mapping[str, Vector], *, by_path: bool) -> list[Finding]:
     """Ratios of accelerations that are not 1, with the units that explain them."""
     ratios: dict[str, Fitted] = {}
-    spans = drive.spans(_SPAN_S)
-    if len(spans) < 40:
-        return []
-    v_x = drive.velocity.real
-    caused = {"a_x": spans.change(v_x) / spans.seconds, "a_y": spans.mean(v_x * drive.omega)}
-    for name, values in measured.items():
-        if varies(values) and varies(caused[name]):
-            seen = spans.mean(values)
-            fit = fitted(np.stack([caused[name], np.ones(len(spans))], axis=1), seen, spans.block)
+    velocity, omega = spans.drive.velocity, spans.drive.omega
+    across = spans.mean(velocity.real * omega) + spans.change(velocity.imag) / spans.seconds
+    for name, caused in (("a_x", spans.change(velocity.real) / spans.seconds), ("a_y", across)):
+        if name in measured and varies(measured[name]) and varies(caused):
+            seen = spans.mean(measured[name])
+            fit = fitted(np.stack([caused, np.ones(len(spans))], axis=1), seen, spans.block)
             if fit is not None and fit.share > _RELATED:
                 ratios[name] = fit
     sizes = {name: float(fit.values[0]) for name, fit in ratios.items()}
@@ -103,6 +119,25 @@ def _accelerations(drive: Drive, measured: Mapping[str, Vector], *, by_path: boo
     wrong = _units(sizes, by_path=by_path)
     name = next(name for name, size in sizes.items() if not _is_near(abs(size), 1.0))
     return [*found, *(_scale(name, ratios[name], quantity, unit) for quantity, unit in wrong.items())]
+
+
+def _wheels(spans: Spans, measured: Vector | None) -> list[Finding]:
+    """Speed of the wheels over ``v_x``: sign and scale."""
+    if measured is None or not varies(measured):
+        return []
+    fit = fitted(spans.mean(spans.drive.velocity.real)[:, None], spans.mean(measured), spans.block)
+    if fit is None or fit.share < _RELATED:
+        return []
+    found = [_sign("wheel_speed", fit)] if fit.values[0] < 0 else []
+    (low, high), ratio = sorted(map(abs, fit.interval())), abs(float(fit.values[0]))
+    if low < 1.0 + _SLIP and high > 1.0 - _SLIP:
+        return found
+    scale = Finding(
+        what="wheel_speed_scale", told=f"wheel_speed over v_x is {number(ratio)}", size=ratio, low=low, high=high,
+        expected=f"1 (within {_SLIP:g})",
+        remedy=f"wheel_speed: {in_unit(1.0 / ratio, 'km/h', 'mph', 'kt', 'ft/s')}, or v_x: scale: {number(ratio)}",
+    )  # fmt: skip
+    return [*found, scale]
 
 
 def _is_near(ratio: float, expected: float) -> bool:
@@ -125,7 +160,7 @@ def _units(sizes: Mapping[str, float], *, by_path: bool) -> dict[str, str]:
 
 def _sign(name: str, fit: Fitted) -> Finding:
     low, high = fit.interval()
-    ratio, other = float(fit.values[0]), ", or omega's" if name == "a_y" else ""
+    ratio, other = float(fit.values[0]), {"a_y": ", or omega's", "wheel_speed": ", or v_x's"}.get(name, "")
     return Finding(
         what=f"{name}_sign", told=f"{name} over {_CAUSES[name]} is {number(ratio)}", size=ratio, low=low, high=high,
         expected="1: x forward, y left", remedy=f"{name}: scale: -1{other}",

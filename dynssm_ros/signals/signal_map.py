@@ -39,6 +39,8 @@ CONTEXT_SIGNALS = ("gear", "engine_speed")
 """What a recording keeps beside, for diagnosis and the anatomy of errors; no model and no node needs it."""
 STEPPED_SIGNALS = (*SPEED_SIGNALS, "gear")
 """Those that stay until the next sample, however fast they come."""
+COMPARED = ("a_x", "a_y", "wheel_speed")
+"""Compared with measured velocities where a log has them; no columns of a recording."""
 SIGNALS = (
     *REQUIRED_SIGNALS,
     *POSE_SIGNALS,
@@ -48,6 +50,7 @@ SIGNALS = (
     *SPEED_SIGNALS,
     *SENSORS,
     *CONTEXT_SIGNALS,
+    "wheel_speed",
 )
 
 Hold = Literal["zero", "first"]
@@ -323,7 +326,7 @@ class SignalMap(StrictModel):
     def active_signals(self) -> dict[str, Source]:
         """The signals that are read: commands only where ``commands: topics``, sensors where velocities are estimated."""
         skipped: tuple[str, ...] = () if self.commands == "topics" else (*self.command_signals, "brake_command")
-        skipped += () if self.estimation is not None else SENSORS
+        skipped += ("wheel_speed",) if self.estimation is not None else (*SENSORS, "wheel_speed")
         return {name: source for name, source in self.signals.items() if name not in skipped}
 
 

@@ -39,7 +39,7 @@ def test_all_signals_of_a_message_come_out_in_si_units() -> None:
 
 def test_scale_and_offset_are_applied_in_this_order() -> None:
     signal_map = with_field("twist.twist.linear.x", scale=-2.0, offset=1.0)
-    decoder = TopicDecoder("/vehicle/odometry", ODOMETRY, signal_map)
+    decoder = TopicDecoder("/vehicle/odometry", ODOMETRY, signal_map.signals)
     assert decoder.decode(odometry(0, (0, 0, 0), (3.0, 0.0, 0.0)))["v_x"] == -5.0
 
 
@@ -50,7 +50,7 @@ def test_a_curve_comes_before_scale_and_offset_and_holds_its_ends(measured: floa
     """A dead band up to 0.2; what is not finite stays so."""
     curve = [[-1.0, -1.6], [0.0, 0.0], [0.2, 0.0], [1.0, 1.0]]
     signal_map = with_field("twist.twist.linear.x", curve=curve, scale=0.5)
-    decoder = TopicDecoder("/vehicle/odometry", ODOMETRY, signal_map)
+    decoder = TopicDecoder("/vehicle/odometry", ODOMETRY, signal_map.signals)
     assert decoder.decode(odometry(0, (0, 0, 0), (measured, 0.0, 0.0)))["v_x"] == pytest.approx(throttle)
 
 
@@ -81,7 +81,7 @@ def test_not_a_number_is_passed_on_for_others_to_judge() -> None:
     ],
 )
 def test_a_field_that_does_not_fit_names_topic_type_field_and_what_is_there(field: str, expected: list[str]) -> None:
-    decoder = TopicDecoder("/vehicle/odometry", ODOMETRY, with_field(field))
+    decoder = TopicDecoder("/vehicle/odometry", ODOMETRY, with_field(field).signals)
     with pytest.raises(BagError) as caught:
         decoder.decode(odometry(0, (0, 0, 0), (0, 0, 0)))
     for part in ("topic /vehicle/odometry", "signal v_x", *expected):
@@ -93,7 +93,7 @@ def test_fields_of_live_messages_are_named_without_their_underscores() -> None:
         __slots__ = ("_check_fields", "_linear")
 
     with pytest.raises(BagError, match="there: linear"):
-        TopicDecoder("/vehicle/odometry", ODOMETRY, with_field("angular")).decode(Live())
+        TopicDecoder("/vehicle/odometry", ODOMETRY, with_field("angular").signals).decode(Live())
 
 
 @pytest.mark.parametrize("stamp", [0, 1, 1_700_000_000_123_456_789, 2**31 * 10**9 - 1])

@@ -1,15 +1,20 @@
-"""Speed, gyro, accelerometers and fixes that are right have no finding; another unit or sign of one is named."""
+"""Speed, gyro, accelerometers, wheels and fixes that are right have no finding; another unit or sign of one is named."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.consistency import checked
+from dynssm_ros.signals.extraction import extract
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.resampling import Stream
 from dynssm_ros.signals.sensor_consistency import sensor_findings
-from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
 from test.signals.test_consistency import driven
 
 DEFAULT = load_signal_map("default")
@@ -60,6 +65,60 @@ def test_another_unit_or_sign_is_named(
 def test_a_gyro_that_turns_against_the_fixes_is_named() -> None:
     found = {each.what: each.size for each in sensor_findings(sensors(True, omega=-1.0), DEFAULT)}
     assert found == {"gyro_sign": pytest.approx(-1.0, abs=0.05)}
+
+
+def beside(drive: Recording, **factors: float) -> dict[str, Stream]:
+    """Velocities and poses that are measured, with accelerometers and wheels that slip beside them."""
+    rng, T_s = np.random.default_rng(1), drive.T_s
+    values: dict[str, Vector] = {name: drive[name] for name in ("v_x", "v_y", "omega", "x", "y")}
+    values["a_x"] = np.gradient(drive["v_x"], T_s) + 0.2
+    values["a_y"] = drive["v_x"] * drive["omega"] + 0.3 * rng.standard_normal(len(drive))
+    values["wheel_speed"] = drive["v_x"] * (1.0 + 0.04 * np.maximum(drive["r_fb"], 0.0))
+    return {name: Stream(drive.time, factors.get(name, 1.0) * one) for name, one in values.items()}
+
+
+@pytest.mark.parametrize(
+    ("what", "size", "remedy", "factors"),
+    [
+        ("a_x_scale", 9.80665, "a_x, a_y: unit: g", {"a_x": 1 / 9.80665, "a_y": 1 / 9.80665}),
+        ("a_y_sign", -1.0, "a_y: scale: -1", {"a_y": -1.0}),
+        ("a_x_sign", -1.0, "a_x: scale: -1", {"a_x": -1.0}),
+        ("a_y_scale", 2.0, "a_y: scale: 2", {"a_y": 0.5}),
+        ("wheel_speed_scale", 3.6, "wheel_speed: unit: km/h", {"wheel_speed": 3.6}),
+        ("wheel_speed_scale", 0.8, "wheel_speed: scale: 1.2", {"wheel_speed": 0.8}),
+        ("wheel_speed_sign", -1.0, "wheel_speed: scale: -1", {"wheel_speed": -1.0}),
+    ],
+)
+def test_sensors_beside_measured_velocities_are_compared_with_them(
+    what: str, size: float, remedy: str, factors: dict[str, float]
+) -> None:
+    drive = driven()
+    assert sensor_findings(beside(drive), DEFAULT) == ()
+    (found,) = sensor_findings(beside(drive, **factors), DEFAULT)
+    assert found.what == what
+    assert found.remedy.startswith(remedy)
+    assert found.size == pytest.approx(size, rel=0.1)
+    marked = replace(drive, info=drive.info.model_copy(update={"findings": (found,)}))
+    assert checked(marked).info.findings == (found,)
+    wrong = replace(marked, columns=drive.columns | {"omega": -drive["omega"]})
+    assert [each.what for each in checked(wrong).info.findings] == ["omega_sign"]
+
+
+def test_a_log_is_compared_with_the_wheels_that_its_map_names_as_far_as_it_has_them(tmp_path: Path) -> None:
+    drive = driven()
+    columns = {name: drive[name] for name in ("v_x", "v_y", "omega", "r_fb", "delta_fb")}
+    columns |= {"t": (drive.time - drive.time[0]) / 1e9, "wheels": 3.6 * drive["v_x"]}
+    np.savez(tmp_path / "log.npz", **columns)
+    signals = {name: {"column": name} for name in ("v_x", "v_y", "omega")}
+    signals |= {"throttle_feedback": {"column": "r_fb"}, "steering_feedback": {"column": "delta_fb"}}
+    signals |= {"wheel_speed": {"column": "wheels"}, "a_y": {"column": "nowhere"}}
+    signal_map = SignalMap.model_validate({"name": "table", "time": {"column": "t", "unit": "s"}, "signals": signals})
+    found = extract([tmp_path / "log.npz"], signal_map, 1 / drive.T_s)
+    assert [(each.what, each.remedy[:23]) for each in found.info.findings] == [
+        ("wheel_speed_scale", "wheel_speed: unit: km/h")
+    ]
+    assert set(found.columns) == {"v_x", "v_y", "omega", "r_fb", "delta_fb", "r_cmd", "delta_cmd"}
+    assert "wheel_speed" not in signal_map.active_signals()
 
 
 def test_of_sensors_that_are_wrong_nothing_else_is_said() -> None:
