@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Mask, Vector
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.signals.findings import Finding, number
 from dynssm_ros.signals.motion import Checked, is_turning
 from dynssm_ros.signals.rest_value import rest_value
@@ -50,18 +50,21 @@ def steering_fit(drive: Drive) -> Fitted | None:
 def understeer(steering: Vector, curvature: Vector, speed: Vector, *, block: Indices) -> Fitted | None:
     """``delta = offset + L k + K v^2 k`` from steering (as recorded), curvature (1/m) and speed (m/s), each ``(n,)``.
 
-    ``block`` numbers neighbours. ``None`` where the rows do not determine it.
+    ``block`` numbers neighbours. Tyres at their limit add a term of the third order in ``v^2 k``: of gentle driving without
+    it and of all driving with it that counts which determines ``L`` better, ``K`` at the root mean square of ``v^2 k``.
+    ``None`` where the rows determine neither.
     """
-    some = gentle(curvature * speed**2)
-    at, v = curvature[some], speed[some]
-    return fitted(np.stack([np.ones(len(at)), at, v**2 * at], axis=1), steering[some], block[some])
-
-
-def gentle(lateral: Vector) -> Mask:
-    """Spans whose lateral acceleration ``(n,)`` is small, as far as tyres are linear; all where few are, ``(n,)``."""
-    size = np.abs(lateral)
-    found = np.asarray(size <= _GENTLE * np.percentile(size, 99))
-    return found if found.sum() >= max(_ENOUGH_SPANS, 0.2 * len(size)) else np.ones(len(size), dtype=bool)
+    lateral = curvature * speed**2
+    gentle = np.abs(lateral) <= _GENTLE * np.percentile(np.abs(lateral), 99)
+    if gentle.sum() < max(_ENOUGH_SPANS, 0.2 * len(lateral)):
+        gentle = np.ones(len(lateral), dtype=bool)
+    linear = np.stack([np.ones(len(lateral)), curvature, lateral], axis=1)
+    fit = fitted(linear[gentle], steering[gentle], block[gentle])
+    bent = lateral**3 / max(float(np.mean(lateral**2)), 1e-300)
+    full = fitted(np.concatenate([linear, bent[:, None]], axis=1), steering, block)
+    if full is None or (fit is not None and fit.std[1] <= full.std[1]):
+        return fit
+    return Fitted(np.append(full.values[:2], full.values[2] + full.values[3]), full.std[:3], full.share)
 
 
 def turns_both_ways(drive: Drive) -> bool:

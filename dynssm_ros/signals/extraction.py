@@ -293,9 +293,7 @@ def _compared(log: Bag | LogTable, signal_map: SignalMap) -> dict[str, Source]:
     }
 
 
-def _bag_streams(
-    bag: Bag, signal_map: SignalMap, compared: Mapping[str, Source], progress: Progress | None
-) -> LogStreams:
+def _bag_streams(bag: Bag, signal_map: SignalMap, compared: dict[str, Source], progress: Progress | None) -> LogStreams:
     """The samples of every mapped signal, as they came, with notes on stamps and frames."""
     by_topic = decoders(signal_map, compared)
     for topic, decoder in by_topic.items():
@@ -340,7 +338,7 @@ def _bag_streams(
 
 
 def _table_streams(
-    table: LogTable, signal_map: SignalMap, compared: Mapping[str, Source], drop_bad: bool
+    table: LogTable, signal_map: SignalMap, compared: dict[str, Source], drop_bad: bool
 ) -> dict[str, Stream]:
     """The cells of every mapped column that have a value, as they came."""
     if not signal_map.is_of_table:
@@ -348,7 +346,7 @@ def _table_streams(
             f"{table.path}: a table, and signal map {signal_map.name} names topics; expected one with columns (`dynssm "
             f"inspect` suggests it)"
         )
-    active = signal_map.active_signals() | dict(compared)
+    active = signal_map.active_signals() | compared
     columns = table.read([column for source in active.values() for column in source.columns])
     clock = clock_of(table, signal_map.time)
     streams = {}
