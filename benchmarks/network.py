@@ -6,8 +6,9 @@
 Each fold leaves out a lap of Putnam Park or a development log of the 1:10 car, or is a simulated cell of the generalisation
 matrix. The car is calibrated and the layer fitted on the rest. There layers that did not know a stretch drive along it, and
 learners are fitted to what these leave of increments. On the left-out drive a learner's prediction is added to the physics,
-and the layer learns what is then left. ``--steps`` scores the layer with the throttle's steps alone, on all simulated cells
-with the usual noise and on further logs of the 1:10 car: those for development, or with ``--test`` those for publishing.
+and the layer learns what is then left. ``--steps`` scores the layer with the throttle's steps, everywhere and where they earn
+their place, on the measured folds, all simulated cells with the usual noise, and further logs of the 1:10 car: those for
+development, or with ``--test`` those for publishing.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -31,9 +33,10 @@ from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.files import write_json
 from dynssm_ros.identification.result.calibration import calibrate
 from dynssm_ros.learning.dataset import normalisation
-from dynssm_ros.learning.earned_layer import LayerBase
+from dynssm_ros.learning.earned_layer import LayerBase, earned_layer
 from dynssm_ros.learning.models.base import OnlineConfig
 from dynssm_ros.learning.models.physics import PhysicsConfig
+from dynssm_ros.learning.models.registry import build_model, load_model_config
 from dynssm_ros.learning.online import LayerDrive, fit_layer
 from dynssm_ros.runtime.along import Along
 from dynssm_ros.runtime.features import INPUT_CHANGE, LayerFeatures, throttle_steps
@@ -107,13 +110,14 @@ def _cell(cell: Cell) -> Fold:
 
 
 def further_folds(data: Path, test: bool) -> dict[str, Callable[[], Fold]]:
-    """Simulated cells with the usual noise, and logs of the 1:10 car's season that no fold of :func:`folds` has."""
+    """Measured folds, all simulated cells with the usual noise, and the other logs of the 1:10 car's season."""
     cells = [cell for cell in simulated_cells() if cell.is_test == test and "-usual-" in cell.name]
     season = sorted(path.name for path in (data / "dart_season").iterdir() if path.is_dir())
     known = {Path(bag).name for bag in _DART.values()}
     logs = [name for name in season if name not in known and (_digest(name) % 3 == 0) == test]
+    laps = {name: fold for name, fold in folds(data).items() if name.startswith(("putnam", "dart"))} if not test else {}
     simulated = {f"cell_{cell.name}": partial(_cell, cell) for cell in cells}
-    return {**simulated, **{f"season_{name}": partial(_season_log, name, data) for name in logs}}
+    return {**laps, **simulated, **{f"season_{name}": partial(_season_log, name, data) for name in logs}}
 
 
 def _digest(name: str) -> int:
@@ -333,13 +337,20 @@ def scored(study: Study) -> dict[str, list[float]]:
 
 
 def steps_scored(study: Study) -> dict[str, list[float]]:
-    """:func:`ratios` of the layer with the throttle's steps; each layer judges its own paths."""
-    found = []
-    for config in (study.base.config, OnlineConfig(throttle_steps=True)):
-        features = study.base._replace(config=config).features(False)
-        layer = study.fitted(features)[0]
-        found.append(score(study, features, layer, judged(study, features, layer)))
-    return {"layer with the throttle's steps": ratios(found[1], found[0])}
+    """:func:`ratios` of the layer with the throttle's steps, and of the one that ``train`` gives."""
+    layers: dict[bool | None, tuple[LayerFeatures, OnlineLayer]] = {}
+    for steps in (False, True, None):
+        base = study.base._replace(config=OnlineConfig(throttle_steps=steps))
+        model = build_model(load_model_config("rls"), base.vehicle, base.normalisation)
+        layers[steps] = earned_layer(base, model, study.fold.training, [])[:2]
+
+    def of(features: LayerFeatures, layer: OnlineLayer) -> Scored:
+        return score(study, features, layer, judged(study, features, layer))
+
+    alone = of(*layers[False])
+    forced = ratios(of(*layers[True]), alone)
+    earned = layers[None][0].layout.throttle
+    return {"everywhere": forced, "where they earn it": forced if earned else [1.0] * len(forced)}
 
 
 def _learner(look: Look, predict: Predict, size: Vector) -> Look:
@@ -372,15 +383,16 @@ def main() -> None:
 
 def extremes(known: dict[str, dict[str, list[float]]]) -> str:
     """Of the throttle's steps: geometric means of the ratios in each group of folds, the least and the largest."""
+    names = list(next(iter(known.values())))
     rows = []
-    for group in dict.fromkeys(name.partition("_")[0] for name in known):
-        of = {fold: next(iter(content.values())) for fold, content in known.items() if fold.startswith(group)}
+    for group, name in product(dict.fromkeys(fold.partition("_")[0] for fold in known), names):
+        of = {fold: content[name] for fold, content in known.items() if fold.startswith(group)}
         for k, what in enumerate(("one step", *(f"path {horizon:g} s" for horizon in HORIZONS_S))):
             ranked = sorted(of, key=lambda fold: of[fold][k])
             ends = [f"{of[fold][k]:.3f} ({fold.partition('_')[2]})" for fold in (ranked[0], ranked[-1])]
             mean = float(np.exp(np.mean(np.log([ratio[k] for ratio in of.values()]))))
-            rows.append([group, str(len(of)), what, f"{mean:.3f}", *ends])
-    return table(["of", "folds", "error", "mean", "least", "largest"], rows)
+            rows.append([group, str(len(of)), name, what, f"{mean:.3f}", *ends])
+    return table(["of", "folds", "steps", "error", "mean", "least", "largest"], rows)
 
 
 def tables(known: dict[str, dict[str, list[float]]]) -> str:

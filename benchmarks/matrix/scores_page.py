@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from benchmarks.matrix.scored_cells import Cell
 from benchmarks.matrix.scores import BASELINES
 from benchmarks.page import render
-from dynssm_ros.learning.earned_layer import NETWORK_GAIN_WANTED
+from dynssm_ros.learning.earned_layer import GAIN_WANTED
 
 QUANTITIES = ("v_x", "v_y", "omega", "ADE", "FDE")
 EXACT = 1e-5
@@ -72,7 +72,7 @@ def _summary(known: Known) -> dict[str, Any]:
         out["models"][model] = entry
     gains = [content["network_gain"].get("dynssm") for content in known.values()]
     known_gains = [gain for gain in gains if gain is not None]
-    out["network_used"] = [sum(gain >= NETWORK_GAIN_WANTED for gain in known_gains), len(known_gains)]
+    out["network_used"] = [sum(gain >= GAIN_WANTED for gain in known_gains), len(known_gains)]
     return out
 
 
@@ -104,7 +104,7 @@ def heat_map(known: Known, model: str = "dynssm") -> Figure:
 def generalisation_page(known: Known, arguments: Sequence[str], figure: str, missing: int) -> str:
     """The results as Markdown; ``missing``: how many cells were not scored."""
     return render(
-        "generalisation", arguments=arguments, baselines=BASELINES, figure=figure, gain_wanted=NETWORK_GAIN_WANTED,
+        "generalisation", arguments=arguments, baselines=BASELINES, figure=figure, gain_wanted=GAIN_WANTED,
         missing=missing, over_noise=_over_noise, parts=summary(known), quantities=list(QUANTITIES), rows=_rows,
     )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The online layer of a trained model: its prior, and whether the network earns a place in it.
+"""The online layer of a trained model: its prior, and whether steps of the throttle and the network earn a place in it.
 
 The evidence are parts of the training laps, each predicted by a network that was trained without it and a layer whose prior
 was fitted without it: one step ahead, and the path over the horizon of a controller.
@@ -25,11 +25,11 @@ from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
-NETWORK_GAIN_WANTED = 0.03
-"""A network that takes away less of the online layer's error is left out of it. On the development cells of
-the generalisation matrix, gains of 1 to 2 % on left-out laps did not carry over to another track."""
+GAIN_WANTED = 0.03
+"""Network or steps of the throttle that take away less of the online layer's error are left out of it. On the development
+cells of the generalisation matrix, gains of 1 to 2 % on left-out laps did not carry over to another track."""
 _FEWEST_ROWS = 3  # of a window
-_STRETCHES = 4  # of the laps, for a layer without a network
+_STRETCHES = 4  # of the laps, for a layer without a network, and for steps of the throttle
 _STARTS = 400  # rollouts in a part, at most
 
 Part = tuple[TrainableModel, Recording]  # a part of the laps, and a model that does not know it
@@ -67,7 +67,7 @@ class LayerBase(NamedTuple):
             min(config.input_lags, most),
             min(errors, most),
             network,
-            config.throttle_steps,
+            bool(config.throttle_steps),
         )
         integrator, substeps = self.physics.stepping(self.vehicle)
         return LayerFeatures(
@@ -91,30 +91,56 @@ class LayerBase(NamedTuple):
         return fit_layer(drives, features, self.normalisation, self.config)
 
 
-def earned_layer(
-    base: LayerBase, model: TrainableModel, laps: Recording, left_out: list[Part]
-) -> tuple[LayerFeatures, OnlineLayer, float | None]:
-    """The online layer, with the network if that earns its place.
+class Earned(NamedTuple):
+    """An online layer with what earned its place."""
 
-    The gain of a network is the share of the error that it takes away: the mean of one step and path, or of the path
-    alone if that is less, since a controller needs the path.
+    features: LayerFeatures
+    layer: OnlineLayer
+    throttle_gain: float | None = None
+    """Share of the error that the throttle's steps take away; ``None`` if they were not tried."""
+    network_gain: float | None = None
+    """The same of the network; ``None`` if there is none, or no evidence."""
 
-    Without ``left_out`` parts of the laps there is no evidence, and the layer rests on the physics alone.
 
-    Returns:
-        Features, layer, and the gain; ``None`` if there is no network or no evidence.
+def earned_layer(base: LayerBase, model: TrainableModel, laps: Recording, left_out: list[Part]) -> Earned:
+    """The online layer, with the throttle's steps and with the network where they earn their place.
+
+    A gain is the share of the error that is taken away: the mean of one step and path, or of the path alone if that is
+    less, since a controller needs the path. Without ``left_out`` parts of the laps there is no evidence of the network, and
+    the layer rests on the physics alone.
     """
+    base, layer, throttle_gain = _with_steps(base, model, laps)
     alone = base.features(False)
-    layer = base.fitted(alone, [(model, laps.select(stretch)) for stretch in laps.stretches(_STRETCHES)]).layer
     if not model.LEARNS or not left_out:
-        return alone, layer, None
+        return Earned(alone, layer, throttle_gain)
     together = base.features(True)
     with_network = base.fitted(together, left_out)
-    ratio_step, ratio_path = _errors(base, together, with_network, left_out) / _errors(
-        base, alone, base.fitted(alone, left_out), left_out
+    gain = _gain(
+        _errors(base, together, with_network, left_out), _errors(base, alone, base.fitted(alone, left_out), left_out)
     )
-    gain = float(1.0 - max(np.sqrt(ratio_step * ratio_path), ratio_path))
-    return (together, with_network.layer, gain) if gain >= NETWORK_GAIN_WANTED else (alone, layer, gain)
+    if gain >= GAIN_WANTED:
+        return Earned(together, with_network.layer, throttle_gain, gain)
+    return Earned(alone, layer, throttle_gain, gain)
+
+
+def _with_steps(base: LayerBase, model: TrainableModel, laps: Recording) -> tuple[LayerBase, OnlineLayer, float | None]:
+    """The base with its question of the throttle's steps answered, the layer on its physics alone, and the steps' gain."""
+    stretches = [(model, part) for part in map(laps.select, laps.stretches(_STRETCHES))]
+    plain = base.fitted(base.features(False), stretches)
+    asked = base.config.throttle_steps is None and base.vehicle.inputs.set_point == "throttle"
+    if not asked or not any(len(base.starts(part)) for _, part in stretches):
+        return base, plain.layer, None
+    bent = base._replace(config=base.config.model_copy(update={"throttle_steps": True}))
+    fitted = bent.fitted(bent.features(False), stretches)
+    gain = _gain(
+        _errors(bent, bent.features(False), fitted, stretches), _errors(base, base.features(False), plain, stretches)
+    )
+    return (bent, fitted.layer, gain) if gain >= GAIN_WANTED else (base, plain.layer, gain)
+
+
+def _gain(errors: Vector, before: Vector) -> float:
+    step, path = errors / before
+    return float(1.0 - max(np.sqrt(step * path), path))
 
 
 def _errors(base: LayerBase, features: LayerFeatures, fitted: FittedLayer, parts: list[Part]) -> Vector:

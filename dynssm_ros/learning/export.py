@@ -147,6 +147,7 @@ def _metrics(trained: Trained) -> dict[str, Any]:
         "best_epoch": trained.best_epoch,
         "restarts": trained.restarts,
         "network_gain": trained.network_gain,
+        "throttle_gain": trained.throttle_gain,
         "history": trained.history,
     }
 

@@ -61,6 +61,8 @@ class Trained:
     online: OnlineLayer | None = None
     network_gain: float | None = None
     """Share of the online layer's error on left-out parts that the network takes away; ``None`` without either."""
+    throttle_gain: float | None = None
+    """The same of the throttle's steps; ``None`` if they were not tried."""
 
     @property
     def failure(self) -> str:
@@ -190,8 +192,11 @@ def _with_layer(trained: Trained, left_out: list[tuple[TrainableModel, Recording
     assert trained.config.online is not None
     physics = trained.config.with_physics
     base = LayerBase(trained.vehicle, physics, trained.normalisation, trained.H, trained.config.online)
-    features, layer, gain = earned_layer(base, trained.model, trained.recording, left_out)
-    return replace(trained, features=features, online=layer, network_gain=gain)
+    earned = earned_layer(base, trained.model, trained.recording, left_out)
+    return replace(
+        trained, features=earned.features, online=earned.layer, network_gain=earned.network_gain,
+        throttle_gain=earned.throttle_gain,
+    )  # fmt: skip
 
 
 def checkpoints(config: ModelConfig, checkpoint: Path) -> list[Path]:

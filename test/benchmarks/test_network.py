@@ -41,7 +41,7 @@ def test_ratios_are_of_one_step_and_of_paths() -> None:
 
 def test_the_least_and_the_largest_ratios_are_named() -> None:
     known = {f"cell_{name}": {"steps": [value, 1.0, 1.0, 1.0]} for name, value in (("a", 0.5), ("b", 2.0), ("c", 1.0))}
-    assert "| cell | 3 | one step | 1.000 | 0.500 (a) | 2.000 (b) |" in network.extremes(known)
+    assert "| cell | 3 | steps | one step | 1.000 | 0.500 (a) | 2.000 (b) |" in network.extremes(known)
 
 
 def test_development_and_test_folds_are_apart(data: Path) -> None:

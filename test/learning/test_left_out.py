@@ -21,7 +21,7 @@ MakeConfig = Callable[..., ModelConfig]
 WITH_PARTS = {
     "history": 0.12,
     "innovation": {"history": 0.04},
-    "online": {"folds": 2},
+    "online": {"folds": 2, "throttle_steps": False},
     "training": {"epochs": 4, "batch_size": 16},
 }
 
@@ -29,7 +29,7 @@ WITH_PARTS = {
 def test_the_layer_is_fitted_to_what_models_say_of_parts_that_they_did_not_know(
     drive: Callable[..., Recording], make_config: MakeConfig, orca: Vehicle, tmp_path: Path, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr("dynssm_ros.learning.earned_layer.NETWORK_GAIN_WANTED", -10.0)
+    monkeypatch.setattr("dynssm_ros.learning.earned_layer.GAIN_WANTED", -10.0)
     recording = drive(orca, 800)
     config = make_config(**WITH_PARTS)
     trained = train(recording, config, orca, tmp_path / "a.pt")

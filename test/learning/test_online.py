@@ -147,7 +147,7 @@ def test_a_layer_whose_features_the_graph_computes_is_read_as_before(noisy_laps,
 
 
 def test_a_networks_increment_is_an_expert_of_its_own(noisy_laps, orca, make_config, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("dynssm_ros.learning.earned_layer.NETWORK_GAIN_WANTED", -1.0)
+    monkeypatch.setattr("dynssm_ros.learning.earned_layer.GAIN_WANTED", -1.0)
     trained = train(noisy_laps, make_config(online={"folds": 2}), orca, tmp_path / "c.pt")
     model = OnnxModel(save_artifact(trained, tmp_path / "model"))
     ends = noisy_laps.window_ends(trained.H, min_speed=orca.minimum_speed)[:20]

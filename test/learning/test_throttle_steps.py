@@ -1,5 +1,6 @@
 """Steps of the throttle among the layer's features: a force that bends is followed, and exact cars stay exact."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,9 @@ def bent(vehicle: Vehicle, rows: int, seed: int) -> Recording:
 
 
 def models(laps: Recording, car: Vehicle, folder: Path) -> dict[str, WindowModel]:
-    """The online layer without the steps, and with them."""
+    """The online layer without the steps, with them, and with them where they earn their place."""
     found: dict[str, WindowModel] = {}
-    for name, steps in (("without", False), ("with", True)):
+    for name, steps in (("without", False), ("with", True), ("earned", None)):
         config = load_model_config("rls", {"online": {"throttle_steps": steps}})
         found[name] = OnnxModel(save_artifact(train(laps, config, car, folder / f"{name}.pt"), folder / name))
     return found
@@ -60,6 +61,9 @@ def test_a_force_that_bends_is_followed_on_another_drive(orca: Vehicle, tmp_path
     assert scores["with"].rmse[0] < 0.8 * scores["without"].rmse[0]
     assert scores["with"].rollout.ade < 0.9 * scores["without"].rollout.ade
     np.testing.assert_allclose(scores["with"].rmse[1:], scores["without"].rmse[1:], rtol=0.03)
+    np.testing.assert_array_equal(scores["earned"].rmse, scores["with"].rmse)
+    gains = {name: json.loads((tmp_path / name / "metrics.json").read_text())["throttle_gain"] for name in known}
+    assert (gains["with"], gains["without"], gains["earned"] > 0.1) == (None, None, True)
 
 
 def test_where_no_force_bends_they_cost_little(drive: Any, orca: Vehicle, tmp_path: Path) -> None:
@@ -67,6 +71,7 @@ def test_where_no_force_bends_they_cost_little(drive: Any, orca: Vehicle, tmp_pa
     scores = evaluate(drive(orca, 1000, seed=1, noise=NOISE), known, calls=1).scores
     np.testing.assert_allclose(scores["with"].rmse, scores["without"].rmse, rtol=0.01)
     assert scores["with"].rollout.ade < 1.02 * scores["without"].rollout.ade
+    np.testing.assert_array_equal(scores["earned"].rmse, scores["without"].rmse)
 
 
 def test_steps_are_of_the_applied_throttle_and_close_to_each_other_about_zero() -> None:
