@@ -43,6 +43,7 @@ _TRACKS = ("club", "club_b")
 _SECONDS = (60.0, 150.0)
 _MEMORIES_S = (0.05, 0.2, 0.5)  # of coloured noise
 _DELAY_ROWS = 2
+_GEAR_SHARE = 0.15  # of the force, less in the upper gear, for size 1
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class Drive:
     car: str
     recording: Recording
     noise: tuple[float, float, float]
+    seed: int
 
 
 def drive(seed: int, effects: dict[str, dict[str, float]] | None = None) -> Drive:
@@ -74,7 +76,7 @@ def drive(seed: int, effects: dict[str, dict[str, float]] | None = None) -> Driv
         except SimulationError:
             continue
         log = dynssm_ros.recorded(run)
-        return Drive(car, _coloured(log, noise, memory, rng) if memory else log, noise)
+        return Drive(car, _coloured(log, noise, memory, rng) if memory else log, noise, seed)
     raise SimulationError(f"drive {seed} of {car} on {track}: off the road in three styles")
 
 
@@ -98,6 +100,15 @@ def _correction(given: Drive, size: float, rng: np.random.Generator) -> tuple[Dr
     rows = int(rng.integers(round(0.4 / log.T_s), round(1.6 / log.T_s)))
     at = np.arange(len(log)) / rows
     return _changed(given, v_y=log["v_y"] + 3.0 * size * given.noise[1] * (at - np.ceil(at))), f"{rows * log.T_s:g} s"
+
+
+def _random_correction(given: Drive, size: float, rng: np.random.Generator) -> tuple[Drive, str]:
+    """The estimate of v_y drifts to a random side in each period, and is pulled back."""
+    log = given.recording
+    rows = int(rng.integers(round(0.4 / log.T_s), round(1.6 / log.T_s)))
+    number, row = np.divmod(np.arange(len(log)), rows)
+    far = 3.0 * size * given.noise[1] * rng.standard_normal(number[-1] + 1)[number]
+    return _changed(given, v_y=log["v_y"] + far * row / rows), f"{rows * log.T_s:g} s"
 
 
 def _spikes(given: Drive, size: float, rng: np.random.Generator) -> tuple[Drive, str]:
@@ -153,24 +164,24 @@ def _wheel(given: Drive, size: float, rng: np.random.Generator) -> tuple[Drive, 
 
 
 def _gears(given: Drive, size: float, rng: np.random.Generator) -> tuple[Drive, str]:
-    """A drive force that is less in the upper of two gears, of which a sensor tells."""
-    log = given.recording
-    up = float(np.percentile(log["v_x"], rng.uniform(40, 60)))
-    gear = 1.0 + changed_above(log["v_x"], up, 0.93 * up)
-    force = np.where((gear == 2) & (log["r_fb"] + log["r_cmd"] > 0), -size * given.noise[0], 0.0)
-    return _changed(_pushed(given, "v_x", force), gear=gear), f"{up:.3g} m/s"
+    """The drive force is less in the upper of two gears, of which a sensor tells."""
+    up = float(np.percentile(given.recording["v_x"], rng.uniform(40, 60)))
+    less = {"factor": 1.0 - _GEAR_SHARE * size, "up": up, "down": 0.93 * up}
+    driven = drive(given.seed, {"gear_shift": less})
+    return _changed(driven, gear=1.0 + changed_above(driven.recording["v_x"], up, 0.93 * up)), f"{up:.3g} m/s"
 
 
 Plant = Callable[[Drive, float, np.random.Generator], tuple[Drive, str]]
 PLANTS: dict[str, tuple[Plant, str, tuple[str, ...]]] = {  # what is planted, in which channel, kinds that name it
     "correction of v_y": (_correction, "v_y", ("period", "echo", "period_of_size", "period_of_spikes")),
+    "correction of random sign": (_random_correction, "v_y", ("period", "echo", "period_of_size", "period_of_spikes")),
     "spikes of omega": (_spikes, "omega", ("spikes",)),
     "late steering": (_delay, "", ("steering_delay",)),
     "steering in steps": (_steps, "", ("quantised",)),
     "resistance by speed": (_speed, "v_x", ("speed", "speed_and_pedal", "speed_and_bend")),
     "force by heading": (_heading, "v_y", ("heading", "place_on_the_lap")),
     "wheels out of round": (_wheel, "v_x", ("wheel_synchronous",)),
-    "force by gear": (_gears, "v_x", ("gear",)),
+    "force by gear": (_gears, "v_x", ("gear", "gear_and_pedal")),
 }
 
 

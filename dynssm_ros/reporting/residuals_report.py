@@ -55,7 +55,6 @@ def pattern_table(found: Anatomy) -> Table:
         (Column("channel", brief=True), lambda row: row[1].channel),
         (Column("share", "% of squared error", brief=True), lambda row: 100 * row[1].share),
         (Column("pattern", brief=True), lambda row: row[1].words),
-        (Column("what to do"), lambda row: row[1].advice),
         (Column("chance"), lambda row: f"{row[1].p:.1g}"),
         caption="Share: what a pattern takes away once the larger ones of its channel that can be fitted are taken off.",
     )

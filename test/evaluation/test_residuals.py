@@ -218,6 +218,7 @@ def test_errors_in_a_gear_and_after_its_changes_are_told(healthy: Recording) -> 
     clean = taken_apart(with_column(healthy, "gear", gear)).errors
     for planted, kind, words in (
         (gear[clean.rows] == 2, "gear", "in gear 2"),
+        ((gear[clean.rows] == 2) & (clean.applied[:, 0] > 0.1), "gear_and_pedal", "under throttle in gear 2"),
         (
             np.diff(gear, prepend=1.0)[clean.rows] > 0,
             "time_since_a_change_up_of_the_gear",
@@ -234,8 +235,9 @@ def test_errors_in_a_gear_and_after_its_changes_are_told(healthy: Recording) -> 
 @pytest.mark.parametrize("length", [0.05, 0.08])
 def test_errors_that_come_with_the_way_are_those_of_the_wheels(healthy: Recording, length: float) -> None:
     turned = 2 * np.pi * np.cumsum(healthy["v_x"]) * healthy.T_s / length
-    found = taken_apart(with_column(healthy, "v_x", healthy["v_x"] + 0.005 * np.sin(turned))).patterns[0]
+    found, *others = taken_apart(with_column(healthy, "v_x", healthy["v_x"] + 0.005 * np.sin(turned))).patterns
     assert (found.channel, found.kind) == ("v_x", "wheel_synchronous")
+    assert "wheel_synchronous" not in {each.kind for each in others}, "the same wheel is told once"
     assert found.size["period_m"] == pytest.approx(length, rel=0.01)
     assert "circumference" in found.advice
     assert found.to_json()["advice"] == found.advice

@@ -33,6 +33,12 @@ def test_a_candidate_tells_amounts_from_shapes() -> None:
     assert drag.free == (("drag", "coefficient"),)
 
 
+def test_a_candidate_pays_for_what_is_fitted_or_searched_and_not_for_the_speed_that_was_driven() -> None:
+    assert Candidate("drag", ("coefficient",)).cost == 1
+    assert Candidate("gear_shift", ("factor",), held=(("up", 16.0), ("down", 13.0))).cost == 3
+    assert Candidate("drive_map", ("half",), held=(("top", 30.0),)).cost == 1
+
+
 def test_what_cannot_be_tried_is_said_and_why() -> None:
     found, left = candidates(problem(with_lap=False), CarEstimate.of(ORCA))
     assert left["load_sensitivity"].startswith("load_transfer false")

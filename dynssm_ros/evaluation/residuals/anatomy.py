@@ -239,8 +239,7 @@ def _fitted(
         looked = list(_tried(errors, values, c, sorted_by, physics))
         tests = max(tests, len(looked) + others)
         sure = _beyond_chance(looked, level, float(np.sum(values**2)) / total, others)
-        before = np.array([each.size["period_s"] for each in found if "period_s" in each.size])
-        sure = [each for each in sure if not np.isclose(each.size.get("period_s", 0.0), before, _NEAR, 0.0).any()]
+        sure = [each for each in sure if not any(_same_period(each, other) for other in found)]
         if not sure:
             break
         most = max(each.share for each in sure)
@@ -249,6 +248,12 @@ def _fitted(
         if best.fitted is not None:
             values -= best.fitted
     return found, values, tests
+
+
+def _same_period(one: Pattern, other: Pattern) -> bool:
+    """Whether both come back after about the same time, or about the same way."""
+    both = [key for key in ("period_s", "period_m") if key in one.size and key in other.size]
+    return any(bool(np.isclose(one.size[key], other.size[key], _NEAR, 0.0)) for key in both)
 
 
 def _beyond_chance(looked: Sequence[Pattern], level: float, left: float, others: int) -> list[Pattern]:

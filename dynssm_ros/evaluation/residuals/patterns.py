@@ -23,7 +23,8 @@ ADVICE = {
     "spikes": _SPIKES, "repeated": "Record the sensor at its own rate.",
     "quantised": "Take the signal with more digits.", "clipped": "Widen the range of the sensor or of its message.",
     "steering_delay": _LATE, "throttle_delay": _LATE, "integrator": "Calibrate with that integrator.",
-    "gear": _GEARS, "time_since_a_change_up_of_the_gear": _GEARS, "time_since_a_change_down_of_the_gear": _GEARS,
+    "gear": _GEARS, "gear_and_pedal": _GEARS,
+    "time_since_a_change_up_of_the_gear": _GEARS, "time_since_a_change_down_of_the_gear": _GEARS,
     "heading": _WORLD, "place_on_the_lap": _WORLD,
     "speed": _FORCE, "throttle": _FORCE, "speed_and_pedal": _FORCE,
 }  # fmt: skip

@@ -72,7 +72,8 @@ def situations(errors: OneStepErrors) -> list[Situation]:
         _bins("lateral acceleration", lateral, "m/s²", _BINS),
         _bins("longitudinal acceleration", (v_x - long_ago) / (rows * T_s), "m/s²", _BINS),
     ]
-    found += _gears(errors)
+    gears = list(_gears(errors))
+    found += gears
     back = max(1, round(_RATE_S / T_s))
     for (name, column), unit in zip(errors.inputs.items(), ("1/s", "rad/s"), strict=True):
         change = column[errors.rows] - errors.before(column, back)
@@ -84,7 +85,8 @@ def situations(errors: OneStepErrors) -> list[Situation]:
     bend = np.digitize(lateral, np.array([-1, 1]) * _STRAIGHT * max(float(np.percentile(np.abs(lateral), 95)), 1e-9))
     speed = found[2]
     if pedal is not None:
-        found.append(_crossed("speed and pedal", speed, pedal, ("under braking", "coasting", "under throttle")))
+        words = ("under braking", "coasting", "under throttle")
+        found += [_crossed(f"{each.name} and pedal", each, pedal, words) for each in (speed, *gears[:1])]
     found.append(_crossed("speed and bend", speed, bend, ("in right bends", "on straights", "in left bends")))
     if log.has_pose:
         turned = np.mod(log["theta"][errors.rows], 2 * np.pi)
@@ -191,12 +193,11 @@ def _bins(name: str, x: Vector, unit: str, most: int, ends: tuple[float, float] 
 
 
 def _crossed(name: str, speed: Situation, other: Indices, words: tuple[str, ...]) -> Situation:
-    """Each range of speed with each of other kinds."""
-    assert speed.edges is not None or len(speed.labels) == 1
+    """Each range of speed, or each gear, with each of other kinds."""
     ranges = speed.labels if speed.edges is None else [
-        f" between {a:.4g} and {b:.4g} m/s" for a, b in pairwise(speed.edges)
+        f"between {a:.4g} and {b:.4g} m/s" for a, b in pairwise(speed.edges)
     ]  # fmt: skip
-    labels = tuple(f"{word}{part}" for part in ranges for word in words)
+    labels = tuple(f"{word} {part}".strip() for part in ranges for word in words)
     return Situation(name, speed.kind * len(words) + other, labels)
 
 

@@ -74,8 +74,8 @@ class Candidate:
 
     @property
     def cost(self) -> int:
-        """How many parameters it has to pay for."""
-        return len(self.parameters) + len(self.held)
+        """How many parameters it has to pay for: those that are fitted or searched for in the errors."""
+        return len(self.parameters) + len(self.held) - len(EFFECTS[self.effect].GIVEN)
 
 
 @dataclass(frozen=True)

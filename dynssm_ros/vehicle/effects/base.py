@@ -108,6 +108,7 @@ class Effect(StageEffect):
     LEAST: ClassVar[float] = 0.0  # how far it is off neutral in any car
     READ_OFF: ClassVar[tuple[str, ...]] = ()
     """Parameters that :meth:`read_off` finds in the errors of single steps, and no fit moves: when the effect acts."""
+    GIVEN: ClassVar[tuple[str, ...]] = ()  # those of them that the driving tells, whatever the errors are
 
     @classmethod
     def variants(cls) -> tuple[tuple[str, ...], ...]:

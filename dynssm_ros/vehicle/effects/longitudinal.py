@@ -108,7 +108,7 @@ class DriveMap(Effect):
         "top": Parameter("m/s", 0.5, 120.0, 40.0, shape=True),
     }
     VARIANTS = (("half",), ("middle",), ("brake",), ("half", "middle"), ("half", "half_at_top", "middle"))
-    READ_OFF = ("top",)
+    READ_OFF = GIVEN = ("top",)
     TYPICAL = (0.025, 0.3)
     half: Array = 1.0
     middle: Array = 1.0
