@@ -99,8 +99,12 @@ def conclusion_in_words(diagnosis: Diagnosis, one: Conclusion) -> str:
         return left_in_words(diagnosis)
     cause = next(each for each in diagnosis.found if each.effect == one.subject)
     sure = "Sure but small, within the structure of the model: " if cause.small else ""
-    gone = f"{percent(one.explains)} of the error on held-out laps"
-    return f"{sure}{cause.effect}{recordings_of(cause)}: {size_in_words(cause)}; {gone}."
+    cars = (
+        (cause.of_given, "the file's car errs {} on held-out laps"),
+        (cause.heldout_improvement, "a recalibrated one {}"),
+    )
+    gone = ", ".join(words.format(_less(share)) for share, words in cars)
+    return f"{sure}{cause.effect}{recordings_of(cause)}: {size_in_words(cause)}; with it {gone}."
 
 
 def _no_better_in_words(diagnosis: Diagnosis, channel: str) -> str:
@@ -252,9 +256,9 @@ def size_in_words(cause: Cause) -> str:
 def evidence_in_words(cause: Cause) -> str:
     """How sure the cause is, and what it takes away."""
     held_out = (
-        f"it takes away {percent(cause.heldout_improvement)} of the error on held-out laps"
+        f"it takes away {percent(cause.heldout_improvement)} of what a recalibrated car errs on held-out laps"
         if cause.heldout_improvement > 0
-        else f"on held-out laps it takes nothing away ({percent(cause.heldout_improvement)})"
+        else f"on held-out laps it takes nothing off a recalibrated car's error ({percent(cause.heldout_improvement)})"
     )
     confirmed, units = cause.confirmation, cause.confirmation.improvement
     shares = zip(STATE_SIGNALS, confirmed.share, strict=True)

@@ -19,6 +19,7 @@ from dynssm_ros.identification.problem.fit import IdentificationProblem
 from dynssm_ros.identification.problem.recordings import RecordingSet
 from dynssm_ros.identification.result.diagnose import _moved_together, diagnose
 from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis
+from dynssm_ros.identification.result.improvement import mean_reduction
 from dynssm_ros.identification.search.candidates import Responses, ScoreTest, candidates
 from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC
 from dynssm_ros.reporting.diagnosis_words import as_text
@@ -122,7 +123,12 @@ def test_the_extended_car_errs_less_on_held_out_rows(lagging: tuple[Recording, V
     hidden = size("steering_lag", np.random.default_rng(1))["time_constant"]
     assert cause.values["time_constant"] == pytest.approx(hidden, abs=4 * cause.std["time_constant"])
     assert cause.heldout_improvement > 0.02
-    assert found.improvement.reduction[found.improvement.horizon, 2] > 0.1
+    windows, at = found.improvement.windows, found.improvement.horizon
+    with_it = replace(found.car, moved=np.zeros_like(found.car.moved))  # the file's coefficients
+    step = round(found.improvement.horizons[at] / windows.data.T_s)
+    with_lag, without = (windows.errors(car)[:, step - 1] for car in (with_it, with_it.without("steering_lag")))
+    assert cause.of_given == pytest.approx(mean_reduction(without, with_lag))
+    assert found.improvement.reduction[at, 2] > 0.1
     low, high = found.improvement.interval[:, found.improvement.horizon]
     assert (
         (low <= found.improvement.reduction[found.improvement.horizon])
@@ -160,7 +166,7 @@ def test_the_json_is_that_of_the_contract(lagging: tuple[Recording, Vehicle, Dia
     assert set(cause) == {"effect", "parameters", "evidence", "on_bound", "alternatives", "only_in", "level", "small"}
     assert set(cause["parameters"]["time_constant"]) == {"value", "std", "unit"}
     assert cause["parameters"]["time_constant"]["unit"] == "s"
-    assert set(cause["evidence"]) == {"delta_bic", "heldout_improvement", "left_out"}
+    assert set(cause["evidence"]) == {"delta_bic", "heldout_improvement", "left_out", "of_given"}
     assert set(cause["evidence"]["left_out"]) == {"improvement", "std", "units", "error_gone"}
     assert cause["evidence"]["left_out"]["improvement"] > cause["evidence"]["left_out"]["std"]
     recalibrated = content["recalibration"] or {"coefficients": []}
@@ -181,11 +187,12 @@ def test_what_takes_little_off_every_channel_is_small_unless_what_was_known_tell
 
     def taking(share: float, heldout: float, known: float = 0.0) -> Cause:
         confirmation = replace(cause.confirmation, share=np.array([0.0, share, -0.1]), known=known)
-        return replace(cause, confirmation=confirmation, heldout_improvement=heldout)
+        return replace(cause, confirmation=confirmation, heldout_improvement=heldout, is_noticed=False)
 
     told = float(cause.confirmation.improvement.sum())
     assert taking(0.05, 0.005).small
     assert not any(one.small for one in (taking(0.07, 0.005), taking(0.05, 0.02), taking(0.05, 0.005, told + 1.0)))
+    assert not replace(taking(0.05, 0.005), is_noticed=True).small
     little = replace(found, found=(taking(0.05, 0.005),))
     assert (little.causes, [one.effect for one in little.small_effects]) == ((), ["steering_lag"])
     assert "Sure but small, within the structure of the model: steering_lag: " in " ".join(as_text(little).split())
@@ -199,7 +206,7 @@ def test_words_name_cause_size_gain_and_advice(lagging: tuple[Recording, Vehicle
     for part in (
         "steering_lag: time_constant = ",
         "±",
-        " s; 5 % of the error on held-out laps.\n",
+        " s; with it the file's car errs ",
         EFFECTS["steering_lag"].ADVICE,
         "Error on held-out laps",
     ):

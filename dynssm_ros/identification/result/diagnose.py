@@ -305,6 +305,8 @@ def _cause(one: Refined, without: Without, selection: Selection, recordings: Rec
         tuple(recordings.names[k] for k in one.candidate.only_in),
         recordings.levels.level(one.candidate.only_in),
         without.errors,
+        without.of_given,
+        without.is_noticed,
     )
 
 

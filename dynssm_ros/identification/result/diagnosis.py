@@ -39,13 +39,16 @@ class Cause:
         values: parameters with which it acts.
         std: standard deviations of those that were fitted.
         delta_bic: decrease of twice the negative log-likelihood by it, less what its parameters cost.
-        heldout_improvement: share of the error on the held-out rows that is gone by it.
+        heldout_improvement: share of the error on the held-out rows that is gone by it, against coefficients that are
+            refitted in its place.
         confirmation: what it improves on parts of the fitted rows that were left out.
         on_bound: its parameters that the data push against a bound: they are at least that far off.
         alternatives: effects that explain the data as well.
         only_in: names of the recordings in which it acts; empty: in all.
         level: what these recordings are.
         without: what the car with all other causes errs on the held-out rows, at the horizon, ``(W, 3)``.
+        of_given: share of the error that is gone by it while the coefficients are those of the vehicle file.
+        is_noticed: whether a channel of that car surely errs less by it, so much that it counts.
     """
 
     effect: str
@@ -59,16 +62,24 @@ class Cause:
     only_in: tuple[str, ...] = ()
     level: Level = "car"
     without: Vector = field(default_factory=lambda: np.empty((0, 3)), repr=False)
+    of_given: float = 0.0
+    is_noticed: bool = False
+
+    @property
+    def explains(self) -> float:
+        """Share of the error on the held-out rows that it takes off the vehicle file's car, or off a recalibrated one."""
+        return max(self.of_given, self.heldout_improvement)
 
     @property
     def small(self) -> bool:
         """Whether it hardly matters, however sure it is: no model is right to the last per mille.
 
-        It takes little off the error of each channel, on parts that were left out and on held-out rows. What a recalibration
-        would make up for is told by what was known, and by how far the coefficients would have to be off, not by the error.
+        It takes little off the error of each channel, on parts that were left out and on held-out rows, and is not noticed in
+        the vehicle file's car. What a recalibration would make up for is told by what was known, and by how far the
+        coefficients would have to be off, not by the error.
         """
         little = float(self.confirmation.share.max()) < tuning.SMALL_SHARE
-        little = little and self.heldout_improvement < tuning.NEGLIGIBLE_SHARE
+        little = little and self.heldout_improvement < tuning.NEGLIGIBLE_SHARE and not self.is_noticed
         return little and not self.confirmation.rests_on_known
 
 
@@ -165,10 +176,7 @@ class Diagnosis:
     @property
     def conclusions(self) -> tuple[Conclusion, ...]:
         """The findings: what is no better than persistence first, then the rest, that which explains most error first."""
-        found = [
-            Conclusion("small" if cause.small else "cause", cause.effect, cause.heldout_improvement)
-            for cause in self.found
-        ]
+        found = [Conclusion("small" if cause.small else "cause", cause.effect, cause.explains) for cause in self.found]
         if self.moved:
             explains = 0.0 if self.recalibration is None else self.recalibration.explains
             found.append(Conclusion("recalibration", "", explains))
@@ -282,6 +290,7 @@ def _cause_to_json(cause: Cause) -> dict[str, Any]:
         "evidence": {
             "delta_bic": cause.delta_bic,
             "heldout_improvement": cause.heldout_improvement,
+            "of_given": cause.of_given,
             "left_out": {
                 "improvement": cause.confirmation.total,
                 "std": cause.confirmation.std,

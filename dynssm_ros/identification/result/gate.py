@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,10 +14,15 @@ from dynssm_ros.identification.problem.fit import IdentificationProblem
 from dynssm_ros.identification.problem.noise import weights
 from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED
-from dynssm_ros.identification.result.improvement import Improvement, mean_reduction, measure_improvement
+from dynssm_ros.identification.result.improvement import (
+    Improvement,
+    is_noticed,
+    mean_reduction,
+    measure_improvement,
+)
 from dynssm_ros.identification.result.residuals import Left, clustered, explained_variance
 from dynssm_ros.identification.search.integrator import SearchResult
-from dynssm_ros.identification.search.selection import Search, Selection
+from dynssm_ros.identification.search.selection import Refined, Search, Selection
 
 
 class Without(NamedTuple):
@@ -26,6 +32,10 @@ class Without(NamedTuple):
     """On the held-out rows at the horizon, ``(W, 3)`` (m/s, m/s, rad/s)."""
     improvement: float
     """Share of them that the cause takes away, as a mean of the channels."""
+    of_given: float
+    """The same while the coefficients are those of the file."""
+    is_noticed: bool
+    """Whether a channel then errs noticeably more."""
 
 
 class Gated(NamedTuple):
@@ -56,7 +66,8 @@ def gated(found: SearchResult, given: CarEstimate, windows: SimulationWindows, s
     """
     selection = found.selection
     while True:
-        without, left = _without_each(selection, found.search, windows, steps), _left(found.problem, selection)
+        without = _without_each(selection, found.search, given, windows, steps)
+        left = _left(found.problem, selection)
         strange = [one.candidate.effect for one in selection.chosen if not one.is_met]
         worst = min(zip(without, selection.candidates, strict=True), key=lambda pair: pair[0].improvement, default=None)
         if worst is not None and worst[0].improvement <= -tuning.NEGLIGIBLE_SHARE:
@@ -80,10 +91,21 @@ def gated(found: SearchResult, given: CarEstimate, windows: SimulationWindows, s
     return Gated(selection, without, left, improvement)
 
 
-def _without_each(selection: Selection, search: Search, windows: SimulationWindows, steps: int) -> tuple[Without, ...]:
-    fits = [selection.fit, *(search.leave_out(selection, one) for one in selection.chosen)]
-    with_all, *without = (windows.errors(fit.car)[:, steps - 1] for fit in fits)
-    return tuple(Without(errors, mean_reduction(errors, with_all)) for errors in without)
+def _without_each(
+    selection: Selection, search: Search, given: CarEstimate, windows: SimulationWindows, steps: int
+) -> tuple[Without, ...]:
+    def errors(car: CarEstimate) -> Vector:
+        return windows.errors(car)[:, steps - 1]
+
+    def one(cause: Refined) -> Without:
+        refitted = errors(search.leave_out(selection, cause).car)
+        set_back = errors(of_file.without(cause.candidate.effect))
+        noticed = is_noticed(set_back, as_file, windows.block)
+        return Without(refitted, mean_reduction(refitted, with_all), mean_reduction(set_back, as_file), noticed)
+
+    of_file = replace(selection.fit.car, moved=given.moved)
+    with_all, as_file = errors(selection.fit.car), errors(of_file)
+    return tuple(map(one, selection.chosen))
 
 
 def _left(problem: IdentificationProblem, selection: Selection) -> Left:

@@ -98,6 +98,19 @@ def reduction_interval(before: Vector, after: Vector, block: Indices) -> Vector:
     return np.asarray(1.0 - np.quantile(ratios, [0.975, 0.025], axis=0))
 
 
+def channel_reduction(before: Vector, after: Vector) -> Vector:
+    """Share of the RMSE that is gone, by channel, ``(3,)``; errors of the same windows, each ``(W, 3)``."""
+    squared = (after**2).sum(axis=0) / np.maximum((before**2).sum(axis=0), 1e-300)
+    return np.asarray(1.0 - np.sqrt(squared))
+
+
+def is_noticed(before: Vector, after: Vector, block: Indices) -> bool:
+    """Whether the errors of a channel surely fall by a share that counts, and those of all in the mean; ``(W, 3)``."""
+    low = reduction_interval(before, after, block)[0]
+    falls = bool(((channel_reduction(before, after) > tuning.NOTICEABLE_SHARE) & (low > 0.0)).any())
+    return falls and mean_reduction(before, after) > 0.0
+
+
 def mean_reduction(before: Vector, after: Vector) -> float:
     """Share of the RMSE that is gone, as a mean of the channels; errors of the same windows, each ``(W, 3)``."""
     left = (after**2).mean(axis=0) / np.maximum((before**2).mean(axis=0), 1e-300)

@@ -19,7 +19,13 @@ from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem, limits, unit, with_values
 from dynssm_ros.identification.problem.windows import SimulationWindows
-from dynssm_ros.identification.result.improvement import Improvement, mean_reduction, reduction_interval
+from dynssm_ros.identification.result.improvement import (
+    Improvement,
+    channel_reduction,
+    is_noticed,
+    mean_reduction,
+    reduction_interval,
+)
 from dynssm_ros.identification.search.candidates import Candidate, Responses
 from dynssm_ros.vehicle import COEFFICIENTS
 from dynssm_ros.vehicle.effects import EFFECTS
@@ -101,9 +107,9 @@ def recalibration(
     windows, at = improvement.windows, improvement.horizon
     before = _errors(windows, replace(fit.car, moved=given.moved), improvement)
     after = improvement.errors[list(improvement.errors)[-1]][:, at]
-    share = _share(before, after)
+    share = channel_reduction(before, after)
     interval, explains = reduction_interval(before, after, windows.block), mean_reduction(before, after)
-    noticed = explains > 0.0 and bool(((share > tuning.NOTICEABLE_SHARE) & (interval[0] > 0.0)).any())
+    noticed = is_noticed(before, after, windows.block)
     selection = _ForwardSelection(problem, fit, given)
     chosen = selection.fewest()
     if not noticed and not selection.is_sure(chosen):
@@ -126,7 +132,7 @@ def recalibration(
                 value,
                 std,
                 float(car.moved[k] - given.moved[k]),
-                _share(without, with_all),
+                channel_reduction(without, with_all),
                 mean_reduction(without, with_all),
                 tuple(MOVABLE[j] for j in selection.alike(chosen, k)),
             )
@@ -188,11 +194,6 @@ def _errors(windows: SimulationWindows, car: CarEstimate, improvement: Improveme
     """Errors ``(W, 3)`` at the horizon."""
     step = round(float(improvement.horizons[improvement.horizon]) / windows.data.T_s)
     return windows.errors(car)[:, step - 1]
-
-
-def _share(before: Vector, after: Vector) -> Vector:
-    squared = (after**2).sum(axis=0) / np.maximum((before**2).sum(axis=0), 1e-300)
-    return np.asarray(1.0 - np.sqrt(squared))
 
 
 def _values(car: CarEstimate) -> list[float]:
