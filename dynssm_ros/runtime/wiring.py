@@ -1,8 +1,8 @@
 """Wrong signs, units and wheelbases, found by comparing seconds of driving with the single-track model.
 
 The car of the model is stepped ahead from measured rows under the measured inputs, as they are and with one signal changed
-the way that wiring goes wrong. If a change makes the predicted lateral velocity and yaw rate much better, it is named.
-Nothing is corrected: somebody has to look. A wheelbase that is off by less than a third is not found.
+the way that wiring goes wrong. If a change makes the predicted lateral velocity and yaw rate much better, and other tyres do
+not, it is named. Nothing is corrected: somebody has to look. A wheelbase that is off by less than a third is not found.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
-from dynssm_ros.vehicle import CarModel, Coefficients, State, Vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, CarModel, Coefficients, State, Vehicle
 
 _SECONDS = 6.0  # that are compared
 _FEWEST = 60  # rows, before anything is said
@@ -23,6 +23,10 @@ _CLEARLY = 0.25  # of the mean square error as it is, below which a change is na
 _TURNING = 0.05  # share of the yaw rate of the tightest corner, below which nothing can be said
 _CONFIRMED = 3  # times that something is found before it is said
 _WHEELBASES = (0.5, 0.7, 1.4, 2.0)
+_TYRES: tuple[dict[str, float], ...] = tuple(
+    {"D_f": front * both, "D_r": both / front} for front in (0.8, 1.0, 1.25) for both in (0.75, 1.0, 1.33)
+)
+"""Factors of other tyres, which no wiring is to be named for: of the whole car, and of one axle against the other."""
 
 _V_X, _V_Y, _OMEGA, _DELTA, _DELTA_CMD = (
     WINDOW_COLUMNS.index(name) for name in ("v_x", "v_y", "omega", "delta_fb", "delta_cmd")
@@ -66,7 +70,10 @@ class Wiring:
         self._found: deque[str] = deque(maxlen=_CONFIRMED)
         constants, unchanged = vehicle.constants, _scaled((), 1.0)
         self._wheelbase = wheelbase = constants.wheelbase
-        suspicions = [("", unchanged, 1.0), *((words, factors, 1.0) for words, factors in _CHANGES.items())]
+        suspicions = [
+            *[("", unchanged, 1.0)] * len(_TYRES),
+            *((words, factors, 1.0) for words, factors in _CHANGES.items()),
+        ]
         for factor in _WHEELBASES:
             words = f"the wheelbase is not {wheelbase:.3g} m, but about {factor * wheelbase:.2g} m"
             suspicions.append((words, unchanged, factor))
@@ -75,6 +82,11 @@ class Wiring:
         self._factors = np.stack([factors for _, factors, _ in suspicions])[:, None]
         longer = np.array([factor for _, _, factor in suspicions])[:, None]
         suspected = constants.model_copy(update={"l_f": constants.l_f * longer, "l_r": constants.l_r * longer})
+        theta = np.tile(vehicle.nominal, (len(suspicions), 1))
+        for values, tyres in zip(theta, _TYRES, strict=False):
+            for name, factor in tyres.items():
+                values[COEFFICIENTS.index(name)] *= factor
+        self._theta = Coefficients(*theta.T[:, :, None])
         self._car = CarModel(suspected, T_s, (), "rk4", 2, set_point=vehicle.inputs.set_point)
 
     def add(self, stamp: int, row: Vector) -> None:
@@ -109,8 +121,8 @@ class Wiring:
             if not np.std(rows[:, _OMEGA]) + np.std(rows[:, _DELTA]) > _TURNING * min(cornering, steering):
                 return ""
             errors = self._errors(rows)
-        best = int(np.argmin(errors))
-        return self._suspicions[best] if errors[best] < _CLEARLY * errors[0] else ""
+        best, innocent = int(np.argmin(errors)), errors[: len(_TYRES)].min()
+        return self._suspicions[best] if errors[best] < _CLEARLY * innocent else ""
 
     def _errors(self, rows: Vector) -> Vector:
         """Mean square of the predicted changes' errors in yaw rate and lateral velocity, over those measured.
@@ -119,16 +131,16 @@ class Wiring:
             rows: what was measured, shape ``(N, 7)``.
 
         Returns:
-            As it is, then under each suspicion, shape ``(C,)``; infinite where the car diverges.
+            With the tyres of :data:`_TYRES`, then under each suspicion, shape ``(C,)``; infinite where the car diverges.
         """
         starts = np.linspace(0, len(rows) - 1 - self._ahead, _STARTS).astype(np.intp)
         rows = rows * self._factors
         first = rows[:, starts, :3]
-        state, theta = first, Coefficients(*self._vehicle.nominal)
+        state = first
         moved = np.zeros_like(state)
         for k in range(self._ahead):
             now = np.moveaxis(np.concatenate([state, rows[:, starts + k, 3:]], axis=-1), -1, 0)
-            following = np.stack(self._car.step(State(*now[:3]), applied_inputs(now), theta)[0], axis=-1)
+            following = np.stack(self._car.step(State(*now[:3]), applied_inputs(now), self._theta)[0], axis=-1)
             moved, state = moved + following - state, following
         measured = rows[:, starts + self._ahead, :3] - first
         spread = np.mean(rows[:, :, 1:3] ** 2, axis=1) + 1e-12

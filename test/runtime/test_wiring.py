@@ -10,7 +10,7 @@ import pytest
 from dynssm_ros.api import recorded, simulate
 from dynssm_ros.runtime.wiring import Wiring
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.vehicle import load_vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
 
 ORCA = load_vehicle("orca")
 COLUMNS = {"v_x": [0], "v_y": [1], "omega": [2], "steering": [4, 6], "speed": [0, 1], "left": [1, 2]}
@@ -70,3 +70,12 @@ def test_nothing_is_said_of_a_straight_or_after_a_gap(laps) -> None:
     for k, row in enumerate(rows[:500]):
         wiring.add((k + 1000) * 20_000_000 * 3, row)  # each row after a gap
     assert wiring.verdict() == ""
+
+
+@pytest.mark.parametrize(("front", "rear"), [(1.0, 1.4), (1.4, 1.0), (1.4, 1.4), (0.7, 0.7)])
+def test_other_tyres_are_no_wiring(laps, front: float, rear: float) -> None:
+    theta = ORCA.nominal.copy()
+    theta[COEFFICIENTS.index("D_f")] *= front
+    theta[COEFFICIENTS.index("D_r")] *= rear
+    others = ORCA.with_nominal(np.clip(theta, ORCA.lower, ORCA.upper))
+    assert verdicts(laps, vehicle=others) == {""}
