@@ -39,6 +39,7 @@ class Outcome:
     too_small: tuple[str, ...] = ()
     """Effects that were hidden and missed, of which the diagnosis says that they would have to be larger to be
     named."""
+    seconds: float | None = None  # of the processor, that the diagnosis took; ``None``: it was not measured
 
     @property
     def missed(self) -> tuple[str, ...]:
@@ -123,6 +124,12 @@ def rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "more_named": _share([len(o.named) > 1 for o in one]),
         "too_small": _share([name in o.too_small for o in outcomes for name in o.missed]),
     }
+
+
+def processor_seconds(outcomes: Sequence[Outcome]) -> tuple[float, float] | None:
+    """Median and maximum of what a diagnosis took, as far as it was measured."""
+    taken = [o.seconds for o in outcomes if o.seconds is not None]
+    return (float(np.median(taken)), max(taken)) if taken else None
 
 
 def _share(right: Sequence[bool]) -> dict[str, Any]:

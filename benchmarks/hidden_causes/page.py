@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.hidden_causes import foreign, multi_body
 from benchmarks.hidden_causes.cases import OFF, Case, Hidden
-from benchmarks.hidden_causes.outcomes import Outcome, by_size, rates
+from benchmarks.hidden_causes.outcomes import Outcome, by_size, processor_seconds, rates
 from benchmarks.page import render
 from dynssm_ros.reporting.evaluation_figures import WIDTH, sheet, styled
 from dynssm_ros.vehicle.effects import EFFECTS
@@ -53,6 +53,7 @@ def hidden_causes_page(outcomes: Sequence[tuple[Case, Outcome | None]], argument
         outcomes=known,
         plants=list(plants.values()),
         rates=_rates(known, [[o for c, o in outcomes if o is not None and c.plant == plant] for plant in plants]),
+        seconds=processor_seconds(known),
         seeds=[case.seed for case, _ in outcomes],
         sizes=[[words, str(rate["of"]), str(rate["count"])] for words, rate in thirds],
         undriven=len(outcomes) - len(known),

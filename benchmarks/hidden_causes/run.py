@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+import time
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from pydantic import TypeAdapter
@@ -22,8 +23,10 @@ def run_case(case: Case, folder: Path) -> None:
     try:
         if not laps.exists():
             drive(case).save(laps)
-        found = diagnose(Recording.load(laps), vehicle_file(case), line=case.road.centre)
-        outcome = judge(case, found.causes, found.minimum_detectable)
+        file, begun = vehicle_file(case), time.process_time()
+        found = diagnose(Recording.load(laps), file, line=case.road.centre)
+        seconds = time.process_time() - begun
+        outcome = replace(judge(case, found.causes, found.minimum_detectable), seconds=seconds)
     except SimulationError:
         outcome = None
     write_json(outcome_file(case, folder), {"outcome": None if outcome is None else asdict(outcome)})

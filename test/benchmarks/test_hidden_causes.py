@@ -6,14 +6,22 @@ import json
 import subprocess
 import sys
 from collections import Counter
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.hidden_causes.cases import NOISE, TRACKS, Case, cases, off, size
-from benchmarks.hidden_causes.outcomes import Outcome, by_size, judge, matrix, rates, share_of_range
+from benchmarks.hidden_causes.outcomes import (
+    Outcome,
+    by_size,
+    judge,
+    matrix,
+    processor_seconds,
+    rates,
+    share_of_range,
+)
 from benchmarks.hidden_causes.page import hidden_causes_page
 from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
 from dynssm_ros.files import write_json
@@ -146,6 +154,14 @@ OUTCOMES = [
 OF = [*zip(cases(7, 5), [*OUTCOMES, None], strict=True)]
 
 
+def test_processor_time_is_told_as_far_as_it_was_measured() -> None:
+    assert processor_seconds(OUTCOMES) is None
+    timed = [replace(OUTCOMES[0], seconds=seconds) for seconds in (3.0, 5.0, 40.0)]
+    assert processor_seconds([*timed, OUTCOMES[1]]) == (5.0, 40.0)
+    words = hidden_causes_page([*zip(cases(7, 3), timed, strict=True)], [], "")
+    assert "A diagnosis took 5 s of processor time in the median, 40 s at the worst." in words
+
+
 def test_rates_and_confusion_count_what_happened() -> None:
     found = rates(OUTCOMES)
     assert {name: (rate["of"], rate["share"]) for name, rate in found.items() if name != "cases"} == {
@@ -181,7 +197,7 @@ def test_the_page_shows_rates_seeds_and_what_went_wrong() -> None:
     assert "| `b` | drag coefficient 0.3 | mass factor 1.2 |" in text
     assert "| `a` |" not in text
     assert "So few cases did not come to `steering_offset`, `steering_gain`, " in text
-    assert "`rolling_resistance`, `drive_gain`, `power_limit`, `yaw_inertia`" in text, "drag and mass were hidden"
+    assert "`rolling_resistance`, `drive_gain`, `power_limit`, `drive_map`, `yaw_inertia`" in text, "drag and mass were hidden"
 
 
 @pytest.mark.slow
@@ -192,6 +208,8 @@ def test_a_case_is_driven_diagnosed_and_read_back(tmp_path: Path) -> None:
     found = read_outcome(case, tmp_path)
     assert found is not None
     assert found.values == case.hidden
+    assert found.seconds is not None
+    assert found.seconds > 0.0
     assert (tmp_path / "drives" / f"{outcome_file(case, tmp_path).stem}.parquet").is_file()
 
 
