@@ -17,7 +17,7 @@ from typing import Any
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.plant import RK4_STEP, Plant, Rk4Plant, register_plant
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.vehicle import Applied, State, Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 from dynssm_ros.vehicle.integrators import integrate
@@ -55,7 +55,7 @@ class _Changes:
 class MultiBody:
     """The car on the road; see :class:`~dynssm_ros.simulation.plant.Plant`."""
 
-    def __init__(self, vehicle: Vehicle, pose: Pose, state: State, line: ClosedLine | None) -> None:
+    def __init__(self, vehicle: Vehicle, pose: Pose, state: State, line: Line | None) -> None:
         from vehiclemodels.init_mb import init_mb
         from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
         from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
@@ -160,9 +160,7 @@ def _followed(value: float, target: float, time_constant: float, h: float) -> fl
 class MultiBodyPlant(Rk4Plant):
     """The car in steps of 1 ms."""
 
-    def make(
-        self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], line: ClosedLine | None
-    ) -> Plant:
+    def make(self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], line: Line | None) -> Plant:
         """One with the vehicle's effects hidden in it; nothing else of the vehicle is its own."""
         return MultiBody(vehicle, pose, state, line)
 

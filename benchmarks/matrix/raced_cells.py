@@ -20,7 +20,7 @@ from dynssm_ros.control.settings import Objective
 from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.simulation.sensing import Sensing
 from dynssm_ros.track.centre_points import TrackError
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.track.tracks import Track, load_track
 from dynssm_ros.vehicle import load_vehicle
 
@@ -148,7 +148,7 @@ def variation(track: Track, seed: int) -> Track:
         )
         beside = _BENT * length / (2 * np.pi) * np.sum(list(waves), axis=0)
         with suppress(TrackError):  # the road overlaps itself
-            bent = replace(track, name=f"{track.name}_{seed}", centre=ClosedLine(track.centre.position(s, beside)))
+            bent = replace(track, name=f"{track.name}_{seed}", centre=Line(track.centre.position(s, beside)))
             if 1.0 / np.abs(bent.centre.curvature(bent.centre.s)).max() > _TIGHTEST * radius:
                 return bent
     raise ValueError(f"track {track.name}: no variation with seed {seed} in {_TRIES} tries")

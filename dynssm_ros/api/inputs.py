@@ -63,16 +63,18 @@ def signal_map_of(signals: SignalMap | PathLike, commands: Commands | None = Non
     return signal_map.with_commands(commands)
 
 
-def track_of(track: Track | PathLike) -> Track:
-    """The track; a :class:`DataWarning` names what was mended of a file's points."""
+def track_of(track: Track | PathLike, *, closed: bool = True) -> Track:
+    """The track, ``closed`` or of any kind; a :class:`DataWarning` names what was mended of a file's points.
+
+    Raises:
+        TrackError: no track, or an open road where a ``closed`` one is needed.
+    """
     from dynssm_ros.track.tracks import Track, load_track
 
-    if isinstance(track, Track):
-        return track
-    found = load_track(track)
-    for words in found.notes:
+    found = track if isinstance(track, Track) else load_track(track)
+    for words in found.notes if found is not track else ():
         warnings.warn(f"track {found.name}: {words}", DataWarning, stacklevel=3)
-    return found
+    return found.require_closed() if closed else found
 
 
 def opened(logs: Log | Sequence[Log], car: Vehicle | None, *, strict: bool = False) -> list[Recording]:

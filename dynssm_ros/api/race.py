@@ -112,7 +112,7 @@ def race(
 
     s, car = settings, vehicle_of(vehicle)
     driven = car.with_effects(s.effects.items())
-    road = _sized(track_of(track), s)
+    road = _sized(track_of(track, closed=False), s)
     for text in models:
         if list(models).count(text) > 1:
             raise SettingError(f"model {text}: given twice; expected different models", "model")

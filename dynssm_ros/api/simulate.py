@@ -69,7 +69,7 @@ def simulate(
     from dynssm_ros.track.racing_line import line_of
 
     car, s = vehicle_of(vehicle).with_effects(settings.effects.items()), settings
-    course = track_of(track).scaled(s.scale)
+    course = track_of(track, closed=False).scaled(s.scale)
     duration = 60.0 if s.duration is None and s.laps is None else s.duration
     return simulate(
         car, course, duration=duration, laps=s.laps, plant=s.plant, seed=s.seed,

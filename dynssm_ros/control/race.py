@@ -1,7 +1,8 @@
 """Laps in closed loop: a plant, a model in the controller, and what is measured of them.
 
 The car starts on the line at the line's own speed unless said otherwise, its actuators at zero. A lap is done when the
-car is once around on the centre line. A violation is its centre of gravity outside the borders at any sample.
+car is once around on the centre line; an open road is driven once, to its end. A violation is its centre of gravity
+outside the borders at any sample.
 """
 
 from __future__ import annotations
@@ -68,12 +69,13 @@ class Course:
 
         Raises:
             SimulationError: the road is too narrow for the car; the start is not on it, or backwards; more than a lap
-                of a line for one.
+                of a line or a road for one; an open road for a car that learns from lap to lap.
         """
-        if self.laps > 1 and self.reference.standing:
-            raise SimulationError(
-                f"{self.laps} laps of line {self.reference.name}, which starts from standstill; expected 1"
-            )
+        if self.learning is not None:
+            self.track.require_closed()
+        if self.laps > 1 and self.reference.once:
+            why = "starts from standstill" if self.track.centre.closed else "is that of an open road"
+            raise SimulationError(f"{self.laps} laps of line {self.reference.name}, which {why}; expected 1")
         narrow = int(np.argmin(self.track.width_left + self.track.width_right))
         width = float(self.track.width_left[narrow] + self.track.width_right[narrow])
         if not width > 2 * self.settings.margin:
@@ -128,8 +130,10 @@ class Race:
 
     @property
     def lap_times(self) -> list[float]:
-        """Times of the complete laps (s)."""
+        """Times of the complete laps, or from the start to the end of an open road (s)."""
         length = self.course.track.length
+        if not self.course.track.centre.closed:
+            return [float(np.interp(length, self.s, self.time))] if self.s[-1] >= length else []
         done = int((self.s[-1] - self.s[0]) / length + 1e-9)
         marks = self.s[0] + length * np.arange(done + 1)
         return [float(lap) for lap in np.diff(np.interp(marks, np.maximum.accumulate(self.s), self.time))]
@@ -195,7 +199,8 @@ class _RaceCar:
             self._learner = LapLearner(course.learning, track, course.reference, settings, car=model.car, theta=theta)
             self.pilot.follow(self._learner.reference, self._learner.theta)
         self.s, self._lateral = (float(value) for value in track.project(pose[:2]))
-        self.start, self.goal = self.s, self.s + course.laps * track.length
+        self.start = self.s
+        self.goal = self.s + course.laps * track.length if track.centre.closed else track.length
 
     def step(self) -> str | None:
         """Drives on by T_s; once it is over, why: a failure, or nothing."""
@@ -213,7 +218,7 @@ class _RaceCar:
         failure = self._failure(t)
         if failure or self.s >= self.goal:
             return failure
-        car.advance(decision.command, self.s % self._course.track.length)
+        car.advance(decision.command, self._course.track.centre.wrapped(self.s))
         self._feedback = decision.command
         if not all(map(math.isfinite, (*car.pose, *car.state))):
             return f"its motion is not finite after {t:.2f} s"
@@ -245,9 +250,9 @@ class _RaceCar:
         """Why the drive ends before its time; empty if it does not."""
         track, state, s = self._course.track, self._car.state, self.s
         if -track.room(s, self._lateral) > LOST * np.sum(track.widths(s)):
-            return f"leaves the track after {t:.2f} s at s = {s % track.length:.4g} m"
+            return f"leaves the track after {t:.2f} s at s = {track.centre.wrapped(s):.4g} m"
         if state.v_x < abs(state.v_y):
-            return f"spins after {t:.2f} s at s = {s % track.length:.4g} m"
+            return f"spins after {t:.2f} s at s = {track.centre.wrapped(s):.4g} m"
         if t > self._limit:
             return f"takes longer than {self._limit:.3g} s"
         return ""

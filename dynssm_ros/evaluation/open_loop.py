@@ -38,7 +38,7 @@ from dynssm_ros.runtime.online import Learned
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, Commands
 from dynssm_ros.track.lap_position import first_lap
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
@@ -70,7 +70,7 @@ class Evaluation:
     drawn: Indices
     regimes: tuple[Regime, ...]
     scores: dict[str, Score]
-    line: ClosedLine | None
+    line: Line | None
     left: dict[str, dict[str, LeftToLearn]] = field(default_factory=dict)
 
     @property
@@ -190,7 +190,7 @@ def evaluate(
     horizon_s: float = PATH_HORIZON_S,
     stride: int = 1,
     calls: int = 200,
-    line: ClosedLine | None = None,
+    line: Line | None = None,
     progress: Callable[[int, int], None] | None = None,
     workers: Workers = HERE,
 ) -> Evaluation:

@@ -140,7 +140,7 @@ class ControllerNode(ManagedNode):
         if self._steps and not _STEPS[0] <= self._steps <= _STEPS[1]:
             raise ConfigurationError(f"parameter horizon: {self._steps}; expected {_STEPS[0]} to {_STEPS[1]}, or 0")
         car = load_vehicle(self._vehicle)
-        road = load_track(self._track).scaled(self._scale)
+        road = load_track(self._track).require_closed().scaled(self._scale)
         for words in road.notes:
             self.get_logger().warning(f"track {road.name}: {words}")
         reference = load_reference(self._line, car, road, self._speed_scale)

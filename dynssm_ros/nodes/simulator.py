@@ -87,7 +87,7 @@ class SimulatorNode(Node):
         if self._seed < 0:
             raise ConfigurationError(f"parameter seed: {self._seed}; expected at least 0")
         self._vehicle = load_vehicle(vehicle).with_effects(map(parse_effect, effects.split()))
-        self._track = load_track(track).scaled(scale)
+        self._track = load_track(track).require_closed().scaled(scale)
         for words in self._track.notes:
             self.get_logger().warning(f"track {self._track.name}: {words}")
         self._style = Style(aggressiveness, variation)

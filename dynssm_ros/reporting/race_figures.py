@@ -74,8 +74,10 @@ def _parting(races: Sequence[Race]) -> tuple[Vector, float]:
 def _draw_paths(axes: Axes, races: Sequence[Race]) -> None:
     course = races[0].course
     draw_borders(axes, course.track)
-    line = course.reference.line.points
-    axes.plot(*_closed(line).T, color="#777777", lw=0.8, ls="--", label=f"{course.reference.name} line")
+    line = course.reference.line
+    axes.plot(
+        *_drawn(line.points, line.closed).T, color="#777777", lw=0.8, ls="--", label=f"{course.reference.name} line"
+    )
     every = max(1, round(stamp_period(races) / course.vehicle.sampling_time))
     for race, style in race_lines(races):
         axes.plot(*race.pose[:, :2].T, label=race.name, **style)
@@ -86,11 +88,11 @@ def _draw_paths(axes: Axes, races: Sequence[Race]) -> None:
 def draw_borders(axes: Axes, track: Track) -> None:
     """Both borders of a track."""
     for border in (track.left_border, track.right_border):
-        axes.plot(*_closed(border).T, color=MEASURED, lw=1.0)
+        axes.plot(*_drawn(border, track.centre.closed).T, color=MEASURED, lw=1.0)
 
 
-def _closed(line: Vector) -> Vector:
-    return np.concatenate([line, line[:1]])
+def _drawn(points: Vector, closed: bool) -> Vector:
+    return np.concatenate([points, points[:1]]) if closed else points
 
 
 def race_lines(races: Sequence[Race]) -> list[tuple[Race, dict[str, Any]]]:

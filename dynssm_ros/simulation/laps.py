@@ -21,7 +21,7 @@ from dynssm_ros.signals.signal_map import POSE_SIGNALS
 from dynssm_ros.signals.standard import write_standard_bag
 from dynssm_ros.simulation.plant import START_TIME, PlantKind, make_plant
 from dynssm_ros.track.driver import Driver, Style
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Applied, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
@@ -92,9 +92,10 @@ def drive(
     plant: PlantKind = "euler",
     seed: int = 0,
     style: Style = DEFAULT_STYLE,
-    line: ClosedLine | None = None,
+    line: Line | None = None,
 ) -> Iterator[Sample]:
-    """Drives without end from a rolling start at the line's first point; see :func:`simulate`.
+    """Drives without end, or to the end of an open road, from a rolling start at the line's first point; see
+    :func:`simulate`.
 
     Raises:
         SimulationError: the car spins, stops or leaves the track.
@@ -117,6 +118,8 @@ def drive(
         _check_place(vehicle, track, time, state, s, lateral)
         command = driver.command(time, pose, state, on_line, feedback)
         yield Sample(time, state, pose, feedback, command, s, lateral, car.measured)
+        if not track.centre.closed and s >= track.length:
+            return
         car.advance(command, on_track)
         feedback = command
 
@@ -130,11 +133,11 @@ def simulate(
     *,
     seed: int = 0,
     style: Style = DEFAULT_STYLE,
-    line: ClosedLine | None = None,
+    line: Line | None = None,
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: Progress | None = None,
 ) -> Run:
-    """Drives ``duration`` seconds or a number of ``laps``.
+    """Drives ``duration`` seconds or a number of ``laps``; an open road once, from start to end, at most.
 
     Args:
         vehicle: the car; its effects act, its actuator limits hold, its T_s is the time between samples.
@@ -155,6 +158,8 @@ def simulate(
     goal = duration if laps is None else laps
     if (duration is None) == (laps is None) or goal is None or not goal > 0:
         raise SimulationError(f"duration {duration}, laps {laps}; expected one of them, positive")
+    if laps is not None and laps > 1 and not track.centre.closed:
+        raise SimulationError(f"{laps:g} laps of track {track.name}, an open road; expected 1 at most")
     samples: list[Sample] = []
     for sample in drive(vehicle, track, plant=plant, seed=seed, style=style, line=line):
         samples.append(sample)
@@ -218,7 +223,7 @@ def _check_place(vehicle: Vehicle, track: Track, time: float, state: State, s: f
     """The centre of gravity must stay between the borders."""
     if not track.room(s, lateral) >= 0:
         raise SimulationError(
-            f"{vehicle.name} leaves track {track.name} after {time:.2f} s at s = {s % track.length:.4g} m "
+            f"{vehicle.name} leaves track {track.name} after {time:.2f} s at s = {track.centre.wrapped(s):.4g} m "
             f"({lateral:+.3g} m beside the centre line, {state.v_x:.3g} m/s); "
             "drive less aggressively or take a wider track"
         )

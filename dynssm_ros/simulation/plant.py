@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.double_track import DoubleTrack
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.integrators import Integrator
@@ -89,7 +89,7 @@ class SingleTrackPlant:
         *,
         first: Sequence[StageEffect] = (),
         last: Sequence[StageEffect] = (),
-        line: ClosedLine | None = None,
+        line: Line | None = None,
         step: float = RK4_STEP,
     ) -> None:
         self.state = state
@@ -190,9 +190,7 @@ class PlantType:
         """Physics that it has beyond the single-track equations."""
         return ()
 
-    def make(
-        self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], line: ClosedLine | None
-    ) -> Plant:
+    def make(self, vehicle: Vehicle, pose: Pose, state: State, last: Sequence[StageEffect], line: Line | None) -> Plant:
         """A car of that kind; see :class:`SingleTrackPlant` for the arguments and errors."""
         return SingleTrackPlant(
             vehicle, self.integrator, pose, state,
@@ -252,7 +250,7 @@ def make_plant(
     state: State,
     *,
     last: Sequence[StageEffect] = (),
-    line: ClosedLine | None = None,
+    line: Line | None = None,
 ) -> Plant:
     """A car of that kind of plant; see :class:`SingleTrackPlant` for the arguments and errors."""
     return plant_type(kind).make(vehicle, pose, state, last, line)

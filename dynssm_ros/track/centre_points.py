@@ -40,14 +40,16 @@ class CentrePoints(NamedTuple):
     table: Vector
     """``x, y``, distances to the right and to the left border (m), ``(N, 4)``."""
     notes: tuple[str, ...]
-    """What was mended, in words."""
+    """What was mended, in words; that it is an open road."""
+    closed: bool = True
+    """Whether its end is at its start."""
 
 
 def mended(table: Vector) -> CentrePoints:
-    """The rows of a closed track ``(M, 4)`` in driving order without repeats, overlap and rounding.
+    """The rows of a track ``(M, 4)`` in driving order without repeats, overlap and rounding.
 
     Raises:
-        TrackError: it turns back, or its end is not at its start.
+        TrackError: it turns back.
     """
     if len(table) < _FEWEST:
         return CentrePoints(table, ())
@@ -62,10 +64,12 @@ def mended(table: Vector) -> CentrePoints:
     lap = _without_overlap(kept, spacing)
     if len(lap) < len(kept):
         notes.append(f"the last {len(kept) - len(lap)} points, which run along the start again, left out")
-    _check_closed(lap, spacing)
-    _check_turns(lap)
-    smooth, words = _without_rounding(lap, spacing)
-    return CentrePoints(smooth, (*notes, *words))
+    closed = _is_closed(lap, spacing)
+    if not closed:
+        notes.append(f"an open road: its end is {_distances(lap)[-1]:.3g} m from its start; it is driven once")
+    _check_turns(lap, closed)
+    smooth, words = _without_rounding(lap, spacing, closed)
+    return CentrePoints(smooth, (*notes, *words), closed)
 
 
 def _distances(table: Vector) -> Vector:
@@ -107,20 +111,17 @@ def _in_frame(away: Vector, ahead: Vector) -> tuple[float, float]:
     return float(away @ ahead), float(ahead[0] * away[1] - ahead[1] * away[0])
 
 
-def _check_closed(table: Vector, spacing: float) -> None:
-    distance = _distances(table)
-    gap = distance[-1]
-    if gap > max(_OPEN * spacing, _OPEN_LONGEST * distance[:-1].max(), float(table[[0, -1], 2:].sum(axis=1).max())):
-        raise TrackError(
-            f"an open road: its last point (x = {table[-1, 0]:.4g} m, y = {table[-1, 1]:.4g} m) is {gap:.3g} m from its "
-            f"first, {gap / spacing:.0f} times the usual distance of its points; expected a closed lap"
-        )
+def _is_closed(table: Vector, spacing: float) -> bool:
+    distance, width = _distances(table), float(table[[0, -1], 2:].sum(axis=1).max())
+    return bool(distance[-1] <= max(_OPEN * spacing, _OPEN_LONGEST * distance[:-1].max(), width))
 
 
-def _check_turns(table: Vector) -> None:
+def _check_turns(table: Vector, closed: bool) -> None:
     step = np.roll(table[:, :2], -1, axis=0) - table[:, :2]
     step = step / np.hypot(*step.T)[:, None]
     cosine = np.sum(step * np.roll(step, 1, axis=0), axis=1)
+    if not closed:
+        cosine[[0, -1]] = 1.0
     back = np.flatnonzero(cosine < _BACK)
     if len(back):
         k = int(back[0])
@@ -130,16 +131,16 @@ def _check_turns(table: Vector) -> None:
         )
 
 
-def _without_rounding(table: Vector, spacing: float) -> tuple[Vector, tuple[str, ...]]:
+def _without_rounding(table: Vector, spacing: float, closed: bool) -> tuple[Vector, tuple[str, ...]]:
     """Smoothed within what rounding moves points by: of variance ``step^2 / 12`` in x and in y."""
     step = _rounded_to(table[:, :2])
     half_width = float(np.median(table[:, 2:]))
     if step == 0.0 or step / spacing**2 < _BENT / half_width:
         return table, ()
-    closed = np.concatenate([table[:, :2], table[:1, :2]])
-    fitted: Any = splprep(closed.T, s=_SMOOTHED * len(closed) * step**2 / 6, per=True)
+    through = np.concatenate([table[:, :2], table[:1, :2]]) if closed else table[:, :2]
+    fitted: Any = splprep(through.T, s=_SMOOTHED * len(through) * step**2 / 6, per=closed)
     (knots, coefficients, degree), at = fitted
-    points: Vector = BSpline(knots, np.stack(coefficients, axis=1), degree)(at[:-1])
+    points: Vector = BSpline(knots, np.stack(coefficients, axis=1), degree)(at[: len(table)])
     moved = float(np.hypot(*(points - table[:, :2]).T).max())
     note = f"x and y are rounded to {step:g} m: smoothed, points moved by up to {moved:.2g} m"
     return np.concatenate([points, table[:, 2:]], axis=1), (note,)

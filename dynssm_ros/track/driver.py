@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.vehicle import Applied, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
@@ -43,7 +43,7 @@ class Driver:
     """Drives one car along one line, with ``room`` metres to either side. The same seed gives the same drive."""
 
     def __init__(
-        self, vehicle: Vehicle, line: ClosedLine, limits: Limits, style: Style, *, seed: int = 0, room: float = 0.0
+        self, vehicle: Vehicle, line: Line, limits: Limits, style: Style, *, seed: int = 0, room: float = 0.0
     ) -> None:
         self.line = line
         self._slower = 0.3 * style.variation
@@ -53,13 +53,13 @@ class Driver:
         self._theta = Coefficients(*vehicle.nominal.tolist())
         self._stiffness = sum(cornering_stiffness(self._theta))
         rng = np.random.default_rng(seed)
-        lap_time = float(np.sum(np.diff(line.s, append=line.length) / self._profile))
+        lap_time = float(np.sum(line.steps / self._profile[: len(line.steps)]))
         self._slowing = SlowVariation(rng, lap_time / 2)
         self._place = SlowVariation(rng, lap_time / 2)
 
     def speed(self, s: float) -> float:
         """The profile's speed (m/s) at ``s`` (m, periodic)."""
-        return float(np.interp(s, self.line.s, self._profile, period=self.line.length))
+        return float(np.interp(s, self.line.s, self._profile, period=self.line.length if self.line.closed else None))
 
     def offset(self, time: float) -> float:
         """How far beside the line (m, positive left) the driver wants to be at ``time`` (s)."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.vehicle.effects import CONTEXT_UNITS
 from dynssm_ros.vehicle.kinematics import time_of_day
 
@@ -17,7 +17,7 @@ _STARTS = 200  # places at which a lap is tried to begin
 _ALIGNED = 0.5  # cosine between the directions in which a place is passed
 
 
-def first_lap(recording: Recording) -> ClosedLine | None:
+def first_lap(recording: Recording) -> Line | None:
     """The path of the first full lap, closed smoothly; ``None`` without positions or if no lap is completed.
 
     A lap begins anywhere, also on an out-lap, and ends where the car passes the same place in the same direction again.
@@ -30,14 +30,14 @@ def first_lap(recording: Recording) -> ClosedLine | None:
     return next((lap for lap in laps if lap is not None), None)
 
 
-def track_position(line: ClosedLine, recording: Recording) -> Vector:
+def track_position(line: Line, recording: Recording) -> Vector:
     """Arc length along ``line`` of each row (m), in ``[0, length)``, shape ``(N,)``."""
     positions = np.stack([recording["x"], recording["y"]], axis=1)
     blocks = np.split(positions, range(_AT_ONCE, len(positions), _AT_ONCE))
     return np.concatenate([line.project(block)[0] for block in blocks])
 
 
-def lap_context(recording: Recording, line: ClosedLine | None) -> dict[str, Vector]:
+def lap_context(recording: Recording, line: Line | None) -> dict[str, Vector]:
     """What effects may read of each row, ``(N,)``: the signals of ``CONTEXT_UNITS`` that ``recording`` has, and the place.
 
     ``t`` (s) counts from the first row, ``clock`` (s) from midnight UTC, ``s`` (m, in ``[0, lap_length)``) along ``line``.
@@ -51,7 +51,7 @@ def lap_context(recording: Recording, line: ClosedLine | None) -> dict[str, Vect
     return context | {"s": s, "lap_length": np.full(len(recording), line.length), "bend": line.bend(s)}
 
 
-def lap_number(recording: Recording, line: ClosedLine | None) -> Vector | None:
+def lap_number(recording: Recording, line: Line | None) -> Vector | None:
     """How many times each row's drive has passed the start of ``line``; ``None`` without one."""
     if line is None:
         return None
@@ -73,7 +73,7 @@ def rms_along(position: Vector, errors: Vector, length: float, bins: int) -> Vec
     return np.sqrt(np.divide(squares, count, out=np.full_like(squares, np.nan), where=count > 0))
 
 
-def _lap(positions: Vector) -> ClosedLine | None:
+def _lap(positions: Vector) -> Line | None:
     """The first closed lap of one gap-free drive, positions ``(N, 2)``."""
     driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(positions, axis=0).T))])
     extent = float(np.hypot(*np.ptp(positions, axis=0)))
@@ -91,5 +91,5 @@ def _lap(positions: Vector) -> ClosedLine | None:
             passing = back[: np.flatnonzero(np.diff(back, append=len(path) + 1) > 1)[0] + 1]
             end = start + _POINTS // 2 + int(passing[np.argmin(distance[passing])])
             ramp = np.linspace(0.0, 1.0, end - start, endpoint=False)[:, None]
-            return ClosedLine(path[start:end] - ramp * (path[end] - path[start]))
+            return Line(path[start:end] - ramp * (path[end] - path[start]))
     return None

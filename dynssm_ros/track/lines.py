@@ -1,4 +1,4 @@
-"""Closed lines in the plane: centre lines, racing lines. Smooth, by arc length, with left as the positive side."""
+"""Lines in the plane, closed or open: centre lines, racing lines. Smooth, by arc length, with left as the positive side."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -25,13 +25,15 @@ _SHARPEST = 0.95  # quantile of the curvature
 
 
 @dataclass(frozen=True, eq=False)
-class ClosedLine:
-    """A closed smooth line: the periodic cubic spline by arc length through ``points``.
+class Line:
+    """A smooth line: the cubic spline by arc length through ``points``.
 
-    These are positions in driving order (m), ``(N, 2)``; the first is not repeated at the end.
+    These are positions in driving order (m), ``(N, 2)``. Of a ``closed`` line the first is not repeated at the end, and arc
+    lengths are periodic. An open line goes straight on before its first and behind its last point.
     """
 
     points: Vector
+    closed: bool = True
 
     def __post_init__(self) -> None:
         points = np.array(self.points, dtype=np.float64)
@@ -41,12 +43,21 @@ class ClosedLine:
     @cached_property
     def s(self) -> Vector:
         """Arc length of the points (m), shape ``(N,)``, 0 at the first."""
-        return self._knots[:-1]
+        return self._knots[:-1] if self.closed else self._knots
 
     @cached_property
     def length(self) -> float:
-        """Length of one lap (m)."""
+        """Length of one lap, or from the first to the last point (m)."""
         return float(self._knots[-1])
+
+    @cached_property
+    def steps(self) -> Vector:
+        """From each point to the next (m): ``(N,)`` of a closed line, ``(N - 1,)`` of an open one."""
+        return np.diff(self._knots)
+
+    def wrapped(self, s: Floats) -> Any:
+        """Arc length ``s`` (m) within the lap of a closed line; of an open one as it is."""
+        return s % self.length if self.closed else s
 
     def position(self, s: Floats, lateral: Floats = 0.0) -> Vector:
         """Positions (m) at arc length ``s`` (m, periodic), ``lateral`` metres to the left; shape ``(..., 2)``."""
@@ -73,7 +84,7 @@ class ClosedLine:
 
         It is the curvature over that which a twentieth of the lap exceeds; from -1 (to the right) to 1 (to the left).
         """
-        return np.interp(np.asarray(s, dtype=np.float64) / self.length % 1.0, *self._bends)
+        return np.asarray(np.interp(self.wrapped(np.asarray(s, dtype=np.float64)) / self.length, *self._bends))
 
     def place(self, s: float) -> dict[str, float]:
         """What effects may know of the place ``s`` (m, counting on over the laps)."""
@@ -87,7 +98,7 @@ class ClosedLine:
             near: arc length (m) to search around, where the line passes itself closely; the whole line if not given.
 
         Returns:
-            Arc length in ``[0, length)`` and signed distance (m, positive to the left), each of shape ``(...)``.
+            Arc length, of a closed line in ``[0, length)``, and signed distance (m, positive to the left), each ``(...)``.
         """
         points = np.asarray(points, dtype=np.float64)
         p: Any = _as_complex(points)
@@ -108,25 +119,27 @@ class ClosedLine:
             position, tangent, _ = self._derivatives(s)
             away = p - position
         cross = (tangent.conjugate() * away).imag
-        return np.asarray(s % self.length), np.asarray(cross / np.abs(tangent))
+        return np.asarray(self.wrapped(s)), np.asarray(cross / np.abs(tangent))
 
     def counted_on(self, s: float, last: float) -> float:
         """Arc length ``s`` (m) counted on over the laps from ``last`` (m), which is less than half a lap away."""
+        if not self.closed:
+            return s
         return last + math.remainder(s - last, self.length)
 
-    def scaled(self, factor: float) -> ClosedLine:
+    def scaled(self, factor: float) -> Line:
         """The same shape, ``factor`` times as large."""
-        return ClosedLine(self.points * factor)
+        return Line(self.points * factor, self.closed)
 
     @cached_property
     def _spline(self) -> CubicSpline:
         """Position over arc length; its parameter is refined until it is the spline's own length."""
-        closed = np.concatenate([self.points, self.points[:1]])
-        pieces = np.hypot(*np.diff(closed, axis=0).T)
+        through = np.concatenate([self.points, self.points[:1]]) if self.closed else self.points
+        pieces = np.hypot(*np.diff(through, axis=0).T)
         nodes, weights = np.polynomial.legendre.leggauss(5)
         for _ in range(4):
             knots = np.concatenate([[0.0], np.cumsum(pieces)])
-            spline = CubicSpline(knots, closed, bc_type="periodic")
+            spline = CubicSpline(knots, through, bc_type="periodic" if self.closed else "natural")
             inside = knots[:-1, None] + np.diff(knots)[:, None] * (nodes + 1) / 2
             tangent = spline(inside, 1)
             pieces = np.hypot(tangent[..., 0], tangent[..., 1]) @ weights / 2 * np.diff(knots)
@@ -148,13 +161,14 @@ class ClosedLine:
         return self._knots.tolist(), self._pieces.T.tolist()
 
     def _derivatives(self, s: Floats) -> tuple[Any, Any, Any]:
-        """Position and its first two derivatives by arc length at ``s`` (m, periodic), each ``(...)``, complex: ``x +
-        iy``.
+        """Position and its first two derivatives by arc length at ``s`` (m), each ``(...)``, complex: ``x + iy``.
 
         Plain numbers for a plain number: a controller asks for few points often, where scipy's own evaluation is
         several times slower.
         """
         at: Any
+        if not self.closed:
+            return self._derivatives_of_open(np.asarray(s, dtype=np.float64))
         if isinstance(s, float):
             knots, pieces = self._listed
             at = s % self.length
@@ -166,14 +180,22 @@ class ClosedLine:
             (a, b, c, d), h = self._pieces[:, places], at - self._knots[places]
         return ((a * h + b) * h + c) * h + d, (3 * a * h + 2 * b) * h + c, 6 * a * h + 2 * b
 
+    def _derivatives_of_open(self, s: Vector) -> tuple[Any, Any, Any]:
+        at = np.clip(s, 0.0, self.length)
+        places = self._knots[1:-1].searchsorted(at, "right")
+        (a, b, c, d), h, over = self._pieces[:, places], at - self._knots[places], s - at
+        tangent, bend = (3 * a * h + 2 * b) * h + c, 6 * a * h + 2 * b
+        return ((a * h + b) * h + c) * h + d + over * tangent, tangent, np.where(over == 0.0, bend, 0.0)
+
     @cached_property
     def _bends(self) -> tuple[Vector, Vector]:
         """Places (laps) and :meth:`bend` there."""
+        mode: Literal["wrap", "nearest"] = "wrap" if self.closed else "nearest"
         lap = np.arange(_BEND_POINTS) / _BEND_POINTS
-        curvature = gaussian_filter1d(self.curvature(lap * self.length), _SMOOTHED * _BEND_POINTS, mode="wrap")
+        curvature = gaussian_filter1d(self.curvature(lap * self.length), _SMOOTHED * _BEND_POINTS, mode=mode)
         sharpest = float(np.quantile(np.abs(curvature), _SHARPEST))
         bend = np.clip(curvature / max(sharpest, 1e-12), -1.0, 1.0)
-        return np.append(lap, 1.0), np.append(bend, bend[0])
+        return np.append(lap, 1.0), np.append(bend, bend[0 if self.closed else -1])
 
     @cached_property
     def _tree(self) -> cKDTree:

@@ -2,8 +2,9 @@
 
 The integral of the squared curvature and the length are minimised over lateral offsets by Gauss-Newton: on the line of
 each round, offsets ``e`` along its normals make the integrand ``(kappa + e'' + kappa^2 e / 2)^2`` (to first order, with
-the change of length), and the borders bound ``e``: a quadratic program in a box with a cyclic banded matrix. Each round
-starts from the line before, not from the centre line, whose normals cross in corners tighter than the road is wide.
+the change of length), and the borders bound ``e``: a quadratic program in a box with a banded matrix, cyclic for a closed
+track. Each round starts from the line before, not from the centre line, whose normals cross in corners tighter than the
+road is wide.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from scipy.sparse.linalg import spsolve
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.track.centre_points import TrackError
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.track.tracks import Track
 from dynssm_ros.vehicle import Vehicle
 
@@ -41,7 +42,7 @@ def border_margin(vehicle: Vehicle, track: Track) -> float:
     return CAR_WIDTH * car.wheelbase / 2 + SAFETY * narrowest
 
 
-def line_of(kind: LineKind, vehicle: Vehicle, track: Track) -> ClosedLine:
+def line_of(kind: LineKind, vehicle: Vehicle, track: Track) -> Line:
     """The centre line, or the racing line with room for the car.
 
     Raises:
@@ -50,8 +51,8 @@ def line_of(kind: LineKind, vehicle: Vehicle, track: Track) -> ClosedLine:
     return track.centre if kind == "centre" else racing_line(track, border_margin(vehicle, track))
 
 
-def racing_line(track: Track, margin: float, tension: float = TENSION) -> ClosedLine:
-    """The closed line of least integral of ``kappa^2 + lambda^2`` inside the borders; its points are evenly spaced.
+def racing_line(track: Track, margin: float, tension: float = TENSION) -> Line:
+    """The line of least integral of ``kappa^2 + lambda^2`` inside the borders; its points are evenly spaced.
 
     Args:
         track: where.
@@ -75,7 +76,7 @@ def racing_line(track: Track, margin: float, tension: float = TENSION) -> Closed
     least = np.inf
     for k in range(_ROUNDS):
         offsets = _offsets(line, track, margin * (1 + _SLACK), weight, _REACH * _CALMING**k)
-        line = _resampled(ClosedLine(line.position(line.s, offsets)), count)
+        line = _resampled(Line(line.position(line.s, offsets), line.closed), count)
         cost = curvature_integral(line) + weight * line.length
         if cost < least and np.min(track.clearance(line.points)) >= margin:
             best, least = line, cost
@@ -88,27 +89,30 @@ def racing_line(track: Track, margin: float, tension: float = TENSION) -> Closed
     return best
 
 
-def curvature_integral(line: ClosedLine) -> float:
+def curvature_integral(line: Line) -> float:
     """Integral of the squared curvature over one lap (1/m)."""
     s = np.linspace(0.0, line.length, 8 * len(line.points), endpoint=False)
     return float(np.mean(line.curvature(s) ** 2) * line.length)
 
 
-def _resampled(line: ClosedLine, count: int) -> ClosedLine:
-    return ClosedLine(line.position(np.linspace(0.0, line.length, count, endpoint=False)))
+def _resampled(line: Line, count: int) -> Line:
+    return Line(line.position(np.linspace(0.0, line.length, count, endpoint=not line.closed)), line.closed)
 
 
-def _offsets(line: ClosedLine, track: Track, margin: float, weight: float, reach: float) -> Vector:
+def _offsets(line: Line, track: Track, margin: float, weight: float, reach: float) -> Vector:
     """Best offsets (m) along the normals of ``line``, linearised there; shape ``(N,)``."""
-    N, h = len(line.points), line.length / len(line.points)
+    N, h = len(line.points), line.length / len(line.steps)
     heading = line.heading(line.s)
     normal = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
-    bend = (np.roll(line.points, 1, axis=0) - 2 * line.points + np.roll(line.points, -1, axis=0)) / h**2
-    kappa = np.sum(bend * normal, axis=1)  # by the differences that ``second`` takes; the spline's would ring with it
     same: Any = sparse.diags_array(np.ones(N), format="csr")
-    second = (same[np.roll(np.arange(N), 1)] - 2 * same + same[np.roll(np.arange(N), -1)]) / h**2
+    ahead = (same[np.roll(np.arange(N), -1)] - same)[: len(line.steps)] / h  # first differences
+    tension = ahead.T @ ahead
+    second = (
+        -tension if line.closed else -sparse.diags_array(np.r_[0.0, np.ones(N - 2), 0.0]) @ tension
+    )  # ends are free
+    kappa = np.sum((second @ line.points) * normal, axis=1)  # by these differences; the spline's would ring with them
     J = second + sparse.diags_array(kappa**2 / 2)
-    H = sparse.csc_array(J.T @ J - weight / 2 * second)
+    H = sparse.csc_array(J.T @ J + weight / 2 * tension)
     g = np.asarray(J.T @ kappa - weight / 2 * kappa)
 
     s, lateral = track.project(line.points)

@@ -7,11 +7,11 @@ from itertools import pairwise
 import numpy as np
 
 from dynssm_ros.arrays import Indices, Vector
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.vehicle.limits import Limits
 
 
-def speed_profile(line: ClosedLine, limits: Limits, share: float | Vector = 1.0, *, reached: bool = True) -> Vector:
+def speed_profile(line: Line, limits: Limits, share: float | Vector = 1.0, *, reached: bool = True) -> Vector:
     """Fastest speed (m/s) at the points of ``line`` by cornering, brakes and drive, shape ``(N,)``.
 
     Lateral and longitudinal acceleration share the grip: they stay on the ellipse of their limits.
@@ -27,8 +27,8 @@ def speed_profile(line: ClosedLine, limits: Limits, share: float | Vector = 1.0,
     v = limits.cornering_speed(curvature)
     ds = np.diff(line.s, append=line.length)
     # from the slowest corner around once, the end meets the start; then the same in reverse for the brakes
-    start = int(np.argmin(v))
-    order = np.asarray((start + np.arange(len(v) + 1)) % len(v), dtype=np.intp)
+    start, count = (int(np.argmin(v)), len(v) + 1) if line.closed else (0, len(v))
+    order = np.asarray((start + np.arange(count)) % len(v), dtype=np.intp)
     if reached:
         v = _forward(v, order, share * ds, curvature, limits, limits.drive)
     return _forward(v, order[::-1], share * np.roll(ds, 1), curvature, limits, limits.brake)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from dynssm_ros.arrays import Vector
 from dynssm_ros.track.centre_points import TrackError, mended
 from dynssm_ros.track.layouts import LAYOUTS, closed_loop
-from dynssm_ros.track.lines import ClosedLine, Floats
+from dynssm_ros.track.lines import Floats, Line
 
 CSV_COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 LARGEST = 1e9  # m, of a coordinate or width
@@ -24,7 +24,7 @@ MAX_FOLDED = 0.25  # share of the lap; 0.04 on the published ETHZ track
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A closed ribbon of road.
+    """A ribbon of road, closed or open as its centre line is.
 
     Attributes:
         name: for messages and results.
@@ -38,7 +38,7 @@ class Track:
     """
 
     name: str
-    centre: ClosedLine
+    centre: Line
     width_right: Vector
     width_left: Vector
     notes: tuple[str, ...] = ()
@@ -53,8 +53,18 @@ class Track:
 
     @property
     def length(self) -> float:
-        """Length of one lap along the centre line (m)."""
+        """Length of one lap, or from start to end, along the centre line (m)."""
         return self.centre.length
+
+    def require_closed(self) -> Track:
+        """The track, if it is a lap.
+
+        Raises:
+            TrackError: it is an open road.
+        """
+        if not self.centre.closed:
+            raise TrackError(f"track {self.name}: an open road of {self.length:.4g} m; expected a closed lap")
+        return self
 
     @cached_property
     def left_border(self) -> Vector:
@@ -68,17 +78,19 @@ class Track:
 
     def widths(self, s: Floats) -> tuple[Vector, Vector]:
         """Distances from the centre line to the right and to the left border (m) at ``s`` (m, periodic)."""
-        at, (places, right, left) = np.asarray(s, dtype=np.float64) % self.length, self._lap
+        at, (places, right, left) = self.centre.wrapped(np.asarray(s, dtype=np.float64)), self._lap
         return np.interp(at, places, right), np.interp(at, places, left)
 
     @cached_property
     def _lap(self) -> tuple[Vector, Vector, Vector]:
-        """Places of the centre line's points (m) and widths there, the first point once more at the end of the lap."""
+        """Places of the centre line's points (m) and widths there, the first point once more at the end of a lap."""
+        if not self.centre.closed:
+            return self.centre.s, self.width_right, self.width_left
         right, left = (np.append(width, width[0]) for width in (self.width_right, self.width_left))
         return np.append(self.centre.s, self.length), right, left
 
     def project(self, points: npt.ArrayLike, near: npt.ArrayLike | None = None) -> tuple[Vector, Vector]:
-        """Track position ``s`` (m) and lateral offset (m, positive left) of ``points``; see ``ClosedLine.project``."""
+        """Track position ``s`` (m) and lateral offset (m, positive left) of ``points``; see ``Line.project``."""
         return self.centre.project(points, near)
 
     def clearance(self, points: npt.ArrayLike) -> Vector:
@@ -113,19 +125,19 @@ def load_track(name_or_path: str | Path) -> Track:
         return read_track(path)
     if str(name_or_path) in LAYOUTS:
         layout = LAYOUTS[str(name_or_path)]()
-        centre = ClosedLine(closed_loop(layout.segments, layout.spacing))
+        centre = Line(closed_loop(layout.segments, layout.spacing))
         half = np.full(len(centre.points), layout.width / 2)
         return Track(str(name_or_path), centre, half, half)
     raise TrackError(f"track '{name_or_path}' is neither a file nor a built-in name ({', '.join(sorted(LAYOUTS))})")
 
 
 def read_track(path: str | Path) -> Track:
-    """Reads ``x_m,y_m,w_tr_right_m,w_tr_left_m`` rows of a closed track.
+    """Reads ``x_m,y_m,w_tr_right_m,w_tr_left_m`` rows of a closed track or an open road.
 
     Points that repeat or overlap are left out, and coordinates that are rounded are smoothed; see :func:`mended`.
 
     Raises:
-        TrackError: unreadable, other columns, a value that is not a number, an open road, or no track.
+        TrackError: unreadable, other columns, a value that is not a number, or no track.
     """
     path = Path(path)
     try:
@@ -142,8 +154,8 @@ def read_track(path: str | Path) -> Track:
             rows.append(_numbers(cells, f"{path}: line {number}"))
     table = np.array(rows).reshape(-1, len(CSV_COLUMNS))
     try:
-        table, notes = mended(table)
-        return Track(path.stem, ClosedLine(table[:, :2]), table[:, 2], table[:, 3], notes)
+        table, notes, closed = mended(table)
+        return Track(path.stem, Line(table[:, :2], closed), table[:, 2], table[:, 3], notes)
     except TrackError as error:
         raise TrackError(f"{path}: {error}") from error
 
@@ -180,7 +192,7 @@ def _check_points(track: Track) -> None:
 
 def _check_borders(track: Track) -> None:
     """The road must not overlap itself. Inside a corner tighter than its half width a border folds; that is allowed."""
-    N, s, length = len(track.centre.points), track.centre.s, track.length
+    s, length, N = track.centre.s, track.length, len(track.centre.steps)
     curvature = track.centre.curvature(s)
     for side, reach in (("left", curvature * track.width_left), ("right", -curvature * track.width_right)):
         if np.mean(reach > 1) > MAX_FOLDED:
@@ -188,11 +200,12 @@ def _check_borders(track: Track) -> None:
                 f"track {track.name}: borders cross: the {side} border runs backwards along {np.mean(reach > 1):.0%} of "
                 "the lap; expected a half width below the radius of the corners"
             )
-    start = np.concatenate([track.left_border, track.right_border])
-    end = np.concatenate([np.roll(border, -1, axis=0) for border in (track.left_border, track.right_border)])
+    borders = (track.left_border, track.right_border)
+    start = np.concatenate([border[:N] for border in borders])
+    end = np.concatenate([np.roll(border, -1, axis=0)[:N] for border in borders])
     i, j = _crossings(start, end)
     apart = np.abs(s[i % N] - s[j % N])
-    apart = np.minimum(apart, length - apart)
+    apart = np.minimum(apart, length - apart) if track.centre.closed else apart
     full_width = track.width_left[i % N] + track.width_right[i % N]
     bad = np.flatnonzero((i // N != j // N) | (apart > 1.5 * full_width))
     if len(bad):

@@ -12,7 +12,7 @@ from dynssm_ros.control.horizon_model import HorizonModel
 from dynssm_ros.control.nmpc import Nmpc
 from dynssm_ros.control.reference import Reference, load_reference
 from dynssm_ros.control.settings import Settings
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.track.tracks import Track, load_track
 from dynssm_ros.vehicle import COEFFICIENTS, CarModel, load_vehicle
 
@@ -51,7 +51,7 @@ def circle():
 
     def build(side=1, radius=1.0, speed=1.5):
         angle = side * np.linspace(0, 2 * np.pi, 200, endpoint=False)
-        line = ClosedLine(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        line = Line(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
         width = np.full(200, 0.2)
         return Track("circle", line, width, width), Reference("circle", line, np.full(200, speed))
 

@@ -11,12 +11,13 @@ from dynssm_ros.control.race import Course, Start, _RaceCar, race
 from dynssm_ros.control.race_models import load_prediction_model, true_model
 from dynssm_ros.control.reference import Reference, load_reference
 from dynssm_ros.control.settings import Settings
-from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.reporting.race_figures import coefficients, driven_coefficients, forces, trajectories
 from dynssm_ros.reporting.race_report import race_json, race_report, race_table, summary
 from dynssm_ros.simulation.laps import SimulationError
 from dynssm_ros.simulation.sensing import Sensing
-from dynssm_ros.track.tracks import load_track
+from dynssm_ros.track.lines import Line
+from dynssm_ros.track.tracks import Track, load_track
 from dynssm_ros.vehicle import COEFFICIENTS, State, load_vehicle
 
 
@@ -214,3 +215,20 @@ def test_a_road_narrower_than_the_car_is_refused(course, orca, club):
     path = replace(club, width_left=club.width_left / 12, width_right=club.width_right / 12)
     with pytest.raises(SimulationError, match=r"track club is 0.0333 m wide .* more than 0.0403 m, the width of orca"):
         race(replace(course, track=path), true_model(orca, "euler"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["centre", "racing"])
+def test_an_open_road_is_raced_once_from_start_to_end(orca, club, kind):
+    """As fast as its line allows, with no straight back to the start."""
+    last = 2 * len(club.centre.points) // 3
+    road = Track("road", Line(club.centre.points[:last], closed=False), club.width_right[:last], club.width_left[:last])
+    reference = load_reference(kind, orca, road)
+    course = Course(orca, road, "euler", reference, replace(Settings.of(orca), deadline=math.inf))
+    driven = race(course, true_model(orca, "euler"))
+    assert driven.completed
+    assert driven.outside == 0.0
+    assert driven.lap_times == [pytest.approx(reference.lap_time, rel=0.05)]
+    for wrong in (replace(course, laps=2), replace(course, learning=orca)):
+        with pytest.raises(UserError, match="open road"):
+            race(wrong, true_model(orca, "euler"))

@@ -30,7 +30,7 @@ from dynssm_ros.runtime.contract import WindowPrediction
 from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
 from dynssm_ros.signals.recording import Recording, RecordingInfo
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.vehicle import load_vehicle
 
 T_s = 0.02
@@ -133,7 +133,7 @@ def test_report_has_a_section_for_everything_that_there_is(report):
 
 def test_errors_are_placed_on_the_line_that_is_given(evaluation):
     circle = np.linspace(0.0, 2 * np.pi, 100, endpoint=False)
-    around = ClosedLine(3.0 * np.stack([np.cos(circle), np.sin(circle)], axis=1))
+    around = Line(3.0 * np.stack([np.cos(circle), np.sin(circle)], axis=1))
     (section,) = (s for s in open_loop_report(replace(evaluation, line=around)).sections if "lap" in s.title)
     assert section.figure.axes[-1].get_xlim() == (0.0, around.length)
 

@@ -11,7 +11,9 @@ from dynssm_ros.signals.messages import COMMAND_TOPIC, FEEDBACK_TOPIC, ODOMETRY_
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.simulation.laps import SimulationError, drive, simulate, write_run
 from dynssm_ros.track.driver import Style
-from dynssm_ros.track.tracks import load_track
+from dynssm_ros.track.lines import Line
+from dynssm_ros.track.racing_line import line_of
+from dynssm_ros.track.tracks import Track, load_track
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, load_vehicle
 
 ORCA, CLUB = load_vehicle("orca"), load_track("club")
@@ -178,3 +180,21 @@ def test_progress_reaches_the_end():
     simulate(ORCA, CLUB, duration=1, progress=lambda done, total: told.append((done, total)))
     assert told[-1] == (1000, 1000)
     assert len(told) == 51
+
+
+def open_road() -> Track:
+    """Two thirds of a lap."""
+    last = 2 * len(CLUB.centre.points) // 3
+    return Track("road", Line(CLUB.centre.points[:last], closed=False), CLUB.width_right[:last], CLUB.width_left[:last])
+
+
+@pytest.mark.parametrize(("line", "until"), [("centre", {"laps": 1}), ("racing", {"duration": 60.0})])
+def test_an_open_road_is_driven_once_from_start_to_end(line, until):
+    road = open_road()
+    run = simulate(ORCA, road, line=line_of(line, ORCA, road), **until)
+    assert run.s[0] == pytest.approx(0.0, abs=0.05)
+    assert road.length <= run.s[-1] < road.length + 3.0 * 0.02
+    assert np.all(np.diff(run.s) > 0)
+    assert run.state[-1, 0] > 1.0  # it does not stop for the end
+    with pytest.raises(SimulationError, match=r"2 laps of track road, an open road; expected 1 at most"):
+        simulate(ORCA, road, laps=2)

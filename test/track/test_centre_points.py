@@ -97,10 +97,22 @@ def test_published_tracks_are_taken_as_they_are(data: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("last", [60, 250, 370])
-def test_an_open_road_is_refused_in_one_line(tmp_path: Path, last: int) -> None:
-    with pytest.raises(TrackError, match=r"track.csv: an open road: its last point .* expected a closed lap") as caught:
-        read(tmp_path, ROWS[:last])
-    assert "\n" not in str(caught.value)
+def test_an_open_road_is_one_says_so_and_is_no_lap(tmp_path: Path, last: int) -> None:
+    """It ends at its last point; no straight closes it."""
+    road = read(tmp_path, ROWS[:last])
+    assert not road.centre.closed
+    assert road.length == pytest.approx(float(np.hypot(*np.diff(ROWS[:last, :2], axis=0).T).sum()), rel=1e-3)
+    assert road.notes[-1].startswith("an open road: its end is ")
+    with pytest.raises(TrackError, match=r"^track track: an open road of .* expected a closed lap$"):
+        road.scaled(2.0).require_closed()
+
+
+def test_a_rounded_open_road_is_smoothed(tmp_path: Path) -> None:
+    rows = ROWS[:250].copy()
+    rows[:, :2] = np.round(rows[:, :2], 2)
+    road, fine = read(tmp_path, rows), read(tmp_path, ROWS[:250])
+    assert len(road.notes) == 2
+    assert np.abs(road.centre.curvature(road.centre.s)).max() < 1.5 * np.abs(fine.centre.curvature(fine.centre.s)).max()
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.track.tracks import load_track
 
 
-def circle(radius: float, count: int = 200, direction: int = 1) -> ClosedLine:
+def circle(radius: float, count: int = 200, direction: int = 1) -> Line:
     angle = direction * np.linspace(0, 2 * np.pi, count, endpoint=False)
-    return ClosedLine(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    return Line(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -39,7 +39,7 @@ def test_the_bend_goes_with_the_curvature_up_to_the_sharpest_places_whatever_the
 
 def test_unevenly_spaced_points_still_give_arc_length():
     angle = np.sort(np.random.default_rng(0).uniform(0, 2 * np.pi, 600))
-    line = ClosedLine(np.stack([3 * np.cos(angle), 3 * np.sin(angle)], axis=1))
+    line = Line(np.stack([3 * np.cos(angle), 3 * np.sin(angle)], axis=1))
     fine = np.linspace(0, line.length, 20001)
     steps = np.hypot(*np.diff(line.position(fine), axis=0).T)
     np.testing.assert_allclose(steps, line.length / 20000, rtol=1e-3)
@@ -83,7 +83,7 @@ def test_many_points_project_like_one_by_one():
 def test_near_keeps_the_projection_on_its_own_branch():
     x = np.linspace(0, 10, 101)
     out, back = np.stack([x, 0 * x], axis=1), np.stack([x[::-1], 0 * x + 0.5], axis=1)
-    line = ClosedLine(np.concatenate([out, back]))  # there and back, half a metre apart
+    line = Line(np.concatenate([out, back]))  # there and back, half a metre apart
     point = [5.0, 0.3]  # nearer to the way back
     assert line.project(point)[0] > 10
     s, lateral = line.project(point, near=5.0)
@@ -95,3 +95,20 @@ def test_lines_cannot_be_changed():
     line = circle(1.0)
     with pytest.raises(ValueError, match="read-only"):
         line.points[0] = 0.0
+
+
+def test_an_open_line_ends_at_its_points_and_goes_straight_on_behind_them() -> None:
+    angle = np.linspace(0.0, np.pi / 2, 600)
+    quarter = Line(10.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1), closed=False)
+    assert quarter.length == pytest.approx(5.0 * np.pi, rel=1e-5)
+    assert quarter.s[-1] == quarter.length
+    middle = quarter.s[20:-20]
+    np.testing.assert_allclose(quarter.curvature(middle), 0.1, rtol=1e-3)
+    np.testing.assert_allclose(quarter.position(quarter.length + 3.0), [-3.0, 10.0], atol=0.01)
+    np.testing.assert_allclose(quarter.position(-2.0), [10.0, -2.0], atol=0.01)
+    assert quarter.curvature(quarter.length + 1.0) == 0.0
+    s, lateral = quarter.project([[-1.0, 9.5], [10.5, -1.0], [7.0, 7.0]])
+    np.testing.assert_allclose(s, [quarter.length + 1.0, -1.0, 2.5 * np.pi], atol=0.02)
+    np.testing.assert_allclose(lateral, [0.5, -0.5, 10.0 - np.hypot(7.0, 7.0)], atol=0.02)
+    assert quarter.counted_on(0.5, 15.0) == 0.5
+    assert quarter.bend(quarter.length + 1.0) == pytest.approx(quarter.bend(quarter.length))

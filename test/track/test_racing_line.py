@@ -6,7 +6,7 @@ from scipy import sparse
 
 from dynssm_ros.simulation.laps import simulate
 from dynssm_ros.track.layouts import LAYOUTS
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.track.racing_line import border_margin, box_qp, curvature_integral, line_of, racing_line
 from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.track.tracks import Track, TrackError, load_track
@@ -20,7 +20,7 @@ BUILT_IN = {name: "orca" if name.startswith("club") else "av21" for name in LAYO
 def ring(direction=1, radius=20.0, half=3.0):
     angle = direction * np.linspace(0, 2 * np.pi, 120, endpoint=False)
     width = np.full(120, half)
-    return Track("ring", ClosedLine(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)), width, width)
+    return Track("ring", Line(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)), width, width)
 
 
 @pytest.fixture(
@@ -116,3 +116,14 @@ def test_box_qp_meets_the_conditions_of_optimality():
     assert np.all(gradient[at_upper] < 1e-5)
     np.testing.assert_allclose(gradient[~at_lower & ~at_upper], 0, atol=1e-5)
     assert np.sum(at_lower) + np.sum(at_upper) > 5
+
+
+def test_on_an_open_road_that_a_chord_fits_into_the_line_is_straight():
+    angle = np.linspace(0.0, np.radians(20.0), 100)
+    arc = Line(100.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1), closed=False)
+    road = Track("road", arc, np.full(100, 3.0), np.full(100, 3.0))
+    line = racing_line(road, 0.5)
+    assert not line.closed
+    assert curvature_integral(line) < 0.01 * curvature_integral(arc)
+    assert road.clearance(line.points).min() >= 0.5
+    assert line.length == pytest.approx(arc.length, rel=0.05)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dynssm_ros.errors import UserError
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.track.speed_profile import speed_profile
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
@@ -15,14 +15,14 @@ from dynssm_ros.vehicle.limits import Limits, vehicle_limits
 CONSTANT = Limits(np.linspace(0.1, 100, 50), np.full(50, 8.0), np.full(50, 3.0), np.full(50, 6.0))
 
 
-def slopes(line: ClosedLine, v: np.ndarray) -> np.ndarray:
+def slopes(line: Line, v: np.ndarray) -> np.ndarray:
     """Longitudinal acceleration from each point to the next."""
     return (np.roll(v, -1) ** 2 - v**2) / (2 * np.diff(line.s, append=line.length))
 
 
 def test_circle_is_driven_at_the_lateral_limit():
     angle = np.linspace(0, 2 * np.pi, 300, endpoint=False)
-    circle = ClosedLine(50 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    circle = Line(50 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     np.testing.assert_allclose(speed_profile(circle, CONSTANT), np.sqrt(8.0 * 50), rtol=1e-4)
 
 
@@ -80,7 +80,7 @@ def test_terminal_speed_is_bounded_by_cornering_and_brakes_alone(share):
 def test_profile_does_not_depend_on_the_first_point():
     line = load_track("club").centre
     limits = vehicle_limits(load_vehicle("orca"))
-    shifted = ClosedLine(np.roll(line.points, -137, axis=0))
+    shifted = Line(np.roll(line.points, -137, axis=0))
     np.testing.assert_allclose(speed_profile(shifted, limits), np.roll(speed_profile(line, limits), -137), rtol=1e-6)
 
 
@@ -123,3 +123,16 @@ def test_car_that_cannot_move_is_refused():
     weak[COEFFICIENTS.index("C_m1")] = 0.01
     with pytest.raises(UserError, match="full throttle does not move it"):
         vehicle_limits(orca.with_nominal(weak))
+
+
+def test_an_open_road_is_neither_braked_for_its_end_nor_accelerated_to_its_start():
+    """A bend at the end asks for brakes as on a lap; after a bend at the start the car accelerates."""
+    bend, straight = np.linspace(0.0, np.pi / 2, 200), np.linspace(0.5, 100.0, 200)[:, None]
+    arc = 20.0 * np.stack([np.sin(bend), 1.0 - np.cos(bend)], axis=1)
+    into = Line(np.concatenate([[-100.0, 0.0] + straight[:-1] * [1.0, 0.0], arc]), closed=False)
+    out = Line(into.points[::-1], closed=False)
+    v, w = speed_profile(into, CONSTANT), speed_profile(out, CONSTANT)
+    bend_ends = 20.0 * np.pi / 2
+    gained = np.interp([0.0, 80.0], into.s, v**2), np.interp([bend_ends + 20.0, out.length], out.s, w**2)
+    assert gained[0][0] - gained[0][1] == pytest.approx(2 * 6.0 * 80.0, rel=1e-3)
+    assert gained[1][1] - gained[1][0] == pytest.approx(2 * 3.0 * (out.length - bend_ends - 20.0), rel=1e-3)

@@ -30,7 +30,7 @@ from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.track.lap_position import first_lap
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 
 LEAST_SHARE = 0.005
 """Share of a channel's squared error from which on a pattern is reported: less is a quarter of a percent of the RMSE."""
@@ -118,7 +118,7 @@ def anatomy(
     *,
     name: str = "",
     min_speed: float | None = None,
-    line: ClosedLine | None = None,
+    line: Line | None = None,
     learn: bool = True,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Anatomy:

@@ -15,7 +15,7 @@ from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS, applied_inputs
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.vehicle.integrators import Integrator
 
 BLOCK_S = 3.0
@@ -45,7 +45,7 @@ class OneStepErrors:
     recording: Recording
     rows: Indices
     values: Vector
-    line: ClosedLine | None = None
+    line: Line | None = None
     wheelbase: float | None = None
 
     def __len__(self) -> int:
@@ -142,7 +142,7 @@ def one_step_errors(
     recording: Recording,
     rows: Indices,
     *,
-    line: ClosedLine | None = None,
+    line: Line | None = None,
     wheelbase: float | None = None,
     tick: Tick = silent,
 ) -> OneStepErrors:

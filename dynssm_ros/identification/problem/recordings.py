@@ -16,7 +16,7 @@ from dynssm_ros.identification.problem.levels import Group, Levels
 from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows, rows_per_sample, v_y_variance
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.track.lap_position import first_lap, lap_context, lap_number, track_position
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 
 
 class Folds(NamedTuple):
@@ -78,11 +78,11 @@ class RecordingSet:
     held_out: Mask
     split: str
     levels: Levels
-    lines: tuple[ClosedLine | None, ...]
+    lines: tuple[Line | None, ...]
 
     @classmethod
     def of(
-        cls, recordings: Sequence[Recording], holdout: float, line: ClosedLine | None = None, suspects: Group = (),
+        cls, recordings: Sequence[Recording], holdout: float, line: Line | None = None, suspects: Group = (),
         known: Mapping[str, float] | None = None,
     ) -> RecordingSet:  # fmt: skip
         """Joins recordings and holds out the share ``holdout`` at the end of each; whole laps if there are three.
@@ -192,11 +192,9 @@ def driven_alike(windows: SimulationWindows, recordings: Collection[int]) -> flo
     return float(np.mean(cKDTree(driven[~own]).query(driven[own])[0] < tuning.LIKE_SPREADS))
 
 
-def _first_laps(
-    recordings: Sequence[Recording], cuts: Sequence[int], road: Sequence[int]
-) -> tuple[ClosedLine | None, ...]:
+def _first_laps(recordings: Sequence[Recording], cuts: Sequence[int], road: Sequence[int]) -> tuple[Line | None, ...]:
     """Of each recording the first full lap on its road before the rows that are held out."""
-    laps: dict[int, ClosedLine | None] = {}
+    laps: dict[int, Line | None] = {}
     for one, cut, number in zip(recordings, cuts, road, strict=True):
         if laps.get(number) is None:
             laps[number] = first_lap(one.select(np.arange(len(one)) < cut))

@@ -25,7 +25,7 @@ from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWi
 from dynssm_ros.progress import Progress
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.track.lap_position import first_lap, lap_context
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.effects.base import LAP
@@ -80,7 +80,7 @@ def calibrate(
     starts: int = 3,
     seed: int = 0,
     on_progress: Progress | None = None,
-    line: ClosedLine | None = None,
+    line: Line | None = None,
 ) -> Calibration:
     """Fits the nominal coefficients within their bounds; mass and geometry stay.
 
@@ -163,7 +163,7 @@ def _rmse(one_step: SimulationWindows, car: CarEstimate) -> Vector:
     return np.asarray(np.sqrt(squares / len(one_step)))
 
 
-def _context(recording: Recording, vehicle: Vehicle, line: ClosedLine | None) -> dict[str, Vector]:
+def _context(recording: Recording, vehicle: Vehicle, line: Line | None) -> dict[str, Vector]:
     """What is known beside state and inputs. Where a lap starts its first full one does not tell, but how the road bends."""
     if line is not None or not any("bend" in effect.needs for effect in vehicle.active_effects):
         return lap_context(recording, line)

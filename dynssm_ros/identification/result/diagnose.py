@@ -29,7 +29,7 @@ from dynssm_ros.parallel import IN_TURN, Pool
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
-from dynssm_ros.track.lines import ClosedLine
+from dynssm_ros.track.lines import Line
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS, require_context
 from dynssm_ros.vehicle.integrators import Integrator
@@ -45,7 +45,7 @@ def diagnose(
     holdout: float | None = None,
     min_speed: float | None = None,
     integrator: Integrator | None = None,
-    line: ClosedLine | None = None,
+    line: Line | None = None,
     on_progress: OnProgress = lambda words: None,
     exclude: Collection[str] = (),
     suspect: Sequence[Recording] = (),
@@ -239,7 +239,7 @@ def _prepare(
     horizon: float,
     holdout: float | None,
     min_speed: float | None,
-    line: ClosedLine | None,
+    line: Line | None,
 ) -> _Prepared:
     """Checks what was given, holds laps out and lays the simulations along the rest; see :func:`diagnose`."""
     least, most = tuning.HOLDOUT_RANGE
