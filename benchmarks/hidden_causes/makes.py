@@ -49,7 +49,7 @@ _OF_A_CAR = 4  # drives
 _RATE = 0.02  # s: sampling time
 _STEP = 5e-3  # s, of Runge and Kutta: 0.4 of the fastest of these cars' time constants
 _TRIES = 6
-_DRIVE = ("drive_gain", "C_m1", "m", "mass")  # what a drive force that is larger is told by
+_DRIVE = ("drive_gain", "C_m1", "mass")  # what a drive force that is larger is told by
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,8 @@ def _drive(
 def _answer(make: str, hidden: Hidden, found: Diagnosis, seconds: float) -> Answer:
     named = tuple(cause.effect for cause in found.causes)
     small = tuple(cause.effect for cause in found.small_effects)
-    reach = {*named, *small, *found.moved}.union(*(cause.alternatives for cause in found.causes))
+    moved = {"mass" if name == "m" else name for name in found.moved}  # which a file may know no better
+    reach = {*named, *small, *moved}.union(*(cause.alternatives for cause in found.causes))
     return Answer(make, hidden, found.verdict, named, frozenset(reach), small, seconds)
 
 
