@@ -177,6 +177,7 @@ class LiveController:
         """Plans by what became of them."""
         self._recent: deque[tuple[float, bool]] = deque(maxlen=_REMEMBERED)  # seconds, and whether there was a plan
         self._last: int | None = None  # stamp of the newest odometry (ns)
+        self._strayed = False  # whether the car is off the road since it was driven without odometry
         self._first = self._planned = 0
         self._heading = 0.0
         # commands from the one that acts at the stamp of the newest odometry to the last
@@ -243,6 +244,7 @@ class LiveController:
             self._reckoned = None
         elif abs(stamp - self._planned - self.period) > _PUNCTUAL * self.period:
             self._pilot.interrupt()
+        self._strayed = self._strayed or (self._last is not None and not together)
         if since < 0:
             self.remote.forget()
         if since < 0 or self._last is None:
@@ -251,7 +253,8 @@ class LiveController:
             self._sent.extend([Applied(float(self.vehicle.inputs.coasting(seen.v_x)), 0.0)] * self._age)
         self._last = self._planned = stamp
         self.laps.passed((stamp - self._first) / 1e9, pose.x, pose.y, together)
-        if self.laps.outside > LOST * self.laps.width:
+        self._strayed = self._strayed and self.laps.outside > 0
+        if self._strayed or self.laps.outside > LOST * self.laps.width:
             self.brakes.apply(f"{self.laps.outside:.3g} m outside the borders")
         if self.brakes.released(seen.v_x):
             return self._answer(stamp, pose, seen)

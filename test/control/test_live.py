@@ -343,6 +343,22 @@ def test_far_off_the_road_it_brakes_and_says_so(online, orca, club):
     assert controller.verdict()[0] != Level.ERROR
 
 
+def test_off_the_road_after_a_gap_it_brakes_until_it_is_back(online, orca, club):
+    controller, car = online(), SteppedCar(orca, club)
+    for _ in range(5):
+        car.answered(controller)
+    beside = Pose(*(float(v) for v in club.centre.position(0.3, -0.25)), float(club.centre.heading(0.3)))
+    car.stamp += 10**9
+    for k in range(20):  # the road's borders are 0.2 m from its centre
+        command = controller.step(car.stamp + k * T_S, beside, State(0.0, 0.0, 0.0))
+        assert command.r == orca.inputs.throttle[0]
+        assert "0.05 m outside the borders: brakes" in controller.verdict()[1]
+    car.stamp += 10**9
+    for _ in range(10):
+        car.answered(controller)
+    assert controller.verdict()[0] != Level.ERROR
+
+
 def test_a_delay_beyond_what_can_be_carried_over_is_refused(online):
     with pytest.raises(ConfigurationError, match=r"delay 0.38 s: expected less than 19 times T_s"):
         online(delay=0.38)
