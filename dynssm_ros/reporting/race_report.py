@@ -101,13 +101,16 @@ def summary(races: Sequence[Race]) -> str:
         laps = {race.name: f"{np.mean(race.lap_times):.3f}" for race in done}
         best = min(laps.values(), key=float)
         fastest = [name for name, lap in laps.items() if lap == best]
-        text = f"{', '.join(fastest)} {'is' if len(fastest) == 1 else 'are'} the fastest with {best} s a lap."
+        each = " a lap" if races[0].course.track.centre.closed else ""
+        text = f"{', '.join(fastest)} {'is' if len(fastest) == 1 else 'are'} the fastest with {best} s{each}."
     if outside:
         text += f" Outside the borders: {', '.join(outside)}."
     return text + (f" Not completed: {'; '.join(lost)}." if lost else "")
 
 
 def _laps(course: Course) -> str:
+    if not course.track.centre.closed:
+        return "an open road"
     return "a lap" if course.laps == 1 else f"{course.laps} laps"
 
 

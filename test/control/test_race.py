@@ -229,6 +229,7 @@ def test_an_open_road_is_raced_once_from_start_to_end(orca, club, kind):
     assert driven.completed
     assert driven.outside == 0.0
     assert driven.lap_times == [pytest.approx(reference.lap_time, rel=0.05)]
+    assert summary([driven]) == f"true is the fastest with {driven.lap_times[0]:.3f} s."
     for wrong in (replace(course, laps=2), replace(course, learning=orca)):
         with pytest.raises(UserError, match="open road"):
             race(wrong, true_model(orca, "euler"))
