@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 import dynssm_ros
+from benchmarks.matrix.scored_cells import season_logs
 from benchmarks.page import render, save_page, table
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import DataWarning
@@ -101,9 +102,8 @@ def simulated(seed: int) -> Iterator[Log]:
 def measured(data: Path, test: bool) -> Iterator[Log]:
     """Real logs, and the one of a public simulator; those marked as test if ``test``."""
     marked = {"free_driving_1027", "circles_right_03_ramp_1653", "tape_and_tiles_right_03_ramp_1758"}
-    season = [path for path in sorted((data / "dart_season").iterdir()) if path.is_dir()]
     logs = [(path, RACER, path.name in marked) for path in sorted((data / "dart").iterdir()) if path.is_dir()]
-    logs += [(path, RACER, int(hashlib.sha256(path.name.encode()).hexdigest(), 16) % 3 == 0) for path in season]
+    logs += [(path, RACER, test) for path in season_logs(data, test)]
     logs += [(data / "av21" / "putnam_park_run4_2", AV21, False), (data / "orca" / "ethz_pure_pursuit", ORCA, False)]
     for path, car, is_test in logs:
         if is_test == test:

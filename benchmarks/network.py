@@ -14,7 +14,6 @@ development, or with ``--test`` those for publishing.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from benchmarks.matrix.scored_cells import RACER, Cell, simulated_cells, test_drive, training_drive
+from benchmarks.matrix.scored_cells import RACER, Cell, season_logs, simulated_cells, test_drive, training_drive
 from benchmarks.page import table
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.files import write_json
@@ -112,17 +111,11 @@ def _cell(cell: Cell) -> Fold:
 def further_folds(data: Path, test: bool) -> dict[str, Callable[[], Fold]]:
     """Measured folds, all simulated cells with the usual noise, and the other logs of the 1:10 car's season."""
     cells = [cell for cell in simulated_cells() if cell.is_test == test and "-usual-" in cell.name]
-    season = sorted(path.name for path in (data / "dart_season").iterdir() if path.is_dir())
     known = {Path(bag).name for bag in _DART.values()}
-    logs = [name for name in season if name not in known and (_digest(name) % 3 == 0) == test]
+    logs = [log.name for log in season_logs(data, test) if log.name not in known]
     laps = {name: fold for name, fold in folds(data).items() if name.startswith(("putnam", "dart"))} if not test else {}
     simulated = {f"cell_{cell.name}": partial(_cell, cell) for cell in cells}
     return {**laps, **simulated, **{f"season_{name}": partial(_season_log, name, data) for name in logs}}
-
-
-def _digest(name: str) -> int:
-    """By which the data's README divides logs into those for development and those for tests."""
-    return int(hashlib.sha256(name.encode()).hexdigest(), 16)
 
 
 def _season_log(name: str, data: Path) -> Fold:
@@ -338,18 +331,19 @@ def scored(study: Study) -> dict[str, list[float]]:
 
 def steps_scored(study: Study) -> dict[str, list[float]]:
     """:func:`ratios` of the layer with the throttle's steps, and of the one that ``train`` gives."""
-    layers: dict[bool | None, tuple[LayerFeatures, OnlineLayer]] = {}
-    for steps in (False, True, None):
+    model = build_model(load_model_config("rls"), study.base.vehicle, study.base.normalisation)
+
+    def fitted(steps: bool | None) -> tuple[LayerFeatures, OnlineLayer]:
         base = study.base._replace(config=OnlineConfig(throttle_steps=steps))
-        model = build_model(load_model_config("rls"), base.vehicle, base.normalisation)
-        layers[steps] = earned_layer(base, model, study.fold.training, [])[:2]
+        return earned_layer(base, model, study.fold.training, [])[:2]
 
     def of(features: LayerFeatures, layer: OnlineLayer) -> Scored:
         return score(study, features, layer, judged(study, features, layer))
 
-    alone = of(*layers[False])
-    forced = ratios(of(*layers[True]), alone)
-    earned = layers[None][0].layout.throttle
+    chosen = fitted(None)
+    earned = chosen[0].layout.throttle
+    layers = {earned: chosen, not earned: fitted(not earned)}
+    forced = ratios(of(*layers[True]), of(*layers[False]))
     return {"everywhere": forced, "where they earn it": forced if earned else [1.0] * len(forced)}
 
 

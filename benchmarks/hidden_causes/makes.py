@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from benchmarks.hidden_causes.cases import NOISE, Hidden, size
+from benchmarks.hidden_causes.outcomes import shared
 from benchmarks.page import table
 from dynssm_ros.errors import DataWarning
 from dynssm_ros.identification.result.calibration import calibrate
@@ -173,7 +173,7 @@ def page(found: list[Answer]) -> str:
     stronger = [one for one in found if one.hidden == _STRONGER]
     causes = [one for one in found if one.hidden and one.hidden != _STRONGER]
     rates = [
-        ("`steering_curve` is named", [" ".join(one.named).count("steering_curve") > 0 for one in found]),
+        ("`steering_curve` is named", ["steering_curve" in one.named for one in found]),
         ("named in a healthy drive and no structure of such a car", [bool(one.not_there) for one in healthy]),
         ("named beside what is hidden and no structure of such a car", [bool(one.not_there) for one in causes]),
         ("the drive force 4 % larger is found", [bool(one.reach & {*_DRIVE}) for one in stronger]),
@@ -201,9 +201,11 @@ def page(found: list[Answer]) -> str:
 
 
 def _rate(words: str, each: list[bool]) -> list[str]:
-    interval = binomtest(sum(each), len(each)).proportion_ci(method="wilson")
-    low, high = 100 * interval.low, 100 * interval.high
-    return [words, f"{sum(each)} of {len(each)}", f"{100 * sum(each) / len(each):.0f} %", f"{low:.0f} to {high:.0f} %"]
+    rate = shared(each)
+    low, high = rate["interval_95"]
+    return [
+        words, f"{rate['count']} of {rate['of']}", f"{100 * rate['share']:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %"
+    ]  # fmt: skip
 
 
 def main() -> None:

@@ -115,14 +115,14 @@ def rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     none = [o for o in outcomes if not o.hidden]
     return {
         "cases": len(outcomes),
-        "named_first": _share([o.first for o in one]),
-        "strictly_first": _share([o.strictly_first for o in one]),
-        "right_size": _share([o.sized for o in outcomes if o.sized is not None]),
-        "covered": _share([covered for o in outcomes for covered in o.covered]),
-        "both_found": _share([o.all for o in two]),
-        "false_alarms": _share([not o.first for o in none]),
-        "more_named": _share([len(o.named) > 1 for o in one]),
-        "too_small": _share([name in o.too_small for o in outcomes for name in o.missed]),
+        "named_first": shared([o.first for o in one]),
+        "strictly_first": shared([o.strictly_first for o in one]),
+        "right_size": shared([o.sized for o in outcomes if o.sized is not None]),
+        "covered": shared([covered for o in outcomes for covered in o.covered]),
+        "both_found": shared([o.all for o in two]),
+        "false_alarms": shared([not o.first for o in none]),
+        "more_named": shared([len(o.named) > 1 for o in one]),
+        "too_small": shared([name in o.too_small for o in outcomes for name in o.missed]),
     }
 
 
@@ -132,7 +132,8 @@ def processor_seconds(outcomes: Sequence[Outcome]) -> tuple[float, float] | None
     return (float(np.median(taken)), max(taken)) if taken else None
 
 
-def _share(right: Sequence[bool]) -> dict[str, Any]:
+def shared(right: Sequence[bool]) -> dict[str, Any]:
+    """Which share of cases came out right, with its 95 % interval (Wilson)."""
     count, of = sum(right), len(right)
     if not of:
         return {"of": 0, "count": 0, "share": None, "interval_95": None}
@@ -150,7 +151,7 @@ def by_size(outcomes: Sequence[Outcome], parts: int = 3) -> list[dict[str, Any]]
     """Shares of cases of one effect that are named first, by size: from the range's least part to its greatest."""
     one = [o for o in outcomes if len(o.values) == 1]
     part = [min(int(parts * max(share_of_range(*next(iter(o.values.items()))), 0.0)), parts - 1) for o in one]
-    return [_share([o.strictly_first for o, p in zip(one, part, strict=True) if p == k]) for k in range(parts)]
+    return [shared([o.strictly_first for o, p in zip(one, part, strict=True) if p == k]) for k in range(parts)]
 
 
 def matrix(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], npt.NDArray[np.intp]]:

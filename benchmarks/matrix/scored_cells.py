@@ -118,6 +118,12 @@ def measured_cells() -> Iterator[Cell]:
         yield Cell(rubber, log, ((log, 0.0, end),), marked=True)
 
 
+def season_logs(data: Path, test: bool) -> list[Path]:
+    """The logs of the 1:10 car's season that are for development, or for a ``test``, by the rule of the data's README."""
+    logs = [path for path in sorted((data / "dart_season").iterdir()) if path.is_dir()]
+    return [log for log in logs if (int(hashlib.sha256(log.name.encode()).hexdigest(), 16) % 3 == 0) == test]
+
+
 def cells(data: Path) -> list[Cell]:
     """All cells, those of the real logs if ``data`` has them."""
     return [*simulated_cells(), *(measured_cells() if (data / "dart").is_dir() else ())]

@@ -244,7 +244,7 @@ class LiveController:
             self._reckoned = None
         elif abs(stamp - self._planned - self.period) > _PUNCTUAL * self.period:
             self._pilot.interrupt()
-        self._strayed = self._strayed or (self._last is not None and not together)
+        gap = self._last is not None and not together
         if since < 0:
             self.remote.forget()
         if since < 0 or self._last is None:
@@ -253,14 +253,18 @@ class LiveController:
             self._sent.extend([Applied(float(self.vehicle.inputs.coasting(seen.v_x)), 0.0)] * self._age)
         self._last = self._planned = stamp
         self.laps.passed((stamp - self._first) / 1e9, pose.x, pose.y, together)
-        self._strayed = self._strayed and self.laps.outside > 0
-        if self._strayed or self.laps.outside > LOST * self.laps.width:
+        if self._is_lost(gap):
             self.brakes.apply(f"{self.laps.outside:.3g} m outside the borders")
         if self.brakes.released(seen.v_x):
             return self._answer(stamp, pose, seen)
         if not self.brakes.until_standing:
             self._believe(stamp, pose, seen)
         return self.brake(stamp + self.answered_after + round(1e9 * late))
+
+    def _is_lost(self, gap: bool) -> bool:
+        """Whether the car is off the road by too much: by anything since a ``gap``, as it was driven unseen."""
+        self._strayed = (self._strayed or gap) and self.laps.outside > 0
+        return self._strayed or self.laps.outside > LOST * self.laps.width
 
     def predicted(self, stamp: int, state: State) -> str:
         """Takes what the predictor says of the instant ``stamp`` (ns). Returns what is wrong with it, else nothing."""

@@ -109,37 +109,42 @@ def earned_layer(base: LayerBase, model: TrainableModel, laps: Recording, left_o
     less, since a controller needs the path. Without ``left_out`` parts of the laps there is no evidence of the network, and
     the layer rests on the physics alone.
     """
-    base, layer, throttle_gain = _with_steps(base, model, laps)
-    alone = base.features(False)
+    base, alone, layer, throttle_gain = _with_steps(base, model, laps)
     if not model.LEARNS or not left_out:
         return Earned(alone, layer, throttle_gain)
     together = base.features(True)
     with_network = base.fitted(together, left_out)
-    gain = _gain(
-        _errors(base, together, with_network, left_out), _errors(base, alone, base.fitted(alone, left_out), left_out)
-    )
+    gain = _gain(base, left_out, (together, with_network), (alone, base.fitted(alone, left_out)))
     if gain >= GAIN_WANTED:
         return Earned(together, with_network.layer, throttle_gain, gain)
     return Earned(alone, layer, throttle_gain, gain)
 
 
-def _with_steps(base: LayerBase, model: TrainableModel, laps: Recording) -> tuple[LayerBase, OnlineLayer, float | None]:
-    """The base with its question of the throttle's steps answered, the layer on its physics alone, and the steps' gain."""
+def _with_steps(
+    base: LayerBase, model: TrainableModel, laps: Recording
+) -> tuple[LayerBase, LayerFeatures, OnlineLayer, float | None]:
+    """The base with the throttle's steps decided, features and layer on its physics alone, and the steps' gain."""
     stretches = [(model, part) for part in map(laps.select, laps.stretches(_STRETCHES))]
-    plain = base.fitted(base.features(False), stretches)
+    plain = base.features(False)
+    without = base.fitted(plain, stretches)
     asked = base.config.throttle_steps is None and base.vehicle.inputs.set_point == "throttle"
     if not asked or not any(len(base.starts(part)) for _, part in stretches):
-        return base, plain.layer, None
+        return base, plain, without.layer, None
     bent = base._replace(config=base.config.model_copy(update={"throttle_steps": True}))
-    fitted = bent.fitted(bent.features(False), stretches)
-    gain = _gain(
-        _errors(bent, bent.features(False), fitted, stretches), _errors(base, base.features(False), plain, stretches)
-    )
-    return (bent, fitted.layer, gain) if gain >= GAIN_WANTED else (base, plain.layer, gain)
+    steps = bent.features(False)
+    with_steps = bent.fitted(steps, stretches)
+    gain = _gain(base, stretches, (steps, with_steps), (plain, without))
+    return (bent, steps, with_steps.layer, gain) if gain >= GAIN_WANTED else (base, plain, without.layer, gain)
 
 
-def _gain(errors: Vector, before: Vector) -> float:
-    step, path = errors / before
+def _gain(
+    base: LayerBase,
+    parts: list[Part],
+    now: tuple[LayerFeatures, FittedLayer],
+    before: tuple[LayerFeatures, FittedLayer],
+) -> float:
+    """Share of the error on parts that are not known that one layer takes off another's; see :func:`earned_layer`."""
+    step, path = _errors(base, *now, parts) / _errors(base, *before, parts)
     return float(1.0 - max(np.sqrt(step * path), path))
 
 

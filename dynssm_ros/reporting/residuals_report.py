@@ -103,7 +103,7 @@ def pattern_sections(label: str, model: ModelAnatomy, most: int) -> Iterator[Sec
     prose = Prose("residuals")
     for pattern in [each for each in model.patterns if each.picture is not None][:most]:
         figure = residuals_figures.pattern_figure(pattern)
-        words = f"{sentence(pattern)}. {pattern.advice}".removesuffix(".").rstrip(". ")
+        words = ". ".join(part.removesuffix(".") for part in (sentence(pattern), pattern.advice) if part)
         yield prose.section(pattern.family, figure, model=label, channel=pattern.channel, words=words)
 
 

@@ -266,7 +266,7 @@ class CoefficientEstimator:
 
     def _mean_increments(self, rows: Vector, cars: Vector) -> Vector:
         """Mean increments over ``rows`` ``(L, 7)`` of cars with coefficients ``(P, 17)``: ``(P, 3)``."""
-        if self._compiled is not None and compiled.LIBRARY is not None and len(rows) == self.rows:
+        if self._compiled is not None and compiled.LIBRARY is not None:
             return np.array([self._compiled.over(rows, theta).mean(axis=0) for theta in cars])
         now = np.broadcast_to(rows.T[:, None], (rows.shape[1], len(cars), len(rows)))
         with np.errstate(all="ignore"):

@@ -214,8 +214,7 @@ class Predictor:
 
     def predict(self, stamp: int, values: dict[str, float], frames: Frames | None = None) -> Prediction | Refusal:
         """Takes the odometry sample ``values`` at ``stamp`` (ns) and predicts the instant ``stamp + T_s``."""
-        if self._learner is not None:
-            self._learner.state.coefficients.finish()
+        self.finish()
         refusal = self.observe(stamp, values, frames)
         if refusal is not None:
             return refusal

@@ -83,10 +83,11 @@ def _extract(
 ) -> Recording:
     """The recording of one log, whose notes begin with ``note``."""
     with open_log(path) as log:
-        signal_map, lack = _without_lacking_context(log, *_with_commands_of(log, signal_map))
+        signal_map, lack = _with_commands_of(log, signal_map)
+        signal_map, left_out = _without_lacking_context(log, signal_map)
         streams, stamped, notes, findings = read_streams(log, signal_map, drop_bad, progress)
     streams, rests = _with_brakes_at_rest(streams, signal_map)
-    notes = [*([note] if note else []), *notes, *lack, *rests]
+    notes = [*([note] if note else []), *notes, *lack, *left_out, *rests]
     if signal_map.velocities is not None:
         streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
         notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")
@@ -132,20 +133,18 @@ def _with_commands_of(log: Bag | LogTable, signal_map: SignalMap) -> tuple[Signa
     if signal_map.commands != "topics":
         return signal_map, []
     sources = [signal_map.signals[name] for name in signal_map.command_signals]
-    missing = [_lacking(log, one) for one in sources if _lacking(log, one)]
+    missing = [what for one in sources if (what := _lacking(log, one))]
     if not missing:
         return signal_map, []
     told = " and ".join(dict.fromkeys(missing))
     return signal_map.with_commands("none"), [f"no commands in the log ({told}); commands: none"]
 
 
-def _without_lacking_context(
-    log: Bag | LogTable, signal_map: SignalMap, notes: list[str]
-) -> tuple[SignalMap, list[str]]:
+def _without_lacking_context(log: Bag | LogTable, signal_map: SignalMap) -> tuple[SignalMap, list[str]]:
     """The map without gear or engine speed where the log lacks them, and a note on each."""
-    lacking = {name: _lacking(log, signal_map.signals[name]) for name in CONTEXT_SIGNALS if name in signal_map.signals}
-    told = [f"{name}: no {what} in the log; left out" for name, what in lacking.items() if what]
-    return signal_map.without([name for name, what in lacking.items() if what]), [*notes, *told]
+    mapped = [name for name in CONTEXT_SIGNALS if name in signal_map.signals]
+    lacking = {name: what for name in mapped if (what := _lacking(log, signal_map.signals[name]))}
+    return signal_map.without(lacking), [f"{name}: no {what} in the log; left out" for name, what in lacking.items()]
 
 
 def _lacking(log: Bag | LogTable, source: Source) -> str:

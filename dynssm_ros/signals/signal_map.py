@@ -326,7 +326,7 @@ class SignalMap(StrictModel):
     def active_signals(self) -> dict[str, Source]:
         """The signals that are read: commands only where ``commands: topics``, sensors where velocities are estimated."""
         skipped: tuple[str, ...] = () if self.commands == "topics" else (*self.command_signals, "brake_command")
-        skipped += ("wheel_speed",) if self.estimation is not None else (*SENSORS, "wheel_speed")
+        skipped += ("wheel_speed", *(SENSORS if self.estimation is None else ()))
         return {name: source for name, source in self.signals.items() if name not in skipped}
 
 

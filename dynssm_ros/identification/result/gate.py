@@ -16,9 +16,11 @@ from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED
 from dynssm_ros.identification.result.improvement import (
     Improvement,
+    channel_reduction,
     is_noticed,
     mean_reduction,
     measure_improvement,
+    reduction_interval,
 )
 from dynssm_ros.identification.result.residuals import Left, clustered, explained_variance
 from dynssm_ros.identification.search.integrator import SearchResult
@@ -100,8 +102,9 @@ def _without_each(
     def one(cause: Refined) -> Without:
         refitted = errors(search.leave_out(selection, cause).car)
         set_back = errors(of_file.without(cause.candidate.effect))
-        noticed = is_noticed(set_back, as_file, windows.block)
-        return Without(refitted, mean_reduction(refitted, with_all), mean_reduction(set_back, as_file), noticed)
+        interval, of_given = reduction_interval(set_back, as_file, windows.block), mean_reduction(set_back, as_file)
+        noticed = is_noticed(channel_reduction(set_back, as_file), interval, of_given)
+        return Without(refitted, mean_reduction(refitted, with_all), of_given, noticed)
 
     of_file = replace(selection.fit.car, moved=given.moved)
     with_all, as_file = errors(selection.fit.car), errors(of_file)

@@ -104,11 +104,15 @@ def channel_reduction(before: Vector, after: Vector) -> Vector:
     return np.asarray(1.0 - np.sqrt(squared))
 
 
-def is_noticed(before: Vector, after: Vector, block: Indices) -> bool:
-    """Whether the errors of a channel surely fall by a share that counts, and those of all in the mean; ``(W, 3)``."""
-    low = reduction_interval(before, after, block)[0]
-    falls = bool(((channel_reduction(before, after) > tuning.NOTICEABLE_SHARE) & (low > 0.0)).any())
-    return falls and mean_reduction(before, after) > 0.0
+def is_noticed(share: Vector, interval: Vector, mean: float) -> bool:
+    """Whether the errors of a channel surely fall by a share that counts, and those of all in the mean.
+
+    Args:
+        share: as :func:`channel_reduction`.
+        interval: as :func:`reduction_interval`.
+        mean: as :func:`mean_reduction`.
+    """
+    return mean > 0.0 and bool(((share > tuning.NOTICEABLE_SHARE) & (interval[0] > 0.0)).any())
 
 
 def mean_reduction(before: Vector, after: Vector) -> float:

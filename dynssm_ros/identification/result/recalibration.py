@@ -109,7 +109,7 @@ def recalibration(
     after = improvement.errors[list(improvement.errors)[-1]][:, at]
     share = channel_reduction(before, after)
     interval, explains = reduction_interval(before, after, windows.block), mean_reduction(before, after)
-    noticed = is_noticed(before, after, windows.block)
+    noticed = is_noticed(share, interval, explains)
     selection = _ForwardSelection(problem, fit, given)
     chosen = selection.fewest()
     if not noticed and not selection.is_sure(chosen):

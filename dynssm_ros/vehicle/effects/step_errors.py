@@ -205,10 +205,8 @@ class _DriveErrors(NamedTuple):
         force = _summed(columns, self.together)
         force = force - self.basis @ (self.basis.T @ force)
         along = force.T @ self.error
-        left, taken = (
-            float(self.error @ self.error),
-            float(along @ np.linalg.lstsq(force.T @ force, along, rcond=1e-9)[0]),
-        )
+        left = float(self.error @ self.error)
+        taken = float(along @ np.linalg.lstsq(force.T @ force, along, rcond=1e-9)[0])
         return len(self.error) * float(np.log(left / max(left - taken, 1e-9 * left)))
 
 
