@@ -83,8 +83,8 @@ def headline(diagnosis: Diagnosis) -> str:
     return {
         "cause": f"The simulation lacks: {', '.join(cause.effect + recordings_of(cause) for cause in diagnosis.causes)}.",
         "unexplained": "Something is wrong that no effect of the library explains.",
-        "recalibrate": "Coefficients of the vehicle file are off. Recalibrated, the simulation is right within the noise of "
-        "the measurement.",
+        "recalibrate": f"{'Coefficients of the vehicle file are' if diagnosis.moved else 'The vehicle file is'} off. "
+        "Recalibrated, the simulation is right within the noise of the measurement.",
         "healthy": "The simulation is right within the noise of the measurement, and the vehicle file's coefficients hold.",
     }[diagnosis.verdict]
 

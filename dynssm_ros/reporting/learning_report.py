@@ -113,12 +113,13 @@ def _diagnosis(out: Path, of: dict[str, list[StepRecord]]) -> Verdict:
         f"{cause['effect']} ({', '.join(_value(name, value) for name, value in cause['parameters'].items())})"
         for cause in found["causes"]
     )
+    off = found["moved"] or [effect["effect"] for effect in found["small_effects"]]
     state, words = {
         "cause": ("look", f"the simulation lacks {causes}; the model's car has it"),
         "healthy": ("ok", "the simulation is right within the noise"),
         "recalibrate": (
             "look",
-            f"off in the calibrated car: {', '.join(found['moved'])}; the model's car is recalibrated",
+            f"off in the calibrated car: {', '.join(off)}; the model's car is recalibrated",
         ),
         "unexplained": ("look", "something is systematically wrong that no effect of the library explains"),
     }[found["verdict"]]

@@ -22,7 +22,7 @@ STATES = {"v_x": 0.1, "v_y": 0.1, "omega": 0.1}
 RESULTS: dict[str, dict[str, object]] = {
     "inspect": {},
     "calibrate": {"rmse_ahead": STATES, "persistence": dict.fromkeys(STATES, 0.5), "on_bound": [], "horizon_s": 0.5},
-    "diagnose": {"verdict": "healthy", "causes": [], "moved": {}},
+    "diagnose": {"verdict": "healthy", "causes": [], "small_effects": [], "moved": {}},
     "evaluate": {
         "horizon_s": 0.6,
         "models": {"model": {"ade": 0.01}, "single_track": {"ade": 0.02}, "persistence": {"ade": 0.1}},

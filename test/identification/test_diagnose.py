@@ -191,13 +191,15 @@ def test_what_takes_little_off_every_channel_is_small_unless_what_was_known_tell
 
     def taking(share: float, heldout: float, known: float = 0.0) -> Cause:
         confirmation = replace(cause.confirmation, share=np.array([0.0, share, -0.1]), known=known)
-        return replace(cause, confirmation=confirmation, heldout_improvement=heldout, is_noticed=False)
+        return replace(cause, confirmation=confirmation, heldout_improvement=heldout)
 
-    told = float(cause.confirmation.improvement.sum())
-    assert taking(0.05, 0.005).small
-    assert not any(one.small for one in (taking(0.07, 0.005), taking(0.05, 0.02), taking(0.05, 0.005, told + 1.0)))
-    assert not replace(taking(0.05, 0.005), is_noticed=True).small
-    little = replace(found, found=(taking(0.05, 0.005),))
+    assert taking(0.05, 0.005, known=4.9).small, "three standard deviations are no very strong evidence"
+    assert not any(one.small for one in (taking(0.07, 0.005), taking(0.05, 0.02), taking(0.05, 0.005, known=5.1)))
+    assert replace(taking(0.05, 0.005), of_given=0.3).small, "the file's coefficients may be off"
+    little = replace(found, found=(taking(0.05, 0.005),), moved={}, recalibration=None)
+    assert little.improvement.is_noticed
+    assert little.verdict == "recalibrate", "the car to write errs less than the file's"
+    assert as_text(little).startswith("recalibrate: The vehicle file is off.")
     assert (little.causes, [one.effect for one in little.small_effects]) == ((), ["steering_lag"])
     assert "Sure but small, within the structure of the model: steering_lag: " in " ".join(as_text(little).split())
     content = little.to_json("vehicle.yaml")

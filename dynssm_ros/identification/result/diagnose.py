@@ -306,7 +306,6 @@ def _cause(one: Refined, without: Without, selection: Selection, recordings: Rec
         recordings.levels.level(one.candidate.only_in),
         without.errors,
         without.of_given,
-        without.is_noticed,
     )
 
 

@@ -48,7 +48,6 @@ class Cause:
         level: what these recordings are.
         without: what the car with all other causes errs on the held-out rows, at the horizon, ``(W, 3)``.
         of_given: share of the error that is gone by it while the coefficients are those of the vehicle file.
-        is_noticed: whether a channel of that car surely errs less by it, so much that it counts.
     """
 
     effect: str
@@ -63,7 +62,6 @@ class Cause:
     level: Level = "car"
     without: Vector = field(default_factory=lambda: np.empty((0, 3)), repr=False)
     of_given: float = 0.0
-    is_noticed: bool = False
 
     @property
     def explains(self) -> float:
@@ -74,13 +72,13 @@ class Cause:
     def small(self) -> bool:
         """Whether it hardly matters, however sure it is: no model is right to the last per mille.
 
-        It takes little off the error of each channel, on parts that were left out and on held-out rows, and is not noticed in
-        the vehicle file's car. What a recalibration would make up for is told by what was known, and by how far the
-        coefficients would have to be off, not by the error.
+        It takes little off the error of each channel of a recalibrated car, on parts that were left out and on held-out rows.
+        What a recalibration would make up for is told by what was known and how far the coefficients would have to be off,
+        not by the error; nor by the error of the file's car, whose coefficients are off themselves, so that an effect takes
+        some of that away by chance.
         """
         little = float(self.confirmation.share.max()) < tuning.SMALL_SHARE
-        little = little and self.heldout_improvement < tuning.NEGLIGIBLE_SHARE and not self.is_noticed
-        return little and not self.confirmation.rests_on_known
+        return little and self.heldout_improvement < tuning.NEGLIGIBLE_SHARE and not self.confirmation.is_known
 
 
 class Conclusion(NamedTuple):
@@ -149,13 +147,14 @@ class Diagnosis:
         """The first that holds of what needs most to be mended.
 
         ``cause``: causes are named; ``unexplained``: errors are left that have no name; ``recalibrate``: coefficients of the
-        file are off, and nothing else; ``healthy``: right within the noise, as the file has it.
+        file are off, and nothing else, or its car errs noticeably more than the one to write; ``healthy``: right within the
+        noise, as the file has it.
         """
         if self.causes:
             return "cause"
         if self.is_left or self.no_better:
             return "unexplained"
-        return "recalibrate" if self.moved else "healthy"
+        return "recalibrate" if self.moved or self.improvement.is_noticed else "healthy"
 
     @property
     def is_left(self) -> bool:

@@ -14,14 +14,7 @@ from dynssm_ros.identification.problem.fit import IdentificationProblem
 from dynssm_ros.identification.problem.noise import weights
 from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED
-from dynssm_ros.identification.result.improvement import (
-    Improvement,
-    channel_reduction,
-    is_noticed,
-    mean_reduction,
-    measure_improvement,
-    reduction_interval,
-)
+from dynssm_ros.identification.result.improvement import Improvement, mean_reduction, measure_improvement
 from dynssm_ros.identification.result.residuals import Left, clustered, explained_variance
 from dynssm_ros.identification.search.integrator import SearchResult
 from dynssm_ros.identification.search.selection import Refined, Search, Selection
@@ -36,8 +29,6 @@ class Without(NamedTuple):
     """Share of them that the cause takes away, as a mean of the channels."""
     of_given: float
     """The same while the coefficients are those of the file."""
-    is_noticed: bool
-    """Whether a channel then errs noticeably more."""
 
 
 class Gated(NamedTuple):
@@ -102,9 +93,7 @@ def _without_each(
     def one(cause: Refined) -> Without:
         refitted = errors(search.leave_out(selection, cause).car)
         set_back = errors(of_file.without(cause.candidate.effect))
-        interval, of_given = reduction_interval(set_back, as_file, windows.block), mean_reduction(set_back, as_file)
-        noticed = is_noticed(channel_reduction(set_back, as_file), interval, of_given)
-        return Without(refitted, mean_reduction(refitted, with_all), of_given, noticed)
+        return Without(refitted, mean_reduction(refitted, with_all), mean_reduction(set_back, as_file))
 
     of_file = replace(selection.fit.car, moved=given.moved)
     with_all, as_file = errors(selection.fit.car), errors(of_file)

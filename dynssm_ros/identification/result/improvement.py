@@ -51,6 +51,12 @@ class Improvement:
         """Its 95 % interval, shape ``(2, n, 3)``."""
         return self.interval_from(next(iter(self.errors)))
 
+    @cached_property
+    def is_noticed(self) -> bool:
+        """Whether the last car errs noticeably less than the first at the horizon of the diagnosis."""
+        first, *_, last = (errors[:, self.horizon] for errors in self.errors.values())
+        return is_noticed(self.reduction[self.horizon], self.interval[:, self.horizon], mean_reduction(first, last))
+
     def reduction_from(self, name: str) -> Vector:
         """Share of a car's error that is gone with the last, shape ``(n, 3)``."""
         return np.asarray(1.0 - self.rmse[list(self.rmse)[-1]] / np.maximum(self.rmse[name], 1e-300))

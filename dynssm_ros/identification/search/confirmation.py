@@ -57,6 +57,11 @@ class Confirmation:
         return self.known > self.elsewhere
 
     @property
+    def is_known(self) -> bool:
+        """Whether what was known of the nominal values is very strong evidence for it by itself."""
+        return 2.0 * self.known > tuning.DECISIVE_DELTA_BIC
+
+    @property
     def holds(self) -> bool:
         """Whether the improvement is more than :attr:`least` standard errors, and there in half of the units or more.
 
