@@ -53,8 +53,20 @@ def _array(archive: Any, name: str) -> Any:
     """A member of an archive; why there is none, where it would have to be unpickled."""
     try:
         return archive[name]
-    except ValueError as error:
-        return one_line(error)
+    except ValueError:
+        return "Python objects, which are not unpickled"
+
+
+def npy_arrays(path: Path) -> tuple[Arrays, dict[str, str]]:
+    """As :func:`npz_arrays`, of a ``.npy`` file.
+
+    Raises:
+        BagError: not such a file, damaged, or of Python objects.
+    """
+    try:
+        return vectors({"array": np.load(path, mmap_mode="r", allow_pickle=False)})
+    except Exception as error:  # numpy raises what its decoders do
+        raise BagError(f"{path}: cannot be read as NumPy's .npy ({one_line(error)})") from error
 
 
 def mat_arrays(path: Path) -> tuple[Arrays, dict[str, str]]:
@@ -88,7 +100,8 @@ def mat_arrays(path: Path) -> tuple[Arrays, dict[str, str]]:
 def vectors(found: dict[str, Any]) -> tuple[Arrays, dict[str, str]]:
     """What is a vector of more than one number, and why the rest is not.
 
-    Fields of a record array are vectors, and so are rows or columns of a matrix that are as long as all vectors.
+    Fields of a record array are vectors, and so are rows or columns of a matrix that are as long as all vectors, or as all
+    matrices where there is no vector.
     """
     arrays: Arrays = {}
     left_out: dict[str, str] = {}
@@ -111,7 +124,7 @@ def vectors(found: dict[str, Any]) -> tuple[Arrays, dict[str, str]]:
             matrices[name] = values
         else:
             arrays[name] = values.reshape(-1)
-    lengths = {len(values) for values in arrays.values()}
+    lengths = {len(values) for values in arrays.values()} or {max(values.shape) for values in matrices.values()}
     length = lengths.pop() if len(lengths) == 1 else -1
     for name, values in matrices.items():
         if values.ndim == 2 and length in values.shape and values.size <= length * _WIDEST:

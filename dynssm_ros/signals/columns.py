@@ -31,6 +31,7 @@ _DATES = {
 }
 _ALIASES = {
     "m/s²": "m/s^2", "m/s2": "m/s^2", "m/s/s": "m/s^2", "mps2": "m/s^2",
+    "1/min": "rpm", "u/min": "rpm", "min-1": "rpm",
     "kmh": "km/h", "kph": "km/h", "kmph": "km/h", "mps": "m/s", "m/sec": "m/s", "kn": "kt", "knots": "kt",
     "°": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "°/s": "deg/s", "deg/sec": "deg/s",
     "dps": "deg/s", "degps": "deg/s", "radps": "rad/s", "rad/sec": "rad/s", "percent": "%", "pct": "%", "prozent": "%",
@@ -40,7 +41,7 @@ _ALIASES = {
 _BRACKETS = re.compile(r"^(?P<bare>.*?)\s*[\[(<{]\s*(?P<unit>[^\[\](){}<>]*?)\s*[\])>}]\s*$")
 _UNIT_LIKE = re.compile(r"^(?:[^\W\d]{1,4}|.*[/^²°%·*].*)$")
 _ENDING = re.compile(
-    r"^(?P<bare>.+)_(?P<unit>m|cm|mm|kmh|kph|mps|mph|deg|rad|pct|percent|degps|dps|radps|s|sec|ms|us|ns|nsec)$"
+    r"^(?P<bare>.+)_(?P<unit>m|cm|mm|s|us|ns|(?i:kmh|kph|mps|mps2|mph|deg|rad|pct|percent|degps|dps|radps|rpm|sec|ms|nsec))$"
 )
 
 

@@ -24,8 +24,8 @@ _WHEEL = re.compile(r"wheel|rear|front|left|right", re.IGNORECASE)
 
 COLUMNS = {
     "v_x": r"wheel\w*(speed|vel\w*)|(speed|vel\w*)_wheel",
-    "a_x": r"^(lin\w*_)?(a|acc|accel|acceleration)_?(x|long\w*)$|^long\w*_?(acc\w*|g)$|^g_?long\w*$",
-    "a_y": r"^(lin\w*_)?(a|acc|accel|acceleration)_?(y|lat|lateral)$|^lat(eral)?_?(acc\w*|g)$|^g_?lat\w*$",
+    "a_x": r"^(lin\w*_)?(a|acc|accel|acceleration)_?(x|long\w*)$|^(long\w*|inline)_?(acc\w*|g)$|^g_?long\w*$|^x_acc|^längsb",
+    "a_y": r"^(lin\w*_)?(a|acc|accel|acceleration)_?(y|lat|lateral)$|^lat(eral)?_?(acc\w*|g)$|^g_?lat\w*$|^y_acc|^querb",
     "latitude": r"^(gps_|gnss_|fix_)?lat(itude)?$",
     "longitude": r"^(gps_|gnss_|fix_)?(lon|lng|long|longitude)$",
 }

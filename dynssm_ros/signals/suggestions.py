@@ -19,10 +19,15 @@ from dynssm_ros.signals.steering_scale import Suggestion, scaled_steering
 
 _MOTION = {
     "v_y": (r"(^|_)(v|vel|velocity|linear)_?(y|lat\w*)$|^v?_?lat\w*_(vel\w*|speed)$|^vlat|quergeschw",),
-    "v_x": (r"(^|_)(v|vel|velocity|linear)_?(x|long\w*)$|^v?_?long\w*(_vel\w*|_speed)?$", r"speed|velocity|geschw|^v$"),
-    "omega": (r"yaw_?(rate|vel\w*|speed)|gierrate|psi_?dot|angular(_vel\w*)?_z$|gyro_?z$|omega(_?z)?$|^(r|wz|w_z)$",),
-    "x": (r"^(pos\w*_|pose_)?x(_pos\w*)?$|position_x$|^(east|easting|pos_?x)$",),
-    "y": (r"^(pos\w*_|pose_)?y(_pos\w*)?$|position_y$|^(north|northing|pos_?y)$",),
+    "v_x": (
+        r"(^|_)(v|vel|velocity|linear)_?(x|long\w*)$|^v_?long\w*$|^long\w*_(vel\w*|speed)$",
+        r"speed|spd|velocity|geschw|^v$",
+    ),
+    "omega": (
+        r"yaw_?(rate|vel\w*|speed)|gierrate|psi_?dot|angular(_vel\w*)?_z$|gyro(_?z)?$|z_gyro$|z_rate_of_rotation$|omega(_?z)?$|^(r|wz|w_z)$",
+    ),
+    "x": (r"^(pos\w*_|pose_)?x(_pos\w*)?$|(^|_)pos(ition)?_?x$|^(east|easting)$",),
+    "y": (r"^(pos\w*_|pose_)?y(_pos\w*)?$|(^|_)pos(ition)?_?y$|^(north|northing)$",),
     "theta": (r"^(pose_)?(yaw|theta|heading|psi|gierwinkel)(_angle)?$|orientation_yaw$", r"^phi$"),
 }
 """Words for signals in headings, in the order in which they are tried."""
@@ -31,7 +36,7 @@ _QUATERNION = re.compile(
     r"^(?P<name>(?:.*(?:orient|quat|rot|pose)\w*[._/ ]+|.*\bq_?|.*_q_?))x(?P<end>\W.*|)$", re.IGNORECASE
 )
 _NOT_MOTION = re.compile(
-    r"wheel|(^|_)(rad|wind|soll)_|cmd|command|target|desired|setpoint|engine|motor|std|cov|sigma|acc|rpm|_ref|steer|lenk|error",
+    r"wheel|whl|(^|_)(rad|wind|soll|eng)_|longitude|cmd|command|target|desired|setpoint|engine|motor|std|cov|sigma|acc|rpm|_ref|steer|lenk|error",
     re.IGNORECASE,
 )
 _QUANTITIES = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "x": "m", "y": "m", "theta": "rad"}
@@ -41,20 +46,28 @@ _FITTING = {
     "m/s^2": ("m/s^2", "g"),
 }  # fmt: skip
 _WORDS = {
-    "steering": re.compile(r"steer|delta|servo|lenk", re.IGNORECASE),
-    "throttle": re.compile(r"throttle|accel\w*pedal|pedal_(?:output|position)|gas|duty|drossel", re.IGNORECASE),
-    "brake": re.compile(r"brake|brems", re.IGNORECASE),
+    "steering": re.compile(r"steer|strg|delta|servo|lenk", re.IGNORECASE),
+    "throttle": re.compile(
+        r"throttle|accelerator|pedal|gas|duty|drossel|(?:^|[\W_])(?:tps|pps|app)(?:$|[\W_])", re.IGNORECASE
+    ),
+    "brake": re.compile(r"brake|brk|brems", re.IGNORECASE),
 }
 _COMMAND = re.compile(r"cmd|command|target|desired|set_?point|request|soll", re.IGNORECASE)
 _SPEED = re.compile(r"(^|[_\[])(speed|velocity|vel|v|(?:soll)?geschw\w*)($|[_\]])", re.IGNORECASE)
-_SET = re.compile(r"ackermann|(^|[\s_/\[])v_?set|position\[speed\]", re.IGNORECASE)
+_SET = re.compile(r"ackermann|(^|[\s_/\[])v_?set|position\[speed\]|drive/speed$", re.IGNORECASE)
 _NO_SPEED = re.compile(r"steer|angular|ang_?vel|wheel|lat\w*_?vel|\.y$|\.z$|rate", re.IGNORECASE)
 _MEASURED = re.compile(r"report|feedback|measured|actual|angle|position|output|pressure", re.IGNORECASE)
 _OTHER = re.compile(
-    r"rate|veloc|speed|torque|current|status|state|enable|fault|counter|temp|rolling|valid|overrid|timeout|limit|effort"
+    r"clutch|kuppl|rate|veloc|speed|torque|current|status|state|enable|fault|counter|temp|rolling|valid|overrid|timeout|limit|effort"
     r"|covariance|stamp|warn|error|source|mode",
     re.IGNORECASE,
 )
+_CONTEXT = {
+    "gear": re.compile(r"(^|_)(gear|gang)(_?(nr|no|num\w*|pos\w*|actual|current|engaged|state))?$"),
+    "engine_speed": re.compile(r"(^|_)(engine|eng|motor)_?(speed|spd|rpm|drehzahl)|(^|_)(rpm|drehzahl)$"),
+}
+"""Words for signals that are only looked at."""
+_RPM = 1000.0  # engine speed from which on it is none in rad/s, where no unit says what it is in
 _SHARE = 1.5  # larger values are no throttle between -1 and 1
 _ONE_TO_ONE = 0.3  # by which a set-point may change more or less than the speed
 _AGREES = 0.5  # correlation with the speed, from which on it may be one
@@ -73,7 +86,7 @@ def suggest(
     used = {one.field for one in motion.values()} if is_table else set()
     others = {name: one for name, one in topics.items() if name not in used}
     signals = motion | _with_set_point(_actuators(others), _speed_set_points(others), notes)
-    signals = _set_point_by_speed(signals, notes)
+    signals = _set_point_by_speed(signals, notes) | _context(others)
     if not set(command_signals(set_point_of(signals))) <= set(signals):  # of no use alone
         signals = {name: source for name, source in signals.items() if not name.endswith("_command")}
     for name in ("steering_feedback", "steering_command"):
@@ -123,6 +136,8 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
     elif "v_y" not in found and (sensed := _sensor_columns(columns, found)):
         found = {name: one for name, one in found.items() if name in STATE_SIGNALS} | sensed
         notes.append(f"no column is v_y; it is estimated from {', '.join(found)} (estimation: give rear_axle, m)")
+    elif "v_y" not in found and {"v_x", "omega"} <= set(found):
+        notes.append("no column is v_y; it is that of a steady turn (estimation: give rear_axle, m)")
     elif not found:
         notes.append("no column tells where the car is or how fast; find v_x, v_y and omega, or x, y and theta")
     if "v_y" in found and spread(found["v_y"].values) == 0:
@@ -190,11 +205,11 @@ def _with_unit(suggestion: Suggestion, quantity: str) -> Suggestion:
 
 
 def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Suggestion]:
-    """The odometry that moves most often, else the twist that does, if there is one."""
+    """The odometry that moves most often, of those with v_y if one has it; else the twist that does, if there is one."""
     moving = _with_velocities(topics)
     if not moving:
         return _without_velocities(topics, notes)
-    best = max(moving, key=lambda topic: topic.count)
+    best = max(moving, key=lambda topic: (_slides(topic), topic.count))
     if len(moving) > 1:
         kind = "odometries" if best.msgtype == ODOMETRY else "twists"
         notes.append(f"several {kind} move: {', '.join(topic.name for topic in moving)}; taken is {best.name}")
@@ -220,6 +235,13 @@ def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Su
     beside = [best] if best.msgtype == ODOMETRY else poses
     placed = max((topic for topic in beside if _moves(topic)), key=lambda topic: topic.count, default=None)
     return _fields(best, twist) | (_fields(placed, pose_fields(placed.msgtype)) if placed else {})
+
+
+def _slides(topic: TopicContent) -> bool:
+    """Whether a topic measures how the car slides, often enough."""
+    twist = twist_fields(topic.msgtype)
+    lives = [spread(topic.values[twist[signal]]) > 0 for signal in ("v_y", "omega")]
+    return all(lives) and topic.rate >= _POSES_HZ
 
 
 def _with_velocities(topics: dict[str, TopicContent]) -> list[TopicContent]:
@@ -296,6 +318,31 @@ def _actuators(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:
             note = "no feedback found: the command is taken for it"
             found[f"{actuator}_feedback"] = replace(command, note=note)
     return found
+
+
+def _context(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:
+    """Gear and engine speed by their names, where they change."""
+    found: dict[str, Suggestion] = {}
+    for signal, words in _CONTEXT.items():
+        fitting = [
+            Suggestion(topic, path)
+            for topic in topics.values()
+            for path, values in topic.values.items()
+            if spread(values) > 0 and not _COMMAND.search(f"{topic.name} {path}") and words.search(_leaf(topic, path))
+        ]
+        if fitting:
+            found[signal] = max(fitting, key=lambda one: one.topic.count)
+    if (engine := found.get("engine_speed")) is not None:
+        in_rpm = engine.topic.unit == "rpm" or float(np.nanmax(np.abs(engine.values), initial=0.0)) > _RPM
+        found["engine_speed"] = replace(engine, unit="rpm" if in_rpm else "1")
+    return found
+
+
+def _leaf(topic: TopicContent, path: str) -> str:
+    """The words of a field, with those of its topic where it is but ``data`` or such."""
+    bare = heading(path).bare if path == topic.name else path
+    leaf = _plain(bare.rsplit(".", 1)[-1])
+    return _plain(topic.name) if leaf in ("data", "value") else leaf
 
 
 def _speed_set_points(topics: dict[str, TopicContent]) -> dict[str, Suggestion]:

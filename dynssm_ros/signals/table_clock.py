@@ -16,9 +16,9 @@ from dynssm_ros.signals.tables import LogTable
 _CERTAIN = re.compile(
     r"^[%# ]*(time|t|timestamp|time_?stamp|stamp|zeit|utc|datetime|date_?time|.*[/.]stamp)$", re.IGNORECASE
 )
-_POSSIBLE = re.compile(r"time|stamp|zeit|clock|utc|date|datum", re.IGNORECASE)
+_POSSIBLE = re.compile(r"time|stamp|zeit|clock|utc|date|datum|elapsed", re.IGNORECASE)
 _OTHER = re.compile(
-    r"lap|delta|diff|duration|left|best|rate|index|frame|sample|count|\bnr\b|\bid\b|dist|odom|row", re.IGNORECASE
+    r"lap(?!sed)|delta|diff|duration|left|best|rate|index|frame|sample|count|\bnr\b|\bid\b|dist|odom|row", re.IGNORECASE
 )
 _SECONDS, _NANOSECONDS = (
     re.compile(r"sec(s|onds)?$", re.IGNORECASE),
@@ -29,6 +29,8 @@ _STEPS = {"days": 0.0, "s": 5e-5, "ms": 0.3, "us": 300.0, "ns": 3e5}  # least st
 _EPOCH_S, _SLOWEST_S = (9e8, 4.1e9), 10.0  # seconds since 1970 of the years 1998 to 2099; between rows
 _DAY = 86_400_000_000_000
 _DATENUM, _EXCEL = 719_529, 25_569  # 1970-01-01 in days of MATLAB and of Excel
+_PANDAS = "__index_level_"  # how pandas begins the name of an index that has none
+_MIDNIGHT = 240_000  # in hhmmss
 _LARGEST = 2**62
 
 
@@ -74,10 +76,7 @@ def _chosen(table: LogTable, given: TimeColumn | None) -> Clock:
                 f"rises"
             )
         return clock
-    named = [
-        name for name, heading in table.headings.items() if _POSSIBLE.search(heading.bare) or _certain(table, name)
-    ]
-    named = [name for name in named if not _OTHER.search(table.headings[name].bare)]
+    named = [name for name in table.headings if _possible(table, name)]
     pairs = {name: beside for name in table.headings if (beside := _nanoseconds_beside(table, name)) is not None}
     named = [name for name in dict.fromkeys([*pairs, *named]) if name not in pairs.values()]
     columns = table.read(named)
@@ -92,18 +91,38 @@ def _chosen(table: LogTable, given: TimeColumn | None) -> Clock:
     for name in named:
         if not found and _certain(table, name):
             raise BagError(f"{table.path}: time column '{name}': {columns[name].reason}; expected numbers or times")
-    for group in [] if found else table.groups():
-        for name, column in group.items():
-            if not column.reason and not _OTHER.search(table.headings[name].bare) and column.present.all():
-                clock = _clock(table, name, column, None)
-                if _rising(clock) == 1.0:
-                    return clock
+    unnamed = [] if found else _unnamed(table)
+    if unnamed:
+        return unnamed[0]
     if found:
         raise BagError(
             f"{table.path}: no time column: '{found[0].column}' rises in {_rising(found[0]):.0%} of the rows; expected one "
             f"that rises (`time: {{column: NAME}}` in the signal map names it)"
         )
-    raise BagError(f"{table.path}: no time column among {table.told_columns}; expected one that rises, such as 'time'")
+    raise BagError(
+        f"{table.path}: no time column among {table.told_columns}; expected one that rises and is no number of the row, such "
+        f"as 'time'"
+    )
+
+
+def _possible(table: LogTable, name: str) -> bool:
+    """Whether a heading is one that a time may have."""
+    bare = table.headings[name].bare
+    return not _OTHER.search(bare) and bool(_POSSIBLE.search(bare) or _certain(table, name))
+
+
+def _unnamed(table: LogTable) -> list[Clock]:
+    """What always rises and is no counter, such as an index without a name: times first, then numbers by their headings."""
+    found = []
+    for group in table.groups():
+        for name, column in group.items():
+            other = _OTHER.search(name.removeprefix(_PANDAS)) and not column.is_time
+            if column.reason or other or not column.present.all():
+                continue
+            clock = _clock(table, name, column, None)
+            if _rising(clock) == 1.0 and not (np.diff(column.values) == 1.0).all():
+                found.append(clock)
+    return sorted(found, key=lambda clock: clock.unit is not None)
 
 
 def _nanoseconds_beside(table: LogTable, name: str) -> str | None:
@@ -149,11 +168,14 @@ def _clock(table: LogTable, name: str, column: LogColumn, unit: str | None) -> C
     if column.is_time:
         stamps = np.zeros(len(known), np.int64) if column.exact is None else column.exact.copy()
         if "time of day" in column.type:
-            back = np.diff(stamps[known], prepend=stamps[known][:1]) < -_DAY // 2
-            stamps[known] += np.cumsum(back) * _DAY  # past midnight
+            stamps[known] = _past_midnight(stamps[known])
         return Clock(name, None, stamps, known, f"time from column '{name}' ({column.type})")
+    if unit is None and (digits := _of_digits(column.values[known])) is not None:
+        stamps = np.zeros(len(known), np.int64)
+        stamps[known] = digits
+        return Clock(name, None, stamps, known, f"time of day, hhmmss, from column '{name}'")
     headed = known_unit(table.headings[name].unit)
-    by_heading = headed if headed in TIME_UNITS else None
+    by_heading = headed if headed in TIME_UNITS and _may_be(column.values[known], TIME_UNITS[headed]) else None
     chosen = unit or by_heading or _unit_by_steps(column.values[known])
     values = np.where(known, column.values, 0.0)
     exact = column.exact
@@ -172,6 +194,31 @@ def _clock(table: LogTable, name: str, column: LogColumn, unit: str | None) -> C
         )
     guessed = "" if unit or by_heading else ", by its steps"
     return Clock(name, chosen, stamps, known, f"time in {chosen} from column '{name}'{guessed}")
+
+
+def _past_midnight(stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Times of day that go on after midnight (ns)."""
+    back = np.diff(stamps, prepend=stamps[:1]) < -_DAY // 2
+    return stamps + np.cumsum(back) * _DAY
+
+
+def _of_digits(values: npt.NDArray[np.float64]) -> npt.NDArray[np.int64] | None:
+    """Times of day (ns) that numbers such as 135959.98 write, as GNSS receivers do; ``None`` where 59 is not followed by
+    100 or nothing tells.
+    """
+    if not ((values >= 0) & (values < _MIDNIGHT)).all():
+        return None
+    whole = np.floor(values).astype(np.int64)
+    hours, minutes, seconds = whole // 10_000, whole // 100 % 100, whole % 100
+    next_minute = (np.diff(seconds) == -59) & (np.diff(60 * hours + minutes) % 1440 == 1)
+    if (minutes > 59).any() or (seconds > 59).any() or not next_minute.any():
+        return None
+    return _past_midnight(np.rint((3600 * hours + 60 * minutes + seconds + values - whole) * 1e9).astype(np.int64))
+
+
+def _may_be(values: npt.NDArray[np.float64], factor: int) -> bool:
+    """Whether times are possible in a unit of ``factor`` ns."""
+    return bool((np.abs(values) < _LARGEST / factor).mean() > _RISES) if len(values) else True
 
 
 def _unit_by_steps(values: npt.NDArray[np.float64]) -> str:

@@ -15,7 +15,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 
 from dynssm_ros.errors import BagError
-from dynssm_ros.signals.array_files import mat_arrays, npz_arrays
+from dynssm_ros.signals.array_files import mat_arrays, npy_arrays, npz_arrays
 from dynssm_ros.signals.columns import Heading, LogColumn, heading, kind_of, parsed, told_bad, typed_column
 from dynssm_ros.signals.csv_layout import OneBlank, TextLayout, layout_of
 from dynssm_ros.signals.recover import vast_table
@@ -24,7 +24,7 @@ _GROUP_BYTES, _CELL_BYTES = 512 << 20, 16  # of columns that are in memory at on
 _MOST_ROWS = 50_000_000  # as of recordings
 _TOLD = 30  # columns that a message names
 _RAGGED = 0.01  # share of lines with another number of cells, from which on a file is no table
-_PARQUET, _ZIP, _MATLAB = b"PAR1", b"PK\x03\x04", b"MATLAB "
+_PARQUET, _ZIP, _MATLAB, _NUMPY = b"PAR1", b"PK\x03\x04", b"MATLAB ", b"\x93NUMPY"
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,8 @@ def open_table(path: str | Path) -> LogTable:
             table = _parquet_table(path)
         elif head.startswith(_ZIP):
             table = _array_table(path, "NumPy archive", *npz_arrays(path))
+        elif head.startswith(_NUMPY):
+            table = _array_table(path, "NumPy array", *npy_arrays(path))
         elif head.startswith(_MATLAB) or path.suffix == ".mat":
             table = _array_table(path, "MATLAB file", *mat_arrays(path))
         else:

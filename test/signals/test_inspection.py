@@ -150,6 +150,28 @@ def test_a_twist_beside_a_pose_is_taken_and_a_commanded_one_is_not(make_bag: Any
     }  # fmt: skip
 
 
+def test_an_odometry_that_knows_how_the_car_slides_is_taken_before_a_faster_one(make_bag: Any) -> None:
+    records = bends()
+    for _, _, stamp, message in bends(rate=100.0)[::2]:
+        twist = message.twist.twist
+        moved = messages.odometry(stamp, (0.1, 0.2, 0.0), (twist.linear.x, 0.0, twist.angular.z))
+        records.append(("/wheel_odom", messages.ODOMETRY, stamp, moved))
+    found = inspect(make_bag(records))
+    assert found.signals["v_y"].topic.name == ODOMETRY
+    assert any("several odometries move: " in note for note in found.notes)
+
+
+def test_gear_and_engine_speed_are_suggested_where_they_change(make_bag: Any) -> None:
+    joints = [
+        ("/can", messages.JOINT_STATE, stamp, messages.joint_state(stamp, {"gear": 1.0 + k // 500, "engine_rpm": 900.0 + k}))
+        for k, (_, _, stamp, _) in enumerate(bends()[::2])
+    ]  # fmt: skip
+    bag = make_bag([*bends(), *joints])
+    mapped = suggested(inspect(bag))
+    assert (mapped.signals["gear"].field, mapped.signals["engine_speed"].unit) == ("position[gear]", "rpm")
+    assert set(extract([bag], mapped, 50.0)["gear"]) == {1.0, 2.0}
+
+
 def test_a_road_wheel_angle_in_rad_is_taken_as_it_is(make_bag: Any) -> None:
     assert inspect(make_bag(bends()), WHEELBASE).signals["steering_feedback"].scale == 1.0
 

@@ -12,10 +12,13 @@ import pytest
 import yaml
 
 from dynssm_ros.errors import BagError
+from dynssm_ros.signals.columns import heading, known_unit
+from dynssm_ros.signals.contents import TopicContent
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inspection import Inspection, inspect
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import SignalMap
+from dynssm_ros.signals.suggestions import suggest
 
 WHEELBASE = 0.3
 T = np.arange(0.0, 20.0, 0.02)
@@ -125,6 +128,46 @@ def assert_driven(recording: Recording, tolerance: float) -> None:
     np.testing.assert_allclose(recording["omega"][rows], np.interp(t, T, OMEGA)[rows], atol=tolerance * 8)
     np.testing.assert_allclose(recording["delta_fb"][rows], np.interp(t, T, DELTA)[rows], atol=tolerance / 2 + 0.02)
     assert 0.25 < recording["r_fb"].mean() < 0.5
+
+
+HEADINGS = {
+    "aim": {"v_x": "GPS Speed [km/h]", "omega": "GPS Gyro [deg/s]", "throttle_feedback": "PPS [%]",
+            "steering_feedback": "Steering Pos [deg]", "brake_feedback": "Brake Press [bar]", "a_x": "InlineAcc [g]",
+            "a_y": "LateralAcc [g]", "latitude": "GPS Latitude", "longitude": "GPS Longitude", "gear": "Gear",
+            "engine_speed": "RPM"},
+    "can": {"v_x": "VehSpd_KPH", "omega": "YawRate_DPS", "throttle_feedback": "AccelPedalPos_pct",
+            "steering_feedback": "StrgAng_deg", "brake_feedback": "BrkPress_bar", "a_x": "LongAccel_mps2",
+            "a_y": "LatAccel_mps2", "gear": "TransGear", "engine_speed": "EngSpd_rpm", "wheel_speed": "WhlSpd_FL"},
+    "german": {"v_x": "v_Fzg [km/h]", "omega": "Gierrate [deg/s]", "throttle_feedback": "Fahrpedal [%]",
+               "steering_feedback": "Lenkradwinkel [°]", "brake_feedback": "Bremsdruck [bar]",
+               "a_x": "Längsbeschleunigung [m/s²]", "a_y": "Querbeschleunigung [m/s²]", "gear": "Gang [-]",
+               "engine_speed": "Motordrehzahl [1/min]"},
+    "telephone": {"v_x": "speed", "omega": "z_rate_of_rotation", "throttle_feedback": "accelerator_pos",
+                  "steering_feedback": "steering_angle", "brake_feedback": "brake_pos", "a_x": "longitudinal_acc",
+                  "a_y": "lateral_acc", "latitude": "latitude", "longitude": "longitude", "engine_speed": "rpm"},
+    "simulator": {"v_x": "LocalVelocityX", "v_y": "LocalVelocityY", "omega": "LocalAngularVelZ", "x": "CarPosX",
+                  "y": "CarPosY", "theta": "Heading", "throttle_feedback": "Gas", "steering_feedback": "SteerAngle",
+                  "gear": "Gear", "engine_speed": "EngineRpm"},
+    "plotted": {"v_x": "/odom/twist/twist/linear/x", "v_y": "/odom/twist/twist/linear/y",
+                "omega": "/odom/twist/twist/angular/z", "steering_feedback": "/drive/drive/steering_angle",
+                "speed_feedback": "/drive/drive/speed"},
+}  # fmt: skip
+"""Headings of loggers, by signal."""
+
+
+@pytest.mark.parametrize("logger", HEADINGS)
+def test_headings_of_loggers_are_known(logger: str) -> None:
+    values = {"gear": np.floor(V_X), "engine_speed": 2000 * V_X, "v_x": V_X, "speed_feedback": V_X + 0.1}
+    topics = {
+        name: TopicContent(name, "number", len(T), 50.0, 0.02, T, {name: values.get(signal, np.sin(T + k))}, unit)
+        for k, (signal, name) in enumerate(HEADINGS[logger].items())
+        for unit in [known_unit(heading(name).unit) or ""]
+    }
+    found = suggest(topics, WHEELBASE, [], is_table=True)
+    assert {name: one.field for name, one in found.items()} == {
+        name: column for name, column in HEADINGS[logger].items() if name != "wheel_speed"
+    }
+    assert found["engine_speed"].unit == "rpm" if "engine_speed" in found else "speed_feedback" in found
 
 
 def test_columns_are_told_with_type_rate_range_and_zeros(tmp_path: Path) -> None:

@@ -134,6 +134,20 @@ def test_rows_or_columns_of_a_matrix_are_columns(tmp_path: Path, columns: Any, n
     assert inspect(tmp_path / name).topics["states[1]"].unit == ""
 
 
+@pytest.mark.parametrize("name", ["log.npz", "log.mat", "log.npy"])
+def test_a_matrix_alone_is_a_table(tmp_path: Path, columns: Any, name: str) -> None:
+    write_csv(tmp_path / "log.csv", columns)
+    columns["time"] = (columns["time"] - START) / 1e9
+    matrix = np.stack(list(columns.values()), axis=1)
+    if name.endswith("npy"):
+        np.save(tmp_path / name, matrix)
+    else:
+        WRITERS[name](tmp_path / name, {"array": matrix})
+    named = {one: {"column": f"array[{k}]"} for k, one in enumerate(columns) if one != "time"}
+    found = extract([tmp_path / name], table_map(**named), 40.0)
+    np.testing.assert_allclose(found.matrix, extract([tmp_path / "log.csv"], table_map(), 40.0).matrix, atol=1e-12)
+
+
 def test_units_curves_and_offsets_are_those_of_the_map(tmp_path: Path, columns: Any) -> None:
     as_logged = {
         **columns, "v_x": columns["v_x"] * 3.6, "omega": np.degrees(columns["omega"]), "y": columns["y"] * 100,
@@ -167,6 +181,39 @@ def test_the_unit_of_time_follows_from_its_steps(tmp_path: Path, columns: Any, u
     )
     assert found.duration == pytest.approx(0.6, abs=1e-5)
     np.testing.assert_array_equal(found.time, told.time)
+
+
+def test_a_unit_of_time_that_cannot_be_is_not_taken_at_its_word(tmp_path: Path, columns: Any) -> None:
+    stamps = columns.pop("time")
+    write_csv(tmp_path / "log.csv", columns | {"time_s": stamps})
+    assert extract([tmp_path / "log.csv"], table_map(), 40.0).time[0] == START
+
+
+@pytest.mark.parametrize("begin", ["10:59:59.7", "23:59:59.7", "07:03:59.7"])
+def test_times_of_gnss_receivers_are_those_of_the_day(tmp_path: Path, columns: Any, begin: str) -> None:
+    first = sum(float(part) * 60**power for part, power in zip(begin.split(":"), (2, 1, 0), strict=True))
+    seconds = (first + np.arange(N) / 100) % 86_400
+    digits = seconds // 3600 * 10_000 + seconds // 60 % 60 * 100 + seconds % 60
+    write_csv(tmp_path / "log.csv", columns | {"time": [f"{one:010.3f}" for one in digits]})
+    for time in (None, inspect(tmp_path / "log.csv").time):
+        found = extract([tmp_path / "log.csv"], table_map(time=time), 40.0)
+        assert (round(found.time[0] / 1e9, 3), len(found), set(found.segment)) == (first, 24, {0})
+
+
+def test_a_number_of_the_row_is_no_time(tmp_path: Path, columns: Any) -> None:
+    """As pandas writes in front of each row, with nothing above."""
+    time = columns.pop("time")
+    write_csv(tmp_path / "log.csv", {"": np.arange(N)} | columns | {"elapsed": (time - START) / 1e9})
+    assert extract([tmp_path / "log.csv"], table_map(), 40.0).duration == pytest.approx(0.6, abs=0.03)
+    write_csv(tmp_path / "none.csv", {"": np.arange(N), "v_x": np.sin(columns["v_x"])})
+    with pytest.raises(BagError, match=r"no time column among column_1, v_x.*and is no number of the row"):
+        inspect(tmp_path / "none.csv")
+
+
+def test_an_index_that_pandas_gave_no_name_is_the_time(tmp_path: Path, columns: Any) -> None:
+    stamps = pa.array(columns.pop("time"), pa.timestamp("ns"))
+    pq.write_table(pa.table(columns | {"__index_level_0__": stamps}), tmp_path / "log.parquet")
+    assert extract([tmp_path / "log.parquet"], table_map(), 40.0).time[0] == START
 
 
 DATES = {
@@ -309,11 +356,12 @@ def zipped(path: Path, name: str) -> None:
             "cannot be read as a MATLAB file|not a table",
         ),
         (lambda path: np.savez(path.open("wb"), time=np.arange(9), v=np.arange(8)), "v of 8 values, time of 9 values"),
-        (lambda path: np.savez(path.open("wb"), a=np.ones((9, 2)), b=1.0), "b: a single value; a: a matrix of 9 x 2"),
+        (lambda path: np.savez(path.open("wb"), a=np.ones((9, 2, 2)), b=1.0), "b: a single value; a: a matrix of 9"),
         (
             lambda path: np.savez(path.open("wb"), a=np.array([{}, {}])),
-            "not a table .a: Object arrays cannot be loaded",
+            "not a table .a: Python objects, which are not",
         ),
+        (lambda path: np.save(path.open("wb"), np.array([{}, {}])), r"cannot be read as NumPy's .npy"),
         (lambda path: np.savez_compressed(path.open("wb"), a=np.zeros(9_000_000)), "unpacks to 68 MB"),
         (
             lambda path: scipy.io.savemat(path, {"s": {"t": 1.0}, "w": {"t": 1}}, appendmat=False),
