@@ -80,7 +80,7 @@ class Soaked:
     violations: dict[str, str] = field(default_factory=dict)  # what must not happen, in words, the first of each kind
 
 
-class _Drive:
+class Drive:
     """The traffic on the bus, and what is known of it."""
 
     def __init__(self, model: Path, collector: Collector, rate: float, seed: int, spoilt: float) -> None:
@@ -187,11 +187,11 @@ def soak(
     card = open_artifact(models[0]).card
     run, done, held = LiveRun(round(card.sampling_time * 1e9)), Soaked(), list[tuple[float, int]]()
     with predictor_process(models[0], {}, os.environ.copy()) as process, collecting(run) as collector:
-        drive = _Drive(models[0], collector, rate, seed, spoilt)
+        drive = Drive(models[0], collector, rate, seed, spoilt)
         drive.wait_for_answer(run, process)
         swapper = _Swapper(collector, models, swap_every)
         begin = time.monotonic()
-        for tick in _ticks(begin, 1 / rate, seconds):
+        for tick in ticks(begin, 1 / rate, seconds):
             drive.step(run, done)
             swapper.step()
             if tick - begin >= len(held):
@@ -220,7 +220,7 @@ def soak(
     return done
 
 
-def _ticks(begin: float, period: float, seconds: float) -> Iterator[float]:
+def ticks(begin: float, period: float, seconds: float) -> Iterator[float]:
     """Yields the time when each period begins; one that was held up for long is not caught up with in a burst."""
     due = begin
     while (now := time.monotonic()) < begin + seconds:
@@ -237,7 +237,7 @@ def _holds(pid: int) -> tuple[float, int]:
     return pages * os.sysconf("SC_PAGE_SIZE") / _MB, len(os.listdir(f"/proc/{pid}/fd"))
 
 
-def _judge(run: LiveRun, drive: _Drive, done: Soaked) -> None:
+def _judge(run: LiveRun, drive: Drive, done: Soaked) -> None:
     done.predictions = sum(stamp - run.T_s in run.sent for stamp in run.predicted)
     done.lost = run.lost
     done.passed_over = len(run.missing()) - done.lost
