@@ -231,9 +231,10 @@ void dynssm_seen(const Features *f, const double *windows, int64_t count, const 
     }
 }
 
-/* The layer's weights and its variances before a step: what OnlineState.variance computes. */
-static void variance(Layer *layer, const double *features, double *stated) {
+/* What is known before a step: weights (CHANNELS, n), the variances that OnlineState.variance computes and the limits (CHANNELS). */
+static void known(const Layer *layer, const double *features, double *weights, double *stated, double *limits) {
     const int64_t n = layer->n;
+    memcpy(weights, layer->mean, CHANNELS * n * sizeof(double));
     for (int64_t c = 0; c < CHANNELS; c++) {
         const double *P = layer->covariance + c * n * n, *f = features + c * n;
         double explained = 0.0;
@@ -242,11 +243,16 @@ static void variance(Layer *layer, const double *features, double *stated) {
             for (int64_t j = 0; j < n; j++) sum += P[i * n + j] * f[j];
             explained += sum * f[i];
         }
+        limits[c] = layer->limit * sqrt(layer->physics[c]);
         stated[c] = layer->width[c] * layer->width[c] * layer->recent[c] * (layer->noise[c] + explained);
     }
 }
 
-void dynssm_variance(Layer *layer, const double *features, double *stated) { variance(layer, features, stated); }
+/* The same one after the other. */
+void dynssm_known(const Layer *layer, const double *features, double *found) {
+    const int64_t size = CHANNELS * layer->n;
+    known(layer, features, found, found + size, found + size + CHANNELS);
+}
 
 static inline double larger(double a, double b) { return a > b ? a : b; }
 static inline double smaller(double a, double b) { return a < b ? a : b; }
@@ -304,9 +310,7 @@ void dynssm_along(Layer *layer, const double *features, const double *physics, c
     for (int64_t k = 0; k < count; k++) {
         taught[k] = follows[k] && update(layer, features + (k - 1) * size, physics + (k - 1) * CHANNELS,
                                          increments + (k - 1) * CHANNELS);
-        memcpy(weights + k * size, layer->mean, size * sizeof(double));
-        variance(layer, features + k * size, stated + k * CHANNELS);
-        for (int64_t c = 0; c < CHANNELS; c++) limits[k * CHANNELS + c] = layer->limit * sqrt(layer->physics[c]);
+        known(layer, features + k * size, weights + k * size, stated + k * CHANNELS, limits + k * CHANNELS);
     }
 }
 
@@ -365,26 +369,43 @@ void dynssm_rollout(const Rollout *r, double *all, int64_t count, const double *
     }
 }
 
-/* Values at the times `grid` (rows) of signals whose samples are in ring buffers, to columns (count, rows): linear between
-   samples as numpy's interp, held beyond them; of signals that are `held` the last value at or before the times `late`.
-   Each signal has a row of places: where its oldest sample's time and value lie, their number, whether it is held. */
-void dynssm_sample(const int64_t *places, int64_t count, const double *grid, const double *late, int64_t rows, double *columns) {
-    for (int64_t s = 0; s < count; s++, places += 4, columns += rows) {
-        const double *t = (const double *)(intptr_t)places[0], *v = (const double *)(intptr_t)places[1];
-        const double *wanted = places[3] ? late : grid;
-        const int64_t last = places[2] - 1;
-        int64_t j = last; /* times ascend, and the newest rows are asked for: back from the newest sample */
-        for (int64_t k = rows - 1; k >= 0; k--) {
-            const double x = wanted[k];
-            while (j > 0 && t[j] > x) j--;
-            if (places[3] || j == last || t[j] >= x)
-                columns[k] = v[j];
-            else {
-                const double slope = (v[j + 1] - v[j]) / (t[j + 1] - t[j]);
-                columns[k] = slope * (x - t[j]) + v[j];
-            }
+/* Values at the times `offsets` after `now` (rows) of a signal whose samples are in a ring buffer, COLUMNS apart: linear between
+   samples as numpy's interp, held beyond them; of one that is held the last value at or before a `slack` later. `place`: where
+   its oldest sample's time and value lie, their number, whether it is held. A brake takes the place of the throttle where it
+   is pressed. */
+static void sample(const int64_t *place, const double *offsets, double now, double slack, int64_t rows, double *column,
+                   int brake) {
+    const double *t = (const double *)(intptr_t)place[0], *v = (const double *)(intptr_t)place[1];
+    const int64_t last = place[2] - 1, held = place[3];
+    int64_t j = last; /* times ascend, and the newest rows are asked for: back from the newest sample */
+    for (int64_t k = rows - 1; k >= 0; k--) {
+        const double grid = offsets[k] + now, x = held ? grid + slack : grid;
+        while (j > 0 && t[j] > x) j--;
+        double value = v[j];
+        if (!(held || j == last || t[j] >= x)) {
+            const double slope = (v[j + 1] - v[j]) / (t[j + 1] - t[j]);
+            value = slope * (x - t[j]) + v[j];
         }
+        if (!brake)
+            column[k * COLUMNS] = value;
+        else if (value > 0.0)
+            column[k * COLUMNS] = -value;
     }
+}
+
+/* The window (rows, COLUMNS) of a history: what History.window samples and model_inputs makes of it. Signals have a row of
+   `places` each: the state, then throttle, brake and steering of the feedback and of the commands; those that there are not
+   have no samples. */
+void dynssm_window(const int64_t *places, const double *offsets, double now, double slack, int64_t rows, double *window) {
+    static const int64_t columns[] = {0, 1, 2, 3, 3, 4, 5, 5, 6}, brakes[] = {0, 0, 0, 0, 1, 0, 0, 1, 0};
+    const int64_t commands = places[6 * 4 + 2];
+    for (int64_t s = 0; s < 9; s++)
+        if (places[4 * s + 2]) sample(places + 4 * s, offsets, now, slack, rows, window + columns[s], (int)brakes[s]);
+    for (int64_t k = 0; k < rows; k++)
+        for (int64_t u = 3; u < 5; u++) {
+            double *row = window + k * COLUMNS + u;
+            row[2] = commands ? row[2] - row[0] : 0.0;
+        }
 }
 
 /* Puts the signals from number `first` on, `k` rows after the starts of some lanes, into a tape. */

@@ -18,18 +18,18 @@ import numpy.typing as npt
 
 LANES = 32
 """Rows that an operation is executed for at once; as in ``compiled.c``."""
-_KINDS = {"p": ctypes.c_void_p, "i": ctypes.c_int64}
+_KINDS = {"p": ctypes.c_void_p, "i": ctypes.c_int64, "d": ctypes.c_double}
 _FUNCTIONS = {
     "dynssm_over": "ppiiip",
     "dynssm_seen": "ppippp",
-    "dynssm_variance": "ppp",
+    "dynssm_known": "ppp",
     "dynssm_update": "pppp",
     "dynssm_along": "ppppippppp",
     "dynssm_rollout": "ppippp",
-    "dynssm_sample": "pippip",
+    "dynssm_window": "ppddip",
     "dynssm_simulate": "ppi",
 }
-"""The library's functions with their arguments: p a structure or the first number of an array, i a count."""
+"""The library's functions with their arguments: p a structure or the first number of an array, i a count, d a number."""
 _SOURCE = Path(__file__).with_suffix(".c")
 
 
@@ -59,8 +59,12 @@ def address(array: npt.NDArray[Any] | None) -> int | None:
     """Where the numbers of a contiguous array lie."""
     if array is None:
         return None
-    place: int = array.__array_interface__["data"][0]
-    return place
+    buffer: Any = array
+    try:
+        return ctypes.addressof(ctypes.c_char.from_buffer(buffer))
+    except (TypeError, ValueError):  # read-only or empty; this takes four times as long
+        place: int = array.__array_interface__["data"][0]
+        return place
 
 
 class Structure(ctypes.Structure):

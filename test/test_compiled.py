@@ -23,7 +23,7 @@ from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.path_judge import _FAR, _pair_steps
 from dynssm_ros.runtime.rollout import LayerRollout, RolloutCorrection, roll_out
 from dynssm_ros.signals.history import History, Refusal
-from dynssm_ros.signals.signal_map import load_signal_map
+from dynssm_ros.signals.signal_map import CONTEXT_SIGNALS, Commands, load_signal_map
 
 NAMES = FeatureLayout(10, 2, 3, 30, False).names
 SOURCE = Path(compiled.__file__).with_suffix(".c")
@@ -158,9 +158,15 @@ def test_rollouts_are_the_same_with_and_without(
         np.testing.assert_allclose(found[tame, model.H, :3], states[tame, 0], rtol=1e-12, atol=1e-12)
 
 
-def test_windows_are_the_same_with_and_without(library: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("signals", "commands"), [("default", "topics"), ("default", "none"), ("av21", "none"), ("default_speed", "topics")]
+)
+def test_windows_are_the_same_with_and_without(
+    library: Any, monkeypatch: pytest.MonkeyPatch, signals: str, commands: Commands
+) -> None:
     """At odd rates, before the oldest and after the newest sample, of signals that are held, from buffers that turn over."""
-    history = History(load_signal_map("default"), 0.02, 30, max_age=1.0, held=("throttle_command",))
+    signal_map = load_signal_map(signals).without(CONTEXT_SIGNALS).with_commands(commands)
+    history = History(signal_map, 0.02, 30, max_age=1.0, held=("throttle_command", "brake_feedback"))
     rng, compared = np.random.default_rng(3), 0
     for k in range(600):
         stamp = 10**18 + k * 7_000_000 + int(rng.integers(0, 3_000_000))

@@ -26,6 +26,14 @@ class WindowPrediction(NamedTuple):
     seen: Seen | None = None
     """What the online layer sees; ``None`` if the model has no such layer."""
 
+    def numbers(self) -> tuple[list[float], list[float], list[float]]:
+        """State, coefficients and variances of the first window; empty where there are none.
+
+        A few floats are judged faster than a small array.
+        """
+        state, theta, variance = ([] if part is None else part[0].tolist() for part in (self[0], self[1], self[3]))
+        return state, theta, variance
+
 
 class WindowModel(Protocol):
     """Any model that predicts one step ahead from a history window."""

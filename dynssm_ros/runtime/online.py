@@ -137,6 +137,8 @@ class OnlineLayer:
 
     def acts(self, v_x: Vector) -> Mask:
         """Whether it learns and corrects at speeds ``v_x`` (m/s); not where that is not known."""
+        if self.least >= 0.0:
+            return v_x >= max(self.minimum_speed, self.least)
         return (np.abs(v_x) >= self.minimum_speed) & (v_x >= self.least)
 
     @property
@@ -162,7 +164,7 @@ class OnlineLayer:
 
     def increments(self, features: Vector, weights: Vector) -> Vector:
         """Increments ``(N, 3)`` (m/s, m/s, rad/s) of features ``(N, 3, n)`` with weights ``(N, 3, n)``."""
-        predicted: Vector = np.einsum("kci,kci->kc", features, weights) * self.scale
+        predicted: Vector = (features[..., None, :] @ weights[..., None])[..., 0, 0] * self.scale
         return predicted
 
     def bounded(self, increments: Vector, physics: Vector, limit: Vector) -> Vector:
@@ -225,8 +227,15 @@ class OnlineState:
 
     def learned(self, features: Vector, trusted: bool = True) -> Learned:
         """What is known now, for a prediction from one window with features ``(3, n)``."""
-        now = self.mean.copy(), self.variance(features), self.limit, self.coefficients.theta, np.array(float(trusted))
-        return Learned(*(part[None] for part in now))
+        if compiled.LIBRARY is not None:
+            size, features = self.mean.size, np.ascontiguousarray(features)
+            known = np.empty((1, size + 2 * CHANNELS))
+            compiled.LIBRARY.dynssm_known(self._structure().address, address(features), address(known))
+            weights = known[:, :size].reshape(1, *self.mean.shape)
+            variance, limit = known[:, size:-CHANNELS], known[:, -CHANNELS:]
+        else:
+            weights, variance, limit = self.mean[None].copy(), self.variance(features)[None], self.limit[None]
+        return Learned(weights, variance, limit, self.coefficients.theta[None], np.array([float(trusted)]))
 
     @property
     def limit(self) -> Vector:
@@ -239,11 +248,6 @@ class OnlineState:
 
         That of weights and noise, times the square of the latest errors in its units, times what makes 90 % of them fit in.
         """
-        if compiled.LIBRARY is not None:
-            found: Vector = np.empty(CHANNELS)
-            features = np.ascontiguousarray(features)
-            compiled.LIBRARY.dynssm_variance(self._structure().address, address(features), address(found))
-            return found
         spread = (self.covariance @ features[:, :, None])[:, :, 0]
         stated: Vector = self.width**2 * self.recent * (self.noise + (spread * features).sum(axis=1))
         return stated

@@ -8,12 +8,12 @@ second sample confirms it, as after a collision or where a filter was set anew.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from operator import le
 from typing import NamedTuple
 
 import numpy as np
 
-from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
 from dynssm_ros.runtime.consistency import Consistency
 from dynssm_ros.signals.decoding import Frames
@@ -166,7 +166,8 @@ class Plausibility:
         self._frames = frames
         self._consistency = _consistency(vehicle)
         rounding = _SINGLE * np.maximum(np.abs(vehicle.lower), np.abs(vehicle.upper))
-        self._lower, self._upper = vehicle.lower - rounding, vehicle.upper + rounding
+        self._lower = (vehicle.lower - rounding).tolist()
+        self._upper = (vehicle.upper + rounding).tolist()
         self.top = self._ranges["v_x"].high if self._ranges else 0.0
         """Largest plausible speed (m/s); 0 where it is not known."""
         self.last = ""
@@ -253,8 +254,8 @@ class Plausibility:
         following: Iterable[float],
         T_s: float,
         *,
-        variance: Vector | None,
-        theta: Vector | None,
+        variance: Sequence[float],
+        theta: Sequence[float],
     ) -> str:
         """What is wrong with a prediction, in words; empty if the car can do it.
 
@@ -262,8 +263,8 @@ class Plausibility:
             now: measured ``v_x, v_y, omega``.
             following: predicted, ``T_s`` later.
             T_s: sampling time (s).
-            variance: stated, ``(3,)``, as far as the model states it.
-            theta: coefficients ``(17,)``, as far as it has them.
+            variance: stated, three numbers, or none if the model states none.
+            theta: the coefficients, or none if it has none.
         """
         for name, before, after in zip(STATE_SIGNALS, now, following, strict=True):
             limit = self._ranges.get(name)
@@ -273,11 +274,11 @@ class Plausibility:
                 return f"predicted {name} = {after:.4g}; expected {limit.low:.4g} to {limit.high:.4g}"
             if abs(after - before) > limit.noise + limit.rate * T_s:
                 return f"predicted {name} = {after:.4g} after {before:.4g}"
-        if variance is not None and variance.min() <= 0:
-            return f"predicted variance {variance.min():.4g}; expected more than zero"
-        if theta is not None and ((theta < self._lower) | (theta > self._upper)).any():
-            beyond = np.maximum(self._lower - theta, theta - self._upper)
-            k = int(np.argmax(beyond))
+        if min(variance, default=1.0) <= 0:
+            return f"predicted variance {min(variance):.4g}; expected more than zero"
+        if theta and not (all(map(le, self._lower, theta)) and all(map(le, theta, self._upper))):
+            values = np.array(theta)
+            k = int(np.argmax(np.maximum(np.subtract(self._lower, values), np.subtract(values, self._upper))))
             return f"{COEFFICIENTS[k]} = {theta[k]:.4g}; expected {self._lower[k]:.4g} to {self._upper[k]:.4g}"
         return ""
 

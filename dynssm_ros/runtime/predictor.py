@@ -10,9 +10,9 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,8 +38,7 @@ _RECENT_S = 10.0  # of driving, that a model to be swapped in is tried on
 _KEPT_ROWS = 2000  # as long at 200 Hz
 
 
-@dataclass(frozen=True)
-class Prediction:
+class Prediction(NamedTuple):
     """The predicted instant.
 
     Attributes:
@@ -92,6 +91,7 @@ class Predictor:
         self._learns = online
         self._window = np.zeros((model.H, len(WINDOW_COLUMNS)))
         self._rows: deque[tuple[int, Vector]] = deque(maxlen=_KEPT_ROWS)
+        self._measured: tuple[int, list[float]] | None = None  # that the hindsight has yet to see
         self._set_model(model)
 
     @property
@@ -167,6 +167,9 @@ class Predictor:
 
     def finish(self) -> None:
         """Does what can wait until the prediction is out; the next one or a horizon does it else."""
+        measured, self._measured = self._measured, None
+        if measured is not None:
+            self._hindsight.measured(*measured)
         if self._learner is not None:
             self._learner.finish()
 
@@ -198,6 +201,7 @@ class Predictor:
         self._plausibility = Plausibility(model.card.vehicle, frames=self._frames)
         self._scale = model.card.normalisation.increment_scale
         self._hindsight = Hindsight(self._scale, model.vehicle.minimum_speed)
+        self._measured = None
         self._period = round(model.T_s * 1e9)
 
     def observe(self, stamp: int, values: dict[str, float], frames: Frames | None = None) -> Refusal | None:
@@ -230,11 +234,10 @@ class Predictor:
             self._learn(self._learner, stamp, window, predicted)
             predicted = self._learner.corrected(window, predicted)
         state, theta, physics, variance = predicted[:4]
-        now, following = window[-1, :3].tolist(), state[0].tolist()  # a few floats are faster than a small array
-        self._hindsight.measured(stamp, now)
-        if not (_finite(following) and _finite_row(theta) and _finite_row(variance)):
+        now, (following, adapted, stated) = window[-1, :3].tolist(), predicted.numbers()
+        self._measured = stamp, now
+        if not (_finite(following) and _finite(stated) and _finite(adapted)):
             return Refusal.BAD_PREDICTION
-        stated, adapted = None if variance is None else variance[0], None if theta is None else theta[0]
         if words := self._plausibility.of_prediction(now, following, self.model.T_s, variance=stated, theta=adapted):
             self._plausibility.last = words
             return Refusal.IMPLAUSIBLE_PREDICTION
@@ -243,9 +246,9 @@ class Predictor:
             stamp + self._period,
             state[0],
             propagate_pose(values, now, following, self.model.T_s),
-            adapted,
+            None if theta is None else theta[0],
             None if self.online is None else self.online.coefficients.std,
-            stated,
+            None if variance is None else variance[0],
             0.0 if physics is None else self._residual_share(now, following, physics[0].tolist()),
         )
 
@@ -326,10 +329,6 @@ def live_signal_map(model: OnnxModel, signal_map: SignalMap) -> SignalMap:
 
 def _finite(values: Iterable[float]) -> bool:
     return all(map(math.isfinite, values))
-
-
-def _finite_row(part: Vector | None) -> bool:
-    return part is None or _finite(part[0].tolist())
 
 
 def propagate_pose(

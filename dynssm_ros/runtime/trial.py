@@ -6,6 +6,7 @@ process has limits of memory and time: a model that takes all of either ends it,
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -155,13 +156,11 @@ def _seconds(model: OnnxModel) -> float:
 def _require_plausible(model: OnnxModel, windows: Vector, predicted: list[WindowPrediction]) -> None:
     plausibility, reasons = Plausibility(model.vehicle), []
     for window, each in zip(windows, predicted, strict=True):
-        state, theta, _, variance = (None if part is None else part[0] for part in each[:4])
-        if not all(np.isfinite(part).all() for part in (state, theta, variance) if part is not None):
+        state, theta, variance = each.numbers()
+        if not all(map(math.isfinite, (*state, *theta, *variance))):
             raise ArtifactError(f"{model.artifact.path}: what it predicts is not finite; expected numbers")
         now = window[-1, :3].tolist()
-        reasons.append(
-            plausibility.of_prediction(now, each.state[0].tolist(), model.T_s, variance=variance, theta=theta)
-        )
+        reasons.append(plausibility.of_prediction(now, state, model.T_s, variance=variance, theta=theta))
     wrong = [reason for reason in reasons if reason]
     if len(wrong) > _TOLERATED * len(reasons):
         raise ArtifactError(f"{model.artifact.path}: {wrong[0]}; {len(wrong)} of {len(reasons)} predictions are so")

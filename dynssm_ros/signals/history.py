@@ -7,6 +7,7 @@ interpolates or holds as the extractor does; beyond the newest it holds.
 from __future__ import annotations
 
 from collections.abc import Collection
+from ctypes import c_int64
 from enum import Enum
 from math import isfinite
 
@@ -45,6 +46,7 @@ class Refusal(Enum):
 
 
 _NUMBER = 8  # bytes
+_ABSENT = 0, 0, 0, False  # place of a signal that there is not
 
 
 class RingBuffer:
@@ -63,6 +65,8 @@ class RingBuffer:
         self._addresses = address(self._times) or 0, address(self._values) or 0
         self._next = 0
         self._count = 0
+        self.holds = False
+        """Whether a sample is kept until the next one, and not a line drawn between them."""
         self.newest = -np.inf
         """Time of the newest sample (ns since the epoch), ``-inf`` if empty."""
 
@@ -89,11 +93,11 @@ class RingBuffer:
         """Time of the oldest sample, ``inf`` if empty."""
         return float(self._times[self._next + self._capacity - self._count]) if self._count else np.inf
 
-    def place(self, held: bool) -> tuple[int, int, int, bool]:
+    def place(self) -> tuple[int, int, int, bool]:
         """Where the compiled loop finds the samples: the oldest one's time and value, their number; whether it holds them."""
         start = _NUMBER * (self._next + self._capacity - self._count)
         times, values = self._addresses
-        return times + start, values + start, self._count, held
+        return times + start, values + start, self._count, self.holds
 
     def interpolate(self, grid: Vector) -> Vector:
         """Values at the times ``grid``, linear between samples and held beyond the newest."""
@@ -120,8 +124,9 @@ class RingBuffer:
         self.newest = -np.inf
 
     def _grow(self) -> None:
-        times, values, count = self.times.copy(), self.values.copy(), self._count
+        times, values, count, holds = self.times.copy(), self.values.copy(), self._count, self.holds
         self.__init__(2 * self._capacity)  # type: ignore[misc]
+        self.holds = holds
         for buffer, old in ((self._times, times), (self._values, values)):
             buffer[:count] = buffer[self._capacity : self._capacity + count] = old
         self._next = self._count = count
@@ -153,6 +158,11 @@ class History:
         self.names = (*STATE_SIGNALS, *inputs)
         self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
         self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
+        speaks = "speed" if "speed_feedback" in self._buffers else "throttle"
+        actuators = [f"{of}_{kind}" for kind in ("feedback", "command") for of in (speaks, "brake", "steering")]
+        ordered = [self._buffers.get(name) for name in (*STATE_SIGNALS, *actuators)]
+        self._ordered = [None if buffer is None else buffer.place for buffer in ordered]
+        self._places = (c_int64 * (len(ordered) * len(_ABSENT)))()
         sources = signal_map.signals
         for name, source in signal_map.active_signals().items():
             if not 0.0 <= source.delay < 1.0:
@@ -170,8 +180,10 @@ class History:
 
     def resize(self, T_s: float, H: int, held: Collection[str] = ()) -> None:
         """Changes the grid of the window; the samples are kept, so a longer window fills on from what is there."""
-        self._held = frozenset(held)
+        for name, buffer in self._buffers.items():
+            buffer.holds = name in held
         self._offsets = -np.arange(H - 1, -1, -1, dtype=np.float64) * (T_s * 1e9)
+        self._grid = address(self._offsets)
         self._span = H * T_s * 1e9 + self._max_age + self._max_gap
         self._slack = ROUNDING * T_s * 1e9
 
@@ -254,27 +266,26 @@ class History:
             filling = filling or self._unbroken[name] > first or buffer.oldest > first
         if filling:
             return Refusal.FILLING
-        grid = self._offsets + now
-        late = grid + self._slack
-        sampled = self._sampled(grid, late)
-        window = np.empty((len(grid), len(WINDOW_COLUMNS)))
-        for k, column in enumerate((*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled))):
-            window[:, k] = column
+        window = np.empty((len(self._offsets), len(WINDOW_COLUMNS)))
+        if compiled.LIBRARY is None:
+            self._sample(now, window)
+        else:
+            self._places[:] = [part for place in self._ordered for part in (place() if place else _ABSENT)]
+            compiled.LIBRARY.dynssm_window(
+                self._places, self._grid, now, self._slack, len(self._offsets), address(window)
+            )
         return window
 
-    def _sampled(self, grid: Vector, late: Vector) -> dict[str, Vector]:
-        """The signals at the times ``grid``; those that are held at ``late``, which is a little later."""
-        if compiled.LIBRARY is None:
-            return {
-                name: buffer.held(late) if name in self._held else buffer.interpolate(grid)
-                for name, buffer in self._buffers.items()
-            }
-        places = np.array([buffer.place(name in self._held) for name, buffer in self._buffers.items()], dtype=np.int64)
-        columns = np.empty((len(places), len(grid)))
-        compiled.LIBRARY.dynssm_sample(
-            address(places), len(places), address(grid), address(late), len(grid), address(columns)
-        )
-        return dict(zip(self._buffers, columns, strict=True))
+    def _sample(self, now: float, window: Vector) -> None:
+        """Fills the window that ends at the time ``now`` (ns since the epoch)."""
+        grid = self._offsets + now
+        late = grid + self._slack
+        sampled = {
+            name: buffer.held(late) if buffer.holds else buffer.interpolate(grid)
+            for name, buffer in self._buffers.items()
+        }
+        for k, column in enumerate((*(sampled[name] for name in STATE_SIGNALS), *model_inputs(sampled))):
+            window[:, k] = column
 
     def ages(self, stamp: int) -> dict[str, float]:
         """Age of the newest sample of each signal at ``stamp`` (s); infinite where none was received."""
