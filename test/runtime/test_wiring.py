@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from dynssm_ros.api import recorded, simulate
 from dynssm_ros.runtime.wiring import Wiring
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
+from dynssm_ros.vehicle import COEFFICIENTS, CarModel, State, load_vehicle
 
 ORCA = load_vehicle("orca")
 COLUMNS = {"v_x": [0], "v_y": [1], "omega": [2], "steering": [4, 6], "speed": [0, 1], "left": [1, 2]}
@@ -70,6 +71,26 @@ def test_nothing_is_said_of_a_straight_or_after_a_gap(laps) -> None:
     for k, row in enumerate(rows[:500]):
         wiring.add((k + 1000) * 20_000_000 * 3, row)  # each row after a gap
     assert wiring.verdict() == ""
+
+
+def test_a_row_waits_for_one_step_of_some_suspicions(laps, monkeypatch: pytest.MonkeyPatch) -> None:
+    stepped: list[int] = []
+
+    def step(car: CarModel, state: State, *others: Any) -> Any:
+        stepped.append(len(state.v_x))
+        return plain(car, state, *others)
+
+    plain = CarModel.step
+    monkeypatch.setattr(CarModel, "step", step)
+    wiring, most = Wiring(ORCA, laps.T_s), 0
+    for stamp, row in zip(laps.time[:600].tolist(), laps.matrix, strict=False):
+        wiring.add(stamp, row)
+        wiring.verdict()
+        assert len(stepped) <= 1
+        assert sum(stepped) <= 12
+        most += len(stepped)
+        stepped.clear()
+    assert most > 50
 
 
 @pytest.mark.parametrize(("front", "rear"), [(1.0, 1.4), (1.4, 1.0), (1.4, 1.4), (0.7, 0.7)])
