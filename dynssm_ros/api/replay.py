@@ -65,5 +65,5 @@ def replay(
         predictor.load_online(s.online_state)
     outcome = replay_to_bag(Path(bag), predictor, Path(out), with_inputs=s.with_inputs, progress=on_progress)
     if s.online_state is not None:
-        predictor.save_online(s.online_state)
+        predictor.online_writer(s.online_state)()
     return outcome

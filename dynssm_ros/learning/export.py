@@ -39,7 +39,7 @@ from dynssm_ros.runtime.artifact import (
     write_card,
 )
 from dynssm_ros.runtime.online import save_layer
-from dynssm_ros.runtime.tensors import write_tensors
+from dynssm_ros.runtime.tensors import as_tensors
 
 LOSSES = "losses.png"
 TOLERANCE = 1e-5  # largest difference between ONNX and torch, in units of each state's scale
@@ -85,7 +85,8 @@ def save_artifact(
     sample = _sample_windows(trained)
     with replacing(out, may_hold=(ONLINE, LOSSES)) as folder:
         folder.mkdir()
-        write_tensors(folder / WEIGHTS, {name: value.numpy(force=True) for name, value in model.state_dict().items()})
+        weights = {name: value.numpy(force=True) for name, value in model.state_dict().items()}
+        (folder / WEIGHTS).write_bytes(as_tensors(weights))
         metrics = _metrics(trained)
         if trained.deploys_network:
             export_onnx(model, sample, folder / ONNX)

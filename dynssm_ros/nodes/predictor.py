@@ -10,8 +10,9 @@ from __future__ import annotations
 import os
 import pathlib
 import stat
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -109,6 +110,7 @@ class PredictorNode(ManagedNode):
         self._period = describe(
             self, "diagnostics_period", 1.0, "Time between /diagnostics (s).", (0.1, 60.0), read_only=True
         )
+        self._writing: threading.Thread | None = None
         self._swap: OnnxModel | None = None
         self._tried: dict[str, OnnxModel | UserError] = {}
         let_wait(self, self._try_models)
@@ -139,7 +141,7 @@ class PredictorNode(ManagedNode):
         self._listen()
         repeat(self, self._period, self._diagnose)
         if self._state:
-            repeat(self, _SAVE_PERIOD_S, self.keep)
+            repeat(self, _SAVE_PERIOD_S, self._keep_aside)
         model = self._predictor.model
         self.get_logger().info(
             f"{model.name} ({model.parameters} parameters): {model.H} rows of {model.T_s:g} s, commands {model.commands}"
@@ -342,10 +344,22 @@ class PredictorNode(ManagedNode):
     def keep(self) -> None:
         """Writes what the online layer has learned, if a file is named for it."""
         if self._state:
-            try:
-                self._predictor.save_online(pathlib.Path(self._state))
-            except UserError as error:
-                self.get_logger().error(str(error))
+            if self._writing is not None:
+                self._writing.join()
+            self._write(self._predictor.online_writer(pathlib.Path(self._state)))
+
+    def _keep_aside(self) -> None:
+        """The same in a thread of its own, so that no prediction waits for a disk."""
+        if self._writing is None or not self._writing.is_alive():
+            write = self._predictor.online_writer(pathlib.Path(self._state))
+            self._writing = threading.Thread(target=self._write, args=(write,), daemon=True)
+            self._writing.start()
+
+    def _write(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except UserError as error:
+            self.get_logger().error(str(error))
 
     def _diagnose(self) -> None:
         now = time.monotonic()

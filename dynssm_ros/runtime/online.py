@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +32,7 @@ from dynssm_ros.configuration import StrictModel
 from dynssm_ros.errors import ArtifactError
 from dynssm_ros.files import replacing
 from dynssm_ros.runtime.coefficients import BlockErrors, CoefficientEstimator
-from dynssm_ros.runtime.tensors import read_tensors, write_tensors
+from dynssm_ros.runtime.tensors import as_tensors, read_tensors
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.integrators import Integrator
@@ -321,15 +321,23 @@ class OnlineState:
             )  # fmt: skip
         return self._compiled
 
-    def save(self, path: Path, owner: str) -> None:
-        """Writes what was learned to ``path``, atomically; ``owner`` names the prior that it belongs to."""
+    def writer(self, path: Path, owner: str) -> Callable[[], None]:
+        """Writes what is known now to ``path``, atomically, once it is called; another thread may do so.
+
+        ``owner`` names the prior that it belongs to.
+        """
         arrays = {name: getattr(self, name) for name in _SAVED}
         arrays |= {f"coefficients.{name}": value for name, value in self.coefficients.kept().items()}
-        with replacing(path) as aside:
-            write_tensors(aside, arrays, {"prior": owner, "steps": str(self.steps)})
+        content = as_tensors(arrays, {"prior": owner, "steps": str(self.steps)})
+
+        def write() -> None:
+            with replacing(path) as aside:
+                aside.write_bytes(content)
+
+        return write
 
     def load(self, path: Path, owner: str) -> None:
-        """Goes on from what :meth:`save` wrote.
+        """Goes on from what a :meth:`writer` wrote.
 
         Raises:
             ArtifactError: unreadable, not finite, or learned by another model.
@@ -368,7 +376,7 @@ def _state_in(path: Path) -> bytes:
 
 def save_layer(layer: OnlineLayer, path: Path) -> None:
     """Writes the numbers of a layer; names and time constants are in the card."""
-    write_tensors(path, {name: getattr(layer, name) for name in _PRIOR})
+    path.write_bytes(as_tensors({name: getattr(layer, name) for name in _PRIOR}))
 
 
 def load_layer(

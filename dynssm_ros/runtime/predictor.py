@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -173,13 +173,15 @@ class Predictor:
         if self._learner is not None:
             self._learner.finish()
 
-    def save_online(self, path: Path) -> None:
-        """Writes what was learned online, so that another stint can start with it; nothing without an online layer."""
-        if self.online is not None:
-            self.online.save(path, self.model.prior)
+    def online_writer(self, path: Path) -> Callable[[], None]:
+        """Writes what was learned online until now, once it is called, so that another stint can start with it.
+
+        Another thread may call it. It writes nothing without an online layer.
+        """
+        return (lambda: None) if self.online is None else self.online.writer(path, self.model.prior)
 
     def load_online(self, path: Path) -> None:
-        """Goes on from what :meth:`save_online` wrote.
+        """Goes on from what :meth:`online_writer` wrote.
 
         Raises:
             ArtifactError: unreadable, or learned by another model; the model has no online layer.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError
@@ -32,10 +31,9 @@ def read_tensors(data: bytes, refusal: str) -> tuple[dict[str, Vector], dict[str
     return arrays, about
 
 
-def write_tensors(path: Path, arrays: Mapping[str, Vector], about: dict[str, str] | None = None) -> None:
-    """Writes arrays by name, and what they are ``about``, to a safetensors file.
+def as_tensors(arrays: Mapping[str, Vector], about: dict[str, str] | None = None) -> bytes:
+    """The content of a safetensors file with arrays by name and what they are ``about``.
 
-    Raises:
-        OSError: cannot be written; the library's own writer raises another error where the disk is full.
+    The library's own writer would raise another error than :class:`OSError` where the disk is full.
     """
-    path.write_bytes(save({name: np.asarray(array, order="C") for name, array in arrays.items()}, about))
+    return save({name: np.asarray(array, order="C") for name, array in arrays.items()}, about)

@@ -279,7 +279,7 @@ def test_a_second_stint_starts_where_the_first_ended(noisy_laps, noisy_model, tm
     part = noisy_laps.select(rows)
     first, second = (Predictor(noisy_model, SIGNALS) for _ in range(2))
     feed(first, part, rows)
-    first.save_online(tmp_path / "state")
+    first.online_writer(tmp_path / "state")()
     second.load_online(tmp_path / "state")
     np.testing.assert_array_equal(second.online.mean, first.online.mean)
     with pytest.raises(ArtifactError, match="switched off"):

@@ -165,12 +165,15 @@ def test_what_was_learned_is_kept_and_belongs_to_its_prior(tmp_path):
     state = layer.start()
     for row in rng.standard_normal((30, 3, N)):
         learn(state, row, row[:, 1])
-    state.save(file, "mine")
+    write, names = state.writer(file, "mine"), ("mean", "covariance", "noise", "physics", "recent", "width")
+    expected = [getattr(state, name).copy() for name in names]
+    learn(state, np.ones((3, N)), np.ones(3))  # before another thread has come to it
+    write()
     other = layer.start()
     other.load(file, "mine")
     assert other.steps == 30
-    for name in ("mean", "covariance", "noise", "physics", "recent", "width"):
-        np.testing.assert_array_equal(getattr(other, name), getattr(state, name))
+    for name, value in zip(names, expected, strict=True):
+        np.testing.assert_array_equal(getattr(other, name), value)
     with pytest.raises(ArtifactError, match="learned by another model"):
         other.load(file, "yours")
     save_file({name: value for name, value in load_file(file).items() if name != "recent"}, file, {"prior": "mine"})
@@ -180,7 +183,7 @@ def test_what_was_learned_is_kept_and_belongs_to_its_prior(tmp_path):
     with pytest.raises(ArtifactError, match="not a readable online state"):
         other.load(file, "mine")
     wider = dataclasses.replace(layer, mean=np.zeros((3, 5)), covariance=np.zeros((3, 5, 5))).start()
-    state.save(file, "mine")
+    state.writer(file, "mine")()
     with pytest.raises(ArtifactError, match="of another shape"):
         wider.load(file, "mine")
 
