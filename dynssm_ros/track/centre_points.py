@@ -1,7 +1,7 @@
 """Points of a centre line as people have them: what cannot be driven is left out, smoothed, or refused in one line.
 
-Points nearer to the one before than a tenth of the usual spacing repeat it. Points behind the start of the lap overlap it.
-Coordinates that are rounded as coarsely as the line would bend by it are smoothed within the rounding.
+Points nearer to the one before than a tenth of the usual spacing repeat it; dense ones are thinned. Points behind the start
+of the lap overlap it. Coordinates that are rounded as coarsely as the line would bend by it are smoothed within the rounding.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
 
 REPEATS = 0.1  # of the usual spacing, nearer than which a point repeats the one before: a spline bends around both
+DENSE = 0.05  # of the road's half width, nearer than which a point tells nothing: no road bends more tightly than that
 _OVERLAP = 0.1  # of the points, at most, that a lap may have been recorded for too long
 _BENT = 0.05  # of the curvature whose radius is the road's half width, that rounding may add
 _BACK = 0.0  # cosine of a turn from point to point, from which on the line turns back: 90 degrees
@@ -51,15 +52,19 @@ def mended(table: Vector) -> CentrePoints:
     Raises:
         TrackError: it turns back.
     """
-    if len(table) < _FEWEST:
+    if len(table) < _FEWEST or not (table[:, 2:] > 0).all():
         return CentrePoints(table, ())
     notes: list[str] = []
-    spacing = _usual(_distances(table)[:-1])
-    kept = _without_repeats(table, REPEATS * spacing)
+    spacing, dense = _usual(_distances(table)[:-1]), DENSE * float(np.median(table[:, 2:]))
+    nearest, of_what = REPEATS * spacing, f"{REPEATS:g} of the usual spacing"
+    if spacing < dense:
+        spacing, nearest, of_what = dense, dense, f"{DENSE:g} of the road's half width"
+    kept = _without_repeats(table, nearest)
+    if len(kept) < _FEWEST:
+        return CentrePoints(table, ())
     if len(kept) < len(table):
         notes.append(
-            f"{len(table) - len(kept)} points nearer than {REPEATS * spacing:.3g} m to the one before left out "
-            f"({REPEATS:g} of the usual spacing)"
+            f"{len(table) - len(kept)} points nearer than {nearest:.3g} m to the one before left out ({of_what})"
         )
     lap = _without_overlap(kept, spacing)
     if len(lap) < len(kept):
@@ -127,7 +132,7 @@ def _check_turns(table: Vector, closed: bool) -> None:
         k = int(back[0])
         raise TrackError(
             f"its line turns by {np.degrees(np.arccos(np.clip(cosine[k], -1, 1))):.0f} degrees from one point to the next "
-            f"at x = {table[k, 0]:.4g} m, y = {table[k, 1]:.4g} m; expected points in driving order"
+            f"at x = {table[k, 0]:.4g} m, y = {table[k, 1]:.4g} m; expected points in driving order, without noise"
         )
 
 
@@ -150,6 +155,6 @@ def _rounded_to(points: Vector) -> float:
     """The step of a power of ten (m) in which all coordinates are; 0 where that is finer than 1e-6 m."""
     for digits in range(_DIGITS):
         scaled = points * 10.0**digits
-        if np.all(np.abs(scaled - np.round(scaled)) < 1e-6 * np.maximum(1.0, np.abs(scaled))):
+        if np.all(np.abs(scaled - np.round(scaled)) < np.maximum(1e-6, 4 * np.spacing(np.abs(scaled)))):
             return float(10.0**-digits)
     return 0.0

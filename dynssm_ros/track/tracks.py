@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,9 @@ from dynssm_ros.track.lines import Floats, Line
 CSV_COLUMNS = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 LARGEST = 1e9  # m, of a coordinate or width
 MIN_POINTS = 10
+_WIDEST = 100.0  # m, from the centre line to a border; runways have 40
+_SLENDER = 1.0, 20_000.0  # length of a road over its width; the published tracks have 28 to 423, the Nordschleife 2,600
+_BETWEEN = re.compile(r"\s*[,;\t]\s*|\s+")  # cells of a row
 MAX_FOLDED = 0.25  # share of the lap; 0.04 on the published ETHZ track
 
 
@@ -141,16 +145,17 @@ def read_track(path: str | Path) -> Track:
     """
     path = Path(path)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise TrackError(f"{path}: cannot be read ({error})") from error
-    rows = []
+    rows: list[list[float]] = []
     for number, line in enumerate(lines, 1):
-        cells = [cell.strip() for cell in line.lstrip("# ").split(",")]
-        if line.startswith("#"):
-            if len(cells) > 1 and tuple(cells) != CSV_COLUMNS:
+        cells = _BETWEEN.split(line.strip("# \t"))
+        commented = line.startswith("#")
+        if (commented and re.search("[,;\t]", line)) or (not commented and not rows and cells[0].isidentifier()):
+            if tuple(cells) != CSV_COLUMNS:
                 raise TrackError(f"{path}: columns {','.join(cells)}; expected {','.join(CSV_COLUMNS)}")
-        elif line.strip():
+        elif line.strip() and not commented:
             rows.append(_numbers(cells, f"{path}: line {number}"))
     table = np.array(rows).reshape(-1, len(CSV_COLUMNS))
     try:
@@ -188,6 +193,18 @@ def _check_points(track: Track) -> None:
         if len(narrow):
             k = narrow[0]
             raise TrackError(f"track {track.name}: {side} at point {k} is {width[k]:g} m; expected more than 0")
+        if (widest := float(width.max())) > _WIDEST:
+            raise TrackError(
+                f"track {track.name}: {side} is up to {widest:g} m: in mm or cm? expected at most {_WIDEST:g} m"
+            )
+    width = float(np.median(track.width_right + track.width_left))
+    least, most = _SLENDER[0] * width, _SLENDER[1] * width
+    if not least <= track.length <= most:
+        mistake = "degrees, or km" if track.length < least else "mm or cm"
+        raise TrackError(
+            f"track {track.name}: its line is {track.length:.3g} m long where it is {width:.3g} m wide: x_m, y_m in "
+            f"{mistake}? expected {least:.3g} to {most:.3g} m"
+        )
 
 
 def _check_borders(track: Track) -> None:

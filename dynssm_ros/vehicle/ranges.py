@@ -59,6 +59,8 @@ def of_inputs(
         yield f"inputs.throttle: up to {throttle[1]:g} m/s; expected a speed set-point above 0"
     for value in steering:
         yield from _outside("inputs.steering", value, PlausibleRange(-1.57, 1.57, "rad", "in degrees? "))
+    if steering[0] > 0 or steering[1] < 0:
+        yield f"inputs.steering: [{steering[0]:g}, {steering[1]:g}]: expected 0, straight ahead, within it"
     yield from _outside("inputs.steering_rate", rate, PlausibleRange(0.01, 50.0, "rad/s", "in degrees/s? "))
 
 

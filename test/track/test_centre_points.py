@@ -59,6 +59,23 @@ def test_points_that_nearly_repeat_are_left_out_with_a_note(tmp_path: Path, rows
     assert f"{len(rows) - len(ROWS)} points nearer than 0.003" in note
 
 
+def test_a_dense_line_is_thinned_and_remains_the_track(tmp_path: Path) -> None:
+    s = np.arange(0.0, CLUB.length, 5e-4)
+    rows = np.column_stack([CLUB.centre.position(s, np.zeros(len(s))), np.full((len(s), 2), 0.2)])
+    track = read(tmp_path, rows)
+    assert len(track.centre.points) < 0.06 * len(rows)
+    assert "of the road's half width" in track.notes[0]
+    assert np.abs(CLUB.project(track.centre.points)[1]).max() < 1e-5
+    assert sharpest(track) == pytest.approx(sharpest(CLUB), rel=0.02)
+
+
+def test_coordinates_far_from_their_origin_are_not_taken_for_rounded(tmp_path: Path) -> None:
+    """As those of UTM, which have seven digits before the point."""
+    track = read(tmp_path, np.add(ROWS, [691_000.0, 5_335_000.0, 0.0, 0.0]))
+    assert track.notes == ()
+    assert sharpest(track) == pytest.approx(sharpest(CLUB), rel=1e-3)
+
+
 @pytest.mark.parametrize("count", [1, 5, 20])
 def test_a_lap_recorded_a_little_too_long_ends_where_it_began(tmp_path: Path, count: int) -> None:
     over = CLUB.centre.position(np.arange(count) * 0.03 + 0.014, 0.01)

@@ -143,6 +143,12 @@ def test_repeated_first_point_is_left_out(tmp_path):
             "line 7: .* expected finite numbers of at most 1e\\+09 m",
         ),
         (eight(), "borders cross near"),
+        ([[x, y, 0.0, 0.0] for x, y, _, _ in ring()], "width_right at point 0 is 0 m"),
+        ([[x, y, -2.0, 2.0] for x, y, _, _ in ring()], "width_right at point 0 is -2 m"),
+        ([ring()[0]] * 40, "points 0 and 1 are the same"),
+        ([[1e3 * x, 1e3 * y, w, v] for x, y, w, v in ring()], "long where it is .* wide: x_m, y_m in mm or cm"),
+        ([[1e-5 * x, 1e-5 * y, w, v] for x, y, w, v in ring()], "x_m, y_m in degrees, or km"),
+        ([[1e3 * each for each in row] for row in ring()], "width_right is up to .* m: in mm or cm"),
         (ring(left=21.0), "borders cross: the left border runs backwards along 100% of the lap"),
     ],
 )
@@ -152,6 +158,14 @@ def test_malformed_tracks_are_refused_in_one_line(tmp_path, rows, complaint):
         read_track(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("header", ["# x_m;y_m;w_tr_right_m;w_tr_left_m\n", "x_m;y_m;w_tr_right_m;w_tr_left_m\n", ""])
+@pytest.mark.parametrize("between", [";", "\t", " ", "; "])
+def test_cells_are_apart_as_people_have_them(tmp_path, header, between):
+    text = header + "".join(between.join(f"{each:.6f}" for each in row) + "\r\n" for row in ring())
+    (tmp_path / "track.csv").write_bytes(b"\xef\xbb\xbf" + text.replace(";", between).encode())
+    np.testing.assert_allclose(read_track(tmp_path / "track.csv").centre.points, [row[:2] for row in ring()], atol=1e-6)
 
 
 def test_neighbouring_stretches_that_overlap_are_refused(tmp_path):

@@ -123,6 +123,7 @@ def test_a_wrong_vehicle_file_names_file_field_and_value(
         ("constants.h_cg", 15.0, "constants.h_cg: 15: in cm? expected 0 to 0.062 m"),
         ("constants.F_z0", 0.402, "constants.F_z0: 0.402: expected 0.121 to 0.282 N"),
         ("inputs.steering", [-20.0, 20.0], "inputs.steering: -20: in degrees? expected -1.57 to 1.57 rad; 1 more"),
+        ("inputs.steering", [0.1, 0.3], "inputs.steering: [0.1, 0.3]: expected 0, straight ahead, within it"),
         ("inputs.throttle", [-100.0, 100.0], "inputs.throttle: -100: in %? expected -1 to 1 as a fraction; 1 more"),
         ("inputs.steering_rate", 300.0, "inputs.steering_rate: 300: in degrees/s? expected 0.01 to 50 rad/s"),
         ("coefficients.I_z", {"nominal": 0.0, "bounds": [0.0, 1e-4]}, "coefficients.I_z.bounds: [0, 0.0001]: expected more"),
