@@ -14,6 +14,7 @@ from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.signals.findings import Finding, number
 from dynssm_ros.signals.motion import Checked, is_turning
 from dynssm_ros.signals.rest_value import rest_value
+from dynssm_ros.signals.signal_map import UNITS
 from dynssm_ros.signals.spans import SIGMAS, Drive, Fitted, blocks, fitted, varies
 from dynssm_ros.signals.timing import acceleration
 
@@ -31,6 +32,10 @@ _LARGE_RAD = 1.6
 """Larger values are no road-wheel angle in rad."""
 SCALES = (0.5, 2.0)
 """Steering scales that are left alone: hidden gains of a steering, a wrong wheelbase and tyres at their limit are within."""
+_UNRELATED = 0.4
+"""Explained share of the curvature, below which a steering is not that of the drive; healthy logs have 0.97 and more."""
+_LIKE_UNIT = 0.25
+"""By how much a scale of the steering may differ from that which a wrong unit of speed or yaw rate gives."""
 _OFFSET_RAD = 0.04
 """Straight-ahead steering that is left alone: servos are trimmed worse than that by nobody; banked roads need 0.02."""
 _LEAST_REST, _RESTS_S, _STANDS = 0.03, 1.0, 0.05
@@ -89,7 +94,7 @@ def steering_sign(drive: Drive) -> tuple[int, Fitted | None]:
     spans, ahead = spans.where(ahead > 0), ahead[ahead > 0]
     curvature = spans.mean(drive.omega) / ahead
     fit = fitted(np.stack([np.ones(len(spans)), curvature], axis=1), spans.mean(drive.steering), spans.block)
-    if fit is None or fit.share < 0.4:
+    if fit is None or fit.share < _UNRELATED:
         return 0, fit
     low, high = fit.interval(1)
     return (1 if low > 0 else -1 if high < 0 else 0), fit
@@ -118,6 +123,20 @@ def check_steering(drive: Drive, wheelbase: float | None) -> Checked:
     return found, drive
 
 
+def check_related(drive: Drive) -> list[Finding]:
+    """A steering that has nothing to do with the curvature of a car that turns to both sides."""
+    sign, fit = steering_sign(drive)
+    if sign or fit is None or fit.share > _UNRELATED or not turns_both_ways(drive):
+        return []
+    return [
+        Finding(
+            what="steering_unrelated", told=f"delta_fb explains {100 * max(fit.share, 0.0):.0f} % of the curvature",
+            size=fit.share, low=fit.share, high=fit.share, expected=f"above {100 * _UNRELATED:.0f} %",
+            remedy="map the steering of this car and drive, and find how far its clock is off",
+        )
+    ]  # fmt: skip
+
+
 def _scale(drive: Drive, fit: Fitted | None, wheelbase: float | None) -> Finding | None:
     """What to multiply the steering with, if that is not about 1."""
     largest = float(np.percentile(np.abs(drive.steering), 99))
@@ -129,7 +148,8 @@ def _scale(drive: Drive, fit: Fitted | None, wheelbase: float | None) -> Finding
             told = f"wheelbase over delta_fb per curvature is {number(scale)}, understeer taken off"
             return Finding(
                 what="steering_scale", told=told, size=scale, low=wheelbase / high, high=wheelbase / low,
-                expected=f"1 ({SCALES[0]:g} to {SCALES[1]:g})", remedy=_scale_remedy(scale),
+                expected=f"1 ({SCALES[0]:g} to {SCALES[1]:g})",
+                remedy=_scale_remedy(scale) + ("" if drive.position is not None else _or_unit(scale)),
             )  # fmt: skip
         return None
     if largest > _LARGE_RAD:
@@ -160,6 +180,13 @@ def _scale_remedy(scale: float) -> str:
     if 1 / 25 < scale < 1 / 8:
         return f"steering_feedback: scale: {number(scale)} (steering wheel, ratio {1 / scale:.3g})"
     return f"steering_feedback: scale: {number(scale)}"
+
+
+def _or_unit(scale: float) -> str:
+    """What else may be wrong where nothing confirms the curvature ``omega / v_x``."""
+    alike = {f"; or v_x, v_y: unit: {unit}": UNITS[unit] for unit in ("km/h", "mph")}
+    alike["; or omega: unit: deg/s"] = 1.0 / UNITS["deg/s"]
+    return "".join(words for words, factor in alike.items() if abs(scale / factor - 1.0) < _LIKE_UNIT)
 
 
 def _offset(drive: Drive, fit: Fitted) -> list[Finding]:

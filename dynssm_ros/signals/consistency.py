@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dynssm_ros.signals.actuation import check_steering, check_throttle, steering_sign
+from dynssm_ros.signals.actuation import check_related, check_steering, check_throttle, steering_sign
 from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.lever import check_lever
 from dynssm_ros.signals.liveness import check_liveness
@@ -20,6 +20,7 @@ from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.sensor_consistency import BESIDE, SENSED
 from dynssm_ros.signals.spans import Drive, Signal
 from dynssm_ros.signals.timing import check_times
+from dynssm_ros.signals.velocity_alone import check_axis, check_ranges
 
 CLOCKS: dict[str, tuple[Signal, ...]] = {
     "inputs_clock": ("steering", "throttle"), "steering_clock": ("steering",), "throttle_clock": ("throttle",),
@@ -69,10 +70,10 @@ def _velocities_from(info: RecordingInfo) -> tuple[str, ...]:
 def _of_recording(recording: Recording, of_log: tuple[Finding, ...], wheelbase: float | None) -> tuple[Finding, ...]:
     """What contradicts within a recording, after what its log told."""
     drive = _on_one_clock(Drive.of(_parts(recording)), of_log)
+    if not len(drive) or drive.stands:
+        return of_log
     found = [*of_log, *check_liveness(drive)]
     dead = {each.what for each in found}
-    if not len(drive) or not drive.speed.max() > 0:
-        return tuple(found)
     more, drive = check_times(drive)
     found += more
     position = None if dead & {"pose_constant", "theta_constant"} else drive.position
@@ -81,11 +82,13 @@ def _of_recording(recording: Recording, of_log: tuple[Finding, ...], wheelbase: 
     if moves:
         more, drive, alternative = _poses(drive, "omega_constant" not in dead)
         found += more
-    elif float(np.mean(drive.velocity.real[drive.speed >= drive.least_speed] > 0)) < 0.1:
-        found.append(_backwards(drive))
-        drive = drive.changed(velocity=-drive.velocity.conj())
-    if "omega_constant" not in dead:
+    else:
+        for check in (check_ranges, check_axis):
+            more, drive = check(drive)
+            found += more
+    if "omega_constant" not in dead and not any(each.what == "v_x_range" for each in found):
         more, drive = check_steering(drive, wheelbase)
+        more = more or ([] if len(found) > len(of_log) else check_related(drive))
         if alternative is not None and not _is_scaled(check_steering(alternative(drive), wheelbase)[0]):
             more = [each for each in more if each.what != "steering_scale"]
         found += more
@@ -115,6 +118,8 @@ def _poses(drive: Drive, turns: bool) -> tuple[list[Finding], Drive, Callable[[D
     """Poses against velocities; where the speed of either is wrong and nothing tells which, also the other possibility."""
     given = drive
     found, drive = check_path_speed(drive)
+    if drive.position is None:
+        return found, drive, None
     alternative: Callable[[Drive], Drive] | None = None
     if found and drive.velocity is not given.velocity and "unit" not in found[0].remedy:
         ratio = found[0].size
@@ -133,11 +138,3 @@ def _poses(drive: Drive, turns: bool) -> tuple[list[Finding], Drive, Callable[[D
 
 def _is_scaled(found: list[Finding]) -> bool:
     return any(each.what == "steering_scale" for each in found)
-
-
-def _backwards(drive: Drive) -> Finding:
-    share = float(np.mean(drive.velocity.real[drive.speed >= drive.least_speed] < 0))
-    return Finding(
-        what="v_x_sign", told=f"v_x is negative in {100 * share:.0f} % of the drive", size=share, low=share, high=share,
-        expected="a car that drives forwards", remedy="v_x: scale: -1",
-    )  # fmt: skip

@@ -23,6 +23,7 @@ _CONTENDING = 0.3
 _LEAST_ROWS = 100  # steps, at every lag
 _SHARE_OF_ROWS = 0.5
 """Of a drive that a lag must leave, so that different lags see much the same of it."""
+_USUAL_SHARE = 0.25  # of a drive, up to which lags are tried
 _RIDGE = 1e-8
 
 
@@ -45,8 +46,9 @@ class Lag:
 
 
 def lag_of(
-    drive: Drive, response: Vector, signal: Vector, known: Vector, *, factors: Vector, expected: tuple[float, float]
-) -> Lag | None:
+    drive: Drive, response: Vector, signal: Vector, known: Vector, *, factors: Vector, expected: tuple[float, float],
+    longest: float = LONGEST_LAG_S,
+) -> Lag | None:  # fmt: skip
     """Finds the lag of ``response`` behind ``signal``.
 
     Args:
@@ -56,13 +58,15 @@ def lag_of(
         known: what else explains the response, at its own time, ``(N, m)``.
         factors: of the terms at the time of the response, ``(N, k)``.
         expected: lags (s) that a car may have.
+        longest: lag that is tried (s), as far as the drive is four times as long, or twice for more than the usual.
 
     Returns:
         ``None`` where too little was driven.
     """
     step = max(1, round(_STEP_S / drive.T_s))
     rows = _decimated(drive.segment, step)
-    most = round(min(LONGEST_LAG_S, 0.25 * len(rows) * step * drive.T_s) / (step * drive.T_s))
+    share = _USUAL_SHARE if longest <= LONGEST_LAG_S else _SHARE_OF_ROWS
+    most = round(min(longest, share * len(rows) * step * drive.T_s) / (step * drive.T_s))
     lags = np.arange(-most, most + 1)
     seconds = np.asarray(lags * (step * drive.T_s), np.float64)
     usable = np.flatnonzero(np.isfinite(response[rows]))

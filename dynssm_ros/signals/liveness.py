@@ -35,7 +35,7 @@ def check_liveness(drive: Drive) -> list[Finding]:
 
 
 def _constants(drive: Drive) -> list[Finding]:
-    moving = drive.speed >= drive.least_speed
+    moving = (drive.speed >= drive.least_speed) & (drive.speed > 0)
     turn = _turn_rate(drive)
     turns = float(np.sqrt(np.mean(turn[moving] ** 2))) if moving.any() else 0.0
     found = []

@@ -22,7 +22,7 @@ _COURSE_S = (0.8, 0.4, 0.2, 0.1)
 """Lengths of spans over which positions move (s); the longest is taken in which a car hardly turns."""
 _HARDLY_RAD = 0.5
 """Change of the course over a span in which its chord is as long as its arc within 1 %."""
-_TURN_S = 1.0
+TURN_S = 1.0
 """Length of spans over which the car turns (s)."""
 SPEED_TOLERANCE, YAW_TOLERANCE = 0.06, 0.12
 """Relative deviations that healthy logs show: tyre radii and drifting localisation, scale of gyros."""
@@ -34,12 +34,14 @@ _RELATED = 0.5
 """Explained share, from which on two signals count as related."""
 _TURNING_RAD_S = 0.02
 """Root mean square yaw rate, below which nothing is said of turning."""
-_AHEAD_RAD = 0.35
+AHEAD_RAD = 0.35
 """Angle between the car's axis and its mean velocity that cars have; they drift by more for moments only."""
-_SCATTER, _ALIGNED, _CLEARER = 0.02, 0.15, 4.0
+_SCATTER, ALIGNED, _CLEARER = 0.02, 0.15, 4.0
 """Circular variance of the angle between path and velocity: up to which it is constant, up to which a frame may explain it,
 and how many times less than in the other frame it must be."""
 
+_DEGREES = (8e-6, 2e-5)
+"""Degrees of latitude or longitude in a metre, up to 60 degrees from the equator."""
 _UNIT_WITHIN = 0.03
 """Relative deviation of a factor from that of a unit that is named."""
 
@@ -78,10 +80,17 @@ def check_path_speed(drive: Drive) -> Checked:
     """Path speed of the positions over the magnitude of the velocity."""
     spans = course_spans(drive)
     way, moved = spans.integral(drive.speed), np.abs(spans.change(drive.position))
-    fit = _ratio(moved, way, spans)
-    if fit is None or _is_one(fit, SPEED_TOLERANCE):
+    fit = ratio_of(moved, way, spans)
+    if fit is None or is_one(fit, SPEED_TOLERANCE):
         return [], drive
     ratio, (low, high) = float(fit.values[0]), fit.interval()
+    if _DEGREES[0] < ratio < _DEGREES[1]:
+        found = Finding(
+            what="pose_speed", told=f"path speed of x, y over hypot(v_x, v_y) is {number(ratio)}: x, y are in degrees",
+            size=ratio, low=low, high=high, expected="1",
+            remedy="map latitude and longitude as such, with `estimation:`, or leave x, y, theta out",
+        )  # fmt: skip
+        return [found], drive.changed(position=None, theta=None)
     unit = unit_of(ratio, "km/h", "mph", "kt", "ft/s")
     told = f"path speed of x, y over hypot(v_x, v_y) is {number(ratio)}"
     of_pose = in_unit(1.0 / ratio, "cm", "mm", "km")
@@ -94,7 +103,7 @@ def check_path_speed(drive: Drive) -> Checked:
     return [found], drive.changed(velocity=drive.velocity * ratio)
 
 
-def _is_one(fit: Fitted, tolerance: float, value: float = 1.0) -> bool:
+def is_one(fit: Fitted, tolerance: float, value: float = 1.0) -> bool:
     """Whether a factor may be 1 within its interval and a tolerance."""
     low, high = fit.interval()
     return low < value + tolerance and high > value - tolerance
@@ -111,13 +120,13 @@ class _Turning(NamedTuple):
 def _turning(drive: Drive) -> _Turning:
     assert drive.theta is not None
     assert drive.position is not None
-    spans = drive.spans(_TURN_S)
-    heading = _ratio(spans.change(drive.theta), spans.integral(drive.omega), spans)
+    spans = drive.spans(TURN_S)
+    heading = ratio_of(spans.change(drive.theta), spans.integral(drive.omega), spans)
     course, between = _course(drive)
     return _Turning(
         heading,
-        _ratio(course, between.integral(drive.omega), between),
-        _ratio(course, between.change(drive.theta), between),
+        ratio_of(course, between.integral(drive.omega), between),
+        ratio_of(course, between.change(drive.theta), between),
     )
 
 
@@ -136,18 +145,18 @@ def _course(drive: Drive) -> tuple[Vector, Spans]:
 def check_course(drive: Drive) -> Checked:
     """Turning of the path against omega where no heading is measured: sign and scale."""
     course, between = _course(drive)
-    fit = _ratio(course, between.integral(drive.omega), between)
+    fit = ratio_of(course, between.integral(drive.omega), between)
     if fit is None or not is_turning(drive):
         return [], drive
     found = []
-    if not _is_one(_positive(fit), 2 * YAW_TOLERANCE):
+    if not is_one(magnitude(fit), 2 * YAW_TOLERANCE):
         found.append(_omega_scale(fit, "turning of the path over omega"))
     if fit.values[0] < 0:
         found.append(_sign(fit, "omega_sign", "course"))
     return found, drive.changed(omega=drive.omega * float(fit.values[0])) if found else drive
 
 
-def _ratio(values: Vector, of: Vector, spans: Spans) -> Fitted | None:
+def ratio_of(values: Vector, of: Vector, spans: Spans) -> Fitted | None:
     """``values`` over ``of``; ``None`` where they do not go together.
 
     Noise in ``of`` makes the ratio too small, by the explained share at most: the deviation counts that.
@@ -224,7 +233,7 @@ def _turning_scales(turning: _Turning, drive: Drive) -> Checked:
     heading, course, both = turning
     if heading is None and course is None:
         return [], drive
-    if heading is None or _is_one(_positive(heading), YAW_TOLERANCE):
+    if heading is None or is_one(magnitude(heading), YAW_TOLERANCE):
         if course is None or both is None or not (_is_in_degrees(course) and _is_in_degrees(both)):
             return [], drive
         of_omega = _omega_scale(course, "turning of the path over omega").model_copy(
@@ -235,8 +244,8 @@ def _turning_scales(turning: _Turning, drive: Drive) -> Checked:
             omega=drive.omega * of_omega.size,
             theta=drive.theta / of_theta.size,  # type: ignore[operator]
         )
-    theta_is_right = both is not None and _is_one(_positive(both), 2 * YAW_TOLERANCE)
-    omega_is_right = course is not None and _is_one(_positive(course), 2 * YAW_TOLERANCE)
+    theta_is_right = both is not None and is_one(magnitude(both), 2 * YAW_TOLERANCE)
+    omega_is_right = course is not None and is_one(magnitude(course), 2 * YAW_TOLERANCE)
     if omega_is_right and not theta_is_right:
         of_theta = _theta_scale(heading)
         return [of_theta], drive.changed(theta=drive.theta / of_theta.size)  # type: ignore[operator]
@@ -246,7 +255,7 @@ def _turning_scales(turning: _Turning, drive: Drive) -> Checked:
 
 def _is_in_degrees(by_course: Fitted) -> bool:
     """Whether what the turning of the path is divided by counts degrees."""
-    return _is_one(_positive(by_course), 2 * YAW_TOLERANCE * UNITS["deg"], UNITS["deg"])
+    return is_one(magnitude(by_course), 2 * YAW_TOLERANCE * UNITS["deg"], UNITS["deg"])
 
 
 def _omega_scale(fit: Fitted, told: str) -> Finding:
@@ -270,7 +279,8 @@ def _theta_scale(fit: Fitted, *, of_course: bool = False) -> Finding:
     )  # fmt: skip
 
 
-def _positive(fit: Fitted) -> Fitted:
+def magnitude(fit: Fitted) -> Fitted:
+    """A fit without its signs."""
     return Fitted(np.abs(fit.values), fit.std, fit.share)
 
 
@@ -283,14 +293,14 @@ def check_direction(drive: Drive) -> Checked:
     if len(spans) < 8:
         return [], drive
     middle = drive.theta[spans.start] + spans.change(drive.theta) / 2
-    course, body = moved / np.abs(moved), _unit(spans.mean(drive.velocity))
+    course, body = moved / np.abs(moved), directions(spans.mean(drive.velocity))
     heading = np.exp(1j * middle)
     error = course * (heading * body).conj()
     mean = complex(error.mean())
     scatter, scatter_in_map = 1.0 - abs(mean), 1.0 - abs(complex((course * body.conj()).mean()))
     if scatter < max(_SCATTER, scatter_in_map / _CLEARER):
         return _turned(mean, error, spans, drive)
-    if scatter_in_map < _ALIGNED and scatter_in_map < scatter / _CLEARER:
+    if scatter_in_map < ALIGNED and scatter_in_map < scatter / _CLEARER:
         low, high = _mean_interval(np.cos(np.angle(error)), spans)
         found = Finding(
             what="twist_in_map_frame",
@@ -316,12 +326,12 @@ def _turned(mean: complex, error: Vector, spans: Spans, drive: Drive) -> Checked
             remedy="v_x: scale: -1 (or theta: offset: 3.142, if the car drove backwards)",
         )  # fmt: skip
         return [found], drive.changed(velocity=-drive.velocity.conj())
-    aside = complex(np.mean(_unit(drive.velocity[drive.speed >= drive.least_speed])))
-    if abs(np.angle(aside)) > _AHEAD_RAD and abs(np.angle(aside * np.exp(1j * angle))) < _AHEAD_RAD:
+    aside = complex(np.mean(directions(drive.velocity[drive.speed >= drive.least_speed])))
+    if abs(np.angle(aside)) > AHEAD_RAD and abs(np.angle(aside * np.exp(1j * angle))) < AHEAD_RAD:
         beside = number(float(np.angle(aside)))
         found = Finding(
             what="twist_turned", told=f"{told}, and v_x, v_y point {beside} rad beside the car's axis",
-            size=angle, low=low, high=high, unit="rad", expected="0: x forward, y left", remedy=_turned_remedy(angle),
+            size=angle, low=low, high=high, unit="rad", expected="0: x forward, y left", remedy=turned_remedy(angle),
         )  # fmt: skip
         return [found], drive.changed(velocity=drive.velocity * np.exp(1j * angle))
     found = Finding(
@@ -331,7 +341,7 @@ def _turned(mean: complex, error: Vector, spans: Spans, drive: Drive) -> Checked
     return [found], drive.changed(theta=drive.theta + angle)  # type: ignore[operator]
 
 
-def _turned_remedy(angle: float) -> str:
+def turned_remedy(angle: float) -> str:
     """What to write where a twist is to be turned by an angle (rad)."""
     quarter = abs(abs(angle) - math.pi / 2) < _ANGLE_TOLERANCE_RAD
     if not quarter:
@@ -344,7 +354,8 @@ def _turned_remedy(angle: float) -> str:
     return f"v_x: {x}, v_y: {y}"
 
 
-def _unit(values: Any) -> Any:
+def directions(values: Any) -> Any:
+    """Complex numbers of length 1; 0 of those that are 0."""
     return values / np.maximum(np.abs(values), 1e-12)
 
 

@@ -29,6 +29,10 @@ _ROUNDS = 20
 _DRIVING = 0.3
 """Share of the 95th percentile of the speed, from which on a car counts as driving."""
 
+_STANDS = 0.25
+"""Mean square of the velocity over seconds, in that of rows, up to which a car stands; those that drive have 0.94 and more,
+and noise at 10 Hz has 0.1."""
+
 Complex = npt.NDArray[np.complex128]
 Signal = Literal["velocity", "omega", "throttle", "steering", "position", "theta"]
 
@@ -73,6 +77,13 @@ class Drive:
     def least_speed(self) -> float:
         """From which on the car counts as driving (m/s)."""
         return _DRIVING * float(np.percentile(self.speed, 95)) if len(self) else 0.0
+
+    @property
+    def stands(self) -> bool:
+        """Whether the car stands throughout: over a second its velocity is noise that averages out."""
+        rows = max(1, round(1.0 / self.T_s))
+        whole = self.velocity[: len(self) // rows * rows].reshape(-1, rows)
+        return not float(np.mean(np.abs(whole.mean(axis=1)) ** 2)) > _STANDS * float(np.mean(np.abs(whole) ** 2))
 
     def changed(self, **signals: Any) -> Drive:
         """The drive with other signals."""

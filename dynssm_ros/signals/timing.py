@@ -11,7 +11,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.findings import Finding, number
-from dynssm_ros.signals.lags import Lag, lag_of
+from dynssm_ros.signals.lags import LONGEST_LAG_S, Lag, lag_of
 from dynssm_ros.signals.motion import Checked, is_turning
 from dynssm_ros.signals.spans import Drive, Signal, varies
 
@@ -24,6 +24,8 @@ _WIDEST_S = 1.0
 """Widest interval of a lag that is told: wider ones belong to drives that repeat or hardly change."""
 _CLEARLY, _EXPLAINED = 0.5, 0.4
 """Of what is unexplained at an expected lag that may be left at the best; share that the best must explain."""
+_FARTHEST_S = 40.0
+"""Longest lag that is tried where no expected one explains anything: GPS time is 18 s, and TAI 37 s, off UTC."""
 _RATE_S = 0.3
 """Over which accelerations, path speeds and rates of the heading are measured (s)."""
 _TOGETHER_S = 0.4
@@ -45,8 +47,8 @@ def is_off(lag: Lag | None, expected: tuple[float, float]) -> bool:
     )
 
 
-def steering_lag(drive: Drive) -> Lag | None:
-    """Of the yaw rate behind the steering."""
+def steering_lag(drive: Drive, longest: float = LONGEST_LAG_S) -> Lag | None:
+    """Of the yaw rate behind the steering, up to the ``longest`` one (s)."""
     if not is_turning(drive) or not varies(drive.steering):
         return None
     speed = np.where(drive.speed >= drive.least_speed, drive.velocity.real, np.nan)
@@ -55,11 +57,11 @@ def steering_lag(drive: Drive) -> Lag | None:
     signal = np.stack([drive.steering, drive.steering], axis=1)
     known = np.nan_to_num(np.stack([np.ones(len(drive)), speed], axis=1))
     response = np.where(np.isfinite(speed), drive.omega, np.nan)
-    return lag_of(drive, response, signal, known, factors=factors, expected=_EXPECTED_S)
+    return lag_of(drive, response, signal, known, factors=factors, expected=_EXPECTED_S, longest=longest)
 
 
-def throttle_lag(drive: Drive) -> Lag | None:
-    """Of the acceleration behind the throttle."""
+def throttle_lag(drive: Drive, longest: float = LONGEST_LAG_S) -> Lag | None:
+    """Of the acceleration behind the throttle, likewise."""
     response = acceleration(drive)
     if not varies(drive.throttle) or not np.isfinite(response).any():
         return None
@@ -67,7 +69,8 @@ def throttle_lag(drive: Drive) -> Lag | None:
     ones = np.ones(len(drive))
     signal = np.stack([drive.throttle, np.minimum(drive.throttle, 0.0)], axis=1)
     known = np.stack([ones, v_x, v_x**2], axis=1)
-    return lag_of(drive, response, signal, known, factors=np.stack([ones, ones], axis=1), expected=_EXPECTED_S)
+    factors = np.stack([ones, ones], axis=1)
+    return lag_of(drive, response, signal, known, factors=factors, expected=_EXPECTED_S, longest=longest)
 
 
 def pose_lag(drive: Drive) -> Lag | None:
@@ -117,6 +120,8 @@ def check_times(drive: Drive) -> Checked:
     The drive comes back with lags that are well known taken off, also those that cars have.
     """
     lags: dict[Signal, Lag | None] = {"steering": steering_lag(drive), "throttle": throttle_lag(drive)}
+    if (far := _far_lag(drive, lags["steering"])) is not None:
+        lags = {"steering": far, "throttle": throttle_lag(drive, _FARTHEST_S)}
     off = [name for name, lag in lags.items() if is_off(lag, _EXPECTED_S)]
     pose = pose_lag(drive) if drive.position is not None else None
     found: list[Finding] = []
@@ -135,6 +140,17 @@ def check_times(drive: Drive) -> Checked:
         if lag is not None and is_known(lag) and not lag.low < 0.0 < lag.high:
             drive = drive.earlier(-round(lag.value / drive.T_s), name)
     return found, drive
+
+
+def _far_lag(drive: Drive, lag: Lag | None) -> Lag | None:
+    """A lag of the steering that is farther than the usual ones, if it alone explains the yaw rate."""
+    if lag is None or lag.near > _EXPLAINED:
+        return None
+    far = steering_lag(drive, _FARTHEST_S)
+    if far is None or not is_off(far, _EXPECTED_S) or abs(far.value) < LONGEST_LAG_S:
+        return None
+    explains = not is_off(lag, _EXPECTED_S) or 1.0 - far.share < _CLEARLY * (1.0 - lag.share)
+    return far if explains else None
 
 
 _INPUTS = {"steering": ("delta_fb", "omega"), "throttle": ("r_fb", "acceleration")}

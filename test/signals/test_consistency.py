@@ -23,12 +23,17 @@ DEGREE = 180.0 / np.pi
 Changed = Callable[[Recording], Recording]
 
 
-def driven(seconds: float = 60.0, noise: float = 0.01, speed: float = 15.0, seed: int = 0) -> Recording:
-    """A car that understeers, ``delta = L k + K v^2 k``, on bends that do not repeat; it accelerates and brakes."""
+def driven(
+    seconds: float = 60.0, noise: float = 0.01, speed: float = 15.0, seed: int = 0, at_random: bool = False
+) -> Recording:
+    """A car that understeers, ``delta = L k + K v^2 k``, on bends of four periods or ``at_random``; it also brakes."""
     t = np.arange(round(seconds / T_S)) * T_S
     rng = np.random.default_rng(seed)
     periods, phases = np.array([4.1, 6.7, 11.3, 19.0]), rng.uniform(0, 2 * np.pi, 4)
     waves = np.sin(2 * np.pi * t[:, None] / periods + phases)
+    if at_random:
+        wide = np.stack([np.convolve(one, np.hanning(50), "same") for one in rng.standard_normal((4, len(t)))], axis=1)
+        waves = wide / wide.std(axis=0) / np.sqrt(2.0)
     acceleration = 0.3 * speed * (waves[:, 1] + waves[:, 2]) / 2
     v_x = speed + np.cumsum(acceleration) * T_S
     curvature = 3.0 / speed**2 * (waves[:, 0] + waves[:, 3]) / 2
@@ -59,13 +64,14 @@ def times(**factors: float) -> Changed:
 
 
 def early(seconds: float, *names: str) -> Changed:
-    """Columns that come some seconds early."""
+    """Columns that come some seconds early; of a drive that is twice as long where these are many."""
 
     def change(drive: Recording) -> Recording:
-        moved = drive.select(slice(0, len(drive) - 240))
-        rows = 120 + round(seconds / T_S)
+        drive, least = (drive, 120) if abs(seconds) < 6.0 else (driven(80.0 + 4 * abs(seconds), at_random=True), 800)
+        moved = drive.select(slice(0, len(drive) - 2 * least))
+        rows = least + round(seconds / T_S)
         columns = {
-            name: values[rows:][: len(moved)] if name in names else values[120:][: len(moved)]
+            name: values[rows:][: len(moved)] if name in names else values[least:][: len(moved)]
             for name, values in drive.columns.items()
         }
         return replace(moved, columns=columns)
@@ -226,6 +232,13 @@ def test_what_healthy_logs_show_has_no_finding(change: Changed) -> None:
         ("v_y_lever", 2.8, ahead_of_rear_axle(2.8)),
         ("v_y_lever", -0.5, lambda drive: without_pose(ahead_of_rear_axle(-0.5)(drive))),
         ("v_y_sign", -1.2, lambda drive: without_pose(times(v_y=-1)(drive))),
+        ("steering_time", 18.0, early(18.0, "delta_fb")),
+        ("inputs_time", -18.0, early(-18.0, "delta_fb", "r_fb")),
+        ("inputs_time", 37.0, early(37.0, "delta_fb", "r_fb")),
+        ("pose_speed", 1e-5, lambda drive: with_columns(drive, x=48.0 + 1e-5 * drive["y"], y=1e-5 * drive["x"])),
+        ("twist_in_map_frame", 1.0, lambda drive: without_pose(in_the_map(drive))),
+        ("twist_turned", np.pi / 2, lambda drive: without_pose(side_on(-np.pi / 2)(drive))),
+        ("twist_turned", -0.8, lambda drive: without_pose(side_on(0.8)(drive))),
         ("throttle_never_used", 0.0075, resting(0.0075)),
         ("throttle_never_used", 0.02, resting(0.02)),
         ("throttle_never_used", 0.05, resting(0.05)),
@@ -256,6 +269,9 @@ def test_a_fault_is_found_with_its_size(what: str, size: float, change: Changed)
         ("steering_constant", constant("delta_fb", 0.1)),
         ("throttle_constant", constant("r_fb")),
         ("v_x_sign", lambda drive: without_pose(times(v_x=-1)(drive))),
+        ("omega_range", lambda drive: without_pose(times(omega=DEGREE)(drive))),
+        ("v_x_range", lambda drive: without_pose(times(v_x=1e3, v_y=1e3)(drive))),
+        ("steering_unrelated", lambda drive: with_columns(drive, delta_fb=driven(seed=7, at_random=True)["delta_fb"])),
     ],
 )
 def test_a_fault_without_a_size_is_named(what: str, change: Changed) -> None:
@@ -281,6 +297,11 @@ def test_clocks_that_are_known_to_be_apart_are_no_lag_as_well() -> None:
     )  # fmt: skip
     known = replace(drive, info=drive.info.model_copy(update={"findings": (apart,)}))
     assert checked(checked(known, WHEELBASE), WHEELBASE).info.findings == (apart,)
+
+
+def test_without_positions_a_speed_in_km_h_is_told_beside_the_scale_of_the_steering() -> None:
+    (found,) = contradictions(without_pose(times(v_x=3.6, v_y=3.6)(driven())), WHEELBASE)
+    assert (found.what, found.remedy.partition("; ")[2]) == ("steering_scale", "or v_x, v_y: unit: km/h")
 
 
 def test_half_the_path_speed_and_a_heading_that_turns_against_omega_are_two_findings() -> None:
@@ -347,7 +368,13 @@ def test_the_sign_of_a_small_lateral_velocity_that_follows_the_yaw_rate_is_not_j
 def test_short_recordings_and_standing_cars_have_no_finding() -> None:
     drive = driven()
     assert contradictions(drive.select(slice(0, 100))) == ()
-    assert contradictions(times(v_x=0, v_y=0, omega=0)(without_pose(drive))) == ()
+    standing = times(v_x=0, v_y=0, omega=0)(drive)
+    assert contradictions(without_pose(standing)) == ()
+    still = {name: np.full(len(drive), 3.0) for name in ("x", "y", "theta")}
+    for noise in (0.0, 0.02):
+        seen = noise * np.random.default_rng(0).standard_normal((3, len(drive)))
+        columns = still | dict(zip(("v_x", "v_y", "omega"), seen, strict=True)) | {"r_fb": np.zeros(len(drive))}
+        assert contradictions(with_columns(drive, **columns), WHEELBASE) == ()
 
 
 def test_findings_are_kept_shown_and_errors_if_asked() -> None:
