@@ -41,6 +41,8 @@ TRACKS = {"road_course": 1.0, "club": 140.0, "club_b": 110.0}
 _RATES = (0.04, 0.04, 0.04, 0.02)  # s: sampling times, drawn with equal chance
 _KNOWN = 0.02  # how well the vehicle file says that they are known
 _SHIFTS = {"S_hf": 0.0007, "S_hr": 0.0007, "S_vf": 40.0, "S_vr": 40.0}  # rad, N: the same for values around 0
+PEAKS = ("D_f", "D_r")  # of which a file may have one wrong, in turn
+_TOO_MUCH = 1.0 / 0.95  # times what the car has
 _TRIES = 6
 TRUTHS: tuple[PlantKind, ...] = ("rk4", "double_track", foreign.NAME, multi_body.NAME)
 _UNKNOWN = (foreign.NAME, multi_body.NAME)  # cars of which nobody knows the values
@@ -60,11 +62,12 @@ class Case:
     duration: float = 120.0  # of the recording (s)
     track: str = "road_course"  # name of the track
     sampling_time: float = 0.04  # of the recording (s)
+    wrong: str = ""  # coefficient that the file has wrong
 
     @property
     def name(self) -> str:
         where = f"{self.plant}/{self.track}/{1 / self.sampling_time:.0f}Hz"
-        return f"{'+'.join(self.hidden) or 'none'}/{where}/{self.seed}"
+        return f"{'+'.join(self.hidden) or 'none'}/{where}/{self.seed}{f'/{self.wrong}' if self.wrong else ''}"
 
     @property
     def road(self) -> Track:
@@ -77,10 +80,13 @@ def size(effect: str, rng: np.random.Generator) -> dict[str, float]:
     return EFFECTS[effect].drawn(float(np.exp(rng.uniform(np.log(low), np.log(high)))), rng)
 
 
-def cases(seed: int, count: int, effects: Sequence[str] = tuple(EFFECTS), healthy: bool = False) -> Iterator[Case]:
-    """``count`` cases: every effect in turn, with pairs and with none in between; the truths in turn.
+def cases(
+    seed: int, count: int, effects: Sequence[str] = tuple(EFFECTS), healthy: bool = False, seconds: float = 120.0
+) -> Iterator[Case]:
+    """``count`` cases of ``seconds``: every effect in turn, with pairs and with none in between; the truths in turn.
 
-    With ``healthy`` nothing is hidden in any of them.
+    With ``healthy`` nothing is hidden in any of them. Every third file of a car that is known has then 5 % too much grip of
+    an axle.
     """
     rng = np.random.default_rng(seed)
     can_be = {plant: tuple(name for name in effects if _can_be(name, plant)) for plant in TRUTHS}
@@ -98,6 +104,8 @@ def cases(seed: int, count: int, effects: Sequence[str] = tuple(EFFECTS), health
             {name: size(name, rng) for name in names},
             seed + k,
             plant,
+            duration=seconds,
+            wrong=PEAKS[k // 3 % 2] if healthy and k % 3 == 2 and plant not in _UNKNOWN else "",
             track=str(rng.choice(list(TRACKS))),
             sampling_time=float(rng.choice(_RATES)),
         )
@@ -151,7 +159,9 @@ def vehicle_file(case: Case) -> Vehicle:
     """The vehicle file, which does not know what is hidden."""
     car = known(case)
     if case.plant not in _UNKNOWN:
-        return off(car, np.random.default_rng([case.seed, 8]))
+        file = off(car, np.random.default_rng([case.seed, 8]))
+        too_much = np.array(COEFFICIENTS) == case.wrong
+        return file.with_nominal(np.where(too_much, _TOO_MUCH * car.nominal, file.nominal))
     reference = replace(case, hidden={}, duration=_REFERENCE_S)
     healthy = _drive(reference, car, case.seed + _OTHER_DRIVE)
     file = car.unmeasured() if case.plant == foreign.NAME else car  # that of the av21 is of another car

@@ -1,6 +1,6 @@
 """Cars of three makes on four wheels, with linear steering: what is named of them that is not there.
 
-    python -m benchmarks.hidden_causes.makes [--seed 0] [--count 12] [--seconds 75]
+    python -m benchmarks.hidden_causes.makes [--seed 0] [--count 12] [--seconds 75] [--of-a-car 4]
 
 Of each car a hash draws how its tyres lose grip with load, how it rolls, its toe, how its steering gives way and how its
 differential locks; none of this is in a vehicle file. The file is calibrated on a drive of the healthy car. Four drives of
@@ -45,7 +45,6 @@ _CAUSES = (
     "downforce", "tire_relaxation", "odometry_lever_arm", "odometry_delay", "yaw_rate_bias",
 )  # fmt: skip
 _STRONGER = {"drive_gain": {"factor": 1.04}}
-_OF_A_CAR = 4  # drives
 _RATE = 0.02  # s: sampling time
 _STEP = 5e-3  # s, of Runge and Kutta: 0.4 of the fastest of these cars' time constants
 _TRIES = 6
@@ -123,17 +122,17 @@ class Answer:
         return tuple(name for name in self.named if name not in (*self.hidden, *STRUCTURE))
 
 
-def answers(seed: int, count: int, seconds: float) -> Iterator[Answer]:
-    """Diagnoses of ``count`` drives of ``seconds``."""
-    for k in range(-(-count // _OF_A_CAR)):
+def answers(seed: int, count: int, seconds: float, of_a_car: int) -> Iterator[Answer]:
+    """Diagnoses of ``count`` drives of ``seconds``, so many of each car."""
+    for k in range(-(-count // of_a_car)):
         make = list(MAKES)[k % len(MAKES)]
         name, scale = MAKES[make]
         track, plant = load_track(name).scaled(scale), f"make_{seed + k}"
         register_plant(plant, Make(seed + k))
         vehicle = load_vehicle(make).model_copy(update={"sampling_time": _RATE})
-        drives = (_drive(vehicle, track, plant, (seed + k, one), seconds) for one in range(_OF_A_CAR + 1))
+        drives = (_drive(vehicle, track, plant, (seed + k, one), seconds) for one in range(of_a_car + 1))
         file = calibrate(next(drives)[1], vehicle, integrator="rk4").vehicle
-        for _, (hidden, laps) in zip(range(count - k * _OF_A_CAR), drives, strict=False):
+        for _, (hidden, laps) in zip(range(min(of_a_car, count - k * of_a_car)), drives, strict=False):
             begun = time.process_time()
             found = diagnose(laps, file, line=track.centre)
             yield _answer(make, hidden, found, time.process_time() - begun)
@@ -214,10 +213,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first car")
     parser.add_argument("--count", type=int, default=12, help="drives")
     parser.add_argument("--seconds", type=float, default=75.0, help="length of each")
+    parser.add_argument(
+        "--of-a-car", type=int, default=4, choices=range(1, 5), help="drives of a car; of 2 both are healthy"
+    )
     given = parser.parse_args()
     warnings.simplefilter("ignore", DataWarning)
     found = []
-    for one in answers(given.seed, given.count, given.seconds):
+    for one in answers(given.seed, given.count, given.seconds, given.of_a_car):
         print(one, flush=True)
         found.append(one)
     print(page(found))

@@ -39,6 +39,9 @@ class Outcome:
     too_small: tuple[str, ...] = ()
     """Effects that were hidden and missed, of which the diagnosis says that they would have to be larger to be
     named."""
+    verdict: str = ""  # of the diagnosis
+    wrong: str = ""  # coefficient that the file has wrong
+    off: tuple[str, ...] = ()  # coefficients that the diagnosis names as off
     seconds: float | None = None  # of the processor, that the diagnosis took; ``None``: it was not measured
 
     @property
@@ -61,6 +64,12 @@ class Outcome:
             for name, value in values.items()
             if name in self.std.get(effect, {}) and not EFFECTS[effect].PARAMETERS[name].shape
         ]
+
+    @property
+    def recalibrated(self) -> bool:
+        """Whether it is told that the file is off in the axle of which a coefficient is wrong, and nothing else."""
+        axle = {f"{letter}_{self.wrong[-1:]}" for letter in "BCDE"}
+        return self.verdict == "recalibrate" and bool(axle & {*self.off})
 
     @property
     def right(self) -> bool:
@@ -121,6 +130,7 @@ def rates(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "covered": shared([covered for o in outcomes for covered in o.covered]),
         "both_found": shared([o.all for o in two]),
         "false_alarms": shared([not o.first for o in none]),
+        "recalibrated": shared([o.recalibrated for o in none if o.wrong]),
         "more_named": shared([len(o.named) > 1 for o in one]),
         "too_small": shared([name in o.too_small for o in outcomes for name in o.missed]),
     }

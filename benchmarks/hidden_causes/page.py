@@ -26,6 +26,7 @@ _IN_WORDS = {
     "covered": "stated 90 % intervals hold what was hidden",
     "both_found": "both effects of a pair are found",
     "false_alarms": "something is named where nothing is hidden",
+    "recalibrated": "verdict `recalibrate` with a coefficient of the axle of which the file has 5 % too much grip",
     "more_named": "more is named than the one effect that is hidden",
     "too_small": "what is missed is smaller than what the diagnosis says that it would name there",
 }

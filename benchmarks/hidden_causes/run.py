@@ -26,7 +26,9 @@ def run_case(case: Case, folder: Path) -> None:
         file, begun = vehicle_file(case), time.process_time()
         found = diagnose(Recording.load(laps), file, line=case.road.centre)
         seconds = time.process_time() - begun
-        outcome = replace(judge(case, found.causes, found.minimum_detectable), seconds=seconds)
+        off = () if found.recalibration is None else tuple(one.name for one in found.recalibration.coefficients)
+        outcome = judge(case, found.causes, found.minimum_detectable)
+        outcome = replace(outcome, verdict=found.verdict, wrong=case.wrong, off=off, seconds=seconds)
     except SimulationError:
         outcome = None
     write_json(outcome_file(case, folder), {"outcome": None if outcome is None else asdict(outcome)})

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.hidden_causes.cases import NOISE, TRACKS, Case, cases, off, size
+from benchmarks.hidden_causes.cases import NOISE, TRACKS, Case, cases, known, off, size, vehicle_file
 from benchmarks.hidden_causes.outcomes import (
     Outcome,
     by_size,
@@ -145,6 +145,23 @@ def test_none_and_two_are_judged_by_all_that_is_named() -> None:
     assert judge(two, [cause("mass", {"factor": 1.2}), cause("drag", {"coefficient": 0.4})]).all
 
 
+def test_a_file_that_has_an_axle_wrong_is_told_by_a_coefficient_of_it() -> None:
+    told = Outcome("e", (), (), True, True, None, verdict="recalibrate", wrong="D_r", off=("S_hf", "B_r"))
+    others = [replace(told, off=("D_f",)), replace(told, verdict="cause"), replace(told, wrong="D_f")]
+    assert [one.recalibrated for one in (told, *others)] == [True, False, False, False]
+    assert rates([told, *others, OUTCOMES[2]])["recalibrated"]["of"] == 4
+    listed = list(cases(0, 24, healthy=True, seconds=60.0))
+    assert {case.wrong for case in listed if case.plant in ("rk4", "double_track")} == {"", "D_f", "D_r"}
+    assert {case.wrong for case in listed if case.plant in ("foreign", "multi_body")} == {""}
+    assert {case.duration for case in listed} == {60.0}
+    assert not any(case.wrong for case in cases(0, 26))
+    case = replace(listed[2], plant="rk4", wrong="D_r", hidden={})
+    file, before, true = vehicle_file(case), vehicle_file(replace(case, wrong="")), known(case)
+    differ = {name for name, c in file.coefficients.items() if c != before.coefficients[name]}
+    assert differ == {"D_r"}
+    assert true.coefficients["D_r"].nominal == pytest.approx(0.95 * file.coefficients["D_r"].nominal)
+
+
 OUTCOMES = [
     Outcome("a", ("drag",), ("drag",), True, True, True),
     Outcome("b", ("drag",), ("mass",), False, False, None, {"drag": {"coefficient": 0.3}}, {"mass": {"factor": 1.2}}),
@@ -171,6 +188,7 @@ def test_rates_and_confusion_count_what_happened() -> None:
         "both_found": (1, 1.0),
         "false_alarms": (1, 1.0),
         "right_size": (2, 0.5),
+        "recalibrated": (0, None),
         "more_named": (2, 0.0),
         "too_small": (1, 0.0),
     }
