@@ -10,8 +10,12 @@ import pytest
 
 from benchmarks.hidden_causes.cases import Case, drive, known
 from dynssm_ros.arrays import Vector
+from dynssm_ros.identification.problem.car import CarEstimate
+from dynssm_ros.identification.problem.fit import IdentificationProblem
 from dynssm_ros.identification.result.diagnose import diagnose
-from dynssm_ros.identification.result.diagnosis import Diagnosis
+from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, Diagnosis
+from dynssm_ros.identification.result.improvement import measure_improvement
+from dynssm_ros.identification.result.recalibration import recalibration
 from dynssm_ros.reporting.diagnosis_report import diagnosis_report
 from dynssm_ros.reporting.diagnosis_words import as_text
 from dynssm_ros.signals.recording import Recording
@@ -43,6 +47,12 @@ def diagnosed(laps: Recording, vehicle: Vehicle) -> Diagnosis:
 def less_grip(laps: Recording) -> Diagnosis:
     """Of a file that has 5 % more rear grip than the car."""
     return diagnosed(laps, file_with(D_r=1.05))
+
+
+@pytest.fixture(scope="module")
+def right(laps: Recording) -> Diagnosis:
+    """Of a file that is right."""
+    return diagnosed(laps, file_with())
 
 
 def assert_named_first(found: Diagnosis, name: str) -> None:
@@ -89,8 +99,25 @@ def test_words_and_json_name_the_coefficient(less_grip: Diagnosis) -> None:
     assert [one["kind"] for one in content["conclusions"]] == ["recalibration"]
 
 
-def test_a_right_file_is_healthy(laps: Recording) -> None:
-    found = diagnosed(laps, file_with())
+def test_coefficients_that_only_make_up_for_a_small_effect_are_not_off(right: Diagnosis) -> None:
+    """A car whose drive is 5 % stronger by an effect, and as much weaker by its coefficients, is that of the file."""
+    given, free = CarEstimate.of(file_with()), (("drive_gain", "factor"),)
+    problem = IdentificationProblem(right.windows, given)
+    fit = problem.fit(given.with_effect("drive_gain", {"factor": 1.0}), free)
+    moved = given.moved.copy()
+    moved[[COEFFICIENTS.index(name) for name in ("C_m1", "C_m2")]] = -np.log(1.05) / 0.02
+    car = replace(given.with_effect("drive_gain", {"factor": 1.05}), moved=moved)
+    fit = replace(fit, car=car, errors=problem.errors(car))
+    improvement = measure_improvement(right.improvement.windows, {GIVEN: given, EXTENDED: car}, right.windows.steps)
+    assert improvement.reduction == pytest.approx(0.0, abs=1e-6)
+    beside = recalibration(problem, fit, given, improvement)
+    assert beside is not None
+    assert {one.name for one in beside.coefficients} <= {"C_m1", "C_m2"}
+    assert recalibration(problem, fit, given, improvement, small=["drive_gain"]) is None
+
+
+def test_a_right_file_is_healthy(right: Diagnosis) -> None:
+    found = right
     assert (found.verdict, found.conclusions, found.recalibration, dict(found.moved)) == ("healthy", (), None, {})
     assert as_text(found).startswith("healthy: The simulation is right within the noise")
     assert [each.state for each in diagnosis_report(found).verdicts] == ["ok"]

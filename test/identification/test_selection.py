@@ -234,9 +234,9 @@ def test_what_leaning_loads_take_from_a_front_axle_is_no_cause(factor: float, na
 
 
 def test_what_the_file_has_already_must_change_noticeably_to_be_a_cause() -> None:
-    assert CarEstimate.of(ORCA).least("steering_lag") == 0.0
+    assert CarEstimate.of(ORCA).least("steering_lag", 0.1) == 0.0
     late = ORCA.with_effect("steering_lag", {"time_constant": 0.05})
-    assert CarEstimate.of(late).least("steering_lag") == EFFECTS["steering_lag"].TYPICAL[0]
+    assert CarEstimate.of(late).least("steering_lag", 0.1) == EFFECTS["steering_lag"].TYPICAL[0]
 
 
 def test_left_out_parts_are_predicted_by_the_others() -> None:

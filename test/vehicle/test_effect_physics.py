@@ -8,7 +8,7 @@ from scipy.interpolate import BSpline
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, load_vehicle
-from dynssm_ros.vehicle.effects import build_effect
+from dynssm_ros.vehicle.effects import EFFECTS, build_effect
 from dynssm_ros.vehicle.single_track import GRAVITY, Motion
 
 AV21 = load_vehicle("av21")
@@ -76,6 +76,20 @@ def test_steering_curve_bends_the_angle_and_may_differ_between_the_sides() -> No
         bent = delta + 0.5 * delta**2 + 4.0 * delta**3
         q = act(applied=Applied(0.4, delta), steering_curve={"quadratic": 0.5, "cubic": 4.0})
         assert accelerations(q) == pytest.approx(accelerations(act(applied=Applied(0.4, bent))))
+
+
+@pytest.mark.parametrize("steered", [0.08, 0.4])
+def test_the_least_curve_turns_the_wheels_as_much_as_the_least_gain(steered: float) -> None:
+    least = {name: EFFECTS[name].least(CONSTANTS, steered) for name in ("steering_gain", "steering_curve")}
+    gain, curve = ({"factor": 1.0 + least["steering_gain"]}, {"cubic": least["steering_curve"]})
+    turned = [
+        act(applied=Applied(0.4, steered), **{name: values}) for name, values in zip(least, (gain, curve), strict=True)
+    ]
+    assert accelerations(turned[0]) == pytest.approx(accelerations(turned[1]))
+    amount = EFFECTS["steering_curve"].amount
+    assert amount({"quadratic": 0.3, "cubic": 0.0}) == pytest.approx(amount({"cubic": 3.0})), (
+        "both turn them alike at 0.1 rad"
+    )
 
 
 @pytest.mark.parametrize(("r", "acts"), [(0.5, 0.4), (0.05, 0.0), (-0.05, 0.0), (-0.5, -0.4)])

@@ -84,11 +84,16 @@ class CarEstimate:
         factor = float(np.exp(self.mass_std * np.clip(self.moved, *self.limits)[-1]))
         return self.vehicle.constants.model_copy(update={"m": self.vehicle.constants.m * factor})
 
-    def least(self, effect: str) -> float:
-        """How far off neutral an effect must be to be a cause: what the file has already is known no better than that."""
+    def least(self, effect: str, steered: float) -> float:
+        """How far off neutral an effect must be to be a cause: what the file has already is known no better than that.
+
+        Args:
+            effect: its name.
+            steered: the largest steering angle that was driven (rad).
+        """
         about = EFFECTS[effect]
         is_known = any(entry.name == effect for entry in self.vehicle.effects)
-        return max(about.least(self.vehicle.constants), about.TYPICAL[0] if is_known else 0.0)
+        return max(about.least(self.vehicle.constants, steered), about.TYPICAL[0] if is_known else 0.0)
 
     def with_effect(self, name: str, values: Values, only_in: tuple[int, ...] | None = None) -> CarEstimate:
         """The same car with an effect added or changed.

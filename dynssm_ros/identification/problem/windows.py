@@ -144,6 +144,11 @@ class SimulationWindows:
         """Mean of each model input along each simulation, shape ``(7, W)``."""
         return np.asarray(self.data.rows[:, self.passed].mean(axis=2))
 
+    @cached_property
+    def steered(self) -> float:
+        """The largest mean steering angle of a simulation (rad)."""
+        return float(np.abs(self.driven[4] + self.driven[6]).max())
+
     @property
     def passed(self) -> Indices:
         """Rows from which each simulation steps, shape ``(W, steps)``."""

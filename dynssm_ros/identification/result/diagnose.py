@@ -94,23 +94,24 @@ def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle
     """What passed the gate, with the car to write and what limits the diagnosis."""
     problem, windows, selection, fit = found.problem, found.problem.windows, gate.selection, gate.selection.fit
     sizes = minimum_detectable(problem, fit, found.search.found)
-    off = recalibration(problem, fit, at.car, gate.improvement)
+    covariance = problem.covariance(fit)
+    std = np.sqrt(np.diag(covariance))
+    causes = [
+        _cause(one, rest, selection, at.recordings, std)
+        for one, rest in zip(selection.chosen, gate.without, strict=True)
+    ]
+    small = [cause.effect for cause in causes if cause.small]
+    off = recalibration(problem, fit, at.car, gate.improvement, small=small)
     if off is not None:
         tried = found.search.found, found.search.responses
         hiding = hidden_candidates(problem, fit, at.car, *tried)
         off = replace(off, candidates=tuple(one for one in hiding if np.isfinite(sizes.get(one.effect, np.inf))))
-    covariance = problem.covariance(fit)
     live, known = _as_held(problem, fit, covariance, at.car)
     suspects = at.recordings.levels.suspects
     extended = live.extended(known, suspects[-1] if suspects else None)
     extended = extended.model_copy(update={"integrator": windows.integrator})
     extended = extended.calibrated_on(at.recordings.recording.select(~at.recordings.held_out).fingerprints, vehicle)
     extended = extended.with_held_out(at.recordings.shares)
-    std = np.sqrt(np.diag(covariance))
-    causes = [
-        _cause(one, rest, selection, at.recordings, std)
-        for one, rest in zip(selection.chosen, gate.without, strict=True)
-    ]
     has_no_name = gate.left.is_there and all(cause.small for cause in causes)
     terms = _formulas(windows, fit.car, at.left_out, at.notes, on_progress) if has_no_name else ()
     notes = (

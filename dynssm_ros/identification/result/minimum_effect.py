@@ -45,7 +45,7 @@ def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable
         for one, worth in zip(left, nearby.worth(left), strict=True):
             one.change(float(worth))
     return {
-        effect: max(float(np.median([one.size for one in each])), fit.car.least(effect))
+        effect: max(float(np.median([one.size for one in each])), fit.car.least(effect, problem.windows.steered))
         for effect, each in sizes.items()
     }
 

@@ -8,8 +8,9 @@ alone is set back to the file's value.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import product
 
 import numpy as np
@@ -91,7 +92,7 @@ class Recalibration:
 
 
 def recalibration(
-    problem: IdentificationProblem, fit: Fit, given: CarEstimate, improvement: Improvement
+    problem: IdentificationProblem, fit: Fit, given: CarEstimate, improvement: Improvement, *, small: Iterable[str] = ()
 ) -> Recalibration | None:
     """What of the vehicle file is off.
 
@@ -103,13 +104,19 @@ def recalibration(
         fit: of the car with its causes.
         given: the car as the vehicle file has it.
         improvement: on held-out laps; the last car is that of the fit.
+        small: effects of the fit that are no causes: what coefficients only make up for them is not off in the file.
     """
     windows, at = improvement.windows, improvement.horizon
-    before = _errors(windows, replace(fit.car, moved=given.moved), improvement)
     after = improvement.errors[list(improvement.errors)[-1]][:, at]
-    share = channel_reduction(before, after)
-    interval, explains = reduction_interval(before, after, windows.block), mean_reduction(before, after)
-    noticed = is_noticed(share, interval, explains)
+
+    def gained(car: CarEstimate) -> tuple[Vector, Vector, float]:
+        before = _errors(windows, car, improvement)
+        interval = reduction_interval(before, after, windows.block)
+        return channel_reduction(before, after), interval, mean_reduction(before, after)
+
+    of_file = replace(fit.car, moved=given.moved)
+    share, interval, explains = gained(of_file)
+    noticed = is_noticed(share, interval, explains) and is_noticed(*gained(reduce(CarEstimate.without, small, of_file)))
     selection = _ForwardSelection(problem, fit, given)
     chosen = selection.fewest()
     if not noticed and not selection.is_sure(chosen):

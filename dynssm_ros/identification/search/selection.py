@@ -39,6 +39,7 @@ class Refined:
         delta_bic: what is left of it when its parameters are paid for.
         confirmation: what it improves on parts of the drive that were left out; ``None``: it was not worth a look.
         sure: by how many standard deviations one of its amplitudes is off neutral.
+        least: how far off neutral it is in any car.
         bounded: its amplitudes that are at a bound: the data ask for more than such a thing can be.
     """
 
@@ -48,6 +49,7 @@ class Refined:
     delta_bic: float
     confirmation: Confirmation | None = None
     sure: float = 0.0
+    least: float = 0.0
     bounded: tuple[str, ...] = ()
 
     @property
@@ -78,10 +80,8 @@ class Refined:
     @property
     def is_little(self) -> bool:
         """Whether a cause of the car is nearer to neutral than what any car shows, one of another structure, or its file."""
-        least = self.fit.car.least(self.candidate.effect)
-        if not least or self.candidate.only_in:
-            return False
-        return EFFECTS[self.candidate.effect].amount({k: self.values[k] for k in self.candidate.amplitudes}) < least
+        amplitudes = {name: self.values[name] for name in self.candidate.amplitudes}
+        return not self.candidate.only_in and EFFECTS[self.candidate.effect].amount(amplitudes) < self.least
 
     @property
     def is_asked_for(self) -> bool:
@@ -365,7 +365,8 @@ class Search:
         own = self._problem.inflation(fit, len(fit.free) - len(without.free))
         improvement = (without.objective - fit.objective) * min(1.0, self._problem.tempering / own)
         delta = improvement - self._price * candidate.cost
-        return Refined(candidate, fit, improvement, delta)
+        least = fit.car.least(candidate.effect, self._problem.windows.steered)
+        return Refined(candidate, fit, improvement, delta, least=least)
 
     def _against(self, chosen: tuple[Candidate, ...], one: Candidate) -> Refined:
         """What ``one`` is worth among ``chosen``."""

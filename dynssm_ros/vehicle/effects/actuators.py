@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from dynssm_ros.vehicle.effects.base import Effect, Parameter, lagged
-from dynssm_ros.vehicle.single_track import Array, Motion, at_least
+from dynssm_ros.vehicle.single_track import Array, Motion, VehicleConstants, at_least
+
+_STEERING_KNOWN = 0.008
+"""Of the wheels' angle: what four wheels with linear steering leave beside the tyre formula of an axle (with load
+sensitivity, toe and steering that gives way). Found in them were a gain of 1.004 and a curve of 0.6 % at the largest angle.
+"""
 
 
 @dataclass(frozen=True)
@@ -35,6 +42,7 @@ class SteeringGain(Effect):
     MANOEUVRE = "corners to both sides at low lateral acceleration"
     PARAMETERS = {"factor": Parameter("1", 0.5, 1.5, 1.0)}
     TYPICAL = (0.015, 0.2)
+    LEAST = _STEERING_KNOWN
     factor: Array = 1.0
 
     def inputs(self, xp: Any, q: Motion) -> None:
@@ -59,6 +67,16 @@ class SteeringCurve(Effect):
     TYPICAL = (1.5, 6.0)
     cubic: Array = 0.0
     quadratic: Array = 0.0
+
+    @classmethod
+    def least(cls, constants: VehicleConstants, steered: float) -> float:
+        """What turns the wheels as much as nobody knows their angle."""
+        return _STEERING_KNOWN / max(steered, 1e-3) ** 2
+
+    @classmethod
+    def amount(cls, values: Mapping[str, float]) -> float:
+        """The cubic; a quadratic counts as the one that turns the wheels as much at 0.1 rad."""
+        return math.hypot(values.get("cubic", 0.0), values.get("quadratic", 0.0) / 0.1)
 
     def inputs(self, xp: Any, q: Motion) -> None:
         q.delta = q.delta * (1.0 + self.quadratic * q.delta + self.cubic * q.delta * q.delta)

@@ -155,8 +155,13 @@ class Effect(StageEffect):
         return None
 
     @classmethod
-    def least(cls, constants: VehicleConstants) -> float:
-        """How far it must be off neutral to be a cause in a car of these constants; less is in any car."""
+    def least(cls, constants: VehicleConstants, steered: float) -> float:
+        """How far it must be off neutral to be a cause in a car of these constants; less is in any car.
+
+        Args:
+            constants: of the car.
+            steered: the largest steering angle that was driven (rad).
+        """
         return cls.LEAST
 
     @classmethod

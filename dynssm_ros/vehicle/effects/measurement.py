@@ -57,7 +57,7 @@ class OdometryLeverArm(MeasurementEffect):
     y: Array = 0.0
 
     @classmethod
-    def least(cls, constants: VehicleConstants) -> float:
+    def least(cls, constants: VehicleConstants, steered: float) -> float:
         """How well anybody knows where the centre of gravity is."""
         return _CENTRE_KNOWN * constants.wheelbase
 
