@@ -34,6 +34,9 @@ SCALES = (0.5, 2.0)
 """Steering scales that are left alone: hidden gains of a steering, a wrong wheelbase and tyres at their limit are within."""
 _UNRELATED = 0.4
 """Explained share of the curvature, below which a steering is not that of the drive; healthy logs have 0.97 and more."""
+_REVERSED, _GOES_WITH = 0.1, 0.9
+"""Share of the bends in which omega turns against the steering, from which on a car reverses (healthy logs: 0.03);
+share of the curvature that the steering then explains but for its sign."""
 _LIKE_UNIT = 0.25
 """By how much a scale of the steering may differ from that which a wrong unit of speed or yaw rate gives."""
 _OFFSET_RAD = 0.04
@@ -81,17 +84,19 @@ def turns_both_ways(drive: Drive) -> bool:
     return bool(right < 0.0 < left)
 
 
-def steering_sign(drive: Drive) -> tuple[int, Fitted | None]:
-    """Sign of the yaw rate against the steering, 0 where they do not go together, with their regression.
+def steering_sign(drive: Drive, *, either_way: bool = False) -> tuple[int, Fitted | None]:
+    """Sign of the curvature against the steering, 0 where they do not go together, with their regression.
 
-    The way that the car drives mostly counts as forwards: the sign of v_x may be what is wrong.
+    ``either_way`` counts the way that the car drives mostly as forwards: the sign of v_x may be what is wrong.
     """
     spans = drive.spans(_SPAN_S)
     if len(spans) < 8 or not is_turning(drive) or not varies(drive.steering):
         return 0, None
     ahead = spans.mean(drive.velocity.real)
-    ahead = ahead * (np.sign(np.median(ahead)) or 1.0)
-    spans, ahead = spans.where(ahead > 0), ahead[ahead > 0]
+    if either_way:
+        ahead = ahead * (np.sign(np.median(ahead)) or 1.0)
+    moving = ahead > 0 if either_way else np.abs(ahead) >= drive.least_speed / 2
+    spans, ahead = spans.where(moving), ahead[moving]
     curvature = spans.mean(drive.omega) / ahead
     fit = fitted(np.stack([np.ones(len(spans)), curvature], axis=1), spans.mean(drive.steering), spans.block)
     if fit is None or fit.share < _UNRELATED:
@@ -124,8 +129,17 @@ def check_steering(drive: Drive, wheelbase: float | None) -> Checked:
 
 
 def check_related(drive: Drive) -> list[Finding]:
-    """A steering that has nothing to do with the curvature of a car that turns to both sides."""
+    """A steering that has nothing to do with the curvature of a car that turns to both sides, or not where it reverses."""
     sign, fit = steering_sign(drive)
+    if (share := _reversed(drive)) > _REVERSED:
+        return [
+            Finding(
+                what="v_x_unsigned", told=f"v_x is never negative, and omega turns against delta_fb in "
+                f"{100 * share:.0f} % of the bends", size=share, low=share, high=share,
+                expected="a v_x that is negative where the car reverses",
+                remedy="give v_x its sign (gear, wheel speeds), or leave out where the car reverses",
+            )
+        ]  # fmt: skip
     if sign or fit is None or fit.share > _UNRELATED or not turns_both_ways(drive):
         return []
     return [
@@ -135,6 +149,19 @@ def check_related(drive: Drive) -> list[Finding]:
             remedy="map the steering of this car and drive, and find how far its clock is off",
         )
     ]  # fmt: skip
+
+
+def _reversed(drive: Drive) -> float:
+    """Share of the bends that a car goes through backwards, by its steering, while v_x is never negative."""
+    spans = drive.spans(_SPAN_S)
+    if len(spans) < _ENOUGH_SPANS or float(np.percentile(drive.velocity.real, 1.0)) < -drive.least_speed / 4:
+        return 0.0
+    curvature, steering = spans.mean(drive.omega) / spans.mean(drive.speed), spans.mean(drive.steering)
+    bends = (np.abs(curvature) > np.median(np.abs(curvature))) & (np.abs(steering) > np.median(np.abs(steering)))
+    against = curvature * steering < 0
+    both = np.stack([np.ones(len(spans)), np.where(against, -curvature, curvature)], axis=1)
+    fit = fitted(both, steering, spans.block)
+    return float(against[bends].mean()) if fit is not None and fit.share > _GOES_WITH and bends.any() else 0.0
 
 
 def _scale(drive: Drive, fit: Fitted | None, wheelbase: float | None) -> Finding | None:
@@ -219,7 +246,8 @@ def check_throttle(drive: Drive) -> list[Finding]:
                 expected="a fraction whose full throttle is 1", remedy="throttle_feedback: scale: so that full is 1",
             )
         ]  # fmt: skip
-    return _throttle_sign(drive, a, known) or _never_used(r[known], a[known]) or _resting(drive, a)
+    never_used = _never_used(r[known], a[known]) if drive.velocity.real.mean() > 0 else []
+    return _throttle_sign(drive, a, known) or never_used or _resting(drive, a)
 
 
 def _throttle_range(drive: Drive, known: Vector, largest: float) -> Finding:

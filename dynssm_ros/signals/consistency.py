@@ -128,12 +128,12 @@ def _poses(drive: Drive, turns: bool) -> tuple[list[Finding], Drive, Callable[[D
             return drive.changed(velocity=drive.velocity / ratio)
 
     if turns:
-        more, drive = check_turning(drive, steering_sign(drive)[0])
+        more, drive = check_turning(drive, steering_sign(drive, either_way=True)[0])
         found += more
-    for check in (check_direction, check_side_slip):
-        more, drive = check(drive)
-        found += more
-    return found, drive, alternative
+    more, drive = check_direction(drive, steering_sign(drive)[0])
+    found += more
+    more, drive = check_side_slip(drive)
+    return [*found, *more], drive, alternative
 
 
 def _is_scaled(found: list[Finding]) -> bool:

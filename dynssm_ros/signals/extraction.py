@@ -19,7 +19,7 @@ from dynssm_ros.signals.estimation import MEASURED, estimated, noise_notes
 from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import V_Y_DEVIATION, Recording, RecordingInfo, concatenate
-from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample
+from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample, without_repeats
 from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.sensor_consistency import sensor_findings
 from dynssm_ros.signals.signal_map import (
@@ -87,7 +87,8 @@ def _extract(
         signal_map, left_out = _without_lacking_context(log, signal_map)
         streams, stamped, notes, findings = read_streams(log, signal_map, drop_bad, progress)
     streams, rests = _with_brakes_at_rest(streams, signal_map)
-    notes = [*([note] if note else []), *notes, *lack, *left_out, *rests]
+    streams, repeats = without_repeats(streams)
+    notes = [*([note] if note else []), *notes, *lack, *left_out, *rests, *repeats]
     if signal_map.velocities is not None:
         streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
         notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")

@@ -284,8 +284,11 @@ def magnitude(fit: Fitted) -> Fitted:
     return Fitted(np.abs(fit.values), fit.std, fit.share)
 
 
-def check_direction(drive: Drive) -> Checked:
-    """Direction in which the position moves, against heading and velocity."""
+def check_direction(drive: Drive, steering_sign: int = 0) -> Checked:
+    """Direction in which the position moves, against heading and velocity.
+
+    ``steering_sign`` is that of the curvature against the steering, 0 if not known: it tells v_x from theta.
+    """
     assert drive.theta is not None
     assert drive.position is not None
     spans = course_spans(drive)
@@ -299,7 +302,7 @@ def check_direction(drive: Drive) -> Checked:
     mean = complex(error.mean())
     scatter, scatter_in_map = 1.0 - abs(mean), 1.0 - abs(complex((course * body.conj()).mean()))
     if scatter < max(_SCATTER, scatter_in_map / _CLEARER):
-        return _turned(mean, error, spans, drive)
+        return _turned(mean, error, spans, drive, steering_sign)
     if scatter_in_map < ALIGNED and scatter_in_map < scatter / _CLEARER:
         low, high = _mean_interval(np.cos(np.angle(error)), spans)
         found = Finding(
@@ -312,7 +315,7 @@ def check_direction(drive: Drive) -> Checked:
     return [], drive
 
 
-def _turned(mean: complex, error: Vector, spans: Spans, drive: Drive) -> Checked:
+def _turned(mean: complex, error: Vector, spans: Spans, drive: Drive, steering_sign: int) -> Checked:
     """A constant angle between the path and where the car goes by its heading and velocity."""
     angle = float(np.angle(mean))
     low, high = _mean_interval(np.angle(error * np.exp(-1j * angle)) + angle, spans)
@@ -320,14 +323,16 @@ def _turned(mean: complex, error: Vector, spans: Spans, drive: Drive) -> Checked
         return [], drive
     told = f"the path points {number(angle)} rad beside theta and the velocity"
     ahead = float(np.mean(drive.velocity.real[drive.speed >= drive.least_speed] > 0))
-    if abs(angle) > math.pi - _ANGLE_TOLERANCE_RAD and ahead < 0.5:
+    backwards = steering_sign < 0 or (steering_sign == 0 and ahead < 0.5)
+    is_opposite = abs(angle) > math.pi - _ANGLE_TOLERANCE_RAD
+    if is_opposite and backwards:
         found = Finding(
             what="v_x_sign", told=told, size=angle, low=low, high=high, unit="rad", expected="0",
             remedy="v_x: scale: -1 (or theta: offset: 3.142, if the car drove backwards)",
         )  # fmt: skip
         return [found], drive.changed(velocity=-drive.velocity.conj())
     aside = complex(np.mean(directions(drive.velocity[drive.speed >= drive.least_speed])))
-    if abs(np.angle(aside)) > AHEAD_RAD and abs(np.angle(aside * np.exp(1j * angle))) < AHEAD_RAD:
+    if not is_opposite and abs(np.angle(aside)) > AHEAD_RAD and abs(np.angle(aside * np.exp(1j * angle))) < AHEAD_RAD:
         beside = number(float(np.angle(aside)))
         found = Finding(
             what="twist_turned", told=f"{told}, and v_x, v_y point {beside} rad beside the car's axis",

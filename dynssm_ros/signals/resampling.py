@@ -17,6 +17,8 @@ from dynssm_ros.signals.signal_map import CONTEXT_SIGNALS, POSE_SIGNALS, ROUNDIN
 Stamps = npt.NDArray[np.int64]
 SLOW = 1.5
 """Periods of the grid between samples, from which on a signal is slower than it."""
+_TOGETHER = 0.8  # of the samples in which something changes, in which all signals of a sensor do
+_FEWEST_NEW = 20  # such samples, before anything is said
 _FEW = 0.05  # of the rows that lie between slower samples, as single ones that were lost
 
 
@@ -51,6 +53,34 @@ def sample(
     before = np.maximum(np.searchsorted(t, grid, side="right") - 1, 0)
     inside = (grid >= t[0]) & (grid <= t[-1]) & (number[before] == number[after])
     return values, np.where(inside, number[after], np.int32(-1))
+
+
+def without_repeats(streams: Mapping[str, Stream]) -> tuple[dict[str, Stream], list[str]]:
+    """The streams without samples of velocities or poses that only repeat the one before, where most do, and a note on it.
+
+    Tables that were written at a fixed rate, and nodes that publish on a timer, hold slower sensors so: all signals of a
+    sensor change together. What stays the same for longer than usual, as of a car that stands, is kept.
+    """
+    found, notes = dict(streams), []
+    for group in (STATE_SIGNALS, POSE_SIGNALS):
+        names = [name for name in group if name in streams]
+        stamps = streams[names[0]].stamps if names else np.empty(0, np.int64)
+        if len(names) < 2 or len(stamps) < 3 or any(len(streams[name].stamps) != len(stamps) for name in names):
+            continue
+        living = [values for name in names if np.ptp(values := streams[name].values) > 0]
+        if not living:
+            continue
+        new = np.stack([np.diff(values, prepend=np.nan) != 0 for values in living])
+        some, all_ = new.any(axis=0), new.all(axis=0)
+        at = np.flatnonzero(some)
+        usual = float(np.median(np.diff(at))) if len(at) > _FEWEST_NEW else 1.0
+        if usual < SLOW or all_.sum() < _TOGETHER * some.sum():
+            continue
+        since = np.arange(len(stamps)) - np.maximum.accumulate(np.where(some, np.arange(len(stamps)), 0))
+        kept = some | (since >= 2 * usual)
+        found |= {name: Stream(stamps[kept], streams[name].values[kept]) for name in names}
+        notes.append(f"{', '.join(names)}: {int((~kept).sum())} samples that repeat the one before left out")
+    return found, notes
 
 
 def uniform_grid(anchor: Stamps, period: float, max_gap: int) -> Stamps:

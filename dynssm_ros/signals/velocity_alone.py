@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from dynssm_ros.signals.actuation import steering_sign
 from dynssm_ros.signals.findings import Finding, number
 from dynssm_ros.signals.motion import (
     AHEAD_RAD,
@@ -34,6 +35,8 @@ def check_axis(drive: Drive) -> Checked:
     """Direction of the velocity in the car's frame, where no position tells that of the path: ahead, and not turning."""
     driving = drive.speed >= drive.least_speed
     if float(np.mean(drive.velocity.real[driving] > 0)) < 0.1:
+        if steering_sign(drive)[0] > 0:  # it does drive backwards
+            return [], drive
         return [_backwards(drive)], drive.changed(velocity=-drive.velocity.conj())
     spans = drive.spans(TURN_S)
     turned = np.concatenate([[0.0], np.cumsum(np.angle(drive.velocity[1:] * drive.velocity[:-1].conj()))])

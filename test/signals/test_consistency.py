@@ -36,6 +36,9 @@ def driven(
         waves = wide / wide.std(axis=0) / np.sqrt(2.0)
     acceleration = 0.3 * speed * (waves[:, 1] + waves[:, 2]) / 2
     v_x = speed + np.cumsum(acceleration) * T_S
+    if at_random:
+        v_x = speed * (1.0 + 0.1 * waves[:, 1])
+        acceleration = np.gradient(v_x, T_S)
     curvature = 3.0 / speed**2 * (waves[:, 0] + waves[:, 3]) / 2
     omega, v_y = v_x * curvature, (1.2 - REAR_SLIP * v_x**2) * v_x * curvature
     theta = np.cumsum(omega) * T_S
@@ -82,6 +85,20 @@ def early(seconds: float, *names: str) -> Changed:
 def with_columns(drive: Recording, **columns: Vector) -> Recording:
     """With other columns."""
     return replace(drive, columns=drive.columns | columns)
+
+
+def reversing(drive: Recording, share: float = 1.0) -> Recording:
+    """A drive whose first ``share`` is driven backwards, along the same bends."""
+    back = np.arange(len(drive)) < share * len(drive)
+    turned = {name: np.where(back, -drive[name], drive[name]) for name in ("v_x", "r_fb", "delta_fb")}
+    sideways = np.where(back, -drive["v_y"] + 2.4 * drive["omega"], drive["v_y"])
+    path = np.cumsum((turned["v_x"] + 1j * sideways) * np.exp(1j * drive["theta"])) * T_S
+    return with_columns(drive, **turned, v_y=sideways, x=path.real, y=path.imag)
+
+
+def unsigned(drive: Recording) -> Recording:
+    """A speed without its sign."""
+    return with_columns(drive, v_x=np.abs(drive["v_x"]))
 
 
 def constant(name: str, value: float = 0.0) -> Changed:
@@ -175,6 +192,20 @@ def set_point(drive: Recording) -> Recording:
 @pytest.mark.parametrize("speed", [3.0, 15.0, 30.0])
 def test_a_healthy_drive_has_no_finding(seed: int, speed: float) -> None:
     assert contradictions(driven(speed=speed, seed=seed), WHEELBASE) == ()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 1.0])
+@pytest.mark.parametrize("change", [lambda drive: drive, without_pose])
+def test_a_drive_that_reverses_has_no_finding(share: float, change: Changed) -> None:
+    assert contradictions(change(reversing(driven(), share)), WHEELBASE) == ()
+
+
+@pytest.mark.parametrize("change", [lambda drive: drive, without_pose])
+def test_a_speed_that_lost_its_sign_in_reverse_is_named(change: Changed) -> None:
+    found = contradictions(change(unsigned(reversing(driven(at_random=True), 0.4))), WHEELBASE)
+    assert [(each.what, round(each.size, 1)) for each in found] == [("v_x_unsigned", pytest.approx(0.4, abs=0.11))]
+    (found,) = contradictions(unsigned(reversing(driven())), WHEELBASE)
+    assert (found.what, found.remedy[:14]) == ("v_x_sign", "v_x: scale: -1")
 
 
 @pytest.mark.parametrize(

@@ -273,6 +273,24 @@ def test_cells_without_a_value_are_no_samples(tmp_path: Path, columns: Any) -> N
     assert recording.info.held_periods["steering_feedback"] == pytest.approx(0.05)
 
 
+def test_samples_that_are_held_until_the_next_count_once(tmp_path: Path, columns: Any) -> None:
+    """As where 50 Hz are written at 100 Hz; what stays longer than that, as at standstill, is kept."""
+    slow = ("v_x", "v_y", "omega", "x", "y", "theta")
+    first = np.arange(N) % 2 == 0
+    held = columns | {name: np.where(first, columns[name], np.roll(columns[name], 1)) for name in slow}
+    blank = columns | {name: pa.array(columns[name], mask=~first) for name in slow}
+    for name, each in (("held", held), ("blank", blank)):
+        write_csv(tmp_path / f"{name}.csv", each)
+    found, expected = (extract([tmp_path / f"{name}.csv"], table_map(), 100.0) for name in ("held", "blank"))
+    rows = slice(0, min(len(found), len(expected)))
+    np.testing.assert_array_equal(found.matrix[rows], expected.matrix[rows])
+    assert "v_x, v_y, omega: 30 samples that repeat the one before left out" in found.info.notes
+    assert found.info.interpolated["v_x"] > 0.4
+    still = columns | {name: np.where(np.arange(N) < 40, columns[name][0], columns[name]) for name in slow}
+    write_csv(tmp_path / "still.csv", still)
+    assert len(extract([tmp_path / "still.csv"], table_map(), 100.0)) >= N - 1
+
+
 def test_cells_that_are_no_numbers_are_told_or_left_out(tmp_path: Path, columns: Any) -> None:
     odd = ["ERR" if k in (20, 30) else f"{value!r}" for k, value in enumerate(columns["v_x"].tolist())]
     write_csv(tmp_path / "log.csv", columns | {"v_x": odd})
