@@ -14,6 +14,7 @@ from dynssm_ros.signals.consistency import checked
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.signals.season import recording_files
 from dynssm_ros.signals.signal_map import Commands, SignalMap, load_signal_map
+from dynssm_ros.signals.spans import Drive
 from dynssm_ros.vehicle import Vehicle, load_vehicle
 
 if TYPE_CHECKING:
@@ -99,13 +100,16 @@ def opened(logs: Log | Sequence[Log], car: Vehicle | None, *, strict: bool = Fal
 
 
 def warn_of_findings(recording: Recording, name: str = "", *, strict: bool) -> None:
-    """A :class:`DataWarning` for each contradiction between the signals of a recording.
+    """A :class:`DataWarning` for each contradiction between the signals of a recording, and for a car that never drives.
 
     Raises:
         RecordingError: ``strict``, and there is one.
     """
-    for finding in recording.info.findings:
-        words = f"{name or name_of(recording)}: {finding.line}"
+    drive = Drive.of(recording)
+    fastest = f"v_x, v_y are up to {drive.speed.max(initial=0.0):.2g} m/s, noise around 0"
+    stands = [f"the car stands throughout: {fastest}; expected a drive"] if drive.stands else []
+    for told in (*stands, *(finding.line for finding in recording.info.findings)):
+        words = f"{name or name_of(recording)}: {told}"
         if strict:
             raise RecordingError(words)
         warnings.warn(words, DataWarning, stacklevel=4)

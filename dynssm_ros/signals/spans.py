@@ -83,6 +83,8 @@ class Drive:
         """Whether the car stands throughout: over a second its velocity is noise that averages out."""
         rows = max(1, round(1.0 / self.T_s))
         whole = self.velocity[: len(self) // rows * rows].reshape(-1, rows)
+        if not len(whole):
+            return False
         return not float(np.mean(np.abs(whole.mean(axis=1)) ** 2)) > _STANDS * float(np.mean(np.abs(whole) ** 2))
 
     def changed(self, **signals: Any) -> Drive:

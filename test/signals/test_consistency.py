@@ -408,6 +408,15 @@ def test_short_recordings_and_standing_cars_have_no_finding() -> None:
         assert contradictions(with_columns(drive, **columns), WHEELBASE) == ()
 
 
+def test_a_car_that_never_drives_is_told_and_an_error_if_asked() -> None:
+    still = times(v_x=0, v_y=0, omega=0)(driven())
+    with pytest.warns(DataWarning, match="drive: the car stands throughout: .*expected a drive"):
+        opened([still], None)
+    with pytest.raises(RecordingError, match="the car stands throughout"):
+        opened([still], None, strict=True)
+    assert len(opened([still.select(slice(0, 10))], None)) == 1  # nothing is said of half a second
+
+
 def test_findings_are_kept_shown_and_errors_if_asked() -> None:
     wrong = checked(times(delta_fb=-1)(driven()))
     assert [each.what for each in concatenate([wrong, wrong]).info.findings] == ["steering_sign"]
