@@ -34,8 +34,11 @@ def npz_arrays(path: Path) -> tuple[Arrays, dict[str, str]]:
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(item.file_size for item in archive.infolist())
-            if "[Content_Types].xml" in archive.namelist():
+            names = archive.namelist()
+            if "[Content_Types].xml" in names:
                 raise BagError(f"{path}: an Excel workbook, which is not read; expected it exported as CSV")
+            if names and not any(name.endswith(".npy") for name in names):
+                raise BagError(f"{path}: a zip file with {names[0]}, not of NumPy; expected it unpacked")
         if size > largest_unpacked(path.stat().st_size):
             raise BagError(f"{path}: unpacks to {size >> 20} MB; expected at most 100 times its size")
         found: dict[str, Any] = {}

@@ -16,7 +16,7 @@ from dynssm_ros.signals.columns import ABSENT, is_value, known_unit
 
 _SAMPLE = 1 << 18  # bytes that are looked at
 _JUDGED = 60  # lines by which delimiters are judged
-_DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blanks"}
+_DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar", " ": "blanks"}
 _NONE = "neither a table nor a bag; expected columns of numbers apart by comma, semicolon, tab or blanks, or a bag"
 _OTHERS = {
     b"\xd0\xcf\x11\xe0": "an Excel workbook", b"\x89HDF\r\n": "an HDF5 file", b"MDF     ": "an MDF file",

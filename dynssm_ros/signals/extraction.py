@@ -41,6 +41,7 @@ from dynssm_ros.signals.stamps import (
     clocks_apart,
     frames_note,
     log_time_note,
+    publishers_note,
 )
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import LogTable
@@ -280,6 +281,9 @@ def read_streams(
         if name not in (*POSE_SIGNALS, *CONTEXT_SIGNALS) or not counted:
             raise BagError(f"{log.path}: {place} {lack if counted else 'has no messages'}, needed for {name}")
         notes.append(f"{name}: {place} {lack}; left out")
+    if {"x", "y"} <= set(streams) and len(streams["x"].stamps) == len(streams["y"].stamps):
+        source = signal_map.signals["x"]
+        notes += publishers_note(source.column or source.recorded, streams["x"].values, streams["y"].values)
     return LogStreams(streams, stamped, notes, findings)
 
 

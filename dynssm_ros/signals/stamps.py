@@ -21,6 +21,9 @@ _LARGEST = 1e12  # in any unit; coordinates of maps in mm are 1e10
 _SEVERAL = 0.1  # of the steps go back, from which on several publishers are likelier than a fault
 _APART = 0.2  # s by which clocks may be apart; what is measured late is rarely later than that
 _DRIFT = 0.1  # s by which clocks may come apart over a log
+_JUMP, _OFF_SHARE, _FEWEST_POSITIONS = 10.0, 0.02, 50
+"""By how much farther a position lies off both neighbours than they are apart; share of such ones that is told; how many
+positions there have to be."""
 _KNOWN = {18: "GPS time is 18 s ahead of UTC", 19: "TAI is 19 s ahead of GPS time", 37: "TAI is 37 s ahead of UTC"}
 
 
@@ -184,3 +187,17 @@ def frames_note(topic: str, frames: Mapping[str, int]) -> list[str]:
     common = sorted(frames.items(), key=lambda one: -one[1])[:3]
     told = ", ".join(f"{name or 'none'} ({count})" for name, count in common)
     return [f"{topic}: its messages are in several frames: {told}; do several nodes publish it?"]
+
+
+def publishers_note(place: str, x: Vector, y: Vector) -> list[str]:
+    """A sentence on positions (m) that lie off both neighbours, which agree, again and again: those of two publishers."""
+    position = x + 1j * y
+    if len(position) < _FEWEST_POSITIONS:
+        return []
+    step, across = np.abs(np.diff(position)), np.abs(position[2:] - position[:-2])
+    off = np.minimum(step[:-1], step[1:]) > _JUMP * np.maximum(across, np.median(across))
+    if float(off.mean()) < _OFF_SHARE:
+        return []
+    by = findings.number(float(np.median(step[:-1][off])))
+    told = f"x, y jump by {by} m and back at {100 * off.mean():.0f} % of the samples"
+    return [f"{place}: {told}; do several nodes publish it?"]

@@ -16,7 +16,7 @@ from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.inspection import inspect
 from dynssm_ros.signals.resampling import Stream
 from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
-from dynssm_ros.signals.stamps import Lateness, clean, clock_notes
+from dynssm_ros.signals.stamps import Lateness, clean, clock_notes, publishers_note
 
 DEFAULT = load_signal_map("default")
 START, SECOND = 1_700_000_000_000_000_000, 1_000_000_000
@@ -145,6 +145,20 @@ def test_odometry_on_another_clock_is_told_by_extract_and_inspect(
     assert [note for note in inspect(bag).notes if "is stamped" in note] == [
         note for note in notes if "is stamped" in note
     ]
+
+
+@pytest.mark.parametrize("every", [1, 5])
+def test_positions_of_two_publishers_are_told(every: int) -> None:
+    """One follows every message of the other, or every fifth, 5 m beside it."""
+    t = np.arange(500) / 50
+    own = np.stack([10.0 * t, np.sin(t)]) + 0.02 * np.random.default_rng(0).standard_normal((2, len(t)))
+    assert publishers_note("/odom", *own) == []
+    both = np.insert(own, np.arange(every, len(t), every), own[:, every::every] + 5.0, axis=1)
+    (note,) = publishers_note("/odom", *both)
+    assert note.startswith("/odom: x, y jump by 7.")
+    assert note.endswith("do several nodes publish it?")
+    still = 0.01 * np.random.default_rng(1).standard_normal((2, 500))
+    assert publishers_note("/odom", *still) == []
 
 
 def test_a_clock_that_drifts_is_told_and_what_is_measured_late_is_not() -> None:

@@ -365,7 +365,7 @@ def zipped(path: Path, name: str) -> None:
         ),
         (lambda path: path.write_bytes(b"\x1f\x8b\x08"), "a gzip file"),
         (lambda path: zipped(path, "[Content_Types].xml"), "an Excel workbook, which is not read"),
-        (lambda path: zipped(path, "notes.txt"), "not a table"),
+        (lambda path: zipped(path, "notes.txt"), "a zip file with notes.txt, not of NumPy; expected it unpacked"),
         (lambda path: path.write_bytes(b"PAR1" + bytes(50)), "cannot be read"),
         (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(50)), "a zip file that cannot be read as NumPy's .npz"),
         (lambda path: path.write_bytes(b"MATLAB 7.3 MAT-file, Platform"), r"version 7.3 \(HDF5\); expected .*'-v7'"),
