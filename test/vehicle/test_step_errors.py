@@ -100,6 +100,15 @@ def test_a_drive_that_bends_over_throttle_or_speed_tells_the_top_speed(bent: Cal
     assert [bent_drive(accelerating(0.0, seed)) for seed in range(6)] == [None] * 6
 
 
+def test_a_small_bend_shows_in_long_sums() -> None:
+    """In sums over 0.2 s it is found in three of the six drives."""
+    for seed in range(6):
+        drive = accelerating(0.0, seed)
+        errors = drive.errors.copy()
+        errors[:, 0] += 0.016 * drive.rows[3] * (1.0 - drive.rows[3])
+        assert bent_drive(drive._replace(errors=errors)) == pytest.approx(24.0, abs=0.5)
+
+
 def test_brakes_of_another_scale_than_the_drive_tell_the_top_speed() -> None:
     drive = accelerating(0.0, 1)
     rows = drive.rows.copy()

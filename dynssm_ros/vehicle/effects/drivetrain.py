@@ -24,6 +24,7 @@ class FrontDrive(Effect):
     MANOEUVRE = "driving and braking in tight corners"
     PARAMETERS = {"share": Parameter("1", 0.0, 1.0, 0.0)}
     TYPICAL = (0.3, 0.9)
+    LEAST = 0.2  # in cars without it tyres and steering that are not of the equations looked like 0.09 to 0.12
     share: Array = 0.0
 
     def forces(self, xp: Any, q: Motion) -> None:

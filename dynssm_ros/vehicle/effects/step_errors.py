@@ -32,7 +32,8 @@ _SPEEDS, _SPEED_RANGE = 40, (0.05, 0.95)  # that are tried as those of a gear ch
 _HYSTERESIS = (0.03, 0.1, 0.2, 0.3)  # of the speed for the change up, by which the one for the change down is less
 _APART = 0.03  # of the speed for the change up, by which a measured one down is less at least
 _SHIFTS, _GAP_ROWS = 4, 3  # changes, at least; rows after one in which the force may have a gap
-_TOGETHER_S = 0.2  # over which errors are summed up
+_TOGETHER_S = 0.2  # over which errors are summed up to find changes of gear
+_BENT_TOGETHER_S = 1.0  # the same to find a bend, that lasts longer: evidence grows with it, as noise does not add up
 _SHIFT_CHANCE = (
     20.0  # of twice the log-likelihood: the best of 160 pairs of speeds reached 12 in nine drives without gears
 )
@@ -184,11 +185,11 @@ class _DriveErrors(NamedTuple):
     basis: Vector  # orthonormal columns of what is no news, ``(M, k)``
 
     @classmethod
-    def of(cls, steps: StepErrors, bent: bool) -> _DriveErrors | None:
+    def of(cls, steps: StepErrors, seconds: float, bent: bool) -> _DriveErrors | None:
         """No news is what the car's coefficients explain, and what else is smooth if ``bent``; ``None`` without errors."""
         v_x, r = steps.rows[0], steps.rows[3] + steps.rows[5]
         driven, braked, v = np.maximum(r, 0.0), np.minimum(r, 0.0), v_x / max(float(np.abs(v_x).max()), 1e-9)
-        together = max(1, round(_TOGETHER_S / steps.T_s))
+        together = max(1, round(seconds / steps.T_s))
         smooth = [np.ones_like(v), v**2, r, r * v]
         smooth += [v, driven, driven * v, driven * v**2, driven**2] if bent else []
         columns = np.stack(smooth, axis=1)
@@ -218,7 +219,7 @@ def _summed(columns: Vector, together: int) -> Vector:
 
 def bent_drive(steps: StepErrors) -> float | None:
     """The largest speed (m/s) under throttle if errors in v_x bend over throttle or speed, or differ under the brakes."""
-    drive = _DriveErrors.of(steps, bent=False)
+    drive = _DriveErrors.of(steps, _BENT_TOGETHER_S, bent=False)
     if drive is None or not drive.driven.any():
         return None
     top = float(np.quantile(drive.v_x[drive.driven > 0.0], _FASTEST))
@@ -234,7 +235,7 @@ def shift_speeds(steps: StepErrors) -> tuple[float, float] | None:
     Compared is what a smooth function of speed and throttle leaves of the errors in v_x, with and without a force that is
     another one above the speeds, and a gap in it where they are passed.
     """
-    drive = _DriveErrors.of(steps, bent=True)
+    drive = _DriveErrors.of(steps, _TOGETHER_S, bent=True)
     if drive is None or np.count_nonzero(drive.driven) < 2 * _SPEEDS:
         return None
     best, found = _SHIFT_CHANCE, None
