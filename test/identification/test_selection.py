@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -231,6 +233,16 @@ def test_what_leaning_loads_take_from_a_front_axle_is_no_cause(factor: float, na
     known = ORCA.with_nominal(ORCA.nominal, 0.01 * np.abs(ORCA.nominal) + 1e-6)
     found = search(known, front_grip={"factor": factor}).run()
     assert [one.candidate.effect for one in found.chosen] == named
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_every_variant_of_an_effect_is_compared_with_its_least_size(name: str) -> None:
+    neutral = {parameter: about.neutral for parameter, about in EFFECTS[name].PARAMETERS.items()}
+    car = CarEstimate.of(ORCA).with_effect(name, neutral)
+    for variant in EFFECTS[name].variants():
+        fit: Any = SimpleNamespace(car=car)
+        one = Refined(Candidate(name, variant), fit, 0.0, 0.0, least=car.least(name, 0.1))
+        assert one.is_little == (one.least > 0.0)
 
 
 def test_what_the_file_has_already_must_change_noticeably_to_be_a_cause() -> None:

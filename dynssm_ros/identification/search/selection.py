@@ -80,8 +80,10 @@ class Refined:
     @property
     def is_little(self) -> bool:
         """Whether a cause of the car is nearer to neutral than what any car shows, one of another structure, or its file."""
+        if not self.least or self.candidate.only_in:
+            return False
         amplitudes = {name: self.values[name] for name in self.candidate.amplitudes}
-        return not self.candidate.only_in and EFFECTS[self.candidate.effect].amount(amplitudes) < self.least
+        return EFFECTS[self.candidate.effect].amount(amplitudes) < self.least
 
     @property
     def is_asked_for(self) -> bool:
