@@ -37,6 +37,8 @@ _UNRELATED = 0.4
 _REVERSED, _GOES_WITH = 0.1, 0.9
 """Share of the bends in which omega turns against the steering, from which on a car reverses (healthy logs: 0.03);
 share of the curvature that the steering then explains but for its sign."""
+_BRAKES = 0.02
+"""Share of driving forwards with a negative value, from which on it is no set-point of the speed."""
 _LIKE_UNIT = 0.25
 """By how much a scale of the steering may differ from that which a wrong unit of speed or yaw rate gives."""
 _OFFSET_RAD = 0.04
@@ -254,7 +256,8 @@ def _throttle_range(drive: Drive, known: Vector, largest: float) -> Finding:
     """A throttle beyond 1: a speed set-point, or a percentage."""
     speed, r = drive.velocity.real[known], drive.throttle[known]
     fit = fitted(np.stack([np.ones(len(r)), speed], axis=1), r, blocks(len(r)))
-    if fit is not None and fit.share > 0.5 and abs(float(fit.values[1]) - 1.0) < 0.3:
+    brakes = float(np.mean(r[speed > 0] < 0)) > _BRAKES
+    if fit is not None and fit.share > 0.5 and abs(float(fit.values[1]) - 1.0) < 0.3 and not brakes:
         low, high = fit.interval(1)
         return Finding(
             what="throttle_setpoint", told=f"r_fb follows v_x with {number(float(fit.values[1]))} per m/s, up to "

@@ -183,6 +183,11 @@ def compass(drive: Recording) -> Recording:
     return with_columns(drive, theta=np.pi / 2 - drive["theta"])
 
 
+def percent_like_speed(drive: Recording) -> Recording:
+    """A throttle in percent that rises with the speed, and brakes."""
+    return with_columns(drive, r_fb=np.where(drive["r_fb"] < -0.3, -5.0, np.roll(drive["v_x"], -4) + 2.0))
+
+
 def set_point(drive: Recording) -> Recording:
     """A speed set-point where the throttle is expected."""
     return with_columns(drive, r_fb=np.roll(drive["v_x"], -4) + 0.4)
@@ -294,6 +299,7 @@ def test_a_fault_is_found_with_its_size(what: str, size: float, change: Changed)
         ("throttle_range", times(r_fb=100)),
         ("throttle_scale", times(r_fb=0.01)),
         ("throttle_setpoint", set_point),
+        ("throttle_range", percent_like_speed),
         ("omega_constant", constant("omega")),
         ("theta_constant", constant("theta")),
         ("v_y_constant", constant("v_y")),
