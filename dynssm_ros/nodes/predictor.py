@@ -42,6 +42,7 @@ from dynssm_ros.nodes.support import (
     run,
     set_pose,
     set_stamp,
+    take,
     waited,
     waiting,
 )
@@ -207,7 +208,18 @@ class PredictorNode(ManagedNode):
         return stamp, arrived
 
     def _on_actuator(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int]) -> None:
+        """Takes a message, and one from each topic after its own as the executor would: its waking up takes as long as
+        a prediction, and messages of one instant come together.
+        """
         self._observe(decoder, message, times, None)
+        topics = list(self._subscribed)
+        for other in topics[topics.index(decoder) + 1 :]:
+            if (taken := take(self._subscribed[other])) is None:
+                continue
+            if other.topic == self._predictor.signal_map.odometry_topic:
+                self._on_odometry(other, *taken)
+            else:
+                self._observe(other, *taken, None)
 
     def _observe(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int], frames: Frames | None) -> None:
         """Takes a message into the history."""
@@ -237,7 +249,7 @@ class PredictorNode(ManagedNode):
         for other, subscription in self._subscribed.items():
             if other is not decoder:
                 for each in waiting(subscription):
-                    self._on_actuator(other, *each)
+                    self._observe(other, *each, None)
         newest = older.pop()
         for each, when in older:
             self._observe(decoder, each, when, frames_of(each))

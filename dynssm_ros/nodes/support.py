@@ -74,13 +74,18 @@ def listen(
     )
 
 
+def take(subscription: Subscription) -> tuple[Any, Mapping[str, int]] | None:
+    """Takes the oldest message that waits, with its times; ``None`` if none does."""
+    with subscription.handle:
+        taken: tuple[Any, Mapping[str, int]] | None = subscription.handle.take_message(
+            subscription.msg_type, subscription.raw
+        )
+    return taken
+
+
 def waiting(subscription: Subscription) -> Iterator[tuple[Any, Mapping[str, int]]]:
     """Takes the messages that wait, oldest first, with their times."""
-    while True:
-        with subscription.handle:
-            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-        if taken is None:
-            return
+    while (taken := take(subscription)) is not None:
         yield taken
 
 

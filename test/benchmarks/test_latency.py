@@ -35,12 +35,14 @@ def test_no_model_is_no_comparison() -> None:
 
 
 @pytest.mark.live
+@pytest.mark.alone
 @pytest.mark.slow
 def test_echo_and_predictor_answer(small_model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in isolated_environment().items():
         monkeypatch.setenv(name, value)
     bare, own = measure([small_model], [50.0], 1.0)
     assert (bare.node, own.node) == (ECHO, small_model.name)
-    assert len(bare.latency) + bare.unanswered > 30
-    assert len(own.latency) > 10
-    assert np.median(bare.latency) < np.median(own.latency)
+    for each in (bare, own):
+        assert len(each.latency) + each.unanswered > 10
+        assert len(each.latency) > each.unanswered
+        assert each.latency.min() > 0.0
