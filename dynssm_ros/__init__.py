@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from dynssm_ros.api.calibrate import calibrate
     from dynssm_ros.api.diagnose import diagnose
     from dynssm_ros.api.evaluate import evaluate
+    from dynssm_ros.api.export import export
     from dynssm_ros.api.extract import extract
     from dynssm_ros.api.inputs import load_model
     from dynssm_ros.api.inspect import inspect
@@ -55,6 +56,7 @@ __all__ = [
     "calibrate",
     "diagnose",
     "evaluate",
+    "export",
     "extract",
     "extract_season",
     "inspect",

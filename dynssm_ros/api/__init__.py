@@ -10,6 +10,7 @@ the input raises a :class:`~dynssm_ros.errors.UserError` whose message is one li
 from dynssm_ros.api.calibrate import calibrate
 from dynssm_ros.api.diagnose import diagnose
 from dynssm_ros.api.evaluate import evaluate
+from dynssm_ros.api.export import export
 from dynssm_ros.api.extract import extract
 from dynssm_ros.api.inputs import load_model
 from dynssm_ros.api.inspect import inspect
@@ -27,6 +28,7 @@ __all__ = [
     "calibrate",
     "diagnose",
     "evaluate",
+    "export",
     "extract",
     "extract_season",
     "inspect",

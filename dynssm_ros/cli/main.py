@@ -19,6 +19,7 @@ from dynssm_ros.cli.calibrate import calibrate
 from dynssm_ros.cli.console import errors, warn
 from dynssm_ros.cli.diagnose import diagnose
 from dynssm_ros.cli.evaluate import evaluate
+from dynssm_ros.cli.export import export
 from dynssm_ros.cli.extract import extract
 from dynssm_ros.cli.inspect import inspect
 from dynssm_ros.cli.learn import learn
@@ -59,6 +60,7 @@ for command in (
     diagnose,
     season,
     race,
+    export,
 ):
     app.command()(command)
 

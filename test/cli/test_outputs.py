@@ -103,9 +103,10 @@ INSIDE = {
     "season": ["season", "R", "--vehicle", "orca"],
     "race": ["race", "--vehicle", "orca", "--track", "oval", "--model", "R"],
     "vehicle": ["vehicle", "new", "--like", "R/car.yaml", "--mass", "3", "--front-mass", "1", "--wheelbase", "0.3"],
+    "export": ["export", "--vehicle", "R/car.yaml"],
 }  # R: a folder or file that the command reads
-OF_FILES = ("simulate", "vehicle")  # which read no folder
-WITHOUT_JSON = ("learn", "vehicle")
+OF_FILES = ("simulate", "vehicle", "export")  # which read no folder
+WITHOUT_JSON = ("learn", "vehicle", "export")
 
 
 @pytest.mark.parametrize("command", sorted(command.callback.__name__ for command in app.registered_commands))
