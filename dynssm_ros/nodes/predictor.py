@@ -208,17 +208,13 @@ class PredictorNode(ManagedNode):
         return stamp, arrived
 
     def _on_actuator(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int]) -> None:
-        """Takes a message, and one from each topic after its own as the executor would: its waking up takes as long as
-        a prediction, and messages of one instant come together.
+        """Takes a message, and one from each actuator topic after its own: those of one instant come together, and another
+        wake-up of the executor takes as long as a prediction.
         """
         self._observe(decoder, message, times, None)
         topics = list(self._subscribed)
         for other in topics[topics.index(decoder) + 1 :]:
-            if (taken := take(self._subscribed[other])) is None:
-                continue
-            if other.topic == self._predictor.signal_map.odometry_topic:
-                self._on_odometry(other, *taken)
-            else:
+            if other.topic != self._predictor.signal_map.odometry_topic and (taken := take(self._subscribed[other])):
                 self._observe(other, *taken, None)
 
     def _observe(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int], frames: Frames | None) -> None:
