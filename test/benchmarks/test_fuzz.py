@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ def test_what_must_not_happen_is_seen(small_model: Path, monkeypatch: pytest.Mon
         outcome = right(self, *message)
         if isinstance(outcome, Prediction):
             last[:] = [outcome]
-            return replace(outcome, state=outcome.state * np.nan)
+            return outcome._replace(state=outcome.state * np.nan)
         if outcome is Refusal.REPEATED:
             raise ZeroDivisionError
         return last[0] if last and outcome is Refusal.IMPLAUSIBLE else outcome

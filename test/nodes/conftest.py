@@ -34,13 +34,13 @@ def call(collector: Collector, service: Any, name: str, **request: Any) -> Any:
     """What a service answers that may be asked twice: an answer is lost where its server has not yet met the client."""
     client = collector.create_client(service, name)
     assert client.wait_for_service(20.0)
-    for _ in range(4):
+    for _ in range(2):
         done = threading.Event()
         future = client.call_async(service.Request(**request))
         future.add_done_callback(lambda _, done=done: done.set())
-        if done.wait(10.0):
+        if done.wait(25.0):  # a model that is tried on a busy machine
             return future.result()
-    raise AssertionError(f"{name}: no answer to any of four requests")
+    raise AssertionError(f"{name}: no answer to either of two requests")
 
 
 class Car:
