@@ -40,7 +40,7 @@ TOP = {"__init__"}  # the names of the Python API
 
 ROS = {
     "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "launch", "launch_ros", "nav_msgs",
-    "rcl_interfaces", "rclpy", "rosgraph_msgs", "sensor_msgs", "std_msgs",
+    "rcl_interfaces", "rclpy", "rosgraph_msgs", "sensor_msgs", "std_msgs", "trajectory_msgs",
 }  # fmt: skip
 OWNERS = {
     "torch": {"learning"}, "casadi": {"control"}, "matplotlib": {"reporting"}, "plotly": {"reporting"},

@@ -24,9 +24,11 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, UserError
+from dynssm_ros.nodes.commands import candidate, rollout_as
 from dynssm_ros.nodes.display import Markers, frame_sender
 from dynssm_ros.nodes.executor import in_thread, let_wait
 from dynssm_ros.nodes.managed import ManagedNode
@@ -38,6 +40,7 @@ from dynssm_ros.nodes.support import (
     listen,
     message_class,
     output,
+    relative,
     repeat,
     run,
     set_pose,
@@ -56,7 +59,14 @@ from dynssm_ros.runtime.wiring import Wiring
 from dynssm_ros.signals.decoding import Frames, TopicDecoder, frames_of, header_stamp_ns, live_decoders
 from dynssm_ros.signals.history import Refusal
 from dynssm_ros.signals.inputs import WINDOW_COLUMNS
-from dynssm_ros.signals.messages import HORIZON_TOPIC, PARAMETERS_TOPIC, PREDICTION_TOPIC, planar_covariance
+from dynssm_ros.signals.messages import (
+    CANDIDATE_TOPIC,
+    HORIZON_TOPIC,
+    PARAMETERS_TOPIC,
+    PREDICTION_TOPIC,
+    ROLLOUT_TOPIC,
+    planar_covariance,
+)
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import COEFFICIENTS
 from dynssm_ros.vehicle.kinematics import Pose
@@ -134,6 +144,7 @@ class PredictorNode(ManagedNode):
         self._output = WatchedOutput(self, Odometry, PREDICTION_TOPIC)
         self._publish_parameters = output(self, JointState, PARAMETERS_TOPIC).publish
         self._publish_horizon = output(self, Path, HORIZON_TOPIC).publish
+        self._publish_rollout = output(self, JointTrajectory, ROLLOUT_TOPIC).publish
         self._markers = Markers(self) if self._draws else None
         self._send_frame = frame_sender(self) if self._sends_frame else None
         self._publish_diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10).publish
@@ -200,6 +211,19 @@ class PredictorNode(ManagedNode):
             receive = self._on_odometry if topic == signal_map.odometry_topic else self._on_actuator
             subscription = listen(self, message_class(decoder.msgtype), decoder.subscribed, partial(receive, decoder))
             self._subscribed[decoder] = subscription
+        listen(self, JointTrajectory, relative(CANDIDATE_TOPIC), self._on_candidate)
+
+    def _on_candidate(self, message: JointTrajectory) -> None:
+        """Answers a planner: what comes of these inputs. What cannot be answered has no points."""
+        T_s, rollout = self._predictor.model.T_s, None
+        if not self.active:
+            return
+        try:
+            inputs = candidate(message, self._predictor.vehicle.inputs.set_point, T_s)
+            rollout = self._predictor.rollout(inputs, deadline=time.monotonic() + _ROLLOUT * T_s)
+        except UserError as error:
+            self.get_logger().warning(str(error), throttle_duration_sec=1.0)
+        self._publish_rollout(rollout_as(rollout, T_s, self._prediction.header.frame_id))
 
     def _arrived(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int]) -> tuple[int, float]:
         """Notes a message; returns its stamp (ns) and when it arrived (s)."""

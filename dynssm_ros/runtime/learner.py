@@ -101,6 +101,12 @@ class OnlineLearner:
         self.judge_paths()
         return self._correction.believed(self._judge.trusted)
 
+    def afresh(self) -> RolloutCorrection:
+        """Corrects a rollout that begins anew, by what is known now."""
+        self.judge_paths()
+        nothing = np.zeros_like(self.state.mean)  # on features hangs the stated variance alone
+        return RolloutCorrection(self.layer, self.state.learned(nothing, self._judge.trusted))
+
     def finish(self) -> None:
         """Does what can wait until the prediction is out; the next row does it else."""
         self.state.coefficients.finish()

@@ -60,6 +60,20 @@ class Prediction(NamedTuple):
     residual_share: float
 
 
+class Rollout(NamedTuple):
+    """What was predicted for inputs that somebody asked about.
+
+    Attributes:
+        stamp: of the odometry that it begins at (ns).
+        states: after each step of T_s.
+        poses: likewise, in the odometry frame; empty if the pose is not mapped.
+    """
+
+    stamp: int
+    states: list[State]
+    poses: list[Pose]
+
+
 class Predictor:
     """A model with the history it needs, for one car.
 
@@ -91,6 +105,7 @@ class Predictor:
         self._learns = online
         self._window = np.zeros((model.H, len(WINDOW_COLUMNS)))
         self._rows: deque[tuple[int, Vector]] = deque(maxlen=_KEPT_ROWS)
+        self._start: tuple[int, Pose | None] | None = None  # of the newest odometry, if it has a prediction
         self._measured: tuple[int, list[float]] | None = None  # that the hindsight has yet to see
         self._set_model(model)
 
@@ -203,7 +218,7 @@ class Predictor:
         self._plausibility = Plausibility(model.card.vehicle, frames=self._frames)
         self._scale = model.card.normalisation.increment_scale
         self._hindsight = Hindsight(self._scale, model.vehicle.minimum_speed)
-        self._measured = None
+        self._measured = self._start = None
         self._period = round(model.T_s * 1e9)
 
     def observe(self, stamp: int, values: dict[str, float], frames: Frames | None = None) -> Refusal | None:
@@ -221,6 +236,7 @@ class Predictor:
     def predict(self, stamp: int, values: dict[str, float], frames: Frames | None = None) -> Prediction | Refusal:
         """Takes the odometry sample ``values`` at ``stamp`` (ns) and predicts the instant ``stamp + T_s``."""
         self.finish()
+        self._start = None
         refusal = self.observe(stamp, values, frames)
         if refusal is not None:
             return refusal
@@ -244,6 +260,7 @@ class Predictor:
             self._plausibility.last = words
             return Refusal.IMPLAUSIBLE_PREDICTION
         self._hindsight.predicted(stamp + self._period, following, now)
+        self._start = stamp, _pose_in(values)
         return Prediction(
             stamp + self._period,
             state[0],
@@ -276,6 +293,42 @@ class Predictor:
             poses.append(pose)
             state = following
         return poses
+
+    def rollout(self, inputs: Vector, *, deadline: float = math.inf) -> Rollout | None:
+        """What comes if the actuators do as they are told, from the newest odometry on.
+
+        Args:
+            inputs: throttle (fraction) or speed set-point (m/s), and steering (rad), absolute, for a step of T_s each,
+                ``(K, 2)``. They are taken as far as the actuators go.
+            deadline: a time of ``time.monotonic`` (s), after which it ends early.
+
+        Returns:
+            ``None`` where the newest odometry had no prediction.
+        """
+        if self._start is None:
+            return None
+        stamp, pose = self._start
+        inputs = np.clip(inputs, *np.transpose([self.vehicle.inputs.throttle, self.vehicle.inputs.steering]))
+        rows = np.concatenate([self._window, np.zeros((len(inputs), len(WINDOW_COLUMNS)))])[None]
+        acting = rows[0, self.model.H - 1 :]
+        if self.model.commands == "topics":
+            acting[1:, 3:5] = inputs
+            acting[1:-1, 5:7] = np.diff(inputs, axis=0)
+            acting[0, 5:7] = inputs[0] - acting[0, 3:5]
+        else:
+            acting[:-1, 3:5], acting[-1, 3:5] = inputs, inputs[-1]
+        step = step_of(self.model, None if self._learner is None else self._learner.afresh())
+        found, state = Rollout(stamp, [], []), State(*self._window[-1, :3].tolist())
+        for (values,) in states_ahead(step, rows, self.model.H):
+            following = State(*values.tolist())
+            if not _finite(following) or time.monotonic() > deadline:
+                break
+            if pose is not None:
+                pose = advance_pose(SCALAR, pose, state, following, self.model.T_s)
+                found.poses.append(pose)
+            found.states.append(following)
+            state = following
+        return found
 
     def _learn(self, learner: OnlineLearner, stamp: int, window: Vector, predicted: WindowPrediction) -> None:
         """Lets the learner follow the drive up to the ``window`` at ``stamp`` (ns), in rows T_s apart.
@@ -333,12 +386,17 @@ def _finite(values: Iterable[float]) -> bool:
     return all(map(math.isfinite, values))
 
 
+def _pose_in(values: Mapping[str, float]) -> Pose | None:
+    """The pose among a sample's values; ``None`` without one."""
+    try:
+        return Pose(values["x"], values["y"], values["theta"])
+    except KeyError:
+        return None
+
+
 def propagate_pose(
     values: Mapping[str, float], now: Iterable[float], following: Iterable[float], T_s: float
 ) -> Pose | None:
     """The pose one step on; ``None`` without a pose."""
-    try:
-        pose = Pose(values["x"], values["y"], values["theta"])
-    except KeyError:
-        return None
-    return advance_pose(SCALAR, pose, State(*now), State(*following), T_s)
+    pose = _pose_in(values)
+    return None if pose is None else advance_pose(SCALAR, pose, State(*now), State(*following), T_s)

@@ -19,6 +19,8 @@ COMMAND_TOPIC = "/vehicle/actuator_command"
 PREDICTION_TOPIC = "/dynssm/prediction"
 PARAMETERS_TOPIC = "/dynssm/parameters"
 HORIZON_TOPIC = "/dynssm/horizon"
+CANDIDATE_TOPIC = "/dynssm/candidate"
+ROLLOUT_TOPIC = "/dynssm/rollout"
 MARKERS_TOPIC = "/dynssm/markers"
 
 UNKNOWN = 1e6

@@ -328,6 +328,38 @@ def test_over_the_horizon_the_actuators_stay_at_the_last_command(drive: Drive, s
     np.testing.assert_allclose(drive.predictor.row[5:], [0.3, -0.15])  # not changed by the rollout
 
 
+def test_a_rollout_of_the_held_command_is_the_prediction_and_its_horizon(drive: Drive) -> None:
+    assert drive.predictor.rollout(np.zeros((1, 2))) is None, "nothing was predicted"
+    outcome = drive.fill()
+    row = drive.predictor.row
+    held = np.tile(row[3:5] + row[5:7], (10, 1))
+    found = drive.predictor.rollout(held)
+    assert found is not None
+    assert found.stamp == outcome.stamp - PERIOD
+    np.testing.assert_allclose(found.states[0], outcome.state, atol=1e-12)
+    np.testing.assert_allclose(found.poses, drive.predictor.horizon(outcome, 10), atol=1e-9)
+    assert len(found.states) == 10
+    assert drive.predictor.rollout(held, deadline=-1.0).states == [], "its time is up"
+    right, left = (drive.predictor.rollout(held + np.array([0.0, side])) for side in (-9.0, 9.0))
+    assert left.poses[-1].theta > found.poses[-1].theta > right.poses[-1].theta
+    _, high = drive.predictor.vehicle.inputs.steering
+    np.testing.assert_array_equal(left.states, drive.predictor.rollout(np.c_[held[:, 0], np.full(10, high)]).states)
+    drive.stamp += 10 * 10**9
+    drive.odometry(v_x=1.0)
+    assert drive.predictor.rollout(held) is None, "the newest odometry has no prediction"
+
+
+def test_in_a_rollout_each_input_acts_for_its_step(drive: Drive, still: Still) -> None:
+    drive.predictor.swap(still)
+    drive.fill()
+    inputs = np.array([[0.1, 0.01], [0.2, -0.02], [0.4, 0.04]])
+    still.asked.clear()
+    assert drive.predictor.rollout(inputs) is not None
+    for asked, applied in zip(still.asked, inputs, strict=True):
+        np.testing.assert_allclose(asked[0, -1, 3:5] + asked[0, -1, 5:7], applied, atol=1e-12)
+    np.testing.assert_allclose(still.asked[2][0, -1, 3:5], inputs[1], atol=1e-12)
+
+
 def test_without_a_pose_there_is_no_horizon(drive: Drive) -> None:
     drive.fill()
     drive.actuators()
