@@ -75,7 +75,7 @@ def layout_of(path: Path) -> TextLayout:
     if twice is not None:
         places = " and ".join(str(k + 1) for k, name in enumerate(names) if name == twice)
         raise BagError(f"{path}: columns {places} are all named '{twice}'; expected different names")
-    written = [len(lines[k].encode(encoding)) + 1 for k in filled if k >= first]
+    written = [len(lines[k].encode(encoding, errors="replace")) + 1 for k in filled if k >= first]
     return TextLayout(encoding, delimiter, comma, tuple(names), tuple(units), first, sum(written) / len(written))
 
 

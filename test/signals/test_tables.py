@@ -492,3 +492,14 @@ def test_a_parquet_file_that_unpacks_to_far_more_than_it_is_is_refused_before_it
     monkeypatch.setattr("dynssm_ros.signals.recover._UNPACKED", 1 << 20)
     with pytest.raises(BagError, match=r"log.parquet: unpacks to \d MB; expected at most 100 times its size"):
         open_table(file)
+
+
+def test_a_byte_that_no_encoding_has_spoils_its_cell_alone(tmp_path: Path, columns: Any) -> None:
+    file = tmp_path / "log.csv"
+    write_csv(file, columns)
+    lines = file.read_bytes().split(b"\n")
+    lines[5] = lines[5].replace(b".", b"\x81", 1)  # neither UTF-8 nor cp1252
+    file.write_bytes(b"\n".join(lines))
+    table = open_table(file)
+    assert table.headings.keys() == columns.keys()
+    assert table.read(["y"])["y"].present.all()
