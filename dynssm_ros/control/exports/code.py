@@ -7,7 +7,6 @@ states are the true ones.
 
 from __future__ import annotations
 
-import re
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dynssm_ros.control.exports.names import identifier
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose, advance_pose, world_velocity
@@ -112,11 +112,6 @@ class Functions(NamedTuple):
     """The states T_s later."""
     rates: Any
     """Their time derivatives."""
-
-
-def identifier(name: str) -> str:
-    """The name of a car as C and Python take it."""
-    return re.sub(r"\W|^(?=\d)", "_", name, flags=re.ASCII)
 
 
 def functions(vehicle: Vehicle) -> Functions:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from dynssm_ros.control.exports.names import identifier
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle import Coefficients, Vehicle
 from dynssm_ros.vehicle.limits import vehicle_limits
@@ -84,10 +85,8 @@ def f1tenth_gym_files(vehicle: Vehicle) -> dict[str, str]:
         "sv_min": -inputs.steering_rate, "sv_max": inputs.steering_rate, "v_switch": linear.v_switch, "a_max": linear.a_max,
         "v_min": linear.v_min, "v_max": linear.v_max, "width": _WIDTH * car.wheelbase, "length": _LENGTH * car.wheelbase,
     }  # fmt: skip
-    return {
-        f"{vehicle.name}_f1tenth_gym.yaml": _HEAD.format(name=vehicle.name, what="f1tenth_gym", axles="")
-        + _yaml(values)
-    }
+    name = identifier(vehicle.name)
+    return {f"{name}_f1tenth_gym.yaml": _HEAD.format(name=name, what="f1tenth_gym", axles="") + _yaml(values)}
 
 
 def commonroad_files(vehicle: Vehicle) -> dict[str, str]:
@@ -106,7 +105,9 @@ def commonroad_files(vehicle: Vehicle) -> dict[str, str]:
         },
     }  # fmt: skip
     head = _HEAD.format(
-        name=vehicle.name, what="CommonRoad's single track", axles=", the difference of front and rear tyres"
+        name=identifier(vehicle.name),
+        what="CommonRoad's single track",
+        axles=", the difference of front and rear tyres",
     )
     return {
         "parameters_vehicle1.yaml": head + _yaml(values),

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.control.exports.names import identifier
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.limits import vehicle_limits
 from dynssm_ros.vehicle.single_track import standing_speed
@@ -89,4 +90,4 @@ def steering_table_files(vehicle: Vehicle) -> dict[str, str]:
     table = np.block([[np.zeros((1, 1)), speed[None]], [delta[:, None], accelerations]])
     text = io.StringIO()
     np.savetxt(text, table, delimiter=",", fmt="%.6g")
-    return {f"{vehicle.name}_lookup_table.csv": text.getvalue()}
+    return {f"{identifier(vehicle.name)}_lookup_table.csv": text.getvalue()}
