@@ -154,7 +154,7 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
         ("odometry_lever_arm", {"x": 0.9 * centre_known}, False),
         ("odometry_lever_arm", {"x": 0.9 * centre_known, "y": 0.9 * centre_known}, True),
     ):
-        sized = replace(strong, candidate=Candidate(effect, tuple(values)))
+        sized = replace(strong, candidate=Candidate(effect, tuple(values)), least=fit.car.least(effect, 0.3))
         assert replace(sized, fit=replace(fit, car=fit.car.with_effect(effect, values))).pays == pays
     for length, pays in ((0.5, True), (0.8, False)):
         values = {"factor": 0.8, "centre": 0.3, "length": length}
