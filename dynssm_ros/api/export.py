@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from dynssm_ros.api.inputs import PathLike, vehicle_of
 from dynssm_ros.api.settings import VerbSettings, keywords, setting
+from dynssm_ros.control.exports import FORMATS, Format
 from dynssm_ros.extras import require
 from dynssm_ros.files import replacing
 from dynssm_ros.vehicle import Vehicle
-
-Format = Literal["c", "acados", "f1tenth_gym", "commonroad", "steering_table"]
 
 
 class ExportSettings(VerbSettings):
@@ -59,6 +57,4 @@ def export(vehicle: Vehicle | PathLike, *, settings: ExportSettings) -> Export:
         ['orca.c', 'orca.h', 'orca_car.h', 'orca_example.cpp']
     """
     require("export", "race")
-    from dynssm_ros.control.exports import FORMATS
-
     return Export(FORMATS[settings.format](vehicle_of(vehicle)))

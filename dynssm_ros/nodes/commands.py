@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.nodes.support import actuators, message_class, set_stamp
-from dynssm_ros.runtime.predictor import Rollout
+from dynssm_ros.runtime.predictor import CandidateRollout
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS
 from dynssm_ros.vehicle import Applied, Vehicle
 from dynssm_ros.vehicle.single_track import SetPoint
@@ -85,7 +85,7 @@ def candidate(message: JointTrajectory, set_point: SetPoint, T_s: float) -> Vect
     return held
 
 
-def rollout_as(rollout: Rollout | None, T_s: float, frame: str) -> JointTrajectory:
+def rollout_as(rollout: CandidateRollout | None, T_s: float, frame: str) -> JointTrajectory:
     """The answer: states after each step, and poses if there are any; without points where nothing can be predicted."""
     if rollout is None:
         return JointTrajectory()

@@ -211,6 +211,8 @@ class PredictorNode(ManagedNode):
             receive = self._on_odometry if topic == signal_map.odometry_topic else self._on_actuator
             subscription = listen(self, message_class(decoder.msgtype), decoder.subscribed, partial(receive, decoder))
             self._subscribed[decoder] = subscription
+        actuators = [each for each in self._subscribed.items() if each[0].topic != signal_map.odometry_topic]
+        self._following = {decoder: actuators[k + 1 :] for k, (decoder, _) in enumerate(actuators)}
         listen(self, JointTrajectory, relative(CANDIDATE_TOPIC), self._on_candidate)
 
     def _on_candidate(self, message: JointTrajectory) -> None:
@@ -236,9 +238,8 @@ class PredictorNode(ManagedNode):
         wake-up of the executor takes as long as a prediction.
         """
         self._observe(decoder, message, times, None)
-        topics = list(self._subscribed)
-        for other in topics[topics.index(decoder) + 1 :]:
-            if other.topic != self._predictor.signal_map.odometry_topic and (taken := take(self._subscribed[other])):
+        for other, subscription in self._following[decoder]:
+            if taken := take(subscription):
                 self._observe(other, *taken, None)
 
     def _observe(self, decoder: TopicDecoder, message: Any, times: Mapping[str, int], frames: Frames | None) -> None:

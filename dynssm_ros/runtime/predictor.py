@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from dynssm_ros.runtime.learner import OnlineLearner
 from dynssm_ros.runtime.online import OnlineState, expert_weights
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.plausibility import Plausibility
-from dynssm_ros.runtime.rollout import states_ahead, step_of
+from dynssm_ros.runtime.rollout import Step, states_ahead, step_of
 from dynssm_ros.runtime.trial import require_same_use
 from dynssm_ros.signals.decoding import Frames
 from dynssm_ros.signals.history import History, Refusal
@@ -60,7 +60,7 @@ class Prediction(NamedTuple):
     residual_share: float
 
 
-class Rollout(NamedTuple):
+class CandidateRollout(NamedTuple):
     """What was predicted for inputs that somebody asked about.
 
     Attributes:
@@ -284,17 +284,10 @@ class Predictor:
         ahead[0, :3], ahead[:, 3:5] = prediction.state, self._window[-1, 3:5] + self._window[-1, 5:7]
         rows = np.concatenate([self._window[1:], ahead])[None]
         step = step_of(self.model, None if self._learner is None else self._learner.rollout())
-        poses, state = [prediction.pose], State(*prediction.state.tolist())
-        for (values,) in states_ahead(step, rows, self.model.H):
-            following = State(*values.tolist())
-            pose = advance_pose(SCALAR, poses[-1], state, following, self.model.T_s)
-            if not _finite(pose) or time.monotonic() > deadline:
-                break
-            poses.append(pose)
-            state = following
-        return poses
+        driven = self._driven(step, rows, State(*prediction.state.tolist()), prediction.pose, deadline)
+        return [prediction.pose, *(pose for _, pose in driven if pose is not None)]
 
-    def rollout(self, inputs: Vector, *, deadline: float = math.inf) -> Rollout | None:
+    def rollout(self, inputs: Vector, *, deadline: float = math.inf) -> CandidateRollout | None:
         """What comes if the actuators do as they are told, from the newest odometry on.
 
         Args:
@@ -318,17 +311,28 @@ class Predictor:
         else:
             acting[:-1, 3:5], acting[-1, 3:5] = inputs, inputs[-1]
         step = step_of(self.model, None if self._learner is None else self._learner.afresh())
-        found, state = Rollout(stamp, [], []), State(*self._window[-1, :3].tolist())
+        states, poses = [], []
+        for state, following in self._driven(step, rows, State(*self._window[-1, :3].tolist()), pose, deadline):
+            states.append(state)
+            if following is not None:
+                poses.append(following)
+        return CandidateRollout(stamp, states, poses)
+
+    def _driven(
+        self, step: Step, rows: Vector, state: State, pose: Pose | None, deadline: float
+    ) -> Iterator[tuple[State, Pose | None]]:
+        """States and poses along ``rows`` ``(1, H + steps, 7)``, as far as they are finite, until ``deadline``.
+
+        ``state`` and ``pose`` are those before the first step.
+        """
         for (values,) in states_ahead(step, rows, self.model.H):
             following = State(*values.tolist())
-            if not _finite(following) or time.monotonic() > deadline:
-                break
             if pose is not None:
                 pose = advance_pose(SCALAR, pose, state, following, self.model.T_s)
-                found.poses.append(pose)
-            found.states.append(following)
+            if not _finite((*following, *(pose or ()))) or time.monotonic() > deadline:
+                return
             state = following
-        return found
+            yield state, pose
 
     def _learn(self, learner: OnlineLearner, stamp: int, window: Vector, predicted: WindowPrediction) -> None:
         """Lets the learner follow the drive up to the ``window`` at ``stamp`` (ns), in rows T_s apart.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 import numpy as np
 
@@ -141,13 +141,13 @@ class Wiring:
             return
         errors = np.full(len(self._suspicions), np.inf)
         for part, car, theta in self._parts:
-            for found in self._errors(rows, self._factors[part], car, theta):
-                errors[part] = found
-                yield None
+            errors[part] = yield from self._errors(rows, self._factors[part], car, theta)
         best, innocent = int(np.argmin(errors)), errors[: len(_TYRES)].min()
         yield self._suspicions[best] if errors[best] < _CLEARLY * innocent else ""
 
-    def _errors(self, rows: Vector, factors: Vector, car: CarModel, theta: Coefficients) -> Iterator[Vector]:
+    def _errors(
+        self, rows: Vector, factors: Vector, car: CarModel, theta: Coefficients
+    ) -> Generator[None, None, Vector]:
         """Mean square of the predicted changes' errors in yaw rate and lateral velocity, over those measured.
 
         Args:
@@ -157,7 +157,10 @@ class Wiring:
             theta: likewise.
 
         Yields:
-            Errors ``(C,)`` so far, step by step; infinite where the car diverges.
+            Nothing, after each step.
+
+        Returns:
+            Errors ``(C,)``; infinite where the car diverges.
         """
         starts = np.linspace(0, len(rows) - 1 - self._ahead, _STARTS).astype(np.intp)
         spread = np.mean(rows[:, 1:3] ** 2, axis=0) * factors[:, 0, 1:3] ** 2 + 1e-12
@@ -167,6 +170,8 @@ class Wiring:
                 inputs = rows[starts + k, 3:] * factors[..., 3:]
                 now = np.moveaxis(np.concatenate([state, inputs], axis=-1), -1, 0)
                 state = np.stack(car.step(State(*now[:3]), applied_inputs(now), theta)[0], axis=-1)
-                moved = state - first - (rows[starts + k + 1, :3] - rows[starts, :3]) * factors[..., :3]
-                error = np.sum(np.mean(moved[:, :, 1:] ** 2, axis=1) / spread, axis=1)
-            yield np.where(np.isfinite(error), error, np.inf)
+            yield
+        with np.errstate(all="ignore"):
+            off = state - first - (rows[starts + self._ahead, :3] - rows[starts, :3]) * factors[..., :3]
+            error = np.sum(np.mean(off[:, :, 1:] ** 2, axis=1) / spread, axis=1)
+        return np.where(np.isfinite(error), error, np.inf)

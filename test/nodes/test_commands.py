@@ -16,7 +16,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.nodes.commands import ACKERMANN, JOINT_STATE, candidate, commands_as, rollout_as
-from dynssm_ros.runtime.predictor import Rollout
+from dynssm_ros.runtime.predictor import CandidateRollout
 from dynssm_ros.signals.decoding import decoders
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import Applied, State, load_vehicle
@@ -108,10 +108,10 @@ def test_a_candidate_that_cannot_be_read_is_told(message: JointTrajectory, words
 
 def test_the_answer_has_states_and_times() -> None:
     states = [State(1.0, 0.1, 0.2), State(1.1, 0.2, 0.3)]
-    answer = rollout_as(Rollout(5 * 10**9, states, [Pose(0.0, 1.0, 2.0)] * 2), 0.6, "map")
+    answer = rollout_as(CandidateRollout(5 * 10**9, states, [Pose(0.0, 1.0, 2.0)] * 2), 0.6, "map")
     assert list(answer.joint_names) == ["x", "y", "theta", "v_x", "v_y", "omega"]
     assert list(answer.points[1].positions) == [0.0, 1.0, 2.0, 1.1, 0.2, 0.3]
     assert (answer.points[1].time_from_start.sec, answer.points[1].time_from_start.nanosec) == (1, 200_000_000)
     assert (answer.header.stamp.sec, answer.header.frame_id) == (5, "map")
-    assert list(rollout_as(Rollout(0, states, []), 0.6, "").joint_names) == ["v_x", "v_y", "omega"]
+    assert list(rollout_as(CandidateRollout(0, states, []), 0.6, "").joint_names) == ["v_x", "v_y", "omega"]
     assert not rollout_as(None, 0.6, "").points

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from benchmarks.endurance.live_run import isolated_environment, run_live
 from dynssm_ros.nodes.support import SENSOR_QOS
@@ -25,7 +24,7 @@ from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.replay import replay
 from dynssm_ros.signals.bags import open_bag
 from dynssm_ros.signals.extraction import extract
-from dynssm_ros.signals.messages import CANDIDATE_TOPIC, PREDICTION_TOPIC, ROLLOUT_TOPIC, UNKNOWN
+from dynssm_ros.signals.messages import PREDICTION_TOPIC, UNKNOWN
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.signals.standard import recording_to_bag
 from dynssm_ros.vehicle import COEFFICIENTS, load_vehicle
@@ -277,34 +276,6 @@ def test_a_model_is_swapped_while_running_and_a_bad_one_is_refused(
     assert car.answered(car.step()), "the window survives the swap"
     assert car.diagnosed("")
     assert car.run.diagnostics[-1][2]["model folder"] == str(other)
-
-
-def test_a_planner_is_told_what_comes_of_its_inputs(car) -> None:
-    car.drive_until_answered()
-    answers: list[JointTrajectory] = []
-    car.collector.create_subscription(JointTrajectory, ROLLOUT_TOPIC, answers.append, 10)
-    ask = car.collector.create_publisher(JointTrajectory, CANDIDATE_TOPIC, 10).publish
-    question = JointTrajectory(joint_names=["throttle", "steering"])
-    for k in range(20):
-        point = JointTrajectoryPoint(positions=[0.2, 0.01])
-        point.time_from_start.nanosec = k * 20_000_000
-        question.points.append(point)
-
-    def comes() -> bool:
-        assert car.answered(car.step())
-        ask(question)
-        return car.collector.wait_for(lambda: any(len(answer.points) == 20 for answer in answers), 0.3)
-
-    assert any(comes() for _ in range(50))
-    answer = next(answer for answer in answers if len(answer.points) == 20)
-    assert list(answer.joint_names) == ["x", "y", "theta", "v_x", "v_y", "omega"]
-    assert answer.points[19].time_from_start.nanosec == 400_000_000
-    assert np.isfinite([point.positions for point in answer.points]).all()
-    answers.clear()
-    ask(JointTrajectory(joint_names=["torque"]))
-    assert car.collector.wait_for(lambda: bool(answers), 5.0)
-    assert not answers[-1].points
-    assert car.answered(car.step()), "it goes on"
 
 
 def test_the_horizon_is_published_on_request(start_car) -> None:

@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from dynssm_ros.signals import messages
 
 START = 1_700_000_000_123_456_789
+ROWS = 60  # of a table
 FEEDBACK, COMMAND, ODOMETRY = messages.FEEDBACK_TOPIC, messages.COMMAND_TOPIC, messages.ODOMETRY_TOPIC
 CUSTOM_TYPES = {
     "team_msgs/msg/Pedals": "std_msgs/Header header\nfloat32 throttle_percent\nfloat64[] brake_kpa\n",
@@ -137,3 +138,15 @@ def drive() -> Callable[..., list[Record]]:
         return found
 
     return records
+
+
+@pytest.fixture
+def columns() -> dict[str, np.ndarray]:
+    """The drive of the fixture ``drive`` as columns; heading as a quaternion has it."""
+    t = np.arange(ROWS) / 100.0
+    theta = 2.0 * np.arctan2(np.sin(0.15), np.cos(0.15))
+    return {
+        "time": START + np.round(t * 1e9).astype(np.int64), "v_x": 10 + t, "v_y": 0.1 * t, "omega": -0.2 * t,
+        "x": 10 * t, "y": np.ones(ROWS), "theta": np.full(ROWS, theta), "throttle_feedback": np.full(ROWS, 0.5),
+        "steering_feedback": 0.01 * t, "throttle_command": np.full(ROWS, 0.55), "steering_command": 0.01 * t + 0.002,
+    }  # fmt: skip

@@ -6,13 +6,15 @@ Each gives the content of files by their names. What a format cannot hold is sai
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Literal
 
 from dynssm_ros.control.exports.code import acados_files, c_files
 from dynssm_ros.control.exports.parameters import commonroad_files, f1tenth_gym_files
 from dynssm_ros.control.exports.steering_table import steering_table_files
 from dynssm_ros.vehicle import Vehicle
 
-FORMATS: Mapping[str, Callable[[Vehicle], dict[str, str]]] = {
+Format = Literal["c", "acados", "f1tenth_gym", "commonroad", "steering_table"]
+FORMATS: Mapping[Format, Callable[[Vehicle], dict[str, str]]] = {
     "c": c_files,
     "acados": acados_files,
     "f1tenth_gym": f1tenth_gym_files,

@@ -12,8 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from dynssm_ros.control.exports.names import identifier
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle import COEFFICIENTS, Applied, CarModel, Coefficients, State, Vehicle
@@ -191,7 +189,7 @@ def acados_files(vehicle: Vehicle) -> dict[str, str]:
     made, name = functions(vehicle), identifier(vehicle.name)
     module = _ACADOS.format(
         name=name, T_s=vehicle.sampling_time, states=made.states, inputs=INPUTS, parameters=COEFFICIENTS,
-        values=np.asarray(vehicle.nominal).tolist(),
+        values=vehicle.nominal.tolist(),
     )  # fmt: skip
     return {
         f"{name}_acados.py": module,

@@ -36,6 +36,7 @@ class LinearCar(NamedTuple):
         v_switch: speed above which the drive falls as 1/v (m/s).
         v_max: top speed (m/s).
         v_min: largest speed backwards, negative (m/s).
+        I_z: yaw inertia (kg m^2).
     """
 
     mu: float
@@ -46,6 +47,7 @@ class LinearCar(NamedTuple):
     v_switch: float
     v_max: float
     v_min: float
+    I_z: float
 
 
 def linear_car(vehicle: Vehicle) -> LinearCar:
@@ -72,7 +74,7 @@ def linear_car(vehicle: Vehicle) -> LinearCar:
     return LinearCar(
         mu, stiffness[0], stiffness[1], h=car.h_cg if car.load_transfer else 0.0, a_max=most,
         v_switch=half * float(limits.drive[0]) / 2 / most, v_max=limits.top_speed,
-        v_min=-limits.top_speed if car.reverse else backwards,
+        v_min=-limits.top_speed if car.reverse else backwards, I_z=theta.I_z,
     )  # fmt: skip
 
 
@@ -81,7 +83,7 @@ def f1tenth_gym_files(vehicle: Vehicle) -> dict[str, str]:
     car, linear, inputs = vehicle.constants, linear_car(vehicle), vehicle.inputs
     values = {
         "mu": linear.mu, "C_Sf": linear.C_Sf, "C_Sr": linear.C_Sr, "lf": car.l_f, "lr": car.l_r, "h": linear.h, "m": car.m,
-        "I": _yaw_inertia(vehicle), "s_min": inputs.steering[0], "s_max": inputs.steering[1],
+        "I": linear.I_z, "s_min": inputs.steering[0], "s_max": inputs.steering[1],
         "sv_min": -inputs.steering_rate, "sv_max": inputs.steering_rate, "v_switch": linear.v_switch, "a_max": linear.a_max,
         "v_min": linear.v_min, "v_max": linear.v_max, "width": _WIDTH * car.wheelbase, "length": _LENGTH * car.wheelbase,
     }  # fmt: skip
@@ -95,7 +97,7 @@ def commonroad_files(vehicle: Vehicle) -> dict[str, str]:
     both = (linear.C_Sf + linear.C_Sr) / 2
     values = {
         "l": _LENGTH * car.wheelbase, "w": _WIDTH * car.wheelbase, "m": car.m, "a": car.l_f, "b": car.l_r,
-        "I_z": _yaw_inertia(vehicle), "h_s": linear.h, "h_cg": linear.h,
+        "I_z": linear.I_z, "h_s": linear.h, "h_cg": linear.h,
         "steering": {
             "min": inputs.steering[0], "max": inputs.steering[1], "v_min": -inputs.steering_rate,
             "v_max": inputs.steering_rate,
@@ -113,10 +115,6 @@ def commonroad_files(vehicle: Vehicle) -> dict[str, str]:
         "parameters_vehicle1.yaml": head + _yaml(values),
         "parameters_tire.yaml": head + _yaml({"tire": {"p_dy1": linear.mu, "p_ky1": -linear.mu * both}}),
     }
-
-
-def _yaw_inertia(vehicle: Vehicle) -> float:
-    return float(Coefficients(*vehicle.nominal.tolist()).I_z)
 
 
 def _yaml(values: dict[str, Any]) -> str:

@@ -7,7 +7,6 @@ A comma-separated table: speeds (m/s) in the first row, steering angles (rad) in
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -29,7 +28,7 @@ def steady_cornering(
     """Lateral velocity and yaw rate of steady corners.
 
     Args:
-        vehicle: the car, without what its sensors do.
+        vehicle: the car.
         speed: ``v_x`` (m/s), ``(M,)``.
         delta: road-wheel angle (rad).
         start: lateral velocities and yaw rates nearby, ``(M,)``.
@@ -38,7 +37,6 @@ def steady_cornering(
         ``v_y`` and ``omega``, ``(M,)``; NaN where there is no stable corner nearby.
     """
     car = CarModel.of(vehicle)
-    car = replace(car, effects=tuple(effect for effect in car.effects if not effect.measures))
     theta, applied = Coefficients(*vehicle.nominal), Applied(vehicle.inputs.coasting(speed), delta + 0.0 * speed)
 
     def rates(v_y: Vector, omega: Vector) -> Vector:
