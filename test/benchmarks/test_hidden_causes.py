@@ -145,6 +145,17 @@ def test_none_and_two_are_judged_by_all_that_is_named() -> None:
     assert judge(two, [cause("mass", {"factor": 1.2}), cause("drag", {"coefficient": 0.4})]).all
 
 
+def test_drives_of_a_car_that_nobody_knows_can_share_its_file() -> None:
+    alone, shared = (list(cases(0, 24, healthy=True, of_a_file=n)) for n in (1, 3))
+    assert {case.reference for case in alone} == {None}
+    assert [case.reference for case in shared if case.plant == "foreign"] == [2, 2, 2, 14, 14, 14]
+    assert [case for case in shared if case.reference is None] == [
+        c for c in alone if c.plant in ("rk4", "double_track")
+    ]
+    assert len({(case.reference, case.track, case.sampling_time) for case in shared if case.plant == "foreign"}) == 2
+    assert len({case.seed for case in shared}) == 24
+
+
 def test_a_file_that_has_an_axle_wrong_is_told_by_a_coefficient_of_it() -> None:
     told = Outcome("e", (), (), True, True, None, verdict="recalibrate", wrong="D_r", off=("S_hf", "B_r"))
     others = [replace(told, off=("D_f",)), replace(told, verdict="cause"), replace(told, wrong="D_f")]
