@@ -50,7 +50,7 @@ def _within(value: Array, low: float, high: float) -> Array:
 
 
 class ForeignPlant(Rk4Plant):
-    """The car in steps of 1 ms."""
+    """The car on the road."""
 
     def first(self, vehicle: Vehicle) -> tuple[StageEffect, ...]:
         return (BrushTyres(),)

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.hidden_causes.cases import NOISE, Hidden, size
+from benchmarks.hidden_causes.cases import NOISE, STEP, Hidden, size
 from benchmarks.hidden_causes.outcomes import shared
 from benchmarks.page import table
 from dynssm_ros.errors import DataWarning
@@ -46,7 +46,6 @@ _CAUSES = (
 )  # fmt: skip
 _STRONGER = {"drive_gain": {"factor": 1.04}}
 _RATE = 0.02  # s: sampling time
-_STEP = 5e-3  # s, of Runge and Kutta: 0.4 of the fastest of these cars' time constants
 _TRIES = 6
 _DRIVE = ("drive_gain", "C_m1", "mass")  # what a drive force that is larger is told by
 
@@ -98,7 +97,7 @@ class Make(Rk4Plant):
     seed: int
 
     def step(self, vehicle: Vehicle) -> float:
-        return _STEP
+        return STEP
 
     def first(self, vehicle: Vehicle) -> tuple[StageEffect, ...]:
         return (FourWheels.drawn(vehicle, self.seed),)

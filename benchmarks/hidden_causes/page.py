@@ -31,7 +31,7 @@ _IN_WORDS = {
     "too_small": "what is missed is smaller than what the diagnosis says that it would name there",
 }
 _PLANTS = {
-    "rk4": "one track, steps of 1 ms", "double_track": "four wheels", foreign.NAME: "another make",
+    "rk4": "one track", "double_track": "four wheels", foreign.NAME: "another make",
     multi_body.NAME: "multi-body",
 }  # fmt: skip
 

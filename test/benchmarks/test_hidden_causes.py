@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.hidden_causes.cases import NOISE, TRACKS, Case, cases, known, off, size, vehicle_file
+from benchmarks.hidden_causes.cases import NOISE, TRACKS, Case, cases, drive, known, off, size, vehicle_file
 from benchmarks.hidden_causes.outcomes import (
     Outcome,
     by_size,
@@ -143,6 +143,15 @@ def test_none_and_two_are_judged_by_all_that_is_named() -> None:
     two = Case({"mass": {"factor": 1.2}, "drag": {"coefficient": 0.4}}, 0)
     assert not judge(two, [cause("mass", {"factor": 1.2})]).all
     assert judge(two, [cause("mass", {"factor": 1.2}), cause("drag", {"coefficient": 0.4})]).all
+
+
+@pytest.mark.parametrize("plant", ["rk4", "double_track", "foreign"])
+def test_cases_are_driven_in_steps_that_are_short_enough(plant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case({"steering_lag": {"time_constant": 0.05}}, 3, plant, 3.0)
+    few = drive(case)
+    monkeypatch.setattr("benchmarks.hidden_causes.cases.STEP", 1e-3)
+    for channel in ("v_x", "v_y", "omega"):
+        np.testing.assert_allclose(few[channel], drive(case)[channel], atol=1e-6)
 
 
 def test_drives_of_a_car_that_nobody_knows_can_share_its_file() -> None:
