@@ -17,7 +17,7 @@ import argparse
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -124,6 +124,7 @@ def _season_log(name: str, data: Path) -> Fold:
     return Fold(f"season_{name}", RACER, concatenate(logs), log, "season")
 
 
+@cache
 def _extracted(bag: Path, signals: str, rate: float) -> Recording:
     return extract([bag], load_signal_map(signals).with_commands("none"), rate)
 

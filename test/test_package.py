@@ -20,6 +20,8 @@ import dynssm_ros
 from dynssm_ros.configuration import config_root
 from dynssm_ros.extras import EXTRAS
 from dynssm_ros.learning.models.registry import load_model_config
+from dynssm_ros.runtime.artifact import model_folder, open_artifact, shipped_models
+from dynssm_ros.runtime.registry import load_model
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle.parameters import load_vehicle
 
@@ -212,6 +214,17 @@ def test_shipped_signal_maps_are_valid(name: str) -> None:
 @pytest.mark.parametrize("name", shipped("models"))
 def test_shipped_models_are_valid(name: str) -> None:
     assert load_model_config(name).name == name
+
+
+def test_shipped_model_folders_open_by_name_and_are_small() -> None:
+    for name in (found := shipped_models()):
+        artifact = open_artifact(name)
+        assert artifact.card.name == name
+        assert load_model(name).online is not None
+        assert sum(path.stat().st_size for path in artifact.path.iterdir()) < 100_000
+    assert found
+    assert model_folder("nothing") == Path("nothing")
+    assert model_folder(Path("here") / next(iter(found))) == Path("here") / next(iter(found)), "a path is no name"
 
 
 # what the policy files of SROS 2 consist of: the parts of an element, and its attributes

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dynssm_ros.control.prediction_model import Adaptive, Fixed, PredictionModel
 from dynssm_ros.errors import ArtifactError, ConfigurationError
+from dynssm_ros.runtime.artifact import model_folder
 from dynssm_ros.runtime.baselines import SingleTrack
 from dynssm_ros.runtime.contract import WindowModel
 from dynssm_ros.runtime.registry import UNTRAINED, load_model
@@ -54,7 +55,7 @@ def load_prediction_model(
     if Path(name_or_path).suffix == ".yaml":
         model: WindowModel = SingleTrack(load_vehicle(name_or_path))
         model.name = Path(name_or_path).stem
-    elif os.path.isdir(name_or_path) or name_or_path in UNTRAINED:
+    elif os.path.isdir(model_folder(name_or_path)) or name_or_path in UNTRAINED:
         model = load_model(name_or_path, known)
     else:
         raise ConfigurationError(

@@ -83,7 +83,7 @@ def fit_layer(
             "online: no window at the vehicle's minimum speed or more; expected some to fit the prior to"
         )
     s_delta: Vector = np.array(scale.increment_scale)
-    moments = [_moments(part, s_delta) for part in parts]
+    moments = [moments_of(part, s_delta) for part in parts]
     others = [[*moments[:k], *moments[k + 1 :]] if len(parts) > 1 else moments for k in range(len(parts))]
 
     vehicle, stepping = features.vehicle, features.stepping
@@ -142,7 +142,7 @@ class _Prior(NamedTuple):
     physics: Vector
 
 
-class _Moments(NamedTuple):
+class Moments(NamedTuple):
     """What least squares needs of a drive; sums over its rows, which add up over drives."""
 
     rows: int
@@ -151,21 +151,22 @@ class _Moments(NamedTuple):
     square: Vector  # of the physics' errors, (3,), in units of s_delta squared
 
 
-def _moments(drive: LayerDrive, s_delta: Vector) -> _Moments:
+def moments_of(drive: LayerDrive, s_delta: Vector) -> Moments:
+    """Those of a drive; ``s_delta``: scale of increments (m/s, m/s, rad/s), ``(3,)``."""
     parts = []
     for block, (F, physics) in drive.blocks():
         error = (drive.measured(block)[1] - physics) / s_delta
         gram = np.einsum("kci,kcj->cij", F, F, optimize=True)
-        parts.append(_Moments(len(error), gram, np.einsum("kci,kc->ci", F, error), np.sum(error**2, axis=0)))
+        parts.append(Moments(len(error), gram, np.einsum("kci,kc->ci", F, error), np.sum(error**2, axis=0)))
     return _added(parts)
 
 
-def _added(parts: list[_Moments]) -> _Moments:
+def _added(parts: list[Moments]) -> Moments:
     rows, *sums = (sum(each) for each in zip(*parts, strict=True))
-    return _Moments(rows, *sums)
+    return Moments(rows, *sums)
 
 
-def _least_squares(parts: list[_Moments]) -> _Prior:
+def _least_squares(parts: list[Moments]) -> _Prior:
     """Weights by least squares, drawn to the physics alone; the mean Gram matrix, mean square errors."""
     rows, total, moment, square = _added(parts)
     n = total.shape[1]

@@ -169,28 +169,44 @@ class Artifact:
         )
 
 
+def model_folder(name_or_path: str | Path) -> Path:
+    """The model folder at a path or, where there is none, the shipped one of that name."""
+    if not os.path.isdir(name_or_path) and str(name_or_path) in (shipped := shipped_models()):
+        return shipped[str(name_or_path)]
+    return Path(name_or_path)
+
+
+def shipped_models() -> dict[str, Path]:
+    """Folders of the shipped models by name."""
+    return {
+        card.parent.name: card.parent for card in sorted((configuration.config_root() / "models").glob(f"*/{CARD}"))
+    }
+
+
 def open_artifact(path: str | Path) -> Artifact:
-    """Opens and checks a model folder.
+    """Opens and checks a model folder, or a shipped one by its name.
 
     Raises:
         ArtifactError: a file is missing, changed, damaged or too large, the format is newer, or a weight is not finite.
     """
-    return parse_artifact(Path(path), read_folder(path))
+    folder = model_folder(path)
+    return parse_artifact(folder, read_folder(folder))
 
 
 def read_folder(path: str | Path, root: str = "") -> dict[str, bytes]:
     """Reads the files of a model folder, each once: what is checked is what is used, whoever writes there meanwhile.
 
     Args:
-        path: of the folder.
+        path: of the folder, or a shipped one's name.
         root: folder below which all files must be, links followed; empty: anywhere.
 
     Raises:
         ArtifactError: no such folder, a file that cannot be read, is too large or none at all, or lies elsewhere.
     """
-    if not os.path.isdir(path):  # unlike Path.is_dir, False where looking is forbidden or the name impossible
+    folder = model_folder(path)
+    if not os.path.isdir(folder):  # unlike Path.is_dir, False where looking is forbidden or the name impossible
         raise ArtifactError(f"{path}: no such model folder; `dynssm train` writes one")
-    return {name: _read(Path(path) / name, root) for name in _LARGEST if os.path.lexists(Path(path) / name)}
+    return {name: _read(folder / name, root) for name in _LARGEST if os.path.lexists(folder / name)}
 
 
 def parse_artifact(path: Path, files: Mapping[str, bytes]) -> Artifact:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dynssm_ros.errors import ConfigurationError
-from dynssm_ros.runtime.artifact import open_artifact
+from dynssm_ros.runtime.artifact import model_folder, open_artifact, shipped_models
 from dynssm_ros.runtime.baselines import Persistence, SingleTrack, SingleTrackEwma
 from dynssm_ros.runtime.contract import WindowModel, without_online
 from dynssm_ros.runtime.kalman import SingleTrackEkf
@@ -23,23 +23,24 @@ UNTRAINED = (Persistence.name, *_PHYSICS)
 
 
 def load_model(name_or_dir: str | Path, vehicle: Vehicle | None = None) -> WindowModel:
-    """Opens a model folder, or one of the models that need no training.
+    """Opens a model folder, a shipped one by its name, or one of the models that need no training.
 
     Args:
-        name_or_dir: a model folder, or one of :data:`UNTRAINED`.
+        name_or_dir: a model folder, the name of a shipped one, or one of :data:`UNTRAINED`.
         vehicle: needed for the single-track models.
 
     Raises:
         ArtifactError: the folder is not a usable model.
         ConfigurationError: no such model, or the vehicle is missing.
     """
-    if os.path.isdir(name_or_dir):
+    if os.path.isdir(model_folder(name_or_dir)):
         return OnnxModel(open_artifact(name_or_dir))
     if name_or_dir == Persistence.name:
         return Persistence()
     physics = _PHYSICS.get(str(name_or_dir))
     if physics is None:
-        raise ConfigurationError(f"model '{name_or_dir}': neither a model folder nor one of {', '.join(UNTRAINED)}")
+        names = ", ".join((*UNTRAINED, *shipped_models()))
+        raise ConfigurationError(f"model '{name_or_dir}': neither a model folder nor one of {names}")
     if vehicle is None:
         raise ConfigurationError(f"model {name_or_dir}: needs --vehicle")
     return physics(vehicle)
