@@ -1,8 +1,8 @@
 """When a controller brakes, why, and when it drives on: two states.
 
 It drives until something is wrong that it cannot drive with; then it brakes. It drives on when nothing was wrong for several
-odometry messages in a row, and, if it may be somewhere else than it was believed, once it stands. Where its odometry was
-wrong again and again, it stays where it is.
+odometry messages in a row. If its pose jumped it stands first, until the pose has come back or is set anew: which of the two
+places was right cannot be told. Where its odometry was wrong again and again, it stays where it is.
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ class Brakes:
         self._times = 0  # that odometry was wrong, each soon after the one before
         self.until_standing = False
         """Whether the car has to stand before it drives on, as it may be elsewhere."""
+        self.waits = False
+        """Whether it stands, and its pose is all that is wrong."""
 
     @property
     def stays(self) -> bool:
@@ -67,13 +69,22 @@ class Brakes:
             self.count += 1
             if doubted:
                 self._times = self._times + 1 if self._driven < self._soon else 1
-        self.reason, self._well, self._driven = reason, 0, 0
+        self.reason, self._well, self._driven, self.waits = reason, 0, 0, False
         self.until_standing = self.until_standing or until_standing
 
-    def released(self, speed: float) -> bool:
-        """Takes an odometry message with which nothing is wrong, at ``speed`` (m/s); whether it drives."""
+    def released(self, speed: float, *, displaced: bool = False) -> bool:
+        """Takes an odometry message with which nothing is wrong; whether it drives.
+
+        Args:
+            speed: of the car (m/s).
+            displaced: whether its pose has jumped, and not come back.
+        """
         self._well += 1
         self._driven += not self.reason
-        if self._well > self._enough and not self.stays and not (self.until_standing and abs(speed) > self.standing):
-            self.reason, self.until_standing = "", False
+        released = self._well > self._enough and not self.stays
+        if released and self.until_standing:
+            self.waits = displaced and abs(speed) <= self.standing
+            released = not displaced and abs(speed) <= self.standing
+        if released:
+            self.reason, self.until_standing, self.waits = "", False, False
         return not self.reason

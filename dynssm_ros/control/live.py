@@ -231,6 +231,8 @@ class LiveController:
             return refusal
         if self._contract.jumps > self._jumps:
             self._jumps = self._contract.jumps
+            if abs(seen.v_x) <= self.brakes.standing:  # somebody sets it
+                self._contract.settle()
             self.brakes.apply("the pose jumped", until_standing=True, doubted=True)
         elif late > self._max_late:
             self.brakes.apply(f"odometry comes {late:.2f} s later than its fastest")
@@ -255,7 +257,7 @@ class LiveController:
         self.laps.passed((stamp - self._first) / 1e9, pose.x, pose.y, together)
         if self._is_lost(gap):
             self.brakes.apply(f"{self.laps.outside:.3g} m outside the borders")
-        if self.brakes.released(seen.v_x):
+        if self.brakes.released(seen.v_x, displaced=self._contract.is_displaced):
             return self._answer(stamp, pose, seen)
         if not self.brakes.until_standing:
             self._believe(stamp, pose, seen)
@@ -365,7 +367,8 @@ class LiveController:
     def verdict(self) -> tuple[Level, str]:
         """How it goes, in words."""
         if self.brakes.reason:
-            return Level.ERROR, f"{self.brakes.reason}: brakes{' until it is configured anew' * self.brakes.stays}"
+            until = " until it is configured anew" if self.brakes.stays else " until the pose is set anew"
+            return Level.ERROR, f"{self.brakes.reason}: brakes{until * (self.brakes.stays or self.brakes.waits)}"
         output, level, words = self.remote.output, Level.OK, ""
         if output.source == RemoteModel.NOMINAL:
             level, words = Level.WARN, f", nothing from the predictor for {self._max_age:g} s"

@@ -8,7 +8,8 @@ from __future__ import annotations
 import threading
 import time
 import traceback
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
@@ -16,15 +17,37 @@ from weakref import WeakKeyDictionary
 from rcl_interfaces.msg import Parameter, SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, await_or_execute
+from rclpy.executors import (
+    ExternalShutdownException,
+    SingleThreadedExecutor,
+    TimeoutException,
+    await_or_execute,
+    timeout_sec_to_nsec,
+)
+from rclpy.guard_condition import GuardCondition
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from rclpy.task import Future
+from rclpy.timer import Timer
 
 from dynssm_ros.errors import UserError
 from dynssm_ros.runtime.health import Level
 
 _Result = TypeVar("_Result")
+_KINDS = ("timer", "subscription", "guard_condition", "client", "service")
+_LOOK_S = 1.0  # after which rclpy looks for what is not in the kept wait set
+_POLL_S = 0.02  # between looks at callbacks that wait for something
 _RECENT_S = 10.0  # for which the verdict speaks of an exception
+
+
+def take(subscription: Subscription) -> tuple[Any, Mapping[str, int]] | None:
+    """Takes the oldest message that waits, with its times; ``None`` if none does."""
+    with subscription.handle:
+        taken: tuple[Any, Mapping[str, int]] | None = subscription.handle.take_message(
+            subscription.msg_type, subscription.raw
+        )
+    return taken
 
 
 class FinishedError(UserError):
@@ -79,8 +102,63 @@ def failures(node: Node) -> Failures:
     return _FAILURES.setdefault(node, Failures())
 
 
+class _KeptWaitSet:
+    """What a node waits for, in one wait set that is kept from wait to wait.
+
+    Args:
+        node: whose entities they are, as they are now. Events of the middleware are not among them.
+        guards: of its executor.
+    """
+
+    def __init__(self, node: Node, guards: Iterable[GuardCondition]) -> None:
+        self._timers, self._subscriptions, self._guards = list(node.timers), list(node.subscriptions), list(node.guards)
+        groups: dict[str, list[Any]] = {
+            "subscription": self._subscriptions,
+            "guard_condition": [*guards, *self._guards],
+            "timer": self._timers,
+            "client": list(node.clients),
+            "service": list(node.services),
+        }
+        self._in_use = ExitStack()
+        for handle in [node.context.handle, *(entity.handle for entities in groups.values() for entity in entities)]:
+            self._in_use.enter_context(handle)
+        self._set = rclpy_implementation.WaitSet(*map(len, groups.values()), 0, node.context.handle)
+        self._add = [
+            partial(getattr(self._set, f"add_{kind}"), entity.handle)
+            for kind, entities in groups.items()
+            for entity in entities
+        ]
+
+    def wait(self, nanoseconds: int) -> tuple[list[Timer], list[Subscription], bool]:
+        """Timers that are due, subscriptions with a message, and whether anything else is to be done.
+
+        Args:
+            nanoseconds: how long at most; for ever if negative.
+        """
+        self._set.clear_entities()
+        for add in self._add:
+            add()
+        self._set.wait(nanoseconds)
+        timers, messages, guards, *asked = map(self._set.get_ready_entities, _KINDS)
+        for guard in self._guards:  # the wait took its trigger; rclpy gives it back where this says so
+            guard._executor_triggered |= guard.handle.pointer in guards
+        return (
+            [timer for timer in self._timers if timer.handle.pointer in timers],
+            [subscription for subscription in self._subscriptions if subscription.handle.pointer in messages],
+            bool(guards or any(asked)),
+        )
+
+    def close(self) -> None:
+        """Lets entities be destroyed."""
+        self._in_use.close()
+
+
 class EnduringExecutor(SingleThreadedExecutor):
     """Serves one node, whatever its callbacks raise.
+
+    Callbacks of timers and subscriptions, which are functions, are called straight from a wait set that is kept. rclpy makes
+    a new one for each, and a second one after it, which takes longer than a prediction. All else is left to rclpy: what is
+    in the wait set at once, events of the middleware within a second.
 
     Args:
         node: with all its services.
@@ -89,6 +167,8 @@ class EnduringExecutor(SingleThreadedExecutor):
     def __init__(self, node: Node) -> None:
         super().__init__(context=node.context)
         self._node = node
+        self._kept: _KeptWaitSet | None = None
+        self._looked = time.monotonic()
         self.add_node(node)
         for service in node.services:
             answer: Any = partial(self._answer, service.srv_name, service.callback)  # rclpy awaits it
@@ -102,13 +182,56 @@ class EnduringExecutor(SingleThreadedExecutor):
             FinishedError: of a callback.
         """
         try:
-            super().spin_once(timeout_sec)
+            self._serve(timeout_sec_to_nsec(timeout_sec))
         except (ExternalShutdownException, FinishedError):
             raise
         except Exception as error:
             if not self.context.ok():
                 raise
             failures(self._node).add(self._node, error)
+
+    def spin(self) -> None:
+        """Serves until rclpy is shut down."""
+        try:
+            super().spin()
+        finally:
+            self._forget()
+
+    def _serve(self, nanoseconds: int) -> None:
+        if self._kept is None:
+            self._kept = _KeptWaitSet(self._node, (self._guard, self._sigint_gc))
+        unfinished = any(not task.done() for task, *_ in self._tasks)
+        timers, subscriptions, others = self._kept.wait(int(1e9 * _POLL_S) if unfinished else nanoseconds)
+        if not self.context.ok():
+            raise ExternalShutdownException
+        if others or time.monotonic() - self._looked > (_POLL_S if unfinished else _LOOK_S):
+            self._forget()  # entities that came or went are among what wakes an executor
+            self._serve_others()
+            return
+        for timer in timers:
+            if timer.handle.is_timer_ready():
+                timer.handle.call_timer()
+                timer.callback()
+        for subscription in subscriptions:
+            if (taken := take(subscription)) is not None:
+                alone = subscription._callback_type is Subscription.CallbackType.MessageOnly
+                subscription.callback(*taken[: 1 if alone else 2])
+
+    def _serve_others(self) -> None:
+        """Lets rclpy serve each that is due once, timers and messages among them."""
+        self._looked, self._cb_iter = time.monotonic(), None
+        while True:
+            try:
+                handler, _, _ = self.wait_for_ready_callbacks(0)
+            except TimeoutException:
+                return
+            handler()
+            handler.result()
+
+    def _forget(self) -> None:
+        if self._kept is not None:
+            self._kept.close()
+            self._kept = None
 
     async def _answer(self, name: str, callback: Callable[..., Any], request: Any, response: Any) -> Any:
         try:

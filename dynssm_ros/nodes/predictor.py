@@ -30,7 +30,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.nodes.commands import candidate, rollout_as
 from dynssm_ros.nodes.display import Markers, frame_sender
-from dynssm_ros.nodes.executor import in_thread, let_wait
+from dynssm_ros.nodes.executor import in_thread, let_wait, take
 from dynssm_ros.nodes.managed import ManagedNode
 from dynssm_ros.nodes.rivals import WatchedOutput
 from dynssm_ros.nodes.support import (
@@ -45,7 +45,6 @@ from dynssm_ros.nodes.support import (
     run,
     set_pose,
     set_stamp,
-    take,
     waited,
     waiting,
 )

@@ -32,7 +32,7 @@ from sensor_msgs.msg import JointState
 from dynssm_ros.configuration import config_root
 from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.extras import load_plugins
-from dynssm_ros.nodes.executor import EnduringExecutor, failures
+from dynssm_ros.nodes.executor import EnduringExecutor, failures, take
 from dynssm_ros.vehicle import Applied
 from dynssm_ros.vehicle.single_track import SetPoint
 
@@ -72,15 +72,6 @@ def listen(
     return node.create_subscription(
         msgtype, topic, callback, copy(qos), qos_overriding_options=QoSOverridingOptions.with_default_policies()
     )
-
-
-def take(subscription: Subscription) -> tuple[Any, Mapping[str, int]] | None:
-    """Takes the oldest message that waits, with its times; ``None`` if none does."""
-    with subscription.handle:
-        taken: tuple[Any, Mapping[str, int]] | None = subscription.handle.take_message(
-            subscription.msg_type, subscription.raw
-        )
-    return taken
 
 
 def waiting(subscription: Subscription) -> Iterator[tuple[Any, Mapping[str, int]]]:

@@ -60,8 +60,24 @@ class Consistency:
         """What was refused last."""
         self.forget()
 
+    @property
+    def is_displaced(self) -> bool:
+        """Whether jumps have moved the pose away from where it was, and none has moved it back."""
+        way, turn = self._driven
+        turned = abs(math.remainder(self._turned, 2 * math.pi))
+        return abs(self._moved) > _JUMP * self._wheelbase + way or turned > _TURN + turn
+
+    def settle(self) -> None:
+        """The pose is right as it is."""
+        self._moved, self._turned = 0j, 0.0  # m, rad, by jumps
+        self._driven = 0.0, 0.0  # m, rad, of it at most
+
     def forget(self) -> None:
-        """The next message is the first."""
+        """The next message is the first, and right."""
+        self.settle()
+        self._begin()
+
+    def _begin(self) -> None:
         self._suspect: tuple[int, Pose, State] | None = None
         self._restart()
 
@@ -90,7 +106,7 @@ class Consistency:
         if self._last is not None and not 0 < stamp - self._last[0] <= _GAP_S * 1e9:
             if -_GAP_S * 1e9 < stamp - self._last[0] <= 0:
                 return None  # in disorder: refused elsewhere
-            self.forget()
+            self._begin()
         if self._last is not None and not self._follows(self._last, stamp, pose, seen):
             suspect, self._suspect = self._suspect, (stamp, pose, seen)
             if suspect is None or suspect[0] >= stamp or not self._follows(suspect, stamp, pose, seen):
@@ -100,24 +116,35 @@ class Consistency:
                     f"{before.x:.4g} m, {before.y:.4g} m, {before.theta:.3g} rad"
                 )
                 return Refusal.JUMPED
-            self.jumps += 1
+            self._jump(self._last, *suspect)
             self._restart(in_doubt=True)
         self._suspect = None
         self._pass(stamp, pose, seen)
         return self._contradiction(stamp)
 
-    def _follows(self, before: tuple[int, Pose, State], stamp: int, pose: Pose, seen: State) -> bool:
-        """Whether the car can have moved to ``pose`` since ``before``."""
-        then, was, had = before
+    def _possible(self, before: tuple[int, Pose, State], stamp: int, seen: State) -> tuple[float, float]:
+        """How far (m) and by how much (rad) the car can have moved and turned since ``before``."""
+        then, _, had = before
         if before is self._last:
             then = self._still_since[0]  # a slow localisation may say the same several times
         elapsed = abs(stamp - then) / 1e9
         speed = max(math.hypot(seen.v_x, seen.v_y), math.hypot(had.v_x, had.v_y))
-        if math.hypot(pose.x - was.x, pose.y - was.y) > _JUMP * self._wheelbase + _FASTER * speed * elapsed:
+        return _FASTER * speed * elapsed, 2.0 * max(abs(seen.omega), abs(had.omega)) * elapsed
+
+    def _follows(self, before: tuple[int, Pose, State], stamp: int, pose: Pose, seen: State) -> bool:
+        """Whether the car can have moved to ``pose`` since ``before``."""
+        was, (way, turn) = before[1], self._possible(before, stamp, seen)
+        if math.hypot(pose.x - was.x, pose.y - was.y) > _JUMP * self._wheelbase + way:
             return False
-        turned = abs(math.remainder(pose.theta - was.theta, 2 * math.pi))
-        possible: float = _TURN + 2.0 * max(abs(seen.omega), abs(had.omega)) * elapsed
-        return turned <= possible
+        return abs(math.remainder(pose.theta - was.theta, 2 * math.pi)) <= _TURN + turn
+
+    def _jump(self, before: tuple[int, Pose, State], stamp: int, pose: Pose, seen: State) -> None:
+        """Notes a jump to ``pose``, and how much of it may have been driven."""
+        was, (way, turn) = before[1], self._possible(before, stamp, seen)
+        self.jumps += 1
+        self._moved += complex(pose.x - was.x, pose.y - was.y)
+        self._turned += pose.theta - was.theta
+        self._driven = self._driven[0] + way, self._driven[1] + turn
 
     def _pass(self, stamp: int, pose: Pose, seen: State) -> None:
         ways, way = (0j,) * (1 + len(_EXPLANATIONS)), 0.0

@@ -179,6 +179,15 @@ class Plausibility:
         """Jumps of the pose that a second message confirmed."""
         return self._consistency.jumps
 
+    @property
+    def is_displaced(self) -> bool:
+        """Whether jumps have moved the pose away from where it was, and none has moved it back."""
+        return self._consistency.is_displaced
+
+    def settle(self) -> None:
+        """The pose is right as it is."""
+        self._consistency.settle()
+
     def forget(self) -> None:
         """The next samples are the first."""
         self._consistency.forget()

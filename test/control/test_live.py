@@ -249,7 +249,8 @@ def test_odometry_that_is_wrong_again_and_again_is_believed_no_more(online, orca
     assert controller.verdict() == (Level.ERROR, "the odometry is in other frames: brakes until it is configured anew")
 
 
-def test_a_car_that_may_be_elsewhere_stands_before_it_drives_on(online, orca, club):
+@pytest.mark.parametrize("anew", [0.0, 0.4], ids=["back", "elsewhere"])
+def test_a_car_that_may_be_elsewhere_stands_until_its_pose_is_set_anew(online, orca, club, anew):
     controller, car = online(), SteppedCar(orca, club)
     for _ in range(20):
         car.answered(controller)
@@ -257,10 +258,29 @@ def test_a_car_that_may_be_elsewhere_stands_before_it_drives_on(online, orca, cl
     for _ in range(100):
         car.answered(controller, spoilt=lambda pose, seen: (pose._replace(y=pose.y + 0.2), seen))
         speeds.append(car.plant.measured.v_x)
-        if controller.brakes.count and not controller.brakes.reason:
-            break
-    assert min(speeds) < 0.2
+    assert abs(speeds[-1]) < 0.02
     assert speeds == sorted(speeds, reverse=True), "without a break"
+    assert controller.verdict() == (Level.ERROR, "the pose jumped: brakes until the pose is set anew")
+    for _ in range(10):
+        car.answered(controller, spoilt=lambda pose, seen: (pose._replace(y=pose.y + anew), seen))
+    assert controller.brakes.reason == ""
+
+
+def test_a_pose_that_jumps_and_comes_back_at_speed_is_believed_once_the_car_stands(online, orca, club):
+    controller, car = online(), SteppedCar(orca, club)
+    for _ in range(20):
+        car.answered(controller)
+    for _ in range(5):
+        car.answered(controller, spoilt=lambda pose, seen: (pose._replace(theta=pose.theta + 1.5), seen))
+    stood = False
+    for _ in range(100):
+        car.answered(controller)
+        if not controller.brakes.reason:
+            break
+        stood = car.plant.measured.v_x < 0.2
+    assert stood
+    assert controller.brakes.reason == ""
+    assert controller.brakes.count == 1
 
 
 def test_odometry_that_comes_twice_or_late_is_refused(online, orca, club):

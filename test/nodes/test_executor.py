@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,12 +15,16 @@ from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter as Value
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.nodes.controller import ControllerNode
-from dynssm_ros.nodes.executor import EnduringExecutor, Failures, failures, refused
+from dynssm_ros.nodes.executor import EnduringExecutor, Failures, failures, in_thread, refused
 from dynssm_ros.nodes.managed import ManagedNode
 from dynssm_ros.runtime.health import Level
 
@@ -125,6 +132,111 @@ def test_a_node_survives_its_timers_forbidden_transitions_and_parameters_of_no_t
     assert failures(node).count == 6
     node.destroy_node()
     asking.destroy_node()
+
+
+@pytest.fixture
+def node(ros: None) -> Iterator[Node]:
+    made = rclpy.create_node("served")
+    yield made
+    made.destroy_node()
+
+
+@pytest.fixture
+def executor(node: Node) -> EnduringExecutor:
+    return EnduringExecutor(node)
+
+
+def spin_until(executor: EnduringExecutor, done: Callable[[], bool]) -> None:
+    """Fails if it is not done within 30 s."""
+    end = time.monotonic() + 30.0
+    while not done():
+        assert time.monotonic() < end
+        executor.spin_once(0.1)
+
+
+@pytest.mark.live
+@pytest.mark.timeout(60)
+def test_subscriptions_are_served_in_their_order_and_one_that_raises_holds_up_no_other(
+    node: Node, executor: EnduringExecutor
+) -> None:
+    heard: list[str] = []
+
+    def fail(message: String) -> None:
+        heard.append(f"fails {message.data}")
+        raise RuntimeError("of the message")
+
+    node.create_subscription(String, "first", lambda message: heard.append(f"first {message.data}"), 10)
+    node.create_subscription(String, "fails", fail, 10)
+    node.create_subscription(
+        String, "last", lambda message, times: heard.append(f"last {message.data}" * bool(times)), 10
+    )
+    first, fails, last = (node.create_publisher(String, topic, 10) for topic in ("first", "fails", "last"))
+    spin_until(executor, lambda: all(each.get_subscription_count() for each in (first, fails, last)))
+    for publisher in (last, fails, first):
+        publisher.publish(String(data="1"))
+    time.sleep(0.1)  # an executor that sees but some of them serves those
+    spin_until(executor, lambda: len(heard) == 3)
+    assert heard == ["first 1", "fails 1", "last 1"]
+    assert failures(node).count == 1
+
+
+@pytest.mark.live
+@pytest.mark.timeout(60)
+def test_what_a_callback_makes_is_waited_for_and_what_it_destroys_no_more(
+    node: Node, executor: EnduringExecutor
+) -> None:
+    heard: list[int] = []
+
+    def begin() -> None:
+        node.destroy_timer(timer)
+        node.create_subscription(String, "made_later", lambda _: heard.append(1), 10)
+
+    timer = node.create_timer(1e-3, begin)
+    publisher = node.create_publisher(String, "made_later", 10)
+    spin_until(executor, lambda: publisher.get_subscription_count() > 0)
+    publisher.publish(String())
+    spin_until(executor, lambda: bool(heard))
+    assert [*node.timers] == []
+
+
+@pytest.mark.live
+@pytest.mark.timeout(60)
+def test_messages_guards_and_other_services_are_served_while_a_service_waits_for_a_thread(
+    node: Node, executor: EnduringExecutor
+) -> None:
+    heard: list[str] = []
+    go_on = threading.Event()
+
+    async def wait(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        await in_thread(node, lambda: go_on.wait(30.0))
+        response.message = "waited"
+        return response
+
+    def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = "at once"
+        return response
+
+    group = MutuallyExclusiveCallbackGroup()
+    node.create_service(Trigger, "waits", wait, callback_group=group)
+    node.create_service(Trigger, "answers", answer)
+    node.create_subscription(String, "topic", lambda message: heard.append(message.data), 10)
+    guard = node.create_guard_condition(lambda: heard.append("guard"))
+    publisher = node.create_publisher(String, "topic", 10)
+    waits, answers = (node.create_client(Trigger, name) for name in ("waits", "answers"))
+    spin_until(executor, lambda: waits.service_is_ready() and answers.service_is_ready())
+    spin_until(executor, lambda: publisher.get_subscription_count() > 0)
+    waiting = waits.call_async(Trigger.Request())
+    spin_until(executor, lambda: bool(executor._tasks))
+    at_once = answers.call_async(Trigger.Request())
+    publisher.publish(String(data="message"))
+    guard.trigger()
+    spin_until(executor, lambda: at_once.done() and len(heard) == 2)
+    assert at_once.result().message == "at once"
+    assert sorted(heard) == ["guard", "message"]
+    assert not waiting.done()
+    go_on.set()
+    spin_until(executor, waiting.done)
+    assert waiting.result().message == "waited"
 
 
 @pytest.mark.live
