@@ -145,16 +145,17 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
     assert not replace(strong, sure=2.9).pays
     assert not replace(strong, confirmation=None).pays
     centre_known = 0.02 * (ORCA.constants.l_f + ORCA.constants.l_r)
-    for effect, values, pays in (
-        ("grip", {"factor": 0.85}, True),
-        ("grip", {"factor": 0.95}, False),
-        ("load_transfer", {"height": -0.011}, True),
-        ("load_transfer", {"height": -0.009}, False),
-        ("odometry_lever_arm", {"x": -1.1 * centre_known}, True),
-        ("odometry_lever_arm", {"x": 0.9 * centre_known}, False),
-        ("odometry_lever_arm", {"x": 0.9 * centre_known, "y": 0.9 * centre_known}, True),
+    for effect, values, sure, pays in (
+        ("grip", {"factor": 0.85}, 10.0, True),
+        ("grip", {"factor": 0.95}, 50.0, False),
+        ("grip", {"factor": 0.884}, 6.2, False),  # 0.9 standard deviations more than any car
+        ("load_transfer", {"height": -0.011}, 34.0, True),
+        ("load_transfer", {"height": -0.011}, 32.0, False),
+        ("odometry_lever_arm", {"x": -1.1 * centre_known}, 34.0, True),
+        ("odometry_lever_arm", {"x": 0.9 * centre_known}, 50.0, False),
+        ("odometry_lever_arm", {"x": 0.9 * centre_known, "y": 0.9 * centre_known}, 20.0, True),
     ):
-        sized = replace(strong, candidate=Candidate(effect, tuple(values)), least=fit.car.least(effect, 0.3))
+        sized = replace(strong, candidate=Candidate(effect, tuple(values)), sure=sure, least=fit.car.least(effect, 0.3))
         assert replace(sized, fit=replace(fit, car=fit.car.with_effect(effect, values))).pays == pays
     for length, pays in ((0.5, True), (0.8, False)):
         values = {"factor": 0.8, "centre": 0.3, "length": length}
@@ -242,7 +243,7 @@ def test_every_variant_of_an_effect_is_compared_with_its_least_size(name: str) -
     for variant in EFFECTS[name].variants():
         fit: Any = SimpleNamespace(car=car)
         one = Refined(Candidate(name, variant), fit, 0.0, 0.0, least=car.least(name, 0.1))
-        assert one.is_little == (one.least > 0.0)
+        assert (one.beyond <= 0.0) == (one.least > 0.0)
 
 
 def test_what_the_file_has_already_must_change_noticeably_to_be_a_cause() -> None:

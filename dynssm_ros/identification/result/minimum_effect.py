@@ -44,9 +44,10 @@ def minimum_detectable(problem: IdentificationProblem, fit: Fit, found: Iterable
         left = [one for each in sizes.values() for one in each if not one.settled]
         for one, worth in zip(left, nearby.worth(left), strict=True):
             one.change(float(worth))
+    seen = {effect: float(np.median([one.size for one in each])) for effect, each in sizes.items()}
+    steered = problem.windows.steered
     return {
-        effect: max(float(np.median([one.size for one in each])), fit.car.least(effect, problem.windows.steered))
-        for effect, each in sizes.items()
+        effect: max(size, nearby.surely_more(size, fit.car.least(effect, steered))) for effect, size in seen.items()
     }
 
 
@@ -149,6 +150,13 @@ class _Nearby:
         share = np.max((rest[..., -3:] ** 2).sum(axis=1) / self._error, axis=1)
         matters = share / (tuning.SMALL_SHARE / (1 - tuning.SMALL_SHARE))
         return np.asarray(np.minimum(told / self._needed, np.where(2 * seen < told, np.inf, matters)))
+
+    def surely_more(self, size: float, least: float) -> float:
+        """What is surely more than ``least``, which any car has; nothing if that is nothing.
+
+        An effect of ``size`` is worth what makes it a cause, so that this many standard deviations are known.
+        """
+        return least + tuning.SURE_STD * size / float(np.sqrt(self._needed)) if least else 0.0
 
     def _told(self, rest: Vector, followed: Vector) -> Vector:
         """Twice the logarithm of the likelihood of what is left and of how far the fitted values moved, ``(n,)``."""

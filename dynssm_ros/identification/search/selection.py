@@ -39,7 +39,7 @@ class Refined:
         delta_bic: what is left of it when its parameters are paid for.
         confirmation: what it improves on parts of the drive that were left out; ``None``: it was not worth a look.
         sure: by how many standard deviations one of its amplitudes is off neutral.
-        least: how far off neutral it is in any car.
+        least: how far off neutral it is in any car: one of another structure, or as the file has it.
         bounded: its amplitudes that are at a bound: the data ask for more than such a thing can be.
     """
 
@@ -78,18 +78,18 @@ class Refined:
         return about.at_bound(value) and value > about.neutral
 
     @property
-    def is_little(self) -> bool:
-        """Whether a cause of the car is nearer to neutral than what any car shows, one of another structure, or its file."""
-        if not self.least or self.candidate.only_in:
-            return False
+    def beyond(self) -> float:
+        """Share of its size that is more than any car has; below 0 where it is less."""
+        if not self.least:
+            return 1.0
         amplitudes = {name: self.values[name] for name in self.candidate.amplitudes}
-        return EFFECTS[self.candidate.effect].amount(amplitudes) < self.least
+        return 1.0 - self.least / max(EFFECTS[self.candidate.effect].amount(amplitudes), 1e-300)
 
     @property
     def is_asked_for(self) -> bool:
-        """Whether the fitted laps ask for it: it is worth its parameters, sure, large enough, and of a part of the lap."""
-        asked = self.delta_bic > tuning.DECISIVE_DELTA_BIC and self.sure > tuning.SURE_STD
-        return asked and not self.is_little and not self.is_everywhere
+        """Whether the fitted laps ask for it: worth its parameters, surely more than any car has, of a part of the lap."""
+        surely_more = self.sure * self.beyond > tuning.SURE_STD
+        return self.delta_bic > tuning.DECISIVE_DELTA_BIC and surely_more and not self.is_everywhere
 
     @property
     def pays(self) -> bool:
@@ -367,7 +367,7 @@ class Search:
         own = self._problem.inflation(fit, len(fit.free) - len(without.free))
         improvement = (without.objective - fit.objective) * min(1.0, self._problem.tempering / own)
         delta = improvement - self._price * candidate.cost
-        least = fit.car.least(candidate.effect, self._problem.windows.steered)
+        least = 0.0 if candidate.only_in else fit.car.least(candidate.effect, self._problem.windows.steered)
         return Refined(candidate, fit, improvement, delta, least=least)
 
     def _against(self, chosen: tuple[Candidate, ...], one: Candidate) -> Refined:
