@@ -1,12 +1,13 @@
 """A start for a car that nobody has trained on: the online layer with a prior over simulated cars of its class.
 
     python -m benchmarks.any_car [--only racer] [--cars 45] [--test] [--out out/any_car] [--data DIR]
+    python -m benchmarks.any_car --vehicle car.yaml [--cars 45] [--out out/any_car]
 
 Each drawn car has its drive (:mod:`benchmarks.drawn_cars`), on which its weights of the online layer are estimated, with
 the car of the class's middle as physics. The prior is the normal distribution over cars that makes all drives likeliest. It
 is written as a model folder, ``dynssm_any_CLASS``, and scored on drives of a real car of the class: by the time that the
 layer has seen, over the errors of ``rls`` that was trained on other drives of that car. ``--test`` takes the logs that are
-for publishing.
+for publishing. ``--vehicle`` writes a model for cars like that of a file.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from benchmarks.drawn_cars import CLASSES, drives, middle
+from benchmarks.drawn_cars import CLASSES, CarClass, drives
 from benchmarks.network import Fold, Study, further_folds
 from benchmarks.page import table
 from dynssm_ros.arrays import Indices, Vector
@@ -131,16 +132,16 @@ class Start(NamedTuple):
     cars: list[Moments]
 
     @classmethod
-    def of(cls, name: str, logs: Sequence[Recording]) -> Start:
+    def of(cls, cars: CarClass, logs: Sequence[Recording]) -> Start:
         """From the drives of cars of a class."""
-        car, joined = middle(name), concatenate(logs)
+        car, joined = cars.middle, concatenate(logs)
         config = load_model_config("rls")
         H = config.rows(car.sampling_time)
         scale = normalisation(joined, joined.window_ends(H, min_speed=car.minimum_speed))
-        base = LayerBase(car, PhysicsConfig(), scale, H, OnlineConfig(throttle_steps=CLASSES[name].throttle_steps))
+        base = LayerBase(car, PhysicsConfig(), scale, H, OnlineConfig(throttle_steps=cars.throttle_steps))
         features = base.features(False)
-        cars = [moments_of(drive_of(log, base, features), np.array(scale.increment_scale)) for log in logs]
-        return cls(base, features, joined, [one for one in cars if one.rows >= _FEWEST_ROWS])
+        moments = [moments_of(drive_of(log, base, features), np.array(scale.increment_scale)) for log in logs]
+        return cls(base, features, joined, [one for one in moments if one.rows >= _FEWEST_ROWS])
 
     def layer(self, prior: OverCars) -> OnlineLayer:
         """The online layer that begins with a prior; it does not follow coefficients, which are nobody's."""
@@ -306,16 +307,23 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/any_car"))
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--only", default="", choices=["", *CLASSES], help="class of cars")
+    parser.add_argument(
+        "--vehicle", default="", help="vehicle file: writes a model for cars like this one, scores nothing"
+    )
     parser.add_argument("--cars", type=int, default=45, help="that are drawn of a class")
     parser.add_argument("--test", action="store_true", help="on logs that are for publishing only")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    for name in [arguments.only] if arguments.only else CLASSES:
-        start = Start.of(name, list(drives(name, arguments.cars, arguments.out / "cars")))
-        start.save(start.layer(over_cars(start.cars)), f"dynssm_any_{name}", arguments.out)
-        out = arguments.out / ("test" if arguments.test else "develop")
-        out.mkdir(parents=True, exist_ok=True)
-        print(f"{name}\n\n{page(scored(name, start, out, arguments.data, arguments.test))}\n")
+    out = arguments.out / ("test" if arguments.test else "develop")
+    out.mkdir(parents=True, exist_ok=True)
+    classes = {name: of for name, of in CLASSES.items() if arguments.only in ("", name)}
+    if arguments.vehicle:
+        classes = {"": CarClass.about(arguments.vehicle)}
+    for name, of in classes.items():
+        start = Start.of(of, list(drives(of, arguments.cars, arguments.out / "cars")))
+        print(start.save(start.layer(over_cars(start.cars)), f"dynssm_any_{of.name}", arguments.out).path)
+        found = scored(name, start, out, arguments.data, arguments.test) if name else {}
+        print(f"\n{page(found)}\n" if found else "")
 
 
 if __name__ == "__main__":

@@ -34,6 +34,11 @@ _LAGGING = 0.7  # share of cars with each of them
 _TRIES = 4
 _STEP = 5e-3  # s, of Runge and Kutta
 _SMOOTHED_S = 0.2  # of an odometry that is fitted to poses, at most
+_SPEED_NOISE, _AXLE_NOISE = 0.02, 0.007  # m/s; of omega the same times a wheelbase
+_BRAKING = -0.5  # a throttle that goes below is that of a car with brakes
+_SMALL_WHEELBASE, _LARGER = 0.062, 1.25
+"""Tracks are for 1:43 cars of that wheelbase (m). Larger cars are faster too: with 0.17 m a track is 3.6 times as large, with
+3 m 126 times."""
 _NOISES = 0.03, 2.0  # in usual deviations
 _HELD_S = 0.1  # for which an input's sample is held, at most
 
@@ -42,10 +47,31 @@ _HELD_S = 0.1  # for which an input's sample is held, at most
 class CarClass:
     """A class of cars."""
 
-    vehicle: str  # file of its middle
+    name: str
+    file: str  # vehicle file of its middle
     tracks: dict[str, float]  # names with their scales
     noise: tuple[float, float, float]  # usual deviations of the measured v_x, v_y, omega (m/s, m/s, rad/s)
-    throttle_steps: bool = False  # whether drive forces of such cars bend with the throttle
+    throttle_steps: bool = False  # as features of the layer: brakes take over from the engine
+
+    @classmethod
+    def about(cls, file: str) -> CarClass:
+        """The class about a vehicle file, with tracks and noise as other cars have them for their wheelbases."""
+        car = load_vehicle(file)
+        scale = (car.constants.wheelbase / _SMALL_WHEELBASE) ** _LARGER
+        omega = _AXLE_NOISE / car.constants.wheelbase
+        brakes = car.inputs.set_point == "throttle" and car.inputs.throttle[0] <= _BRAKING
+        noise = _SPEED_NOISE, _SPEED_NOISE, omega
+        return cls(car.name, file, {"club": scale, "club_b": scale}, noise, brakes)
+
+    @property
+    def middle(self) -> Vehicle:
+        """The car of its middle: its file, with lags in the middle of what is typical.
+
+        It steps by Runge and Kutta, since Euler steps ring in slow light cars.
+        """
+        car = load_vehicle(self.file).model_copy(update={"integrator": "rk4"})
+        lags = [(lag, {"time_constant": float(np.sqrt(np.prod(EFFECTS[lag].TYPICAL)))}) for lag in _LAGS]
+        return car.with_effects(lags)
 
 
 class _SingleTrack(Rk4Plant):
@@ -67,23 +93,17 @@ for _name, _plant in zip(_PLANTS, (_SingleTrack(), _DoubleTrack()), strict=True)
     register_plant(_name, _plant)
 
 CLASSES = {
-    "racer": CarClass(RACER, {"club": 3.0, "club_b": 3.0}, CARS["racer"].noise),
-    "indy": CarClass("indy", TRACKS, NOISE, throttle_steps=True),
+    of.name: of
+    for of in (
+        CarClass("racer", RACER, {"club": 3.0, "club_b": 3.0}, CARS["racer"].noise),
+        CarClass("indy", "indy", TRACKS, NOISE, throttle_steps=True),
+    )
 }
 
 
-def middle(name: str) -> Vehicle:
-    """The car of a class's middle: its file, with lags in the middle of what is typical.
-
-    It steps by Runge and Kutta, since Euler steps ring in slow light cars.
-    """
-    car = load_vehicle(CLASSES[name].vehicle).model_copy(update={"integrator": "rk4"})
-    return car.with_effects([(lag, {"time_constant": float(np.sqrt(np.prod(EFFECTS[lag].TYPICAL)))}) for lag in _LAGS])
-
-
-def drawn(name: str, seed: int) -> tuple[Vehicle, PlantKind]:
-    """A car of the class with that name, and how it moves."""
-    file, rng = load_vehicle(CLASSES[name].vehicle), np.random.default_rng([seed, 21])
+def drawn(of: CarClass, seed: int) -> tuple[Vehicle, PlantKind]:
+    """A car of the class, and how it moves."""
+    file, rng = load_vehicle(of.file), np.random.default_rng([seed, 21])
     spread = np.array([std or 0.0 for std in file.std])
     theta = np.clip(file.nominal + spread * rng.standard_normal(len(spread)), file.lower, file.upper)
     others = [effect for effect in EFFECTS if effect not in _LAGS]
@@ -93,14 +113,14 @@ def drawn(name: str, seed: int) -> tuple[Vehicle, PlantKind]:
     return car, _PLANTS[int(rng.integers(2))]
 
 
-def drive(name: str, seed: int) -> Recording | None:
+def drive(of: CarClass, seed: int) -> Recording | None:
     """The drive of a drawn car without errors of sensors; ``None`` if it cannot be driven however gently."""
     rng = np.random.default_rng([seed, 22])
-    track = str(rng.choice(list(CLASSES[name].tracks)))
-    road = load_track(track).scaled(CLASSES[name].tracks[track])
+    track = str(rng.choice(list(of.tracks)))
+    road = load_track(track).scaled(of.tracks[track])
     aggressiveness, variation = float(rng.uniform(0.2, 0.9)), float(rng.uniform(0.4, 0.9))
     with suppress(UserError, ValueError):
-        car, plant = drawn(name, seed)
+        car, plant = drawn(of, seed)
         for attempt in range(_TRIES):
             style = Style(aggressiveness * 0.75**attempt, variation)
             with suppress(SimulationError):
@@ -108,31 +128,31 @@ def drive(name: str, seed: int) -> Recording | None:
     return None
 
 
-def drives(name: str, count: int, kept: Path) -> Iterator[Recording]:
+def drives(of: CarClass, count: int, kept: Path) -> Iterator[Recording]:
     """Drives of the first ``count`` cars that can be driven; kept in a folder, and measured as :func:`measured` says."""
     kept.mkdir(parents=True, exist_ok=True)
     seed = -1
     while count:
         seed += 1
-        file, failed = kept / f"{name}_{seed}.parquet", kept / f"{name}_{seed}.undrivable"
+        file, failed = kept / f"{of.name}_{seed}.parquet", kept / f"{of.name}_{seed}.undrivable"
         if failed.exists():
             continue
         if not file.exists():
-            recording = drive(name, seed)
+            recording = drive(of, seed)
             if recording is None:
                 failed.touch()
                 continue
             recording.save(file)
         count -= 1
-        yield measured(Recording.load(file), name, seed)
+        yield measured(Recording.load(file), of, seed)
 
 
-def measured(recording: Recording, name: str, seed: int) -> Recording:
+def measured(recording: Recording, of: CarClass, seed: int) -> Recording:
     """The drive as its car's sensors and estimators give it: noise, smoothing, inputs that are sampled seldom."""
     rng, T_s = np.random.default_rng([seed, 23]), recording.T_s
     recording = recording.with_commands("none")
     columns = dict(recording.columns)
-    noise = np.exp(rng.uniform(*np.log(_NOISES))) * np.array(CLASSES[name].noise)
+    noise = np.exp(rng.uniform(*np.log(_NOISES))) * np.array(of.noise)
     rows = 2 * int(rng.integers(0, round(_SMOOTHED_S / T_s / 2) + 1)) + 1
     for signal, deviation in zip(STATE_SIGNALS, noise, strict=True):
         columns[signal] = smoothed(columns[signal] + deviation * rng.standard_normal(len(recording)), rows)

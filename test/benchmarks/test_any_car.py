@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks import any_car, drawn_cars
 from benchmarks.any_car import OWN, Errors, OverCars, Start, over_cars
+from benchmarks.drawn_cars import CarClass
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.evaluation.open_loop import accuracies
 from dynssm_ros.learning.online import Moments
@@ -17,6 +18,7 @@ from dynssm_ros.runtime.registry import load_model
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 
+RACERS = drawn_cars.CLASSES["racer"]
 MEAN, DEVIATIONS, NOISE = np.array([0.5, -1.0, 0.0]), np.array([0.3, 0.2, 1.0]), 0.2
 
 
@@ -57,11 +59,11 @@ def test_doubt_widens_the_prior_of_few_cars() -> None:
 
 
 def test_cars_are_drawn_within_their_bounds_and_the_same_again() -> None:
-    middle = drawn_cars.middle("racer")
+    middle = RACERS.middle
     cars = []
     for seed in range(20):
         with suppress(ConfigurationError):  # an effect that cannot act on such a car
-            cars.append(drawn_cars.drawn("racer", seed)[0])
+            cars.append(drawn_cars.drawn(RACERS, seed)[0])
     assert len(cars) > 12
     theta = np.array([car.nominal for car in cars])
     assert ((theta >= middle.lower) & (theta <= middle.upper)).all()
@@ -70,7 +72,19 @@ def test_cars_are_drawn_within_their_bounds_and_the_same_again() -> None:
     assert 0.4 < lagging < 1.0
     assert len({each.NAME for car in cars for each in car.active_effects}) > 6
     assert {each.NAME for car in cars for each in car.active_effects} <= {*EFFECTS}
-    assert drawn_cars.drawn("racer", 0) == drawn_cars.drawn("racer", 0)
+    assert drawn_cars.drawn(RACERS, 0) == drawn_cars.drawn(RACERS, 0)
+
+
+@pytest.mark.parametrize("file", ["f1tenth", "indy"])
+def test_cars_like_that_of_a_file_can_be_driven(file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawn_cars, "SECONDS", 1.0)
+    of = CarClass.about(file)
+    assert of.throttle_steps == (file == "indy")
+    logs = [log for seed in range(2) if (log := drawn_cars.drive(of, seed)) is not None]
+    assert logs
+    assert all(log.info.set_point == of.middle.inputs.set_point for log in logs)
+    largest = max(np.abs(log["v_x"] * log["omega"]).max() for log in logs)
+    assert 0.5 < largest < 20.0, "bends at the usual share of grip"
 
 
 def test_smoothing_is_the_slope_of_a_quadratic_through_the_path() -> None:
@@ -87,7 +101,7 @@ def test_smoothing_is_the_slope_of_a_quadratic_through_the_path() -> None:
 def test_sensors_hold_inputs_and_blur_speeds_and_a_seed_gives_the_same_again(drive: Any, orca: Vehicle) -> None:
     log = drive(orca, 400)
     for seed in range(5):
-        seen = drawn_cars.measured(log, "racer", seed)
+        seen = drawn_cars.measured(log, RACERS, seed)
         assert seen.info.commands == "none"
         assert not seen["r_cmd"].any()
         rows = np.flatnonzero(np.diff(seen["delta_fb"], prepend=np.nan))
@@ -95,15 +109,15 @@ def test_sensors_hold_inputs_and_blur_speeds_and_a_seed_gives_the_same_again(dri
         assert len(rows) >= 400 / 5
         blur = np.abs(seen["v_x"] - log["v_x"])[20:-20]
         assert 0 < blur.max() < 0.3
-    np.testing.assert_array_equal(drawn_cars.measured(log, "racer", 4).matrix, seen.matrix)
+    np.testing.assert_array_equal(drawn_cars.measured(log, RACERS, 4).matrix, seen.matrix)
 
 
 @pytest.fixture(scope="module")
 def start(drive: Any) -> Start:
     """Of three drives of the class's middle car, each with noise of its own."""
-    car = drawn_cars.middle("racer").model_copy(update={"integrator": "euler"})
+    car = RACERS.middle.model_copy(update={"integrator": "euler"})
     logs = [drive(car, 500, seed=seed, noise=(0.005, 0.005, 0.02)) for seed in range(3)]
-    return Start.of("racer", [log.with_commands("none") for log in logs])
+    return Start.of(RACERS, [log.with_commands("none") for log in logs])
 
 
 def test_the_model_folder_holds_the_prior_and_predicts(start: Start, tmp_path: Path) -> None:
