@@ -17,10 +17,11 @@ from dynssm_ros import __version__
 from dynssm_ros.api.inputs import PathLike
 from dynssm_ros.api.settings import CommandsSettings, keywords, setting
 from dynssm_ros.configuration import find_config
-from dynssm_ros.errors import ConfigurationError
+from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.extras import require
 from dynssm_ros.files import content_key, digest, forced, require_no_input, require_replaceable, write_json
 from dynssm_ros.progress import OnProgress
+from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import load_vehicle
 
 if TYPE_CHECKING:
@@ -140,6 +141,10 @@ def learn(
             records.append(StepRecord.model_validate(before))
             continue
         records.append(_done(step, key, told))
+        if number == 1 and not records[0].failure:
+            records[0] = records[0].model_copy(
+                update={"failure": _misfit(step.outputs[0], str(vehicle), settings.signals)}
+            )
         known[step.words] = records[-1].model_dump(mode="json")
         write_json(folder / STATE, {"steps": known})
         if records[-1].failure:
@@ -188,6 +193,18 @@ def plan(logs: Sequence[Path], vehicle: str, out: Path, settings: LearnSettings)
     rivals = ("--model", "single_track", "--model", "persistence", "--vehicle", str(found))
     words = ("evaluate", *laps, "--model", str(model), *rivals, *track, *jobs, "--out", str(out / "evaluation"))
     yield LearningStep("evaluate", words, (*recordings, model, found, *roads), (out / "evaluation" / "results.json",))
+
+
+def _misfit(suggested: Path, vehicle: str, signals: str | None) -> str:
+    """Why what a signal map gives is not what the car takes, found before anything else is done; empty if it is."""
+    from dynssm_ros.signals.recording import require_set_point
+
+    try:
+        of, car = load_signal_map(signals or suggested), load_vehicle(vehicle)
+        require_set_point(f"signal map {of.name}", of.set_point, car.inputs.set_point, f"vehicle {car.name}")
+    except UserError as error:
+        return str(error)
+    return ""
 
 
 def _names(logs: Sequence[Path]) -> list[str]:

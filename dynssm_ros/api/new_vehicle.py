@@ -10,6 +10,7 @@ from dynssm_ros.errors import SettingError
 from dynssm_ros.files import replacing, require_replaceable
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.draft import TYRES, MeasuredCar, Tyre, as_commented_file, drafted
+from dynssm_ros.vehicle.single_track import SetPoint
 
 NEEDED = ("mass", "front_mass", "wheelbase")
 
@@ -36,6 +37,9 @@ class NewVehicleSettings(VerbSettings):
     )
     steering: float | None = setting(
         None, "Largest angle of the road wheels (rad).", otherwise="that of the car to begin from", gt=0.0, le=1.57
+    )
+    set_point: SetPoint | None = setting(
+        None, "What the first input is: throttle, or speed (m/s).", otherwise="that of the car to begin from"
     )
     rate: float | None = setting(
         None, "Of the rows (Hz).", otherwise="that of the car to begin from", ge=1.0, le=1000.0
@@ -84,7 +88,7 @@ def new_vehicle(name: str, *, settings: NewVehicleSettings) -> VehicleDraft:
     like = vehicle_of(s.like)
     T_s = None if s.rate is None else 1 / s.rate
     measured = MeasuredCar(s.mass, s.front_mass, s.wheelbase, s.height, s.acceleration, s.steering, T_s)
-    vehicle = drafted(like, name, measured, s.tyre)
+    vehicle = drafted(like, name, measured, tyre=s.tyre, set_point=s.set_point)
     tyres = f"those of {like.name}" if s.tyre is None else TYRES[s.tyre].words
     head = (
         f"A guess: {like.name}, scaled to {s.mass:g} kg, {s.front_mass:g} kg of them in front, and a wheelbase of "

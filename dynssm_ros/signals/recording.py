@@ -48,6 +48,19 @@ _INPUTS: dict[SetPoint, str] = {"throttle": "a throttle", "speed": "a speed set-
 _IN_SPEED = {"r_fb": "m/s", "r_cmd": "m/s"}
 
 
+def require_set_point(what: str, given: SetPoint, taken: SetPoint, of: str) -> None:
+    """Checks that the first input that ``what`` gives is the one that is taken by ``of``, something that shall use it.
+
+    Raises:
+        RecordingError: it is not.
+    """
+    if given != taken:
+        raise RecordingError(
+            f"{what}: its first input is {_INPUTS[given]}, but {of} takes {_INPUTS[taken]} (inputs.set_point: {taken}); "
+            f"`dynssm vehicle new --set-point {given}` writes a file that fits"
+        )
+
+
 class RecordingInfo(StrictModel):
     """What a recording says of itself."""
 
@@ -221,11 +234,7 @@ class Recording:
         Raises:
             RecordingError: it is not.
         """
-        if self.info.set_point != set_point:
-            raise RecordingError(
-                f"recording {', '.join(self.info.source)}: its first input is {_INPUTS[self.info.set_point]}, but {of} "
-                f"takes {_INPUTS[set_point]} (inputs.set_point: {set_point})"
-            )
+        require_set_point(f"recording {', '.join(self.info.source)}", self.info.set_point, set_point, of)
 
     def save(self, path: str | Path) -> None:
         """Writes Parquet with the metadata and checksums of its pages inside, atomically."""

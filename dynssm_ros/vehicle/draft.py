@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 from dynssm_ros import configuration
+from dynssm_ros.vehicle.limits import vehicle_limits
 from dynssm_ros.vehicle.parameters import COEFFICIENT_UNITS, COEFFICIENTS, Vehicle
-from dynssm_ros.vehicle.single_track import GRAVITY
+from dynssm_ros.vehicle.single_track import GRAVITY, SetPoint
 
 Tyre = Literal["road", "slick", "rubber"]
 
@@ -66,6 +67,7 @@ _WORDS = {
     "C_r0": "rolling resistance", "C_r2": "drag", "I_z": "yaw inertia",
 }  # fmt: skip
 _OF_CONTROLLER = {"C_m1": "largest force of the speed controller", "C_m2": "gain of the speed controller"}
+_REACHED_S = 0.16  # within which a speed controller reaches its set-point: that of the f1tenth
 _WEIGHED = 0.01  # share of the mass to which a car is weighed, with fuel or batteries that differ
 
 
@@ -87,12 +89,23 @@ class MeasuredCar:
         return self.wheelbase * (1 - self.front_mass / self.mass)
 
 
-def drafted(like: Vehicle, name: str, car: MeasuredCar, tyre: Tyre | None = None) -> Vehicle:
-    """The car ``name``, of the kind of ``like``; with ``tyre`` that kind of tyres on both axles.
+def drafted(
+    like: Vehicle, name: str, car: MeasuredCar, *, tyre: Tyre | None = None, set_point: SetPoint | None = None
+) -> Vehicle:
+    """The car ``name``, of the kind of ``like``.
+
+    Args:
+        like: a known car.
+        name: of the new one.
+        car: what is measured of it.
+        tyre: kind of the tyres on both axles; those of the known car if not given.
+        set_point: its first input; that of the known car if not given.
 
     Raises:
         ConfigurationError: no car is like that.
     """
+    if set_point not in (None, like.inputs.set_point):
+        like = _commanded_otherwise(like)
     old = like.constants
     length = car.wheelbase / old.wheelbase
     load = car.mass * GRAVITY / 2
@@ -153,6 +166,24 @@ def as_commented_file(vehicle: Vehicle, head: Iterable[str]) -> str:
         value = f"{{nominal: {each.nominal:g}, bounds: [{low:g}, {high:g}], std: {each.std:g}}}"
         lines.append(f"  {name}: {value}  # {COEFFICIENT_UNITS[name]}, {words}")
     return "\n".join([*lines, "effects: []", ""])
+
+
+def _commanded_otherwise(like: Vehicle) -> Vehicle:
+    """The car with a throttle in place of a speed set-point, or the other way round: as strong, and as fast."""
+    changed: dict[str, Any]
+    if like.inputs.set_point == "speed":
+        changed = {"set_point": "throttle", "throttle": (-1.0, 1.0)}
+        value = like.coefficients["C_m1"].nominal / like.inputs.throttle[1]
+    else:
+        changed = {"set_point": "speed", "throttle": (0.0, _rounded(vehicle_limits(like).top_speed, 2))}
+        value = like.constants.m / _REACHED_S
+    coefficient = like.coefficients["C_m2"].model_copy(update={"nominal": value})
+    return like.model_copy(
+        update={
+            "inputs": like.inputs.model_copy(update=changed),
+            "coefficients": like.coefficients | {"C_m2": coefficient},
+        }
+    )
 
 
 def _scaled(like: Vehicle, car: MeasuredCar, length: float, load: float) -> dict[str, float]:

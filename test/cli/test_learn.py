@@ -13,6 +13,7 @@ import pytest
 
 from dynssm_ros import api
 from dynssm_ros.api.learn import LearnSettings, plan
+from dynssm_ros.configuration import config_root
 from dynssm_ros.errors import UserError
 from dynssm_ros.progress import OnProgress
 from dynssm_ros.reporting.page import Report, Section, figures_of
@@ -31,6 +32,9 @@ RESULTS: dict[str, dict[str, object]] = {
 }
 
 
+FILES = {"signals.yaml": (config_root() / "signals" / "default.yaml").read_text()}
+
+
 class Commands:
     """Writes what each command would write; ``lines`` are what some print, ``status`` how some end."""
 
@@ -47,7 +51,7 @@ class Commands:
         if not self.status.get(verb):
             for path in _written(verb, options):
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(json.dumps(RESULTS[verb]) if path.suffix == ".json" else verb)
+                path.write_text(json.dumps(RESULTS[verb]) if path.suffix == ".json" else FILES.get(path.name, verb))
         return self.status.get(verb, 0)
 
 
@@ -75,6 +79,18 @@ def log(tmp_path: Path) -> Path:
     file = tmp_path / "run.csv"
     file.write_text("time\n0\n")
     return file
+
+
+@pytest.mark.parametrize("signals", [None, "default"])
+def test_a_car_with_another_first_input_is_told_after_the_first_look(
+    commands: Commands, log: Path, tmp_path: Path, signals: str | None
+) -> None:
+    found = api.learn([log], "f1tenth", tmp_path / "out", signals=signals)
+    assert commands.verbs == ["inspect"]
+    assert found.failure == (
+        "signal map default: its first input is a throttle, but vehicle f1tenth takes a speed set-point (inputs.set_point: "
+        "speed); `dynssm vehicle new --set-point throttle` writes a file that fits"
+    )
 
 
 WAY = ["inspect", "extract", "calibrate", "diagnose", "train", "evaluate"]

@@ -59,7 +59,8 @@ def test_another_kind_of_car_is_refused_in_one_line(recording: Recording) -> Non
     with pytest.raises(RecordingError) as caught:
         recording.require_set_point("throttle", "vehicle orca")
     assert str(caught.value) == (
-        "recording bag: its first input is a speed set-point, but vehicle orca takes a throttle (inputs.set_point: throttle)"
+        "recording bag: its first input is a speed set-point, but vehicle orca takes a throttle "
+        "(inputs.set_point: throttle); `dynssm vehicle new --set-point speed` writes a file that fits"
     )
 
 

@@ -11,6 +11,7 @@ from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.vehicle import COEFFICIENTS, Vehicle, load_vehicle
 from dynssm_ros.vehicle.draft import TYRES, MeasuredCar, as_commented_file, drafted
 from dynssm_ros.vehicle.limits import vehicle_limits
+from dynssm_ros.vehicle.single_track import SetPoint
 
 SHIPPED = sorted(path.stem for path in (config_root() / "vehicles").glob("*.yaml"))
 
@@ -56,6 +57,18 @@ def test_forces_grow_with_mass_inertia_with_mass_and_axles_drag_with_area() -> N
     assert car.constants.h_cg == pytest.approx(1.5 * like.constants.h_cg, rel=1e-3)
 
 
+@pytest.mark.parametrize("name", SHIPPED)
+def test_with_the_other_first_input_a_car_is_as_strong_and_as_fast(name: str) -> None:
+    like = load_vehicle(name)
+    other: SetPoint = "speed" if like.inputs.set_point == "throttle" else "throttle"
+    car = drafted(like, "mine", itself(like), set_point=other)
+    assert car.inputs.set_point == other
+    assert car.coefficients["C_m1"].nominal == pytest.approx(like.coefficients["C_m1"].nominal, rel=2e-3)
+    assert vehicle_limits(car).top_speed == pytest.approx(vehicle_limits(like).top_speed, rel=0.2)
+    assert yaml.safe_load(as_commented_file(car, []))["inputs"].get("set_point", "throttle") == other
+    assert drafted(like, "mine", itself(like), set_point=like.inputs.set_point) == drafted(like, "mine", itself(like))
+
+
 def test_axle_loads_give_the_centre_of_gravity() -> None:
     car = drafted(load_vehicle("f1tenth"), "mine", MeasuredCar(1.58, 0.847, 0.1735))
     assert car.constants.l_f == pytest.approx(0.0805, abs=1e-4)
@@ -66,7 +79,7 @@ def test_axle_loads_give_the_centre_of_gravity() -> None:
 @pytest.mark.parametrize("tyre", sorted(TYRES))
 def test_a_kind_of_tyre_gives_friction_and_stiffness(tyre: str) -> None:
     like = load_vehicle("sedan")
-    car = drafted(like, "mine", itself(like), tyre)  # type: ignore[arg-type]
+    car = drafted(like, "mine", itself(like), tyre=tyre)  # type: ignore[arg-type]
     kind = TYRES[tyre]  # type: ignore[index]
     assert car.coefficients["D_r"].nominal == pytest.approx(kind.friction * car.constants.F_z0, rel=1e-3)
     assert car.coefficients["B_f"].nominal == kind.B
