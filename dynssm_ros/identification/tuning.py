@@ -85,6 +85,7 @@ DECISIVE_DELTA_BIC = 10.0  # very strong evidence (Kass and Raftery 1995) [test_
 AMBIGUITY_DELTA_BIC = 6.0  # candidates this close are polished before they are compared [causes]
 LOOK_SHARE = 0.3  # of the best delta BIC, that another must reach to be tried on left-out parts [causes]
 SURE_STD = 3.0  # standard deviations that count as sure: one chance in 370 [test_selection, test_residuals]
+BEYOND_STD = 1.0  # more than any car has: a healthy car had 0.9, a planted front_grip of 1.17 1.4 [test_selection]
 DOUBTFUL_STD = 2.0  # standard errors, where many were tried or the prior alone decides [test_selection]
 WEAK_LOG_RATIO = 3.0  # of likelihoods: no strong evidence yet (Kass and Raftery 1995) [test_selection]
 TEMPERING_CHANGE = 0.1  # of the logarithm of the inflation, from which the data are weighed anew

@@ -149,8 +149,8 @@ def test_evidence_that_does_not_repeat_does_not_pay() -> None:
         ("grip", {"factor": 0.85}, 10.0, True),
         ("grip", {"factor": 0.95}, 50.0, False),
         ("grip", {"factor": 0.884}, 6.2, False),  # 0.9 standard deviations more than any car
-        ("load_transfer", {"height": -0.011}, 34.0, True),
-        ("load_transfer", {"height": -0.011}, 32.0, False),
+        ("load_transfer", {"height": -0.011}, 11.5, True),
+        ("load_transfer", {"height": -0.011}, 10.5, False),
         ("odometry_lever_arm", {"x": -1.1 * centre_known}, 34.0, True),
         ("odometry_lever_arm", {"x": 0.9 * centre_known}, 50.0, False),
         ("odometry_lever_arm", {"x": 0.9 * centre_known, "y": 0.9 * centre_known}, 20.0, True),

@@ -156,7 +156,7 @@ class _Nearby:
 
         An effect of ``size`` is worth what makes it a cause, so that this many standard deviations are known.
         """
-        return least + tuning.SURE_STD * size / float(np.sqrt(self._needed)) if least else 0.0
+        return least + tuning.BEYOND_STD * size / float(np.sqrt(self._needed)) if least else 0.0
 
     def _told(self, rest: Vector, followed: Vector) -> Vector:
         """Twice the logarithm of the likelihood of what is left and of how far the fitted values moved, ``(n,)``."""

@@ -87,9 +87,9 @@ class Refined:
 
     @property
     def is_asked_for(self) -> bool:
-        """Whether the fitted laps ask for it: worth its parameters, surely more than any car has, of a part of the lap."""
-        surely_more = self.sure * self.beyond > tuning.SURE_STD
-        return self.delta_bic > tuning.DECISIVE_DELTA_BIC and surely_more and not self.is_everywhere
+        """Whether the fitted laps ask for it: worth its parameters, sure, more than any car has, of a part of the lap."""
+        sure = self.sure > tuning.SURE_STD and self.sure * self.beyond > tuning.BEYOND_STD
+        return self.delta_bic > tuning.DECISIVE_DELTA_BIC and sure and not self.is_everywhere
 
     @property
     def pays(self) -> bool:
