@@ -224,7 +224,7 @@ def _sections(evaluation: Evaluation) -> Iterator[Section]:
     groups, prose = evaluation.groups, _prose(evaluation)
     states = {name: group.first.state for name, group in groups.items()}
     recording, horizon = evaluation.recording, groups[_focus(evaluation)].first.rollout.time
-    time = (recording.time[evaluation.rows + 1] - recording.time[0]) / 1e9  # since the start of the recording (s)
+    time = recording.elapsed[evaluation.rows + 1]
     rmse = _over_seeds(evaluation, lambda score: score.rmse)
     yield prose.section("relative", evaluation_figures.relative_errors(*rmse, evaluation.persistence_rmse))
     yield prose.section(
@@ -269,7 +269,7 @@ def _trajectories(evaluation: Evaluation) -> Figure:
     recording, steps, starts = evaluation.recording, evaluation.steps, evaluation.drawn
     driven = slice(starts[0], starts[-1] + steps + 1)
     return track_figures.trajectories(
-        (recording.time[driven] - recording.time[0]) / 1e9,
+        recording.elapsed[driven],
         np.concatenate([np.zeros((1, 2)), path(recording.states(driven), recording.T_s)]),
         {
             name: branches(group.first.model, recording, starts, steps, group.first.known)

@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,7 @@ COLUMN_UNITS = {
 
 
 _INPUTS: dict[SetPoint, str] = {"throttle": "a throttle", "speed": "a speed set-point"}
+_PAUSE_S = 1.0  # between drives, at most, where their time is told
 _IN_SPEED = {"r_fb": "m/s", "r_cmd": "m/s"}
 
 
@@ -117,6 +119,12 @@ class Recording:
     def T_s(self) -> float:
         """Sampling time (s)."""
         return self.info.sampling_time
+
+    @cached_property
+    def elapsed(self) -> Vector:
+        """Time of each row since the start (s), pauses cut to a second: drives of other days follow each other; ``(N,)``."""
+        steps = np.minimum(np.diff(self.time, prepend=self.time[:1]) / 1e9, max(_PAUSE_S, self.T_s))
+        return np.asarray(np.cumsum(steps))
 
     @property
     def has_pose(self) -> bool:

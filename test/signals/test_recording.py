@@ -321,3 +321,11 @@ def test_windows_are_the_rows_up_to_each_end_and_over_the_horizon() -> None:
     np.testing.assert_array_equal(found[0], r.matrix[0:7])
     np.testing.assert_array_equal(found[5], r.matrix[5:12])
     np.testing.assert_array_equal(r.windows(ends, 4)[:, -1, :3], r.states(ends))
+
+
+def test_drives_of_other_days_follow_each_other_where_time_is_told() -> None:
+    one = recording([0] * 5)
+    other = recording([1] * 5)
+    later = Recording(other.info, one.time + 3 * 86_400 * 10**9, other.segment, other.columns)
+    rows = 0.04 * np.arange(5)
+    np.testing.assert_allclose(concatenate([one, later]).elapsed, [*rows, *(rows[-1] + 1.0 + rows)], atol=1e-9)

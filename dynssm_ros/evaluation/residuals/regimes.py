@@ -65,7 +65,7 @@ def situations(errors: OneStepErrors) -> list[Situation]:
     r, delta = errors.applied.T
     found = [
         _all(errors),
-        _bins("time of the drive", errors.seconds, "s", _TIMES),
+        _bins("time of the drive", log.elapsed[errors.rows + 1], "s", _TIMES),
         _bins("speed", v_x, "m/s", _BINS),
         _bins("throttle", r, "", _BINS),
         _bins("steering", delta, "rad", _BINS),
