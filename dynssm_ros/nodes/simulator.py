@@ -141,8 +141,8 @@ class SimulatorNode(Node):
     def _on_command(self, message: JointState) -> None:
         values = self._decoder.decode(message)
         command = Applied(*(values.get(name, math.nan) for name in command_signals(self._vehicle.inputs.set_point)))
-        if self._commands.receive(command):
-            acts = header_stamp_ns(message) or self._pace.stamp
+        acts = header_stamp_ns(message) or self._pace.stamp
+        if self._commands.receive(command, after=(acts - self._pace.stamp) / 1e9):
             self._commanded = acts, time.monotonic()
             if not self._lockstep and acts >= self._pace.stamp and self._pace.behind(time.monotonic()):
                 self._step()

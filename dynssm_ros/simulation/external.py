@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import deque
 from collections.abc import Callable, Iterator
 
 from dynssm_ros.simulation.laps import Sample, SimulationError
@@ -16,12 +17,12 @@ from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.low_speed import LowSpeedRolling
 
 Clock = Callable[[], float]
-_CAUGHT_UP_S = 1.0
+_CAUGHT_UP_S = 1.0  # that a car may be behind its clock, and its commands ahead
 
 
 class CommandHolder:
-    """The last command, within what the actuators of ``vehicle`` can do, while it is at most ``timeout`` old (s, by
-    ``clock``).
+    """The last command that has begun to act, within what the actuators of ``vehicle`` can do, while it is at most
+    ``timeout`` old (s, by ``clock``).
 
     After that the car brakes with its steering held.
     """
@@ -33,21 +34,37 @@ class CommandHolder:
         self._clock = clock
         self._last = Applied(0.0, 0.0)
         self._since = -math.inf
+        self._coming: deque[tuple[float, Applied]] = deque()  # by when they begin to act
 
     @property
     def fresh(self) -> bool:
         """Whether there is a command to obey."""
+        self._begin()
         return self._clock() - self._since <= self._timeout
 
-    def receive(self, command: Applied) -> bool:
-        """Takes a command; one that is not finite changes nothing. Returns whether it was taken."""
+    def receive(self, command: Applied, *, after: float = 0.0) -> bool:
+        """Takes a command in place of those that would begin to act later. Returns whether it was taken.
+
+        Args:
+            command: one that is not finite changes nothing.
+            after: seconds until it begins to act. More than one is another clock: it acts at once.
+        """
         if not all(map(math.isfinite, command)):
             return False
-        self._last, self._since = command, self._clock()
+        begins = self._clock() + (max(after, 0.0) if after <= _CAUGHT_UP_S else 0.0)
+        while self._coming and self._coming[-1][0] >= begins:
+            self._coming.pop()
+        self._coming.append((begins, command))
         return True
+
+    def _begin(self) -> None:
+        now = self._clock()
+        while self._coming and self._coming[0][0] <= now + self._T_s / 2:
+            self._since, self._last = self._coming.popleft()
 
     def command(self, previous: Applied) -> Applied:
         """What the actuators do next, ``previous`` being what they do now."""
+        self._begin()
         wanted = self._last if self.fresh else Applied(self._limits.full_brakes, previous.delta)
         return self._limits.reached(wanted, previous, self._T_s)
 

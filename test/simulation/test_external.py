@@ -43,6 +43,26 @@ def test_fresh_commands_are_obeyed_within_the_actuators():
     assert holder.command(Applied(0.0, -0.34)) == (-0.1, -0.35), "throttle and steering range"
 
 
+def test_a_command_waits_until_it_acts_and_a_newer_one_takes_the_place_of_later_ones():
+    watch = Watch()
+    holder = CommandHolder(ORCA, 0.2, watch)
+    holder.receive(Applied(0.4, 0.0))
+    holder.receive(Applied(-0.1, 0.0), after=0.1)
+    assert holder.command(Applied(0.4, 0.0)).r == 0.4
+    watch.now += 0.1
+    assert holder.command(Applied(0.4, 0.0)).r == -0.1
+    watch.now += 0.19
+    assert holder.fresh, "since it acts"
+    holder.receive(Applied(0.3, 0.0), after=0.1)
+    holder.receive(Applied(0.2, 0.0), after=0.04)
+    watch.now += 0.04
+    assert holder.command(Applied(0.4, 0.0)).r == 0.2
+    watch.now += 0.06
+    assert holder.command(Applied(0.4, 0.0)).r == 0.2
+    holder.receive(Applied(0.1, 0.0), after=1e3)
+    assert holder.command(Applied(0.4, 0.0)).r == 0.1, "of another clock"
+
+
 def test_old_commands_make_it_brake_with_the_steering_held():
     watch = Watch()
     holder = CommandHolder(ORCA, 0.2, watch)
