@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from pathlib import Path
 
 import pytest
@@ -16,9 +17,10 @@ pytestmark = pytest.mark.live
 
 def test_each_message_is_answered_while_models_are_swapped(small_model: Path, tmp_path: Path) -> None:
     other = shutil.copytree(small_model, tmp_path / "other")
+    begin = time.monotonic()
     done = soak([small_model, other], 3.0, 100.0, swap_every=0.8)
     assert done.violations == {}
-    assert 1 <= done.swaps <= 3, "a busy machine sends and tries less in 3 s"
+    assert 1 <= done.swaps <= (time.monotonic() - begin) / 0.8, "a busy machine takes longer and tries less"
     assert done.odometry == done.predictions + done.passed_over
     assert 50 < done.odometry <= 310
     assert done.messages == 3 * done.odometry
