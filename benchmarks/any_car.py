@@ -171,7 +171,7 @@ class Start(NamedTuple):
 def drive_of(log: Recording, base: LayerBase, features: LayerFeatures) -> LayerDrive:
     """A log as the layer sees it."""
     ends = log.window_ends(base.H, min_speed=base.vehicle.minimum_speed)
-    return LayerDrive(lambda block: features.seen(log.windows(ends[block], base.H)), log, ends, ends[:0])
+    return LayerDrive.of(log, ends, base.H, features.seen)
 
 
 class Errors(NamedTuple):

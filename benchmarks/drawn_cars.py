@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import savgol_filter
 
-from benchmarks.hidden_causes.cases import NOISE, TRACKS, size
+from benchmarks.hidden_causes.cases import COARSE, NOISE, TRACKS, size
 from benchmarks.matrix.scored_cells import CARS, RACER
 from dynssm_ros.arrays import Vector
 from dynssm_ros.errors import UserError
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.simulation.laps import SimulationError, as_recording, simulate
-from dynssm_ros.simulation.plant import DoubleTrackPlant, PlantKind, Rk4Plant, register_plant
+from dynssm_ros.simulation.plant import PlantKind
 from dynssm_ros.track.driver import Style
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Vehicle, load_vehicle
@@ -32,7 +32,7 @@ SECONDS = 60.0
 _LAGS = ("steering_lag", "throttle_lag")
 _LAGGING = 0.7  # share of cars with each of them
 _TRIES = 4
-_STEP = 5e-3  # s, of Runge and Kutta
+_PLANTS = COARSE["rk4"], COARSE["double_track"]
 _SMOOTHED_S = 0.2  # of an odometry that is fitted to poses, at most
 _SPEED_NOISE, _AXLE_NOISE = 0.02, 0.007  # m/s; of omega the same times a wheelbase
 _BRAKING = -0.5  # a throttle that goes below is that of a car with brakes
@@ -73,24 +73,6 @@ class CarClass:
         lags = [(lag, {"time_constant": float(np.sqrt(np.prod(EFFECTS[lag].TYPICAL)))}) for lag in _LAGS]
         return car.with_effects(lags)
 
-
-class _SingleTrack(Rk4Plant):
-    """The single-track car in steps of 5 ms, which are short enough for its errors to be far below a sensor's."""
-
-    def step(self, vehicle: Vehicle) -> float:
-        return _STEP
-
-
-class _DoubleTrack(DoubleTrackPlant):
-    """Four wheels in such steps."""
-
-    def step(self, vehicle: Vehicle) -> float:
-        return _STEP
-
-
-_PLANTS: tuple[PlantKind, ...] = ("drawn_single_track", "drawn_double_track")
-for _name, _plant in zip(_PLANTS, (_SingleTrack(), _DoubleTrack()), strict=True):
-    register_plant(_name, _plant)
 
 CLASSES = {
     of.name: of

@@ -155,7 +155,7 @@ class Study:
 
     def drive(self, log: Recording, ends: Indices, features: LayerFeatures) -> LayerDrive:
         """A log as a layer sees it."""
-        return LayerDrive(lambda block: features.seen(log.windows(ends[block], self.base.H)), log, ends, ends[:0])
+        return LayerDrive.of(log, ends, self.base.H, features.seen)
 
     def fitted(self, features: LayerFeatures) -> tuple[OnlineLayer, list[tuple[LayerDrive, OnlineLayer]]]:
         """The layer of the training, and its stretches, each with a layer that did not know it."""

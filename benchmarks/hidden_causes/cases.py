@@ -52,7 +52,8 @@ TRUTHS: tuple[PlantKind, ...] = ("rk4", "double_track", foreign.NAME, multi_body
 _UNKNOWN = (foreign.NAME, multi_body.NAME)  # cars of which nobody knows the values
 _OTHER_DRIVE = 10**6  # added to the seed
 _REFERENCE_S = 120.0  # of the drive that the file of such a car is calibrated on
-_COARSE = {kind: f"{kind} in few steps" for kind in ("rk4", "double_track", foreign.NAME)}
+COARSE: dict[PlantKind, PlantKind] = {kind: f"{kind} in few steps" for kind in ("rk4", "double_track", foreign.NAME)}
+"""Names of the same plants in steps of :data:`STEP`."""
 _ROUND = 13  # cases, of which two have a pair of effects and two none
 _PAIRS, _NONE = (4, 10), (6, 12)
 
@@ -70,7 +71,7 @@ class _Coarse(Rk4Plant):
         return self.of.first(vehicle)
 
 
-for _kind, _name in _COARSE.items():
+for _kind, _name in COARSE.items():
     register_plant(_name, _Coarse(PLANTS[_kind]))
 
 
@@ -174,7 +175,7 @@ def _drive(case: Case, car: Vehicle, seed: int) -> Recording:
     def lap(attempt: int) -> Recording:
         return as_recording(
             simulate(
-                car, case.road, duration=case.duration, plant=_COARSE.get(case.plant, case.plant), seed=seed,
+                car, case.road, duration=case.duration, plant=COARSE.get(case.plant, case.plant), seed=seed,
                 style=Style(aggressiveness * 0.9**attempt, variation), noise=(noise[0], noise[1], noise[2]),
             )
         )  # fmt: skip

@@ -83,8 +83,8 @@ class Brakes:
         self._driven += not self.reason
         released = self._well > self._enough and not self.stays
         if released and self.until_standing:
-            self.waits = displaced and abs(speed) <= self.standing
-            released = not displaced and abs(speed) <= self.standing
+            stands = abs(speed) <= self.standing
+            self.waits, released = stands and displaced, stands and not displaced
         if released:
             self.reason, self.until_standing, self.waits = "", False, False
         return not self.reason

@@ -229,10 +229,7 @@ class LiveController:
             return self.brake(stamp + self.answered_after, _DOUBTED_S)
         if refusal is not None:
             return refusal
-        if self._contract.jumps > self._jumps:
-            self._jumps = self._contract.jumps
-            if abs(seen.v_x) <= self.brakes.standing:  # somebody sets it
-                self._contract.settle()
+        if self._has_jumped(seen.v_x):
             self.brakes.apply("the pose jumped", until_standing=True, doubted=True)
         elif late > self._max_late:
             self.brakes.apply(f"odometry comes {late:.2f} s later than its fastest")
@@ -262,6 +259,13 @@ class LiveController:
         if not self.brakes.until_standing:
             self._believe(stamp, pose, seen)
         return self.brake(stamp + self.answered_after + round(1e9 * late))
+
+    def _has_jumped(self, v_x: float) -> bool:
+        """Whether the pose has jumped since the last look. That of a car that stands is set by somebody, and right."""
+        before, self._jumps = self._jumps, self._contract.jumps
+        if self._jumps > before and abs(v_x) <= self.brakes.standing:
+            self._contract.settle()
+        return self._jumps > before
 
     def _is_lost(self, gap: bool) -> bool:
         """Whether the car is off the road by too much: by anything since a ``gap``, as it was driven unseen."""
@@ -367,8 +371,10 @@ class LiveController:
     def verdict(self) -> tuple[Level, str]:
         """How it goes, in words."""
         if self.brakes.reason:
-            until = " until it is configured anew" if self.brakes.stays else " until the pose is set anew"
-            return Level.ERROR, f"{self.brakes.reason}: brakes{until * (self.brakes.stays or self.brakes.waits)}"
+            until = " until the pose is set anew" if self.brakes.waits else ""
+            if self.brakes.stays:
+                until = " until it is configured anew"
+            return Level.ERROR, f"{self.brakes.reason}: brakes{until}"
         output, level, words = self.remote.output, Level.OK, ""
         if output.source == RemoteModel.NOMINAL:
             level, words = Level.WARN, f", nothing from the predictor for {self._max_age:g} s"

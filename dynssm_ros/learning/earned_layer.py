@@ -162,7 +162,7 @@ def _drive(features: LayerFeatures, model: TrainableModel, recording: Recording,
     ends = recording.window_ends(base.H, min_speed=base.vehicle.minimum_speed)
     see = partial(_seen, features, model.eval())
     starts = np.searchsorted(ends, base.starts(recording))
-    return LayerDrive(lambda block: see(recording.windows(ends[block], base.H)), recording, ends, starts)
+    return LayerDrive.of(recording, ends, base.H, see, starts=starts)
 
 
 def _seen(features: LayerFeatures, model: TrainableModel, windows: Vector) -> Seen:

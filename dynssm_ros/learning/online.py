@@ -35,6 +35,24 @@ class LayerDrive(NamedTuple):
     ends: Indices  # the last row of each window, (N,), ascending
     starts: Indices  # the windows from which paths are predicted, ascending
 
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        ends: Indices,
+        H: int,
+        see: Callable[[Vector], Seen],
+        *,
+        starts: Indices | None = None,
+    ) -> LayerDrive:
+        """The windows of ``H`` rows of a recording that end at ``ends``, seen by ``see``; no paths without ``starts``."""
+        return cls(
+            lambda block: see(recording.windows(ends[block], H)),
+            recording,
+            ends,
+            ends[:0] if starts is None else starts,
+        )
+
     def measured(self, block: slice) -> tuple[Vector, Vector]:
         """The last rows of some windows, ``(n, 7)``, and the increments to the next, ``(n, 3)`` (m/s, m/s, rad/s)."""
         ends = self.ends[block]

@@ -35,7 +35,7 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.runtime.health import Level
 
 _Result = TypeVar("_Result")
-_KINDS = ("timer", "subscription", "guard_condition", "client", "service")
+_KINDS = ("subscription", "guard_condition", "timer", "client", "service")  # as a wait set counts them
 _LOOK_S = 1.0  # after which rclpy looks for what is not in the kept wait set
 _POLL_S = 0.02  # between looks at callbacks that wait for something
 _RECENT_S = 10.0  # for which the verdict speaks of an exception
@@ -112,22 +112,18 @@ class _KeptWaitSet:
 
     def __init__(self, node: Node, guards: Iterable[GuardCondition]) -> None:
         self._timers, self._subscriptions, self._guards = list(node.timers), list(node.subscriptions), list(node.guards)
-        groups: dict[str, list[Any]] = {
-            "subscription": self._subscriptions,
-            "guard_condition": [*guards, *self._guards],
-            "timer": self._timers,
-            "client": list(node.clients),
-            "service": list(node.services),
-        }
-        self._in_use = ExitStack()
-        for handle in [node.context.handle, *(entity.handle for entities in groups.values() for entity in entities)]:
+        groups: list[list[Any]] = [
+            self._subscriptions, [*guards, *self._guards], self._timers, list(node.clients), list(node.services)
+        ]  # fmt: skip
+        self._set = rclpy_implementation.WaitSet(*map(len, groups), 0, node.context.handle)
+        self._in_use, self._add = ExitStack(), list[Callable[[], object]]()
+        handles: list[Any] = [node.context.handle]
+        for kind, entities in zip(_KINDS, groups, strict=True):
+            for entity in entities:
+                handles.append(entity.handle)
+                self._add.append(partial(getattr(self._set, f"add_{kind}"), entity.handle))
+        for handle in handles:
             self._in_use.enter_context(handle)
-        self._set = rclpy_implementation.WaitSet(*map(len, groups.values()), 0, node.context.handle)
-        self._add = [
-            partial(getattr(self._set, f"add_{kind}"), entity.handle)
-            for kind, entities in groups.items()
-            for entity in entities
-        ]
 
     def wait(self, nanoseconds: int) -> tuple[list[Timer], list[Subscription], bool]:
         """Timers that are due, subscriptions with a message, and whether anything else is to be done.
@@ -139,7 +135,7 @@ class _KeptWaitSet:
         for add in self._add:
             add()
         self._set.wait(nanoseconds)
-        timers, messages, guards, *asked = map(self._set.get_ready_entities, _KINDS)
+        messages, guards, timers, *asked = map(self._set.get_ready_entities, _KINDS)
         for guard in self._guards:  # the wait took its trigger; rclpy gives it back where this says so
             guard._executor_triggered |= guard.handle.pointer in guards
         return (

@@ -12,17 +12,16 @@ from plotly.subplots import make_subplots
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.reporting.evaluation_figures import MEASURED, PALETTE, UNITS, cut_at_holes, model_colours
+from dynssm_ros.signals.recording import PAUSE_S, without_pauses
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 MOST_ROWS = 30_000
 """Rows that are drawn: ten minutes at 50 Hz. More make pages slow to open."""
-LONGEST_GAP = 1.0
-"""Time (s) that is drawn of a gap: between two recordings may lie days."""
 _INPUT_COLOURS = (PALETTE[6], PALETTE[7], PALETTE[8])
 _TITLES = {"v_x": "v<sub>x</sub>", "v_y": "v<sub>y</sub>", "omega": "ω"}
 _HINT = (
     "Drag to zoom, double-click to go back, click a name to hide it. "
-    f"The first {MOST_ROWS:,} rows, with gaps cut to {LONGEST_GAP:g} s."
+    f"The first {MOST_ROWS:,} rows, with gaps cut to {PAUSE_S:g} s."
 )
 _HEIGHT = 720  # pixels
 
@@ -33,12 +32,12 @@ def predicted_and_measured(
     """Values at the left and errors at the right over the whole time, zoomed together, above the inputs; as HTML.
 
     Args:
-        time: of the rows (s), ``(N,)``; lines break where it jumps, and longer jumps than ``LONGEST_GAP`` are cut to that.
+        time: of the rows (s), ``(N,)``; lines break where it jumps, and longer jumps than ``PAUSE_S`` are cut to that.
         measured: states, ``(N, 3)``.
         predicted: states by model, ``(N, 3)``.
         inputs: by name, ``(N,)``.
     """
-    time = np.concatenate([time[:1], time[0] + np.cumsum(np.minimum(np.diff(time), LONGEST_GAP))])
+    time = without_pauses(time)
     figure = make_subplots(rows=4, cols=2, shared_xaxes="all", vertical_spacing=0.03, horizontal_spacing=0.09)
     colours = {"measured": MEASURED} | model_colours(list(predicted))
     for name, states in {"measured": measured, **predicted}.items():

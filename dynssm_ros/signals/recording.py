@@ -46,8 +46,14 @@ COLUMN_UNITS = {
 
 
 _INPUTS: dict[SetPoint, str] = {"throttle": "a throttle", "speed": "a speed set-point"}
-_PAUSE_S = 1.0  # between drives, at most, where their time is told
+PAUSE_S = 1.0
+"""Between drives, at most, where their time is told (s)."""
 _IN_SPEED = {"r_fb": "m/s", "r_cmd": "m/s"}
+
+
+def without_pauses(time: Vector) -> Vector:
+    """Ascending times (s) with longer pauses than :data:`PAUSE_S` cut to that, ``(N,)``."""
+    return np.asarray(time[:1] + np.cumsum(np.minimum(np.diff(time, prepend=time[:1]), PAUSE_S)))
 
 
 def require_set_point(what: str, given: SetPoint, taken: SetPoint, of: str) -> None:
@@ -123,8 +129,7 @@ class Recording:
     @cached_property
     def elapsed(self) -> Vector:
         """Time of each row since the start (s), pauses cut to a second: drives of other days follow each other; ``(N,)``."""
-        steps = np.minimum(np.diff(self.time, prepend=self.time[:1]) / 1e9, max(_PAUSE_S, self.T_s))
-        return np.asarray(np.cumsum(steps))
+        return without_pauses((self.time - self.time[:1]) / 1e9)
 
     @property
     def has_pose(self) -> bool:

@@ -16,6 +16,7 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import ListParameters, SetParameters, SetParametersAtomically
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter as Value
@@ -174,7 +175,7 @@ def test_subscriptions_are_served_in_their_order_and_one_that_raises_holds_up_no
     spin_until(executor, lambda: all(each.get_subscription_count() for each in (first, fails, last)))
     for publisher in (last, fails, first):
         publisher.publish(String(data="1"))
-    time.sleep(0.1)  # an executor that sees but some of them serves those
+        assert publisher.wait_for_all_acked(Duration(seconds=30)), "all wait before the executor looks"
     spin_until(executor, lambda: len(heard) == 3)
     assert heard == ["first 1", "fails 1", "last 1"]
     assert failures(node).count == 1
