@@ -138,16 +138,15 @@ def learn(
         key, before = step.key, known.get(step.words)
         if before and before["key"] == key and not before["failure"] and all(map(os.path.exists, step.outputs)):
             told("as before")
-            records.append(StepRecord.model_validate(before))
-            continue
-        records.append(_done(step, key, told))
-        if number == 1 and not records[0].failure:
-            records[0] = records[0].model_copy(
-                update={"failure": _misfit(step.outputs[0], str(vehicle), settings.signals)}
-            )
-        known[step.words] = records[-1].model_dump(mode="json")
+            record = StepRecord.model_validate(before)
+        else:
+            record = _done(step, key, told)
+        if number == 1 and not record.failure:
+            record = record.model_copy(update={"failure": _misfit(step.outputs[0], str(vehicle), settings.signals)})
+        records.append(record)
+        known[step.words] = record.model_dump(mode="json")
         write_json(folder / STATE, {"steps": known})
-        if records[-1].failure:
+        if record.failure:
             break
     learning_report(folder, records, settings.holdout).save(folder / "index.html")
     return Learning(folder, tuple(records))

@@ -87,6 +87,10 @@ def test_a_car_with_another_first_input_is_told_after_the_first_look(
 ) -> None:
     found = api.learn([log], "f1tenth", tmp_path / "out", signals=signals)
     assert commands.verbs == ["inspect"]
+    seen = api.learn([log], "f1tenth", tmp_path / "seen", signals="default_speed")
+    assert not seen.failure
+    again = api.learn([log], "f1tenth", tmp_path / "seen", signals="default")
+    assert "its first input is a throttle" in again.failure, "although the log was looked at before"
     assert found.failure == (
         "signal map default: its first input is a throttle, but vehicle f1tenth takes a speed set-point (inputs.set_point: "
         "speed); `dynssm vehicle new --set-point throttle` writes a file that fits"
