@@ -141,11 +141,11 @@ def learn(
             record = StepRecord.model_validate(before)
         else:
             record = _done(step, key, told)
-        if number == 1 and not record.failure:
-            record = record.model_copy(update={"failure": _misfit(step.outputs[0], str(vehicle), settings.signals)})
-        records.append(record)
         known[step.words] = record.model_dump(mode="json")
         write_json(folder / STATE, {"steps": known})
+        if number == 1 and not record.failure:  # not kept: the map may be corrected, and is not to be written anew
+            record = record.model_copy(update={"failure": _misfit(step.outputs[0], str(vehicle), settings.signals)})
+        records.append(record)
         if record.failure:
             break
     learning_report(folder, records, settings.holdout).save(folder / "index.html")

@@ -97,6 +97,16 @@ def test_a_car_with_another_first_input_is_told_after_the_first_look(
     )
 
 
+def test_a_map_that_is_corrected_after_the_first_look_is_kept(commands: Commands, log: Path, tmp_path: Path) -> None:
+    corrected = (config_root() / "signals" / "default_speed.yaml").read_text()
+    assert api.learn([log], "f1tenth", tmp_path / "out").failure
+    file = tmp_path / "out" / "inspection" / "run" / "signals.yaml"
+    file.write_text(corrected)
+    assert not api.learn([log], "f1tenth", tmp_path / "out").failure
+    assert file.read_text() == corrected
+    assert commands.verbs == WAY
+
+
 WAY = ["inspect", "extract", "calibrate", "diagnose", "train", "evaluate"]
 
 
@@ -116,7 +126,7 @@ def test_what_is_unchanged_is_not_run_again(commands: Commands, log: Path, tmp_p
     api.learn(log, "orca", out, on_progress=told.append)
     assert (len(commands.verbs), told.count("as before")) == (6, 6)
     assert f"[1/6] dynssm inspect {log} --vehicle orca" in told[0]
-    (out / "inspection" / "run" / "signals.yaml").write_text("corrected")
+    (out / "inspection" / "run" / "signals.yaml").write_text(FILES["signals.yaml"] + "# corrected\n")
     api.learn(log, "orca", out)
     assert commands.verbs[6:] == ["extract"]  # whose recording is the same again
     log.write_text("time\n0\n1\n")
