@@ -13,10 +13,12 @@ from dynssm_ros.errors import DataWarning, RecordingError
 from dynssm_ros.extras import require
 from dynssm_ros.files import forced
 from dynssm_ros.progress import Progress
-from dynssm_ros.signals.recording import COLUMN_UNITS
+from dynssm_ros.signals.recording import COLUMN_UNITS, Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
+from dynssm_ros.signals.spans import Drive
 from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.integrators import Integrator
+from dynssm_ros.vehicle.single_track import standing_speed
 
 if TYPE_CHECKING:
     from dynssm_ros.identification.result.calibration import Calibration
@@ -62,7 +64,7 @@ def calibrate(
         on_progress: called after each starting point.
 
     Raises:
-        RecordingError: the calibrated car predicts a state no better than that nothing changes; see also ``--force``.
+        RecordingError: the car stands, or calibrated predicts a state no better than that nothing changes; see ``--force``.
 
     Example:
         >>> laps = recorded(simulate("orca", "club", duration=20.0))
@@ -77,6 +79,7 @@ def calibrate(
     logs = opened(recordings, car, strict=s.strict)
     left_out = held_out(logs, s.holdout, car)
     data = joined(logs, s.commands, left_out)
+    require_a_drive(data, car)
     line = None if s.track is None else centre_line(s.track, data)
     found = calibrate(
         data, car, horizon=s.horizon, min_speed=s.min_speed, integrator=s.integrator, starts=s.starts, seed=s.seed,
@@ -106,6 +109,26 @@ def require_physics(found: Calibration) -> None:
         "expected less; look at sign, unit and time of these states and of the inputs (dynssm inspect), at the vehicle file, "
         "and at what it lacks (dynssm diagnose)"
     )
+    _refuse(words)
+
+
+def require_a_drive(laps: Recording, car: Vehicle) -> None:
+    """Checks that the car drives: standing, its tyres and its motor do nothing that coefficients follow from.
+
+    Raises:
+        RecordingError: it stands; with ``--force`` it is a :class:`DataWarning`.
+    """
+    drive, least = Drive.of(laps), standing_speed(car.constants.wheelbase)
+    fastest = drive.speed_but_glitches
+    if drive.stands or fastest < least:
+        _refuse(
+            f"{', '.join(laps.info.source)}: the car stands: hardly a second is faster than {fastest:.2g} m/s; "
+            f"expected a drive, {least:.2g} m/s or more"
+        )
+
+
+def _refuse(words: str) -> None:
+    """Ends with an error, or warns with ``--force``."""
     if not forced():
         raise RecordingError(f"{words}; --force writes it all the same")
-    warnings.warn(words, DataWarning, stacklevel=4)
+    warnings.warn(words, DataWarning, stacklevel=5)

@@ -21,6 +21,7 @@ from dynssm_ros.errors import ConfigurationError, UserError
 from dynssm_ros.extras import require
 from dynssm_ros.files import content_key, digest, forced, require_no_input, require_replaceable, write_json
 from dynssm_ros.progress import OnProgress
+from dynssm_ros.signals.map_differences import differences
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import load_vehicle
 
@@ -143,8 +144,14 @@ def learn(
             record = _done(step, key, told)
         known[step.words] = record.model_dump(mode="json")
         write_json(folder / STATE, {"steps": known})
-        if number == 1 and not record.failure:  # not kept: the map may be corrected, and is not to be written anew
-            record = record.model_copy(update={"failure": _misfit(step.outputs[0], str(vehicle), settings.signals)})
+        if (
+            step.name == "inspect" and not record.failure
+        ):  # not kept: the map may be corrected, and is not to be written anew
+            words = _compared(step.outputs[0], steps[0].outputs[0], settings.signals)
+            for line in words:
+                told(line)
+            failure = _misfit(step.outputs[0], str(vehicle), settings.signals) if number == 1 else ""
+            record = record.model_copy(update={"notes": (*record.notes, *words), "failure": failure})
         records.append(record)
         if record.failure:
             break
@@ -204,6 +211,21 @@ def _misfit(suggested: Path, vehicle: str, signals: str | None) -> str:
     except UserError as error:
         return str(error)
     return ""
+
+
+def _compared(suggested: Path, first: Path, signals: str | None) -> list[str]:
+    """A warning for each signal for which a log suggests something else than the first one, whose map all take."""
+    if signals is not None or suggested == first:
+        return []
+    try:
+        told = differences(load_signal_map(first), load_signal_map(suggested))
+    except UserError:  # an incomplete map is told where it is needed
+        return []
+    log, taken = suggested.parent.name, first.parent.name
+    remedy = f"taken for all logs is {first}: correct it, or leave out the log that is wrong"
+    return [
+        f"warning: {log}: {name}: {here} suits this log, {there} suits {taken}; {remedy}" for name, here, there in told
+    ]
 
 
 def _names(logs: Sequence[Path]) -> list[str]:

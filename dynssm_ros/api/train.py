@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from dynssm_ros.api.calibrate import require_physics
+from dynssm_ros.api.calibrate import require_a_drive, require_physics
 from dynssm_ros.api.inputs import Log, PathLike, files, held_out, joined, opened, vehicle_in_windows
 from dynssm_ros.api.settings import EPOCHS, HOLDOUT, CommandsSettings, StrictSettings, keywords, setting
 from dynssm_ros.errors import ConfigurationError
@@ -91,6 +91,7 @@ def train(
         paths, begins = zip(*_looked_at(recordings, car, s.strict), strict=True)
         left_out = held_out(begins, s.holdout, car)
         data = sampled(paths, s.memory, commands=s.commands, holdouts=[left_out[each] for each in begins])
+    require_a_drive(data, car)
     car, calibrated = car.with_held_out(left_out), partial(_calibrated, rows=len(data))
     trained = train(data, config, car, checkpoint, device=s.device, progress=on_progress, calibrate=calibrated)
     artifact = save_artifact(trained, folder, {"holdout": _in_brief(left_out), "device": s.device}, picture)

@@ -6,6 +6,7 @@ blocks of neighbouring spans, since errors of neighbours are alike.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -81,11 +82,24 @@ class Drive:
     @property
     def stands(self) -> bool:
         """Whether the car stands throughout: over a second its velocity is noise that averages out."""
-        rows = max(1, round(1.0 / self.T_s))
-        whole = self.velocity[: len(self) // rows * rows].reshape(-1, rows)
-        if not len(whole):
+        slow, rows = self._velocities_of_seconds, max(1, round(1.0 / self.T_s))
+        if not len(slow):
             return False
-        return not float(np.mean(np.abs(whole.mean(axis=1)) ** 2)) > _STANDS * float(np.mean(np.abs(whole) ** 2))
+        fast = self.velocity[: len(slow) * rows]
+        return not float(np.mean(np.abs(slow) ** 2)) > _STANDS * float(np.mean(np.abs(fast) ** 2))
+
+    @property
+    def speed_but_glitches(self) -> float:
+        """Speed (m/s) over whole seconds that 2 % of them exceed; infinite where there is no second."""
+        slow = self._velocities_of_seconds
+        return float(np.percentile(np.abs(slow), 98)) if len(slow) else math.inf
+
+    @property
+    def _velocities_of_seconds(self) -> Complex:
+        """Mean velocity of each second, one after the other (m/s)."""
+        rows = max(1, round(1.0 / self.T_s))
+        found: Complex = self.velocity[: len(self) // rows * rows].reshape(-1, rows).mean(axis=1)
+        return found
 
     def changed(self, **signals: Any) -> Drive:
         """The drive with other signals."""

@@ -84,6 +84,25 @@ def test_a_car_that_predicts_worse_than_that_nothing_changes_is_written_by_force
     assert load_vehicle(car).held_out == {recording.beginning: 0.2}
 
 
+@pytest.mark.parametrize("command", [("calibrate",), ("train", "--model", "ridge")])
+@pytest.mark.parametrize("still", ["exactly", "noise", "creeps", "a glitch"])
+def test_of_a_log_in_which_the_car_stands_nothing_is_written(
+    dynssm: Run, laps: Path, tmp_path: Path, still: str, command: tuple[str, ...]
+) -> None:
+    """Somebody turns the wheel in the pit, and sensors have noise, an offset or a jump."""
+    recording = Recording.load(laps)
+    rng, N = np.random.default_rng(0), len(recording)
+    velocity = {name: np.zeros(N) for name in ("v_x", "v_y", "omega")}
+    if still != "exactly":
+        velocity = {name: 0.03 * rng.standard_normal(N) for name in velocity}
+        velocity["v_x"] += {"noise": 0.0, "creeps": 0.05, "a glitch": 4.0 * (np.arange(N) == 100)}[still]
+    replace(recording, columns=recording.columns | velocity).save(laps)
+    status, _, err = dynssm(*command, laps, "--vehicle", "orca", "--out", tmp_path / "out")
+    (line,) = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert (status, (tmp_path / "out").exists()) == (1, False)
+    assert re.search(r"the car stands: .* expected a drive, 0.097 m/s or more; --force writes it all the same", line)
+
+
 def test_errors_are_compared_with_those_of_nothing_state_by_state() -> None:
     """Changes by 1, 2 and 4; errors of a half, a quarter and twice as much."""
     windows = SimpleNamespace(

@@ -36,12 +36,13 @@ FILES = {"signals.yaml": (config_root() / "signals" / "default.yaml").read_text(
 
 
 class Commands:
-    """Writes what each command would write; ``lines`` are what some print, ``status`` how some end."""
+    """Writes what each command would write; ``lines`` are what some print, ``status`` how some end, ``maps`` of some logs."""
 
     def __init__(self) -> None:
         self.verbs: list[str] = []
         self.lines: dict[str, list[str]] = {}
         self.status: dict[str, int] = {}
+        self.maps: dict[str, str] = {}
 
     def __call__(self, command: Sequence[str], on_line: OnProgress) -> int:
         verb, options = command[0], dict(pairwise(command))
@@ -51,7 +52,8 @@ class Commands:
         if not self.status.get(verb):
             for path in _written(verb, options):
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(json.dumps(RESULTS[verb]) if path.suffix == ".json" else FILES.get(path.name, verb))
+                files = FILES | {"signals.yaml": self.maps.get(path.parent.name, FILES["signals.yaml"])}
+                path.write_text(json.dumps(RESULTS[verb]) if path.suffix == ".json" else files.get(path.name, verb))
         return self.status.get(verb, 0)
 
 
@@ -188,6 +190,26 @@ def test_several_logs_have_recordings_of_their_own(tmp_path: Path) -> None:
     logs = [tmp_path / "a" / "run.csv", tmp_path / "b" / "run.csv"]
     steps = list(plan(logs, "orca", tmp_path / "out", LearnSettings()))
     assert [step.outputs[0].name for step in steps if step.name == "extract"] == ["run_1.parquet", "run_2.parquet"]
+
+
+def test_a_log_that_suggests_another_scale_than_the_first_is_told(
+    commands: Commands, log: Path, tmp_path: Path
+) -> None:
+    """As often as it runs, unless a map is given."""
+    other, told, out = tmp_path / "other.csv", list[str](), tmp_path / "out"
+    other.write_text("time\n0\n")
+    steering = 'field: "position[steering]"}'
+    commands.maps["other"] = FILES["signals.yaml"].replace(steering, steering.replace("}", ", scale: 4.2}"), 1)
+    expected = (
+        f"warning: other: steering_feedback: scale 4.2 suits this log, scale 1 suits run; taken for all logs is "
+        f"{out / 'inspection' / 'run' / 'signals.yaml'}: correct it, or leave out the log that is wrong"
+    )
+    for _ in range(2):
+        api.learn([log, other], "orca", out, on_progress=told.append)
+    assert [line for line in told if line.startswith("warning")] == [expected] * 2
+    assert lines(out)["data"] == "look"
+    api.learn([log, other], "orca", tmp_path / "given", signals="default", on_progress=told.append)
+    assert told.count(expected) == 2
 
 
 def test_a_folder_of_something_else_is_not_written_to(log: Path, tmp_path: Path, commands: Commands) -> None:
