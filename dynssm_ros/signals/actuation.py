@@ -41,7 +41,7 @@ _BRAKES = 0.02
 """Share of driving forwards with a negative value, from which on it is no set-point of the speed."""
 _LIKE_UNIT = 0.25
 """By how much a scale of the steering may differ from that which a wrong unit of speed or yaw rate gives."""
-_OFFSET_RAD = 0.04
+OFFSET_RAD = 0.04
 """Straight-ahead steering that is left alone: servos are trimmed worse than that by nobody; banked roads need 0.02."""
 _LEAST_REST, _RESTS_S, _STANDS = 0.03, 1.0, 0.05
 """Rest value of a throttle that is told; for how long the car rests with it (s); share of its speed at which it stands."""
@@ -221,12 +221,12 @@ def _or_unit(scale: float) -> str:
 def _offset(drive: Drive, fit: Fitted) -> list[Finding]:
     """Steering at which the car goes straight, if that is not about 0; told where it turned to both sides."""
     offset, (low, high) = float(fit.values[0]), fit.interval(0)
-    if (low < _OFFSET_RAD and high > -_OFFSET_RAD) or not turns_both_ways(drive):
+    if (low < OFFSET_RAD and high > -OFFSET_RAD) or not turns_both_ways(drive):
         return []
     return [
         Finding(
             what="steering_offset", told=f"the car goes straight at delta_fb = {number(offset)} rad", size=offset, low=low,
-            high=high, unit="rad", expected=f"0 (within {_OFFSET_RAD:g} rad)",
+            high=high, unit="rad", expected=f"0 (within {OFFSET_RAD:g} rad)",
             remedy=f"steering_feedback: offset: {number(-offset)}",
         )
     ]  # fmt: skip

@@ -5,11 +5,12 @@ steering-wheel angles and swapped signs are seen.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.signals.actuation import SCALES, UNDERSTEER, believable, understeer
+from dynssm_ros.signals.actuation import OFFSET_RAD, SCALES, UNDERSTEER, believable, understeer
 from dynssm_ros.signals.contents import TopicContent, spread
 from dynssm_ros.signals.signal_map import UNITS
 from dynssm_ros.signals.spans import blocks
@@ -37,20 +38,30 @@ class Suggestion:
         return self.scale * UNITS[self.unit] * self.topic.values[self.field] + self.offset
 
 
+class _Driven(NamedTuple):
+    """How a car bends with a steering signal; each value, its least and its largest."""
+
+    slope: tuple[float, float, float]  # change of the curvature in a slow car (1/m per unit)
+    straight: tuple[float, float, float]  # signal at which it goes straight; 0 where that is not known
+
+
 def scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], wheelbase: float | None) -> Suggestion:
-    """The steering in rad at the road wheel, as far as the curvature that it drives tells."""
+    """The steering in rad at the road wheel, 0 straight ahead, as far as the curvature that it drives tells."""
     suggestion = replace(suggestion, scale=1.0)
-    seen, values = _curvature_per_unit(suggestion, signals), suggestion.values
+    seen, values = _driven(suggestion, signals), suggestion.values
     if seen is None:
         large = float(np.nanmax(np.abs(values), initial=0.0)) > _RADIANS
         note = "too large for rad at the road wheel: find its scale" if large else suggestion.note
         return replace(suggestion, note=note)
-    slope, low, high = seen
-    told = f"the curvature follows it with {slope:.4g} 1/m per unit, understeer taken off"
+    told = f"the curvature follows it with {seen.slope[0]:.4g} 1/m per unit, understeer taken off"
     if wheelbase is None:
         return replace(suggestion, note=f"{told}: the scale is about that times the wheelbase")
-    low, high = low * wheelbase, high * wheelbase
-    sign, least, most = (1.0, low, high) if slope > 0 else (-1.0, -high, -low)
+    return _straightened(_scaled(suggestion, told, *(each * wheelbase for each in seen.slope)), suggestion, seen)
+
+
+def _scaled(suggestion: Suggestion, told: str, scale: float, low: float, high: float) -> Suggestion:
+    """In rad: as it is where that is possible, else in degrees, else by the ``scale`` of which an interval is known."""
+    sign, least, most = (1.0, low, high) if scale > 0 else (-1.0, -high, -low)
     other = replace(suggestion, scale=sign, note=told)
     if sign < 0:
         other = replace(
@@ -61,11 +72,21 @@ def scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], whee
     degree = UNITS["deg"]
     if suggestion.unit == "1" and least < _DEGREES[1] * degree and most > _DEGREES[0] * degree:
         return replace(other, unit="deg")
-    return replace(other, scale=slope * wheelbase, note=f"{other.note}; measure the scale at the wheel")
+    return replace(other, scale=scale, note=f"{other.note}; measure the scale at the wheel")
 
 
-def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) -> tuple[float, float, float] | None:
-    """Change of ``omega / v_x`` (1/m) per unit of the signal in a slow car, and its least and largest value.
+def _straightened(scaled: Suggestion, suggestion: Suggestion, seen: _Driven) -> Suggestion:
+    """With an offset where the car goes straight at another angle than 0, as by the position of a servo."""
+    factor = scaled.scale * UNITS[scaled.unit] / UNITS[suggestion.unit]
+    angle, low, high = (factor * each for each in seen.straight)
+    if min(low, high) < OFFSET_RAD and max(low, high) > -OFFSET_RAD:
+        return scaled
+    note = f"the car goes straight at {angle:.3g} rad of it: offset"
+    return replace(scaled, offset=-angle, note=f"{scaled.note}; {note}" if scaled.note else note)
+
+
+def _driven(suggestion: Suggestion, signals: dict[str, Suggestion]) -> _Driven | None:
+    """How ``omega / v_x`` goes with the signal.
 
     Understeer is fitted with it where speeds differ enough, else it is what cars have. ``None`` where the two do not go
     together.
@@ -85,7 +106,16 @@ def _curvature_per_unit(suggestion: Suggestion, signals: dict[str, Suggestion]) 
     sign, speed = float(np.sign(slope)), v_x[fast]
     fit = understeer(sign * values[fast], curvature, speed, block=blocks(len(speed)))
     if fit is not None and fit.share > _AGREES:
+        right, left = np.percentile(curvature, [10.0, 90.0])
+        straight = (fit.values[0], *fit.interval(0)) if right < 0.0 < left else (0.0,) * 3
         low, high = believable(fit, float(np.mean(speed**2)))
         if 0 < low <= high:
-            return sign / float(fit.values[1]), *sorted((sign / low, sign / high))  # type: ignore[return-value]
-    return slope, *sorted(slope * (1.0 + share) for share in UNDERSTEER)  # type: ignore[return-value]
+            slopes = (1.0 / float(fit.values[1]), 1.0 / high, 1.0 / low)
+            return _Driven(*(_turned(sign, *each) for each in (slopes, straight)))
+    return _Driven(_turned(1.0, slope, *(slope * (1.0 + share) for share in UNDERSTEER)), (0.0,) * 3)
+
+
+def _turned(sign: float, value: float, one: float, other: float) -> tuple[float, float, float]:
+    """With another sign, the least of both ends first."""
+    low, high = sorted((sign * one, sign * other))
+    return sign * float(value), float(low), float(high)

@@ -28,16 +28,23 @@ def suggested(found: Inspection) -> SignalMap:
 
 
 def bends(
-    joints: str = "steering", scale: float = 1.0, late: float = 0.0, topic: str = FEEDBACK, rate: float = 50.0
+    joints: str = "steering",
+    scale: float = 1.0,
+    late: float = 0.0,
+    topic: str = FEEDBACK,
+    rate: float = 50.0,
+    straight: float = 0.0,
 ) -> list[Any]:
-    """20 s of bends without slip; the joints say ``scale`` times the road-wheel angle, ``late`` by another clock (s)."""
+    """20 s of bends without slip; the joints say ``straight`` and ``scale`` times the road-wheel angle, ``late`` by another
+    clock (s).
+    """
     records = []
     for t in np.arange(0.0, 20.0, 1 / rate):
         stamp, delta, v_x = START + round(t * 1e9), 0.2 * np.sin(t), 3.0 + np.sin(0.3 * t)
         omega = v_x * np.tan(delta) / WHEELBASE
         moved = messages.odometry(stamp, (t, 0.1 * t, 0.0), (v_x, 0.01 * np.sin(t), omega))
         values = messages.joint_state(
-            stamp - round(late * 1e9), {"throttle": 0.4 + 0.1 * np.sin(t), joints: scale * delta}
+            stamp - round(late * 1e9), {"throttle": 0.4 + 0.1 * np.sin(t), joints: straight + scale * delta}
         )
         records.append((ODOMETRY, messages.ODOMETRY, stamp, moved))
         records.append((topic, messages.JOINT_STATE, stamp, values))
@@ -76,6 +83,31 @@ def test_degrees_swapped_signs_and_steering_wheels_are_seen_by_the_curvature(
     assert "curvature" in found.note
     unknown = inspect(bag).signals["steering_feedback"]
     assert (unknown.scale, "times the wheelbase" in unknown.note) == (1.0, True)
+
+
+@pytest.mark.parametrize(
+    ("scale", "straight", "offset"),
+    [
+        (-1.2135, 0.5304, 0.5304),
+        (1.0, -0.1, 0.1),
+        (1.0, 0.02, 0.0),
+        (180 / np.pi, 20.0, -np.radians(20.0)),
+        (14.0, 7.0, -0.5),
+    ],
+)
+def test_a_servo_whose_position_is_not_0_straight_ahead_gets_an_offset(
+    make_bag: Any, scale: float, straight: float, offset: float
+) -> None:
+    """As of F1TENTH cars, whose servo is at 0.53 then and turns to the right."""
+    bag = make_bag(bends(scale=scale, straight=straight))
+    found = inspect(bag, WHEELBASE)
+    one = found.signals["steering_feedback"]
+    assert one.offset == pytest.approx(offset, abs=0.03)
+    assert ("goes straight at" in one.note) == (offset != 0.0)
+    assert not [each for each in found.findings if each.what.startswith("steering")]
+    recording = extract([bag], suggested(found), 50.0)
+    ahead = np.abs(recording["omega"]) < 0.05 * np.abs(recording["omega"]).max()
+    assert np.median(recording["delta_fb"][ahead]) == pytest.approx(0.0, abs=0.03)
 
 
 def moved(change: Any) -> list[Any]:
