@@ -22,6 +22,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.configuration import StrictModel
 
 GRAVITY = 9.81  # m/s^2
@@ -175,6 +176,13 @@ class StageEffect:
     def carries(self) -> tuple[str, ...]:
         """Names of its own states (a lag, a relaxing tyre), which the integrator advances with the car's."""
         return ()
+
+    def before(self, rows: Vector) -> dict[str, Vector]:
+        """Own states at measured rows ``(7, N)`` that the drive until there tells, by name, each ``(N,)``.
+
+        A simulation that begins there is given them in the context.
+        """
+        return {}
 
     @property
     def measures(self) -> bool:

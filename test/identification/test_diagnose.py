@@ -51,15 +51,8 @@ def hidden_drive(name: str, laps: Laps) -> tuple[Recording, Vehicle]:
     return laps(name, seed=SEED, duration=120.0 if name == "grip_patch" else 70.0)
 
 
-NOT_NAMED = pytest.mark.xfail(strict=True, reason="drag is named instead, as in two of six drives something else is")
-
-
 @pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[*[pytest.mark.slow] * (name not in AT_ONCE), *[NOT_NAMED] * (name == "gear_shift")])
-        for name in sorted(EFFECTS)
-    ],
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in AT_ONCE)) for name in sorted(EFFECTS)]
 )
 def test_a_hidden_cause_is_named(name: str, laps: Laps, lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:
     if name == "steering_lag":

@@ -59,6 +59,18 @@ def test_a_lag_is_led_along_the_rows_before_the_start() -> None:
     np.testing.assert_array_equal(some.errors(in_fit), some.errors(CarEstimate.of(lagging)))
 
 
+def test_between_two_speeds_the_drive_before_tells_the_gear() -> None:
+    shifting = AV21.with_effect("gear_shift", {"factor": 0.7, "up": 34.0, "down": 24.0})
+    some = windows(shifting)
+    begin, upper = some.starts - some.warm, np.zeros(some.data.rows.shape[1])
+    for row, speed in enumerate(some.data.rows[0]):
+        upper[row] = 1.0 if speed > 34.0 else 0.0 if speed < 24.0 else upper[row - 1]
+    misled = (some.data.rows[0, begin] > 29.0) != upper[begin]
+    with_gears, without = (np.abs(some.errors(CarEstimate.of(car))).max(axis=(1, 2)) for car in (shifting, AV21))
+    assert np.count_nonzero(misled) > 10
+    assert with_gears.max() < 0.01 < without[misled].max()
+
+
 def test_simulations_in_blocks_are_those_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     some, car = windows(AV21), CarEstimate.of(AV21)
     cars = [car.with_effect("steering_lag", {"time_constant": value}) for value in (0.05, 0.1)]

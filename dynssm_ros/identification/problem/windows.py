@@ -270,7 +270,8 @@ class SimulationWindows:
         """The other signals that effects of the car read, by row; ``context`` replaces them."""
         signals = self.data.context
         needs = dict.fromkeys(name for effect in car.effects for name in effect.needs if name in signals)
-        return {name: (context or {}).get(name, signals[name]) for name in needs}
+        told = {name: values for effect in car.effects for name, values in effect.before(self.data.rows).items()}
+        return told | {name: (context or {}).get(name, signals[name]) for name in needs}
 
     def _read(self, car: CarModel, k: int, context: Mapping[str, float] | None) -> dict[str, Any]:
         """The other signals that effects of the car read, ``k`` rows after the starts; ``context`` replaces them."""

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from dynssm_ros.arrays import Vector
 from dynssm_ros.vehicle.effects.base import SLOWEST, Effect, Parameter, like
-from dynssm_ros.vehicle.effects.step_errors import StepErrors, shift_speeds
+from dynssm_ros.vehicle.effects.step_errors import StepErrors, changed_above, shift_speeds
 from dynssm_ros.vehicle.single_track import Array, Motion, at_least
 
 TRACK_WIDTH = 0.55  # of the wheelbase: 1.64 m for an Indy car, 34 mm for a 1:43 car
@@ -70,7 +71,8 @@ class GearShift(Effect):
 
     The gear changes up where the speed exceeds ``up`` and down where it falls below ``down``. Its state ``g`` goes from 0 to
     1 and back, ``dg/dt = ((v > up) (1 - g) - (v < down) g) / time_constant``; the force is that of the lower gear times
-    ``(1 + (factor - 1) g) (1 - 4 gap g (1 - g))``. Where nothing tells the gear, it is by the middle of the two speeds.
+    ``(1 + (factor - 1) g) (1 - 4 gap g (1 - g))``. Between the speeds the drive until then tells the gear; where it is not
+    known, it is by the middle of the two.
     """
 
     NAME = "gear_shift"
@@ -106,10 +108,15 @@ class GearShift(Effect):
         up = float(rng.uniform(22.0, 30.0))
         return {"factor": 1.0 + float(rng.choice([-1.0, 1.0])) * amount, "up": up, "down": 0.85 * up}
 
+    def before(self, rows: Vector) -> dict[str, Vector]:
+        (name,) = self.EFFECT_STATES
+        return {name: changed_above(rows[0], self.up, self.down)} if isinstance(self.up, float) else {}
+
     def drive(self, xp: Any, q: Motion) -> None:
         (name,) = self.EFFECT_STATES
         speed = abs(q.v_x)
-        gear: Array = q.effect_states.setdefault(name, like(q, 1.0 * (speed > (self.up + self.down) / 2)))
+        first = q.context[name] if name in q.context else like(q, 1.0 * (speed > (self.up + self.down) / 2))
+        gear: Array = q.effect_states.setdefault(name, first)
         rate = (speed > self.up) * (1.0 - gear) - (speed < self.down) * gear
         q.effect_state_rates[name] = rate / at_least(self.time_constant, q.h)
         changed = (1.0 + (self.factor - 1.0) * gear) * (1.0 - 4.0 * self.gap * gear * (1.0 - gear))

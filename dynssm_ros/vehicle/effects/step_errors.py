@@ -31,12 +31,12 @@ _ALIKE = 0.97  # of the best, from which on a rounder period is taken
 _SPEEDS, _SPEED_RANGE = 40, (0.05, 0.95)  # that are tried as those of a gear change, of the speeds under throttle
 _HYSTERESIS = (0.03, 0.1, 0.2, 0.3)  # of the speed for the change up, by which the one for the change down is less
 _APART = 0.03  # of the speed for the change up, by which a measured one down is less at least
+_FINER_SPEEDS = (0.02, 0.007)  # shares of both speeds in which the best pair is placed more finely, one after the other
+_STEPS_ASIDE = (0, 1, -1, 2, -2)  # of these that are tried
 _SHIFTS, _GAP_ROWS = 4, 3  # changes, at least; rows after one in which the force may have a gap
-_TOGETHER_S = 0.2  # over which errors are summed up to find changes of gear
+_TOGETHER_S = 0.5  # over which errors are summed up to find changes of gear: the noise of their ends does not add up
 _BENT_TOGETHER_S = 1.0  # the same to find a bend, that lasts longer: evidence grows with it, as noise does not add up
-_SHIFT_CHANCE = (
-    20.0  # of twice the log-likelihood: the best of 160 pairs of speeds reached 12 in nine drives without gears
-)
+_SHIFT_CHANCE = 25.0  # of twice the log-likelihood: the best pair reached 18 in 41 drives without gears
 _FASTEST = 0.98  # quantile of the speeds under throttle that counts as the top speed
 _BENT_CHANCE = 25.0  # of twice the log-likelihood of five columns, which chance exceeds in one drive of 7000
 
@@ -210,6 +210,15 @@ class _DriveErrors(NamedTuple):
         taken = float(along @ np.linalg.lstsq(force.T @ force, along, rcond=1e-9)[0])
         return len(self.error) * float(np.log(left / max(left - taken, 1e-9 * left)))
 
+    def sure_of_shifts(self, up: float, down: float) -> float:
+        """Twice the log-likelihood of a force that is another one above these speeds, with a gap where they are passed."""
+        gear = changed_above(self.v_x, up, down)
+        passed = np.abs(np.diff(gear, prepend=gear[0]))
+        gap = sum(np.concatenate([np.zeros(k), passed[: len(passed) - k]]) for k in range(_GAP_ROWS))
+        if not _SHIFTS <= passed.sum() <= len(gear) / (4 * _GAP_ROWS):
+            return 0.0
+        return self.sure(np.stack([self.driven * gear, self.driven * gap], axis=1))
+
 
 def _summed(columns: Vector, together: int) -> Vector:
     """Sums of so many rows each of columns ``(N, k)``."""
@@ -233,22 +242,21 @@ def shift_speeds(steps: StepErrors) -> tuple[float, float] | None:
 
     Tried are the usual speeds of the changes into each gear where the recording tells the gear, else a grid of speeds.
     Compared is what a smooth function of speed and throttle leaves of the errors in v_x, with and without a force that is
-    another one above the speeds, and a gap in it where they are passed.
+    another one above the speeds, and a gap in it where they are passed. The best of the grid is then placed more finely.
     """
     drive = _DriveErrors.of(steps, _TOGETHER_S, bent=True)
     if drive is None or np.count_nonzero(drive.driven) < 2 * _SPEEDS:
         return None
-    best, found = _SHIFT_CHANCE, None
     told = _told_speeds(steps)
-    for up, down in _grid_of_speeds(drive.v_x[drive.driven > 0.0]) if told is None else told:
-        gear = changed_above(drive.v_x, up, down)
-        passed = np.abs(np.diff(gear, prepend=gear[0]))
-        gap = sum(np.concatenate([np.zeros(k), passed[: len(passed) - k]]) for k in range(_GAP_ROWS))
-        if not _SHIFTS <= passed.sum() <= len(gear) / (4 * _GAP_ROWS):
-            continue
-        sure = drive.sure(np.stack([drive.driven * gear, drive.driven * gap], axis=1))
-        if sure > best:
-            best, found = sure, (up, down)
+    tried = _grid_of_speeds(drive.v_x[drive.driven > 0.0]) if told is None else told
+    sure, found = max(((drive.sure_of_shifts(*pair), pair) for pair in tried), default=(0.0, None))
+    if found is None or sure < _SHIFT_CHANCE:
+        return None
+    for share in _FINER_SPEEDS if told is None else ():
+        near = (
+            (found[0] * (1.0 + share * k), found[1] * (1.0 + share * j)) for k in _STEPS_ASIDE for j in _STEPS_ASIDE
+        )
+        found = max((pair for pair in near if pair[1] < pair[0]), key=lambda pair: drive.sure_of_shifts(*pair))
     return found
 
 
