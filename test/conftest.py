@@ -217,15 +217,28 @@ def vast_model(small_model: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def rls_model(kept: Kept) -> Path:
-    """The folder of the online layer alone, trained on 40 s of a four-wheeled small car with noisy sensors."""
+def four_wheels(kept: Kept) -> Path:
+    """40 s of a small car with four wheels and load transfer on a club track, with noisy sensors, as a recording."""
+
+    def make(folder: Path) -> None:
+        from dynssm_ros.api import recorded, simulate
+
+        noise = (0.01, 0.01, 0.03)
+        recorded(simulate("orca", "club", duration=40.0, seed=5, plant="double_track", noise=noise)).save(
+            folder / "laps.parquet"
+        )
+
+    return kept("four_wheels", make) / "laps.parquet"
+
+
+@pytest.fixture(scope="session")
+def rls_model(four_wheels: Path, kept: Kept) -> Path:
+    """The folder of the online layer alone, trained on ``four_wheels``."""
 
     def make(folder: Path) -> None:
         import dynssm_ros
 
-        noise = (0.01, 0.01, 0.03)
-        run = dynssm_ros.simulate("orca", "club", duration=40.0, seed=1, plant="double_track", noise=noise)
-        dynssm_ros.train(dynssm_ros.recorded(run), "rls", "orca", folder / "rls")
+        dynssm_ros.train(four_wheels, "rls", "orca", folder / "rls")
 
     return kept("rls_model", make) / "rls"
 

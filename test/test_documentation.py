@@ -136,6 +136,7 @@ def assert_links_lead_somewhere(page: str, text: str, folder: Path) -> None:
         assert "://" in target or (folder / target).exists(), f"{page}: {target}"
 
 
+@pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "-d", str(tmp_path / "trees")]
     built = subprocess.run(

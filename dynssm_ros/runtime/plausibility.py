@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import le
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,12 +18,14 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.runtime.consistency import Consistency
 from dynssm_ros.signals.decoding import Frames
 from dynssm_ros.signals.history import Refusal
-from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENTS, State, Vehicle
 from dynssm_ros.vehicle.kinematics import Pose
 from dynssm_ros.vehicle.limits import vehicle_limits
 from dynssm_ros.vehicle.single_track import standing_speed
+
+if TYPE_CHECKING:  # reading files is not what a node starts with
+    from dynssm_ros.signals.recording import Recording
 
 _BEYOND = 1.5  # times a limit
 _SPIN = 3.0  # times the yaw rate of the tightest corner at the limit

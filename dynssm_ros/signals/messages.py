@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
 
 from dynssm_ros.arrays import Vector
 
@@ -26,7 +26,12 @@ MARKERS_TOPIC = "/dynssm/markers"
 UNKNOWN = 1e6
 """Variance of what nobody states: so large that who weighs by it gives it no weight (zero would mean certain)."""
 
-_TYPES = get_typestore(Stores.ROS2_JAZZY).types
+
+@cache
+def _types() -> Mapping[str, Any]:
+    from rosbags.typesys import Stores, get_typestore  # 0.2 s at the start of each node, which needs the names alone
+
+    return get_typestore(Stores.ROS2_JAZZY).types
 
 
 def odometry(
@@ -50,30 +55,32 @@ def odometry(
     """
     x, y, theta = pose
     v_x, v_y, omega = state
-    vector, point = _TYPES["geometry_msgs/msg/Vector3"], _TYPES["geometry_msgs/msg/Point"]
-    quaternion = _TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2))
-    body = _TYPES["geometry_msgs/msg/Pose"](point(float(x), float(y), 0.0), quaternion)
-    twist = _TYPES["geometry_msgs/msg/Twist"](vector(float(v_x), float(v_y), 0.0), vector(0.0, 0.0, float(omega)))
+    types = _types()
+    vector, point = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Point"]
+    quaternion = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2))
+    body = types["geometry_msgs/msg/Pose"](point(float(x), float(y), 0.0), quaternion)
+    twist = types["geometry_msgs/msg/Twist"](vector(float(v_x), float(v_y), 0.0), vector(0.0, 0.0, float(omega)))
     covariance = planar_covariance(None) if twist_covariance is None else twist_covariance
-    return _TYPES[ODOMETRY](
+    return types[ODOMETRY](
         _header(stamp, frame_id),
         child_frame_id,
-        _TYPES["geometry_msgs/msg/PoseWithCovariance"](body, planar_covariance(None)),
-        _TYPES["geometry_msgs/msg/TwistWithCovariance"](twist, covariance),
+        types["geometry_msgs/msg/PoseWithCovariance"](body, planar_covariance(None)),
+        types["geometry_msgs/msg/TwistWithCovariance"](twist, covariance),
     )
 
 
 def joint_state(stamp: int, values: Mapping[str, float], effort: Vector | None = None) -> Any:
     """A JointState message with a position for each name, and an effort if given; ``stamp`` in ns."""
     position = np.array(list(values.values()), dtype=np.float64)
-    return _TYPES[JOINT_STATE](
+    return _types()[JOINT_STATE](
         _header(stamp, ""), list(values), position, np.zeros(0), np.zeros(0) if effort is None else effort
     )
 
 
 def _header(stamp: int, frame_id: str) -> Any:
     seconds, nanoseconds = divmod(int(stamp), 1_000_000_000)
-    return _TYPES["std_msgs/msg/Header"](_TYPES["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame_id)
+    types = _types()
+    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame_id)
 
 
 def planar_covariance(variances: Vector | None) -> Vector:

@@ -13,7 +13,7 @@ from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.signals.history import Refusal
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_no_damaged_message_raises_or_yields_a_prediction(small_model: Path, seed: int) -> None:
     done = fuzz(small_model, 6000, seed)
     assert done.violations == {}
@@ -23,10 +23,12 @@ def test_no_damaged_message_raises_or_yields_a_prediction(small_model: Path, see
     assert {"not_finite", "implausible", "jumped", "no_orientation", "repeated", "outlier"} <= set(done.refusals)
 
 
+@pytest.mark.slow
 def test_the_same_seed_sends_the_same(small_model: Path) -> None:
     assert fuzz(small_model, 1000, 3) == fuzz(small_model, 1000, 3)
 
 
+@pytest.mark.slow
 def test_what_must_not_happen_is_seen(small_model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     right = Predictor.predict
     last: list[Prediction] = []

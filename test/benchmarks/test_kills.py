@@ -29,6 +29,7 @@ def test_an_extraction_that_is_killed_leaves_the_older_recording(laps_bag: Path,
     assert outcome.older + outcome.newer == 3
 
 
+@pytest.mark.slow
 def test_an_output_that_is_written_in_place_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kills, "_dynssm", lambda arguments: [sys.executable, "-c", _IN_PLACE, *arguments])
     outcome = kill(Command("toy", (), "out"), tmp_path, 8, seed=0)

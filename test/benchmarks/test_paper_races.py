@@ -55,6 +55,7 @@ def document(plan, root, path):
     return path.read_text()
 
 
+@pytest.mark.slow
 def test_models_without_training_drive_and_those_that_are_not_there_are_left_out(plan, root):
     driven = json.loads((root / race_key("lap") / NUMBERS).read_text())
     assert list(driven["models"]) == ["true", "single_track"]

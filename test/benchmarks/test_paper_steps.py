@@ -253,6 +253,7 @@ def test_a_test_part_is_scored_and_nothing_else(quick_run):
     assert track.test("late")["horizon_s"] == 0.1
 
 
+@pytest.mark.slow
 def test_fine_tuning_goes_on_from_the_model_that_the_split_has_anyway(plan, tmp_path):
     """A planted mark in the first model's checkpoint comes out of the second's."""
     study = plan.studies["track"].model_copy(update={"models": ("fthd_orca_ddm", "fthd_orca"), "seeds": 1})

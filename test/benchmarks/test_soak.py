@@ -15,6 +15,7 @@ from benchmarks.endurance.soak import main, soak
 pytestmark = pytest.mark.live
 
 
+@pytest.mark.slow
 def test_each_message_is_answered_while_models_are_swapped(small_model: Path, tmp_path: Path) -> None:
     other = shutil.copytree(small_model, tmp_path / "other")
     begin = time.monotonic()

@@ -33,6 +33,7 @@ def arguments(laps_bag: Path, tiny_model: Path, tmp_path: Path) -> list[str]:
     return ["train", str(tmp_path / "laps.parquet"), *model]
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_says_how_to_go_on_and_does(
     dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -71,6 +72,7 @@ def test_a_training_that_came_to_nothing_says_so_and_leaves_what_shows_why(
     assert (tmp_path / "model" / "losses.png").is_file()
 
 
+@pytest.mark.slow
 def test_fine_tuning_takes_one_command_and_goes_on_in_the_stage_where_it_was(
     dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -128,6 +130,7 @@ def test_a_device_that_is_not_there_is_refused(refused: Callable[..., str], argu
     assert refused(*arguments, "--device", "cuda") == "error: --device cuda: not available here; expected cpu"
 
 
+@pytest.mark.slow
 def test_the_present_folder_can_hold_the_model(
     dynssm: Run, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -196,7 +196,7 @@ def looked_up(table: Vector, acceleration: float, speed: float) -> float:
     return float(np.interp(acceleration, column, table[1 : len(column) + 1, 0]))
 
 
-@pytest.mark.parametrize("name", ["orca", "av21", "sedan"])
+@pytest.mark.parametrize("name", ["orca", *(pytest.param(name, marks=pytest.mark.slow) for name in ("av21", "sedan"))])
 def test_the_steering_of_the_table_makes_the_acceleration(name: str, tmp_path: Path) -> None:
     vehicle = without_shifts(name)
     export(vehicle, format="steering_table").save(tmp_path / "table")

@@ -65,6 +65,7 @@ def test_a_delay_that_is_known_costs_the_true_model_nothing(course, lap, orca, d
     np.testing.assert_allclose(late.pose[100:250], lap.pose[100:250], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_noise_is_filtered_before_it_is_planned_from(course, lap, orca, monkeypatch):
     sensing = Sensing(noise=(0.03, 0.03, 0.09), pose_noise=(0.005, 0.005, 0.005), seed=1)
     noisy = replace(course, start=Start(lateral=0.05), sensing=sensing)

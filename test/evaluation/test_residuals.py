@@ -104,6 +104,7 @@ def test_speeds_at_which_large_errors_come_are_named_as_ranges_and_none_by_chanc
     assert chance == ()
 
 
+@pytest.mark.slow
 def test_a_drive_in_other_steps_than_the_file_names_the_integrator_and_no_delay() -> None:
     drive = dynssm_ros.simulate("orca", "club", duration=60.0, noise=NOISE, seed=3, plant="rk4")
     found = taken_apart(dynssm_ros.recorded(drive)).patterns

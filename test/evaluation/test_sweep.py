@@ -80,6 +80,7 @@ def test_more_trials_go_on_from_those_that_are_there(tmp_path: Path) -> None:
     assert bit.trials == whole.trials
 
 
+@pytest.mark.slow
 def test_several_processes_find_what_one_finds(tmp_path: Path) -> None:
     found: list[list[Trial]] = []
     for name, workers in (("one", Workers()), ("two", Workers(2))):

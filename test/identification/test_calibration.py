@@ -164,6 +164,7 @@ def test_the_calibrated_vehicle_carries_values_and_errors(orca: Vehicle, found: 
     assert found.vehicle.constants == orca.constants
 
 
+@pytest.mark.slow
 def test_outliers_hardly_move_it(noisy: Recording, orca: Vehicle, found: Calibration) -> None:
     spoilt = {name: values.copy() for name, values in noisy.columns.items()}
     spoilt["omega"][200::397] += 5.0
@@ -174,6 +175,7 @@ def test_outliers_hardly_move_it(noisy: Recording, orca: Vehicle, found: Calibra
     assert np.median(off) < 0.02
 
 
+@pytest.mark.slow
 def test_the_seed_alone_decides(noisy: Recording, orca: Vehicle) -> None:
     part, car = noisy.select(slice(0, 800)), around(orca, 0.5)
     first, second = (calibrate(part, car, integrator="euler", starts=3, seed=7) for _ in range(2))

@@ -56,6 +56,7 @@ def test_grip_that_grows_does_not_stand_for_a_scale_that_drifts(spoiled: Callabl
     assert any("grip_drift would be on the side of neutral on which no car has it" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_was_loose_for_seconds_is_placed_in_time(spoiled: Callable[..., Diagnosis]) -> None:
     found = spoiled(loose_sensor, QUICK)
     assert (found.verdict, found.causes) == ("unexplained", ())

@@ -123,6 +123,7 @@ def test_each_road_has_its_own_laps(days: list[Recording]) -> None:
     assert len(set(parts.unit[together.number[starts] == 1])) == 4
 
 
+@pytest.mark.slow
 def test_many_short_laps_are_left_out_in_groups() -> None:
     together = RecordingSet.of([recorded(200.0, 4)], 0.25)
     whole, parts, _ = together.left_out(np.flatnonzero(~together.held_out)[::20])

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dynssm_ros.api import recorded, simulate
 from dynssm_ros.runtime.plausibility import ranges
+from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import load_vehicle
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
@@ -31,9 +32,8 @@ Send = Callable[[Any, Row], "int | None"]
 
 
 @pytest.fixture(scope="module")
-def laps() -> list[Row]:
-    """A car with four wheels, with the usual noise."""
-    drive = recorded(simulate("orca", "club", plant="double_track", duration=30.0, noise=(0.01, 0.01, 0.03), seed=5))
+def laps(four_wheels: Path) -> list[Row]:
+    drive = Recording.load(four_wheels)
     columns = {"v_x": "v_x", "v_y": "v_y", "omega": "omega", "throttle": "r_fb", "steering": "delta_fb"}
     return [{name: float(drive[column][k]) for name, column in columns.items()} for k in range(len(drive))]
 

@@ -55,6 +55,7 @@ class NamespacedCar:
         return self.stamp
 
 
+@pytest.mark.slow
 def test_two_cars_in_two_namespaces_do_not_hear_each_other(small_model: Path) -> None:
     """The second car drives half an hour later than the first, and both at the same time."""
     with ExitStack() as stack:

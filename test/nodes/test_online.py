@@ -33,7 +33,7 @@ SECONDS, GAP_NS = 35.0, 5_000_000_000
 FIRST = 12.0  # s of the stint on the known track
 
 
-def drive(track, seed, seconds=SECONDS, **effects):
+def drive(track, seed, seconds, **effects):
     run = dynssm_ros.simulate(
         "orca", track, duration=seconds, seed=seed, plant="double_track", noise=(0.01, 0.01, 0.03), effects=effects
     )
@@ -41,11 +41,15 @@ def drive(track, seed, seconds=SECONDS, **effects):
 
 
 @pytest.fixture(scope="module")
-def stints():
-    """Another driver on the track of the training, then another track with less grip, 5 s later."""
-    first, second = drive("club", 2, FIRST), drive("club_b", 3, front_grip={"factor": 0.85})
-    shift = first.time[-1] + GAP_NS - second.time[0]
-    return first, dataclasses.replace(second, time=second.time + shift)
+def first():
+    """Another driver on the track of the training."""
+    return drive("club", 2, FIRST)
+
+
+def another(first, seconds):
+    """Another track with less grip, 5 s after ``first``."""
+    second = drive("club_b", 3, seconds, front_grip={"factor": 0.85})
+    return dataclasses.replace(second, time=second.time + first.time[-1] + GAP_NS - second.time[0])
 
 
 def replayed(model, bag, online=True, state=None):
@@ -69,9 +73,9 @@ def rmse(found, recording, start, end):
 
 
 @pytest.mark.slow
-def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(rls_model, stints, tmp_path: Path):
-    bag = tmp_path / "both"
-    recording_to_bag(concatenate(stints), bag)
+def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(rls_model, first, tmp_path: Path):
+    bag, second = tmp_path / "both", another(first, SECONDS)
+    recording_to_bag(concatenate([first, second]), bag)
     run = run_live(rls_model, bag, 0.02, rate=3.0, in_step=True)
     assert len(run.missing()) < 40, run.diagnostics[-1]  # the window fills anew after the gap
     expected = replayed(rls_model, bag)
@@ -81,19 +85,19 @@ def test_on_another_track_it_is_better_after_twenty_seconds_and_equal_to_replay(
     assert same.mean() > 0.98  # odometry that overtakes its actuators is predicted from held samples
     found = {stamp: np.array(state) for stamp, state in run.predicted.items()}
     without = replayed(rls_model, bag, online=False)
-    before, after = (rmse(found, stints[1], *part) / rmse(without, stints[1], *part) for part in ((1, 6), (20, 35)))
+    before, after = (rmse(found, second, *part) / rmse(without, second, *part) for part in ((1, 6), (20, 35)))
     print("error with the layer over that without: first seconds", before.round(3), "after 20 s", after.round(3))
     assert np.all(after < 1.0)
     assert np.prod(after) < np.prod(before)
 
 
-def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(rls_model, stints, tmp_path: Path):
+def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(rls_model, first, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
-    recording_to_bag(stints[0], bag)
+    recording_to_bag(first, bag)
     run_live(rls_model, bag, 0.02, rate=2.5, duration=5.0, in_step=True, parameters={"online_state": str(state)})
     assert state.is_file()
     second = tmp_path / "second"
-    recording_to_bag(stints[1].select(slice(0, 400)), second)
+    recording_to_bag(another(first, 8.0), second)
     fresh, goes_on = replayed(rls_model, second), replayed(rls_model, second, state=state)
     assert set(fresh) == set(goes_on)
     first = sorted(fresh)[0]
@@ -101,9 +105,9 @@ def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(rls_model, st
 
 
 @pytest.mark.parametrize("stops", [2, pytest.param(15, marks=pytest.mark.slow)])
-def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(rls_model, stints, stops, tmp_path: Path):
+def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(rls_model, first, stops, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
-    recording_to_bag(stints[0], bag)
+    recording_to_bag(first, bag)
     os.environ.update(isolated_environment())
     here = os.environ.copy()
     with ExitStack() as stack:
@@ -119,9 +123,9 @@ def test_a_busy_node_can_be_stopped_at_any_moment_and_keeps_what_it_learned(rls_
             assert state.is_file()
 
 
-def test_a_state_that_cannot_be_read_is_set_aside_and_the_node_begins_from_the_prior(rls_model, stints, tmp_path: Path):
+def test_a_state_that_cannot_be_read_is_set_aside_and_the_node_begins_from_the_prior(rls_model, first, tmp_path: Path):
     bag, state = tmp_path / "first", tmp_path / "online.safetensors"
-    recording_to_bag(stints[0], bag)
+    recording_to_bag(first, bag)
     state.write_bytes(b"")
     run = run_live(rls_model, bag, 0.02, rate=2.5, duration=5.0, in_step=True, parameters={"online_state": str(state)})
     assert len(run.predicted) > 100

@@ -312,6 +312,7 @@ def test_the_predicted_pose_is_sent_to_tf(start_car, stand_in: Callable[[str, st
     assert sent.transform.rotation.w == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_diagnostics_that_take_longer_than_their_period_leave_time_for_what_waits(
     start_car, stand_in: Callable[[str, str], None]
 ) -> None:
@@ -420,6 +421,7 @@ def test_the_process_holds_no_torch(car) -> None:
     assert "torch" not in mapped
 
 
+@pytest.mark.slow
 def test_simulated_time_without_a_clock_does_not_hinder_predictions(start_car) -> None:
     car = start_car(use_sim_time=True)
     assert car.drive_until_answered() == H

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynssm_ros.api import recorded, simulate
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.health import Health, Level
 from dynssm_ros.runtime.hindsight import Hindsight
@@ -80,9 +79,8 @@ Row = dict[str, float]
 
 
 @pytest.fixture(scope="module")
-def laps() -> Recording:
-    """A car with four wheels, with the usual noise."""
-    return recorded(simulate("orca", "club", plant="double_track", duration=9.0, noise=(0.01, 0.01, 0.03), seed=5))
+def laps(four_wheels: Path) -> Recording:
+    return Recording.load(four_wheels).select(slice(0, 451))
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def test_rows_of_a_recording_that_the_car_cannot_have_driven_are_named() -> None
     assert named[1].endswith("(2 such rows)")
 
 
-@pytest.mark.parametrize("plant", ["rk4", "double_track"])
+@pytest.mark.parametrize("plant", ["rk4", pytest.param("double_track", marks=pytest.mark.slow)])
 def test_a_car_at_its_limit_with_three_times_the_usual_noise_is_plausible(plant) -> None:
     drive = recorded(simulate("orca", "club", plant=plant, duration=20.0, noise=(0.03, 0.03, 0.09), seed=3))
     checks = Plausibility(ORCA)

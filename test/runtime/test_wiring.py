@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from dynssm_ros.api import recorded, simulate
 from dynssm_ros.runtime.wiring import Wiring
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.vehicle import COEFFICIENTS, CarModel, State, load_vehicle
@@ -18,9 +18,8 @@ COLUMNS = {"v_x": [0], "v_y": [1], "omega": [2], "steering": [4, 6], "speed": [0
 
 
 @pytest.fixture(scope="module")
-def laps() -> Recording:
-    """A car with four wheels and load transfer, with the usual noise."""
-    return recorded(simulate("orca", "club", plant="double_track", duration=20.0, noise=(0.01, 0.01, 0.03), seed=5))
+def laps(four_wheels: Path) -> Recording:
+    return Recording.load(four_wheels).select(slice(0, 1000))
 
 
 def verdicts(laps: Recording, columns: Sequence[int] = (), factor: float = 1.0, vehicle=ORCA) -> set[str]:

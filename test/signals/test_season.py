@@ -255,6 +255,7 @@ def test_a_damaged_manifest_is_named(bags: list[Path], tmp_path: Path) -> None:
         Season.load(tmp_path / "season")
 
 
+@pytest.mark.slow
 def test_the_commands_take_a_season(bags: list[Path], tmp_path: Path, told: Callable[..., tuple[int, str]]) -> None:
     season = tmp_path / "season"
     extracting = ("extract", *bags, "--signals", "default", "--rate", 50, "--out", season)

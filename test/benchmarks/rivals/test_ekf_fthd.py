@@ -76,6 +76,7 @@ def config(make_ddm: Callable[..., ModelConfig]) -> ModelConfig:
     return parse_model_config(ddm | changes, "test")
 
 
+@pytest.mark.slow
 def test_variances_that_are_learned_from_the_next_measurement_filter_the_noise_away(
     clean: Recording, noisy: Recording, config: ModelConfig, orca: Vehicle
 ) -> None:
