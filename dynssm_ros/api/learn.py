@@ -144,14 +144,8 @@ def learn(
             record = _done(step, key, told)
         known[step.words] = record.model_dump(mode="json")
         write_json(folder / STATE, {"steps": known})
-        if (
-            step.name == "inspect" and not record.failure
-        ):  # not kept: the map may be corrected, and is not to be written anew
-            words = _compared(step.outputs[0], steps[0].outputs[0], settings.signals)
-            for line in words:
-                told(line)
-            failure = _misfit(step.outputs[0], str(vehicle), settings.signals) if number == 1 else ""
-            record = record.model_copy(update={"notes": (*record.notes, *words), "failure": failure})
+        if step.name == "inspect" and not record.failure:  # not kept: maps may be corrected, and are not written anew
+            record = _with_maps(record, step.outputs[0], steps[0].outputs[0], str(vehicle), settings.signals, told=told)
         records.append(record)
         if record.failure:
             break
@@ -199,6 +193,17 @@ def plan(logs: Sequence[Path], vehicle: str, out: Path, settings: LearnSettings)
     rivals = ("--model", "single_track", "--model", "persistence", "--vehicle", str(found))
     words = ("evaluate", *laps, "--model", str(model), *rivals, *track, *jobs, "--out", str(out / "evaluation"))
     yield LearningStep("evaluate", words, (*recordings, model, found, *roads), (out / "evaluation" / "results.json",))
+
+
+def _with_maps(
+    record: StepRecord, suggested: Path, first: Path, vehicle: str, signals: str | None, *, told: OnProgress
+) -> StepRecord:
+    """The record of an inspection with what its map says beside the car and the map of the first log."""
+    words = _compared(suggested, first, signals)
+    for line in words:
+        told(line)
+    failure = _misfit(first, vehicle, signals) if suggested == first else ""
+    return record.model_copy(update={"notes": (*record.notes, *words), "failure": failure})
 
 
 def _misfit(suggested: Path, vehicle: str, signals: str | None) -> str:
