@@ -12,12 +12,12 @@ of the car that has their sampling time; the settings that were tried of a model
 ``quick=1`` (a few epochs, one seed: tries everything out), ``plan`` (another plan than ``plan.yaml``), ``results`` (file of
 the first page). Of ``hidden_causes``: ``seed`` (of the first case), ``count`` (of cases), ``healthy=1`` (nothing is hidden
 in any, and every third file of a known car has an axle wrong), ``seconds`` (of a drive), ``cars`` (those of some truths
-alone, apart by commas), ``of_a_file`` (drives that share the file of a car that nobody knows); after a change of the engine
-``doit forget`` has cases diagnosed again. Of both matrices: ``only`` (words that names must begin with, apart by commas),
-``part`` (``development``, the default, or ``all``: test cells too), ``sets`` (``shipped``, the default, ``ablations``,
-``rivals``, apart by commas; rivals take a day). Of ``closed_loop`` also ``trained`` (folder of the generalisation matrix,
-which has the models, or gets those that it lacks) and ``models`` (those of the sets that are driven); its tasks ``learn``
-and ``learning_page`` run if they are named.
+alone, apart by commas), ``effects`` (those that are hidden, likewise), ``of_a_file`` (drives that share the file of a car
+that nobody knows); after a change of the engine ``doit forget`` has cases diagnosed again. Of both matrices: ``only``
+(words that names must begin with, apart by commas), ``part`` (``development``, the default, or ``all``: test cells too),
+``sets`` (``shipped``, the default, ``ablations``, ``rivals``, apart by commas; rivals take a day). Of ``closed_loop`` also
+``trained`` (folder of the generalisation matrix, which has the models, or gets those that it lacks) and ``models`` (those
+of the sets that are driven); its tasks ``learn`` and ``learning_page`` run if they are named.
 """
 
 from __future__ import annotations
@@ -54,6 +54,7 @@ from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
 from dynssm_ros.runtime.artifact import CARD
 from dynssm_ros.signals.recording import Recording
+from dynssm_ros.vehicle.effects import EFFECTS
 
 GROUP = get_var("group", "")
 OUT = Path(get_var("out", f"out/{GROUP}"))
@@ -170,12 +171,13 @@ class HiddenCauses:
     """Simulated drives in which something is hidden, diagnosed."""
 
     def __init__(self) -> None:
-        usual = {"seed": "0", "count": "130", "healthy": "0", "seconds": "120", "of_a_file": "1"}
+        usual = {"seed": "0", "count": "130", "healthy": "0", "seconds": "120", "of_a_file": "1", "effects": ""}
         self.variables = Variables(**usual, cars=",".join(TRUTHS))
         seed, count, of_a_file = (int(self.variables[name]) for name in ("seed", "count", "of_a_file"))
         cars = self.variables.several("cars", TRUTHS)
         healthy, seconds = self.variables["healthy"] == "1", float(self.variables["seconds"])
-        every = cases(seed, count, healthy=healthy, seconds=seconds, of_a_file=of_a_file)
+        effects = self.variables.several("effects", EFFECTS) or tuple(EFFECTS)
+        every = cases(seed, count, effects, healthy=healthy, seconds=seconds, of_a_file=of_a_file)
         self.cases = [case for case in every if case.plant in cars]
 
     def task_case(self) -> Iterator[dict[str, Any]]:

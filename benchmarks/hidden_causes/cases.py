@@ -125,9 +125,9 @@ def cases(
     for k in range(count):
         kind, plant = k % _ROUND, TRUTHS[k % len(TRUTHS)]
         can = can_be[plant]
-        if healthy or kind in _NONE:
+        if healthy or kind in _NONE or not can:
             names: list[str] = []
-        elif kind in _PAIRS:
+        elif kind in _PAIRS and len(can) > 1:
             names = [can[i] for i in rng.choice(len(can), 2, replace=False)]
         else:
             names = [next(turns[can])]

@@ -87,6 +87,13 @@ def test_the_cases_hold_every_effect_none_two_and_all_truths() -> None:
     assert four_wheels == {0, 1, 2}
 
 
+def test_some_effects_alone_can_be_hidden() -> None:
+    for some in (["gear_shift"], ["gear_shift", "drive_map"]):
+        listed = list(cases(0, 26, some))
+        assert {name for case in listed for name in case.hidden} == {*some}
+        assert not any(case.hidden for case in listed if case.plant == "multi_body"), "it cannot hide these"
+
+
 def test_the_nominal_car_is_off_by_what_it_says() -> None:
     car = load_vehicle("av21")
     drawn = [off(car, np.random.default_rng(seed)) for seed in range(200)]
