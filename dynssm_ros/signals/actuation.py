@@ -154,9 +154,12 @@ def check_related(drive: Drive) -> list[Finding]:
 
 
 def _reversed(drive: Drive) -> float:
-    """Share of the bends that a car goes through backwards, by its steering, while v_x is never negative."""
-    spans = drive.spans(_SPAN_S)
-    if len(spans) < _ENOUGH_SPANS or float(np.percentile(drive.velocity.real, 1.0)) < -drive.least_speed / 4:
+    """Share of the bends that a car goes through backwards, by its steering, while v_x is never negative.
+
+    It stands for a moment before; one that never does has a steering of other bends.
+    """
+    spans, signed = drive.spans(_SPAN_S), float(np.percentile(drive.velocity.real, 1.0)) < -drive.least_speed / 4
+    if len(spans) < _ENOUGH_SPANS or signed or drive.speed.min() > drive.least_speed / 2:
         return 0.0
     curvature, steering = spans.mean(drive.omega) / spans.mean(drive.speed), spans.mean(drive.steering)
     bends = (np.abs(curvature) > np.median(np.abs(curvature))) & (np.abs(steering) > np.median(np.abs(steering)))

@@ -348,7 +348,12 @@ def _usable_file(file: Path, scratch: Path, notes: list[str]) -> Path | None:
     recovered = scratch / f"recovered{source.suffix}"
     messages, complete, bad = recover(source, recovered)
     if messages == 0:
-        notes.append(f"{file.name} holds nothing: not a bag, or cut off before its first message ({damage})")
+        with source.open("rb") as stream:
+            of_ros1 = stream.read(25).endswith(b"\4\0\0\0ros1")  # the profile at the beginning of an MCAP file
+        told = "messages of ROS 1: take the .bag that it was made of" if of_ros1 else (
+            f"nothing: not a bag, or cut off before its first message ({damage})"
+        )  # fmt: skip
+        notes.append(f"{file.name} holds {told}")
         return None
     if (left := _damage(recovered)) is not None:
         notes.append(f"{file.name} cannot be read ({left.replace(str(recovered), file.name)})")

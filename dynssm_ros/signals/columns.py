@@ -18,6 +18,8 @@ ABSENT = ("", "-", "n/a", "N/A", "NA", "#N/A", "#NV", "null", "NULL", "None", "N
 """Cells without a value."""
 _NUMBER = r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$|^[+-]?(?i:nan|inf|infinity)$"
 _THOUSANDS = r"^[+-]?\d{1,3}(?:\.\d{3})+(?:,\d*)?$"  # with a decimal comma
+_COMMAS = r"^[+-]?\d{1,3}(?:,\d{3})+(?:\.\d*)?$"  # between thousands, with a decimal point
+_SURELY_COMMAS = re.compile(r"^[+-]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:,\d{3}){2,})$")  # where 1,234 may be a decimal
 _SWITCHES = {"true": "1", "false": "0"}
 _LONG = 15  # digits, from which on a double is no longer exact
 _CLOCK = r"(?P<hour>\d{1,2}):(?P<minute>\d{1,2}):(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d{1,9}))?"
@@ -87,7 +89,7 @@ def known_unit(text: str) -> str | None:
 def kind_of(cells: list[str], comma: bool) -> str:
     """What the cells of a text column are: ``number``, ``integer``, a date, ``time of day`` or ``text``."""
     cells = [cell for cell in (cell.strip() for cell in cells) if cell not in ABSENT]
-    dated, cells = cells, [_with_point(cell) for cell in cells] if comma else cells
+    dated, cells = cells, [_with_point(cell) if comma else _without_commas(cell) for cell in cells]
     numbers = [bool(re.match(_NUMBER, cell)) or cell.lower() in _SWITCHES for cell in cells]
     if sum(numbers) * 2 >= len(cells):
         whole = all(cell.lstrip("+-").isdigit() for cell in cells)
@@ -102,6 +104,11 @@ def _with_point(cell: str) -> str:
     """A number that is written with a decimal comma and points between thousands; a lone point makes it none."""
     cell = cell.replace(".", "") if re.match(_THOUSANDS, cell) else cell.replace(".", "?")
     return cell.replace(",", ".")
+
+
+def _without_commas(cell: str) -> str:
+    """A number with a decimal point whose thousands are apart by commas."""
+    return cell.replace(",", "") if _SURELY_COMMAS.match(cell) else cell
 
 
 def is_value(cell: str, comma: bool) -> bool:
@@ -124,6 +131,9 @@ def parsed(text: Any, kind: str, comma: bool) -> tuple[Any, Any]:
     try:
         return pc.cast(plain, pa.int64() if kind == "integer" else pa.float64()), pa.array(np.zeros(len(text), bool))
     except pa.ArrowInvalid:
+        if not comma:
+            apart = pc.match_substring_regex(plain, _COMMAS)
+            plain = pc.if_else(apart, pc.replace_substring(plain, ",", ""), plain)
         lower = pc.utf8_lower(plain)
         for word, number in _SWITCHES.items():
             plain = pc.if_else(pc.equal(lower, word), number, plain)

@@ -29,6 +29,7 @@ from dynssm_ros.signals.motion_filter import (
     Y,
     smoothed,
 )
+from dynssm_ros.signals.resampling import Stream
 from dynssm_ros.signals.signal_map import POSE_SIGNALS, SENSORS, STATE_SIGNALS, SignalMap
 
 Stamps = npt.NDArray[np.int64]
@@ -147,6 +148,21 @@ def _columns(block: _Block, at: list[int]) -> tuple[Stamps, Vector, Vector]:
     poses = np.where(has_pose[:, None], x[:, [X, Y, THETA]], np.nan)
     stamps = np.array([one.stamp for one in moments])
     return stamps, np.hstack([states, poses]), np.diagonal(block.P, axis1=1, axis2=2)[at]
+
+
+def require_degrees(streams: Mapping[str, Stream], where: str) -> None:
+    """Checks that fixes are places on earth.
+
+    Raises:
+        RecordingError: they are not; receivers write degrees and minutes in one number.
+    """
+    for name, most in (("latitude", 90.0), ("longitude", 360.0)):
+        largest = float(np.abs(streams[name].values).max(initial=0.0)) if name in streams else 0.0
+        if largest > most:
+            raise RecordingError(
+                f"{where}: {name} is up to {largest:.7g}; expected at most {most:g} degrees (of NMEA's degrees and minutes, "
+                "4807.038, first make 48 + 7.038 / 60)"
+            )
 
 
 def _plane(streams: Mapping[str, tuple[Stamps, Vector]], settings: Estimation) -> Plane | None:

@@ -15,7 +15,7 @@ from dynssm_ros.progress import Progress
 from dynssm_ros.signals.bags import Bag
 from dynssm_ros.signals.consistency import checked
 from dynssm_ros.signals.decoding import LOG_TIME, decoders, frames_told, header_stamp_ns, stamped_by, to_si
-from dynssm_ros.signals.estimation import MEASURED, estimated, noise_notes
+from dynssm_ros.signals.estimation import MEASURED, estimated, noise_notes, require_degrees
 from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import V_Y_DEVIATION, Recording, RecordingInfo, concatenate
@@ -94,6 +94,7 @@ def _extract(
         streams |= pose_velocities(streams, signal_map.velocities.window, str(path))
         notes.append(f"v_x, v_y, omega: from poses, over {signal_map.velocities.window:g} s")
     deviations: dict[str, float] = {}
+    require_degrees(streams, str(path))
     findings += sensor_findings(streams, signal_map)
     if signal_map.estimation is not None:
         streams, deviations, told = estimated_velocities(streams, signal_map, str(path))

@@ -16,6 +16,8 @@ _CLIPPED_SHARE, _CLIPPED_S = 0.01, 0.2
 """Share of rows at the very largest value, and the time at a stretch, that no sensor shows that is not clipped."""
 _FROZEN_S = 1.0
 """Time at a stretch for which no odometry of a driving car repeats itself; slow ones are interpolated between samples."""
+_DEAD_S = 5.0
+"""Likewise of a steering while the car turns to both sides; those of circles and long straights stay as long."""
 _STEP = 0.3
 """Step of a signal in units of its standard deviation, from which on it is coarse."""
 _SPIKE, _SPIKE_SHARE = 15.0, 0.05
@@ -27,6 +29,7 @@ _SPIKES, _SPIKES_SHARE = 5, 0.01
 def check_liveness(drive: Drive) -> list[Finding]:
     """Constants, clipping, coarse steps and spikes."""
     found = [*_constants(drive), *_frozen(drive)]
+    found += [] if found else _dies(drive)
     dead = _names(found)
     for name, values in (("v_x", drive.velocity.real), ("v_y", drive.velocity.imag), ("omega", drive.omega)):
         if name not in dead and varies(values):
@@ -101,6 +104,26 @@ def _frozen(drive: Drive) -> list[Finding]:
     ]  # fmt: skip
 
 
+def _dies(drive: Drive) -> list[Finding]:
+    """A steering that stays as it is for long while the car turns to both sides."""
+    same = (np.diff(drive.steering, prepend=np.nan) == 0) & (np.diff(drive.segment, prepend=-1) == 0)
+    first, last = _longest_at(same)
+    if (last - first) * drive.T_s < _DEAD_S:
+        return []
+    turn = _turn_rate(drive)[first:last]
+    low, high = np.percentile(turn, [5.0, 95.0])
+    if float(np.sqrt(np.mean(turn**2))) < _TURNS_RAD_S or min(-low, high) < _BOTH_WAYS * max(-low, high):
+        return []
+    seconds = (last - first) * drive.T_s
+    stays = f"steering stays at {number(float(drive.steering[first]))} for {seconds:.3g} s"
+    return [
+        Finding(
+            what="steering_frozen", told=f"{stays} although the car turns to both sides", size=seconds, low=seconds,
+            high=seconds, unit="s", expected="a signal that lives", remedy="find why it stops, or leave those rows out",
+        )
+    ]  # fmt: skip
+
+
 def _turn_rate(drive: Drive) -> Vector:
     """Rate of turning by the heading, the yaw rate where there is none, or the steering (rad/s), ``(N,)``."""
     if drive.theta is not None and np.ptp(drive.theta) > 0:
@@ -147,8 +170,15 @@ def _runs(at: Mask) -> int:
 
 
 def _longest_run(at: Mask) -> int:
-    edges = np.flatnonzero(np.diff(at.astype(int), prepend=0, append=0))
-    return int((edges[1::2] - edges[::2]).max(initial=0))
+    first, last = _longest_at(at)
+    return last - first
+
+
+def _longest_at(at: Mask) -> tuple[int, int]:
+    """First row of the longest run, and the row after it."""
+    first, last = np.flatnonzero(np.diff(at.astype(int), prepend=0, append=0)).reshape(-1, 2).T
+    longest = int(np.argmax(last - first)) if len(first) else 0
+    return (int(first[longest]), int(last[longest])) if len(first) else (0, 0)
 
 
 def _coarse(name: str, values: Vector) -> list[Finding]:

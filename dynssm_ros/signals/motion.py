@@ -14,7 +14,7 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.findings import Finding, number
 from dynssm_ros.signals.signal_map import UNITS
-from dynssm_ros.signals.spans import SIGMAS, Drive, Fitted, Spans, fitted
+from dynssm_ros.signals.spans import SIGMAS, Drive, Fitted, Spans, fitted, varies
 
 Checked = tuple[list[Finding], Drive]
 """What was found, and the drive with that mended."""
@@ -32,6 +32,8 @@ _OPPOSITE = (-2.0, -0.5)
 """Ratio of two lateral velocities whose signs differ; others belong to a v_y that says too little to judge."""
 _RELATED = 0.5
 """Explained share, from which on two signals count as related."""
+_NOISE, _NOISE_SIZE = 0.1, 0.5
+"""Explained share up to which a v_y knows nothing of turning, and its size in that of the path; noise is smaller still."""
 _TURNING_RAD_S = 0.02
 """Root mean square yaw rate, below which nothing is said of turning."""
 AHEAD_RAD = 0.35
@@ -179,6 +181,8 @@ def check_turning(drive: Drive, steering_sign: int) -> Checked:
     ``steering_sign`` is that of the yaw rate against the steering, 0 if not known: it breaks ties.
     """
     turning = _turning(drive)
+    if (unrelated := _unrelated(turning, drive)) is not None:
+        return [unrelated], drive
     found, drive = _turning_scales(turning, drive)
     signs = [0 if fit is None else int(np.sign(fit.values[0])) for fit in turning]
     heading, course, both = signs
@@ -201,6 +205,21 @@ def check_turning(drive: Drive, steering_sign: int) -> Checked:
             drive.changed(position=drive.position.conj())  # type: ignore[union-attr]
         )
     return found, drive
+
+
+def _unrelated(turning: _Turning, drive: Drive) -> Finding | None:
+    """A yaw rate that is not that of the drive, where heading and path turn alike."""
+    heading, course, both = turning
+    if heading is not None or course is not None or both is None or not is_one(magnitude(both), 2 * YAW_TOLERANCE):
+        return None
+    spans = drive.spans(TURN_S)
+    fit = fitted(spans.integral(drive.omega)[:, None], spans.change(drive.theta), spans.block)
+    share = 0.0 if fit is None else max(fit.share, 0.0)
+    return Finding(
+        what="omega_unrelated", told=f"omega explains {100 * share:.0f} % of how theta and the path turn", size=share,
+        low=share, high=share, expected=f"above {100 * _RELATED:.0f} %",
+        remedy="omega: map the yaw rate, about the axis that points up, of this car and drive",
+    )  # fmt: skip
 
 
 _SIGNS = {
@@ -371,6 +390,14 @@ def _mean_interval(values: Vector, spans: Spans) -> tuple[float, float]:
     return float(values.mean()) - half, float(values.mean()) + half
 
 
+def _v_y_unrelated(size: float) -> Finding:
+    return Finding(
+        what="v_y_unrelated", told=f"v_y is {number(size)} of the lateral velocity of x, y, and does not turn with the car",
+        size=size, low=size, high=size, expected="about 1",
+        remedy="nothing measures it: give `velocities:` with the pose, or leave v_y out for the estimator",
+    )  # fmt: skip
+
+
 def check_side_slip(drive: Drive) -> Checked:
     """Lateral velocity of the position in the car's frame against v_y: sign and scale.
 
@@ -392,6 +419,12 @@ def check_side_slip(drive: Drive) -> Checked:
     fit = fitted(np.stack(terms, axis=1), moved, spans.block)
     if fit is None or fit.share < _RELATED:
         return [], drive
+    turning = np.stack(terms[1:], axis=1)
+    of_path, of_v_y = (fitted(turning, each, spans.block) for each in (moved, terms[0]))
+    if of_path and of_path.share > _RELATED and (of_v_y is None or of_v_y.share < _NOISE) and varies(terms[0]):
+        size = float(terms[0].std() / moved.std())
+        if size < _NOISE_SIZE:
+            return [_v_y_unrelated(size)], drive
     slope, (low, high) = float(fit.values[0]), fit.interval()
     if high < 0.0 and _OPPOSITE[0] < slope < _OPPOSITE[1]:
         found = Finding(

@@ -21,7 +21,8 @@ from dynssm_ros.signals.resampling import Stream
 from dynssm_ros.signals.signal_map import COMPARED, UNITS, SignalMap
 from dynssm_ros.signals.spans import Drive, Fitted, Spans, fitted, varies
 
-BESIDE = ("a_x_scale", "a_y_scale", "a_x_sign", "a_y_sign", "wheel_speed_scale", "wheel_speed_sign")
+_AXES = "acceleration_axes"
+BESIDE = ("a_x_scale", "a_y_scale", "a_x_sign", "a_y_sign", _AXES, "wheel_speed_scale", "wheel_speed_sign")
 """Findings of what no velocity comes from where all of them are measured."""
 SENSED = ("speed_scale", "gyro_scale", "gyro_sign", *BESIDE)
 """Findings of this module."""
@@ -106,12 +107,12 @@ def _accelerations(spans: Spans, measured: Mapping[str, Vector], *, by_path: boo
     ratios: dict[str, Fitted] = {}
     velocity, omega = spans.drive.velocity, spans.drive.omega
     across = spans.mean(velocity.real * omega) + spans.change(velocity.imag) / spans.seconds
-    for name, caused in (("a_x", spans.change(velocity.real) / spans.seconds), ("a_y", across)):
-        if name in measured and varies(measured[name]) and varies(caused):
-            seen = spans.mean(measured[name])
-            fit = fitted(np.stack([caused, np.ones(len(spans))], axis=1), seen, spans.block)
-            if fit is not None and fit.share > _RELATED:
-                ratios[name] = fit
+    causes = {"a_x": spans.change(velocity.real) / spans.seconds, "a_y": across}
+    for name, caused in causes.items():
+        if name in measured and (fit := _ratio(measured[name], caused, spans)) is not None:
+            ratios[name] = fit
+    if not ratios and (exchanged := _exchanged(measured, causes, spans)) is not None:
+        return [exchanged]
     sizes = {name: float(fit.values[0]) for name, fit in ratios.items()}
     found = [_sign(name, fit) for name, fit in ratios.items() if fit.values[0] < 0]
     if all(_is_near(abs(size), 1.0) for size in sizes.values()):
@@ -119,6 +120,29 @@ def _accelerations(spans: Spans, measured: Mapping[str, Vector], *, by_path: boo
     wrong = _units(sizes, by_path=by_path)
     name = next(name for name, size in sizes.items() if not _is_near(abs(size), 1.0))
     return [*found, *(_scale(name, ratios[name], quantity, unit) for quantity, unit in wrong.items())]
+
+
+def _ratio(measured: Vector, caused: Vector, spans: Spans) -> Fitted | None:
+    """An acceleration over what causes it, beside a bias; ``None`` where the two do not go together."""
+    if not (varies(measured) and varies(caused)):
+        return None
+    fit = fitted(np.stack([caused, np.ones(len(spans))], axis=1), spans.mean(measured), spans.block)
+    return fit if fit is not None and fit.share > _RELATED else None
+
+
+def _exchanged(measured: Mapping[str, Vector], causes: Mapping[str, Vector], spans: Spans) -> Finding | None:
+    """Accelerations each of which goes with what causes the other, as of a sensor that is turned by a quarter."""
+    pairs = (("a_x", "a_y"), ("a_y", "a_x"))
+    ratios = [_ratio(measured[one], causes[other], spans) if one in measured else None for one, other in pairs]
+    if ratios[0] is None or (ratios[1] is None and "a_y" in measured):
+        return None
+    ratio, (low, high) = float(ratios[0].values[0]), ratios[0].interval()
+    signs = ["" if fit is None or fit.values[0] > 0 else " (scale: -1)" for fit in ratios]
+    return Finding(
+        what=_AXES, told=f"a_x goes with {_CAUSES['a_y']}, by {number(ratio)}, and not with {_CAUSES['a_x']}", size=ratio,
+        low=low, high=high, expected="x forward, y left",
+        remedy=f"map what is a_x as a_y{signs[0]}, and what is a_y as a_x{signs[1]}",
+    )  # fmt: skip
 
 
 def _wheels(spans: Spans, measured: Vector | None) -> list[Finding]:

@@ -199,6 +199,12 @@ class SignalMap(StrictModel):
     )
     signals: dict[str, Source]
 
+    @field_validator("signals", mode="before")
+    @classmethod
+    def _none_given(cls, value: Any) -> Any:
+        """None yet, as where a suggested map has found nothing, are missing ones."""
+        return {} if value is None else value
+
     @model_validator(mode="before")
     @classmethod
     def _that_estimates(cls, content: Any) -> Any:

@@ -88,12 +88,17 @@ def with_columns(drive: Recording, **columns: Vector) -> Recording:
 
 
 def reversing(drive: Recording, share: float = 1.0) -> Recording:
-    """A drive whose first ``share`` is driven backwards, along the same bends."""
-    back = np.arange(len(drive)) < share * len(drive)
+    """A drive whose first ``share`` is driven backwards, along the same bends; it stops before it goes forwards."""
+    at = np.arange(len(drive))
+    back, stops = at < share * len(drive), np.clip(np.abs(at - share * len(drive)) * T_S, 0.01, 1.0)
     turned = {name: np.where(back, -drive[name], drive[name]) for name in ("v_x", "r_fb", "delta_fb")}
     sideways = np.where(back, -drive["v_y"] + 2.4 * drive["omega"], drive["v_y"])
-    path = np.cumsum((turned["v_x"] + 1j * sideways) * np.exp(1j * drive["theta"])) * T_S
-    return with_columns(drive, **turned, v_y=sideways, x=path.real, y=path.imag)
+    velocity = stops * (turned["v_x"] + 1j * sideways)
+    omega = stops * drive["omega"]
+    theta = np.cumsum(omega) * T_S
+    path = np.cumsum(velocity * np.exp(1j * theta)) * T_S
+    turned |= {"v_x": velocity.real, "v_y": velocity.imag, "omega": omega, "theta": theta}
+    return with_columns(drive, **turned, x=path.real, y=path.imag)
 
 
 def unsigned(drive: Recording) -> Recording:
@@ -213,6 +218,17 @@ def test_a_speed_that_lost_its_sign_in_reverse_is_named(change: Changed) -> None
     assert (found.what, found.remedy[:14]) == ("v_x_sign", "v_x: scale: -1")
 
 
+def test_inputs_of_laps_that_were_swapped_are_those_of_other_bends() -> None:
+    """Not of a car that reverses, which would have stopped."""
+    drive = driven(at_random=True)
+    order = np.r_[0:200, 700:1200, 200:700, 1200 : len(drive)]
+    found = contradictions(
+        with_columns(drive, **{name: drive[name][order] for name in ("delta_fb", "r_fb")}), WHEELBASE
+    )
+    assert {each.what for each in found} <= {"steering_unrelated", "steering_time", "inputs_time"}
+    assert found
+
+
 @pytest.mark.parametrize(
     "change",
     [lambda drive: drive, without_pose, times(delta_fb=1.4), early(0.2, "x", "y", "theta"), early(-0.2, "delta_fb")],
@@ -259,6 +275,11 @@ def test_what_healthy_logs_show_has_no_finding(change: Changed) -> None:
         ("twist_turned", np.pi / 2, side_on(-np.pi / 2)),
         ("twist_turned", -0.8, side_on(0.8)),
         ("odometry_frozen", 0.25, frozen),
+        (
+            "steering_frozen",
+            24.0,
+            lambda drive: with_columns(drive, delta_fb=drive["delta_fb"][np.minimum(np.arange(1200), 720)]),
+        ),
         ("steering_offset", 0.1, lambda drive: with_columns(drive, delta_fb=drive["delta_fb"] + 0.1)),
         ("throttle_rest", 0.12, never_released(0.12)),
         ("throttle_rest", 0.05, never_released(0.05, noise=0.001)),
@@ -301,6 +322,8 @@ def test_a_fault_is_found_with_its_size(what: str, size: float, change: Changed)
         ("throttle_setpoint", set_point),
         ("throttle_range", percent_like_speed),
         ("omega_constant", constant("omega")),
+        ("v_y_unrelated", lambda drive: with_columns(drive, v_y=0.05 * np.sin(1e3 * np.arange(len(drive)) ** 2))),
+        ("omega_unrelated", lambda drive: with_columns(drive, omega=0.1 * np.sin(np.arange(len(drive))))),
         ("theta_constant", constant("theta")),
         ("v_y_constant", constant("v_y")),
         ("steering_constant", constant("delta_fb", 0.1)),

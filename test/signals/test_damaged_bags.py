@@ -287,6 +287,18 @@ def test_topics_that_are_not_of_ros_do_not_hide_those_that_are(tmp_path: Path, t
     assert "its 60 ROS messages were copied" in notes[-1]
 
 
+def test_messages_of_ros_1_in_mcap_are_told(tmp_path: Path) -> None:
+    """As `mcap convert` makes them of a ROS 1 bag."""
+    with (tmp_path / "old.mcap").open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="ros1")
+        schema = writer.register_schema("std_msgs/Float64", "ros1msg", b"float64 data")
+        writer.add_message(writer.register_channel("/a", "ros1", schema), 1, bytes(8), 1)
+        writer.finish()
+    with pytest.raises(BagError, match=r"old.mcap holds messages of ROS 1: take the .bag that it was made of"):
+        read(tmp_path / "old.mcap")
+
+
 def test_a_file_without_the_ros_profile_is_read(tmp_path: Path, typestore: Any, drive: Any) -> None:
     found, notes = read(write_mcap(tmp_path / "bag.mcap", typestore, drive(20), profile=""))
     assert len(found) == 60

@@ -13,11 +13,12 @@ from dynssm_ros.configuration import validate
 from dynssm_ros.errors import ConfigurationError, RecordingError
 from dynssm_ros.signals import messages
 from dynssm_ros.signals.decoding import live_decoders
-from dynssm_ros.signals.estimation import LiveEstimation, Plane, estimated, noise_notes
+from dynssm_ros.signals.estimation import LiveEstimation, Plane, estimated, noise_notes, require_degrees
 from dynssm_ros.signals.extraction import extract, read_streams
 from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.motion_filter import THETA, V_X, V_Y, Estimation, MotionFilter
 from dynssm_ros.signals.recording import Recording
+from dynssm_ros.signals.resampling import Stream
 from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
 from dynssm_ros.simulation.plant import SingleTrackPlant
 from dynssm_ros.vehicle import Applied, State, load_vehicle
@@ -282,6 +283,17 @@ def test_the_plane_is_that_of_the_ellipsoid() -> None:
     assert Plane((0.0, 0.0)).at(1e-3, 0.0)[1] == pytest.approx(110.574, abs=1e-3)  # m per 0.001 degrees at the equator
     assert Plane((45.0, 7.0)).at(45.0, 7.001)[0] == pytest.approx(78.847, abs=1e-3)
     assert Plane((45.0, 7.0)).at(45.001, 7.0)[1] == pytest.approx(111.132, abs=1e-3)
+
+
+@pytest.mark.parametrize(("name", "value"), [("latitude", 4807.038), ("longitude", -1131.0)])
+def test_fixes_in_degrees_and_minutes_are_refused(name: str, value: float) -> None:
+    fixes = {"latitude": 48.1173, "longitude": -11.5167}
+    streams = {key: Stream(START + np.arange(3), np.full(3, one)) for key, one in fixes.items()}
+    require_degrees(streams, "log")
+    with pytest.raises(
+        RecordingError, match=rf"log: {name} is up to {abs(value):.7g}; expected at most \d+ degrees .*7.038 / 60"
+    ):
+        require_degrees(streams | {name: Stream(START + np.arange(3), np.full(3, value))}, "log")
 
 
 def test_sensors_that_are_noisier_than_stated_are_told(drive: Drive) -> None:

@@ -67,6 +67,17 @@ def test_a_gyro_that_turns_against_the_fixes_is_named() -> None:
     assert found == {"gyro_sign": pytest.approx(-1.0, abs=0.05)}
 
 
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_accelerometers_that_are_turned_by_a_quarter_are_named(way: float) -> None:
+    right = sensors(True)
+    turned = {"a_x": right["a_y"], "a_y": replace(right["a_x"], values=-right["a_x"].values)}
+    turned = {name: replace(one, values=way * one.values) for name, one in turned.items()}
+    (found,) = sensor_findings(right | turned, DEFAULT)
+    assert (found.what, found.size) == ("acceleration_axes", pytest.approx(1.1 * way, rel=0.05))
+    signs = ("", " (scale: -1)") if way > 0 else (" (scale: -1)", "")
+    assert found.remedy == "map what is a_x as a_y{}, and what is a_y as a_x{}".format(*signs)
+
+
 def beside(drive: Recording, **factors: float) -> dict[str, Stream]:
     """Velocities and poses that are measured, with accelerometers and wheels that slip beside them."""
     rng, T_s = np.random.default_rng(1), drive.T_s

@@ -91,6 +91,23 @@ def test_seconds_and_nanoseconds_may_stand_in_two_columns(tmp_path: Path, column
         assert extract([tmp_path / "log.csv"], table_map(time=time), 40.0).time[0] == START
 
 
+@pytest.mark.parametrize(("start", "form"), [(0, ",.1f"), (999_900, ",.1f"), (999_900, ","), (12_345_000, ",")])
+def test_commas_between_thousands_are_read(tmp_path: Path, columns: Any, start: int, form: str) -> None:
+    del columns["time"]
+    american = {name: [f"{one:,.3f}" for one in column.tolist()] for name, column in columns.items()}
+    stamps = [format(start + 10 * k, form) for k in range(N)]
+    write_csv(tmp_path / "log.csv", american | {"Time [ms]": stamps}, quoting_style="all_valid")
+    recording = extract([tmp_path / "log.csv"], table_map(), 40.0)
+    assert (recording.time[0], len(recording)) == (start * 10**6, 24)
+    german = {name: [f"{one:.3f}".replace(".", ",") for one in column.tolist()] for name, column in columns.items()}
+    write_csv(
+        tmp_path / "german.csv",
+        german | {"time": [f"{0.01 * k:.3f}".replace(".", ",") for k in range(N)]},
+        delimiter=";",
+    )
+    assert extract([tmp_path / "german.csv"], table_map(), 40.0).duration < 1.0
+
+
 @pytest.mark.parametrize("start", [0, 999_000, 12_345_000])
 def test_points_between_thousands_are_none_of_decimals(tmp_path: Path, columns: Any, start: int) -> None:
     stamps = [f"{start + 10 * k:,}".replace(",", ".") for k in range(N)]
