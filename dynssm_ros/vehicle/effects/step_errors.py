@@ -30,7 +30,7 @@ _ALIKE = 0.97  # of the best, from which on a rounder period is taken
 
 _SPEEDS, _SPEED_RANGE = 40, (0.05, 0.95)  # that are tried as those of a gear change, of the speeds under throttle
 _HYSTERESIS = (0.03, 0.1, 0.2, 0.3)  # of the speed for the change up, by which the one for the change down is less
-_APART = 0.03  # of the speed for the change up, by which a measured one down is less at least
+_APART = 0.03  # of the speed for the change up, by which that for the change down is less at least
 _FINER_SPEEDS = (0.02, 0.007)  # shares of both speeds in which the best pair is placed more finely, one after the other
 _STEPS_ASIDE = (0, 1, -1, 2, -2)  # of these that are tried
 _SHIFTS, _GAP_ROWS = 4, 3  # changes, at least; rows after one in which the force may have a gap
@@ -256,7 +256,8 @@ def shift_speeds(steps: StepErrors) -> tuple[float, float] | None:
         near = (
             (found[0] * (1.0 + share * k), found[1] * (1.0 + share * j)) for k in _STEPS_ASIDE for j in _STEPS_ASIDE
         )
-        found = max((pair for pair in near if pair[1] < pair[0]), key=lambda pair: drive.sure_of_shifts(*pair))
+        apart = [pair for pair in near if pair[1] <= (1.0 - _APART) * pair[0]]
+        found = max(apart, key=lambda pair: drive.sure_of_shifts(*pair))
     return found
 
 
