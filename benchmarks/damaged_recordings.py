@@ -257,7 +257,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "damaged_recordings.md")
     parser.add_argument("--seed", type=int, default=500, help="of the simulated drives")
-    given, begin, data = parser.parse_args(), time.process_time(), Path(os.environ["DYNSSM_DATA"])
+    given, begin = parser.parse_args(), time.process_time()
+    data = Path(os.environ.get("DYNSSM_DATA", ROOT.parent / "shared" / "data"))
     warnings.simplefilter("ignore", DataWarning)
     logs = {
         "simulated": list(simulated(given.seed)),
