@@ -6,6 +6,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Mask, Vector
 from dynssm_ros.signals.findings import Finding, number
+from dynssm_ros.signals.motion import WITHOUT_V_Y
 from dynssm_ros.signals.spans import SIGMAS, Drive, varies
 
 _TURNS_RAD_S, _BOTH_WAYS = 0.02, 0.3
@@ -66,7 +67,7 @@ def _names(found: list[Finding]) -> set[str]:
 
 _REMEDIES = {
     "omega": "take omega from a gyro, or give `velocities:` with the pose",
-    "v_y": "nothing measures it: give `velocities:` with the pose, or leave v_y out for the estimator",
+    "v_y": WITHOUT_V_Y,
     "steering": "steering_feedback: map the measured or commanded angle",
     "throttle": "throttle_feedback: map what drives the car",
     "theta": "leave x, y, theta out, or map what measures the heading",
@@ -86,8 +87,7 @@ def _frozen(drive: Drive) -> list[Finding]:
     """An odometry that repeats itself while the inputs go on."""
     values = [drive.velocity.real, drive.velocity.imag, drive.omega]
     values += [] if drive.position is None else [drive.position.real, drive.position.imag]
-    same = np.logical_and.reduce([np.diff(each, prepend=np.nan) == 0 for each in values])
-    same &= (drive.speed >= drive.least_speed) & (drive.speed > 0) & (np.diff(drive.segment, prepend=-1) == 0)
+    same = _repeats(drive, *values) & (drive.speed >= drive.least_speed) & (drive.speed > 0)
     moves = (np.diff(drive.steering, prepend=0.0) != 0) | (np.diff(drive.throttle, prepend=0.0) != 0)
     stays = _longest_run(same) * drive.T_s
     if stays < _FROZEN_S or not (same & moves).any():
@@ -106,8 +106,7 @@ def _frozen(drive: Drive) -> list[Finding]:
 
 def _dies(drive: Drive) -> list[Finding]:
     """A steering that stays as it is for long while the car turns to both sides."""
-    same = (np.diff(drive.steering, prepend=np.nan) == 0) & (np.diff(drive.segment, prepend=-1) == 0)
-    first, last = _longest_at(same)
+    first, last = _longest_at(_repeats(drive, drive.steering))
     if (last - first) * drive.T_s < _DEAD_S:
         return []
     turn = _turn_rate(drive)[first:last]
@@ -122,6 +121,12 @@ def _dies(drive: Drive) -> list[Finding]:
             high=seconds, unit="s", expected="a signal that lives", remedy="find why it stops, or leave those rows out",
         )
     ]  # fmt: skip
+
+
+def _repeats(drive: Drive, *signals: Vector) -> Mask:
+    """Rows at which all these signals are as in the row before."""
+    same = [np.diff(each, prepend=np.nan) == 0 for each in signals]
+    return np.logical_and.reduce([np.diff(drive.segment, prepend=-1) == 0, *same])  # type: ignore[no-any-return]
 
 
 def _turn_rate(drive: Drive) -> Vector:
@@ -176,9 +181,11 @@ def _longest_run(at: Mask) -> int:
 
 def _longest_at(at: Mask) -> tuple[int, int]:
     """First row of the longest run, and the row after it."""
+    if not at.any():
+        return 0, 0
     first, last = np.flatnonzero(np.diff(at.astype(int), prepend=0, append=0)).reshape(-1, 2).T
-    longest = int(np.argmax(last - first)) if len(first) else 0
-    return (int(first[longest]), int(last[longest])) if len(first) else (0, 0)
+    longest = np.argmax(last - first)
+    return int(first[longest]), int(last[longest])
 
 
 def _coarse(name: str, values: Vector) -> list[Finding]:

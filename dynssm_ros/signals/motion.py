@@ -36,6 +36,8 @@ _NOISE, _NOISE_SIZE = 0.1, 0.5
 """Explained share up to which a v_y knows nothing of turning, and its size in that of the path; noise is smaller still."""
 _TURNING_RAD_S = 0.02
 """Root mean square yaw rate, below which nothing is said of turning."""
+WITHOUT_V_Y = "nothing measures it: give `velocities:` with the pose, or leave v_y out for the estimator"
+"""What to do about a v_y that is none."""
 AHEAD_RAD = 0.35
 """Angle between the car's axis and its mean velocity that cars have; they drift by more for moments only."""
 _SCATTER, ALIGNED, _CLEARER = 0.02, 0.15, 4.0
@@ -394,7 +396,7 @@ def _v_y_unrelated(size: float) -> Finding:
     return Finding(
         what="v_y_unrelated", told=f"v_y is {number(size)} of the lateral velocity of x, y, and does not turn with the car",
         size=size, low=size, high=size, expected="about 1",
-        remedy="nothing measures it: give `velocities:` with the pose, or leave v_y out for the estimator",
+        remedy=WITHOUT_V_Y,
     )  # fmt: skip
 
 

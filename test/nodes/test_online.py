@@ -100,8 +100,8 @@ def test_a_node_that_is_stopped_keeps_what_it_learned_for_the_next(rls_model, fi
     recording_to_bag(another(first, 8.0), second)
     fresh, goes_on = replayed(rls_model, second), replayed(rls_model, second, state=state)
     assert set(fresh) == set(goes_on)
-    first = sorted(fresh)[0]
-    assert np.abs(fresh[first] - goes_on[first]).max() > 0.0
+    stamp = min(fresh)
+    assert np.abs(fresh[stamp] - goes_on[stamp]).max() > 0.0
 
 
 @pytest.mark.parametrize("stops", [2, pytest.param(15, marks=pytest.mark.slow)])

@@ -208,15 +208,18 @@ class SimulationWindows:
         ):  # fmt: skip
             return
         first = self.data.rows[:, self.starts + shift]
-        here = self._read(car, shift, context)
         state = State(*first[:3])
+        here = self._read(beside, shift)
         effect_states = car.settled(state, Applied(*first[3:5]), fleet.theta, context=here)
         with np.errstate(all="ignore"):
             for k in range(shift, self.steps):
                 if k <= 0:
                     measured = self.data.rows[:3, self.starts + k]
                     state = State(*(led + taken * (row - led) for led, row in zip(state, measured, strict=True)))
-                state, effect_states = self._step(car, fleet.theta, state, effect_states, k, context)
+                applied = Applied(*self._acting[:, self.starts + k])
+                state, effect_states = car.step(
+                    state, applied, fleet.theta, effect_states, context=self._read(beside, k)
+                )
                 if k >= 0 and (k + 1) % self.every == 0:
                     for channel, value in enumerate(state):
                         out[:, :, k // self.every, channel] = value
@@ -248,19 +251,6 @@ class SimulationWindows:
         """Standard deviation of the measured states, shape ``(3,)``."""
         return np.asarray(np.maximum(self.target.reshape(-1, 3).std(axis=0), 1e-6))
 
-    def _step(
-        self,
-        car: CarModel,
-        theta: Coefficients,
-        state: State,
-        effect_states: Mapping[str, Vector],
-        k: int,
-        context: Mapping[str, float] | None = None,
-    ) -> tuple[State, dict[str, Vector]]:
-        """One step from the rows ``k`` after the starts."""
-        applied = Applied(*self._acting[:, self.starts + k])
-        return car.step(state, applied, theta, effect_states, context=self._read(car, k, context))
-
     @property
     def _acting(self) -> Vector:
         """Throttle and steering from each row to the next, shape ``(2, N)``."""
@@ -273,10 +263,9 @@ class SimulationWindows:
         told = {name: values for effect in car.effects for name, values in effect.before(self.data.rows).items()}
         return told | {name: (context or {}).get(name, signals[name]) for name in needs}
 
-    def _read(self, car: CarModel, k: int, context: Mapping[str, float] | None) -> dict[str, Any]:
-        """The other signals that effects of the car read, ``k`` rows after the starts; ``context`` replaces them."""
-        read = self._signals(car, context)
-        return {name: value[self.starts + k] if np.ndim(value) else value for name, value in read.items()}
+    def _read(self, signals: Mapping[str, Any], k: int) -> dict[str, Any]:
+        """Signals by row, ``k`` rows after the starts."""
+        return {name: value[self.starts + k] if np.ndim(value) else value for name, value in signals.items()}
 
     def _bound(self, fleet: CarBatch) -> CarModel:
         return CarModel(
