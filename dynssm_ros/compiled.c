@@ -127,6 +127,19 @@ WIDE static void run(const Tape *tape, int64_t wanted) {
     }
 }
 
+/* Executes a tape so many `times` for one row, which all lanes that run() computes hold, its results each time in the place of
+   its first inputs. */
+void dynssm_repeat(const Tape *tape, int64_t times) {
+    double *work = tape->work;
+    for (int64_t k = 0; k < times; k++) {
+        run(tape, 1);
+        for (int64_t j = 0; j < tape->count; j++) /* a result may lie where another one goes */
+            work[j * LANES + LANES - 1] = work[(int64_t)tape->outputs[j] * LANES];
+        for (int64_t j = 0; j < tape->count; j++)
+            for (int64_t i = 0; i < GROUP; i++) work[j * LANES + i] = work[j * LANES + LANES - 1];
+    }
+}
+
 /* Puts a window's row into a lane: state and applied inputs. */
 static inline void enter(double *work, int64_t lane, const double *row) {
     work[lane] = row[0];

@@ -1,4 +1,4 @@
-"""The compiled loops of the predictor's step and of a fit's simulations. Where they were not built, numpy computes the same.
+"""The compiled loops of the predictor's step, of plants and of a fit's simulations. Without them numpy computes the same.
 
 ``pip`` and ``colcon`` build ``compiled.c`` where a C compiler is, and go on without one where none is. A library of another
 version of that file is not used. ``DYNSSM_COMPILED=0`` in the environment switches it off.
@@ -28,6 +28,7 @@ _FUNCTIONS = {
     "dynssm_rollout": "ppippp",
     "dynssm_window": "ppddip",
     "dynssm_simulate": "ppi",
+    "dynssm_repeat": "pi",
 }
 """The library's functions with their arguments: p a structure or the first number of an array, i a count, d a number."""
 _SOURCE = Path(__file__).with_suffix(".c")

@@ -11,6 +11,7 @@ from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.double_track import DoubleTrack
 from dynssm_ros.track.lines import Line
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
+from dynssm_ros.vehicle.compiled_car import CompiledStep
 from dynssm_ros.vehicle.effects import require_context
 from dynssm_ros.vehicle.integrators import Integrator
 from dynssm_ros.vehicle.kinematics import SCALAR, Pose, time_of_day, world_velocity
@@ -117,6 +118,7 @@ class SingleTrackPlant:
             dict(zip(_Odometer.POSE, pose, strict=True)),
             context=self._context(0.0),
         )
+        self._compiled = CompiledStep.of(self._car, self._theta, tuple(self._effect_states), tuple(self._context(0.0)))
         self._late = _Late(delay, self._seen()) if delay > 0 else None
 
     @property
@@ -133,12 +135,15 @@ class SingleTrackPlant:
         """Moves the car on by T_s under constant inputs; ``s`` is its track position (m)."""
         context = self._context(s)
         for _ in range(self._pieces):
-            self.state, self._effect_states = self._car.step(
-                self.state, applied, self._theta, self._effect_states, context=context
-            )
+            self.state, self._effect_states = self._step(applied, context)
             if self._late:
                 self._late.add(self._car.T_s, self._seen())
         self._steps += 1
+
+    def _step(self, applied: Applied, context: dict[str, float]) -> tuple[State, dict[str, float]]:
+        if self._compiled is not None:
+            return self._compiled(self.state, applied, self._effect_states, context)
+        return self._car.step(self.state, applied, self._theta, self._effect_states, context=context)
 
     def _context(self, s: float) -> dict[str, float]:
         place = {"s": s} if self._line is None else self._line.place(s)

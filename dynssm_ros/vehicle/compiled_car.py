@@ -1,8 +1,11 @@
-"""A car's steps over windows by the compiled loop: its equations as tapes."""
+"""A car's steps by the compiled loop, over windows and one after the other: its equations as tapes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import pickle
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +14,7 @@ from dynssm_ros import compiled
 from dynssm_ros.arrays import Vector
 from dynssm_ros.vehicle.car import CarModel
 from dynssm_ros.vehicle.effects.base import initial_effect_states
+from dynssm_ros.vehicle.integrators import add
 from dynssm_ros.vehicle.parameters import COEFFICIENTS
 from dynssm_ros.vehicle.single_track import Applied, Coefficients, State
 from dynssm_ros.vehicle.tape import Tape, trace
@@ -117,3 +121,56 @@ class CompiledCar:
             self._structure.address, compiled.address(rows), 1, count, count, compiled.address(moved)
         )
         return moved
+
+
+class CompiledStep:
+    """One step of a car after the other, its coefficients fixed, as a plant takes them."""
+
+    def __init__(self, car: CarModel, tape: Tape, states: Sequence[str], context: Sequence[str]) -> None:
+        self._names, self._context, self._substeps = tuple(states), tuple(context), car.substeps
+        work = room(tape)
+        self._moved, self._given = np.split(work[: tape.inputs], [len(tape.outputs)])
+        self._structure = tape_structure(tape, work)
+
+    @classmethod
+    def of(
+        cls, car: CarModel, theta: Coefficients, states: Sequence[str], context: Sequence[str]
+    ) -> CompiledStep | None:
+        """Of a car with these effect states, whose effects read this ``context``.
+
+        ``None`` without the library, or if its equations cannot be traced. Neither are those of an effect that changes
+        while it computes, or computes something else a second time.
+        """
+        if compiled.LIBRARY is None:
+            return None
+        n = 3 + len(states)
+
+        def step(xp: Any, *q: Any) -> Sequence[Any]:
+            moved, start, applied, beside = q[:n], q[n : 2 * n], Applied(*q[2 * n : 2 * n + 2]), q[2 * n + 2 :]
+            now, here = add(start, moved), dict(zip(context, beside, strict=True))
+            carried = dict(zip(states, now[3:], strict=True))
+            change, changed = there.under(xp).increment(State(*now[:3]), applied, theta, carried, context=here)
+            return add(moved, [*change, *(changed[name] for name in states)])
+
+        inputs = 2 * n + 2 + len(context)
+        try:
+            effects = deepcopy(car.effects)  # a trace leaves no mark on what drives
+            there = replace(car, T_s=car.T_s / car.substeps, substeps=1, effects=effects)
+            before = pickle.dumps(effects)
+            tape, again = trace(step, inputs), trace(step, inputs)
+            same = pickle.dumps(effects) == before and pickle.dumps(tape) == pickle.dumps(again)
+        except (TypeError, AttributeError, pickle.PicklingError):
+            return None
+        return cls(car, tape, states, context) if same else None
+
+    def __call__(
+        self, state: State, applied: Applied, effect_states: Mapping[str, float], context: Mapping[str, float]
+    ) -> tuple[State, dict[str, float]]:
+        """As :meth:`CarModel.step`."""
+        assert compiled.LIBRARY is not None
+        start = [*state, *(effect_states[name] for name in self._names)]
+        self._moved[:] = 0.0
+        self._given[:] = np.array([*start, *applied, *(context[name] for name in self._context)])[:, None]
+        compiled.LIBRARY.dynssm_repeat(self._structure.address, self._substeps)
+        now = add(start, self._moved[:, 0].tolist())
+        return State(*now[:3]), dict(zip(self._names, now[3:], strict=True))

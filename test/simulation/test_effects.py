@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dynssm_ros import compiled
 from dynssm_ros.errors import ConfigurationError
 from dynssm_ros.simulation.external import drive_by_commands
 from dynssm_ros.simulation.laps import simulate
@@ -57,6 +58,21 @@ def driven(vehicle: Vehicle, kind: PlantKind) -> tuple[np.ndarray, np.ndarray, l
         true.append(car.state)
         measured.append(car.measured)
     return np.array(true), np.array(measured), signals
+
+
+@pytest.mark.parametrize("kind", ["euler", "double_track"])
+@pytest.mark.parametrize("name", EFFECTS)
+def test_a_compiled_plant_drives_as_numpy_does(
+    name: str, kind: PlantKind, acting: Any, library: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicle = with_effect(name, acting)
+    monkeypatch.setattr(compiled, "LIBRARY", library)
+    car = make_plant(vehicle, kind, *START, line=LINE)
+    assert car._compiled is not None  # type: ignore[attr-defined]
+    quick = driven(vehicle, kind)
+    monkeypatch.setattr(compiled, "LIBRARY", None)
+    for found, expected in zip(quick[:2], driven(vehicle, kind)[:2], strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dynssm_ros import compiled
 from dynssm_ros.simulation.plant import Pose, SingleTrackPlant
 from dynssm_ros.track.tracks import load_track
 from dynssm_ros.vehicle import Applied, State, load_vehicle
@@ -88,7 +89,7 @@ def test_lagging_steering_is_carried_from_step_to_step():
 def test_effects_see_time_place_and_pose():
     seen = []
 
-    class Witness(StageEffect):
+    class Witness(StageEffect):  # no file of its own, so that it is not traced
         def slip(self, xp, q):
             seen.append(dict(q.context))
 
@@ -102,3 +103,41 @@ def test_effects_see_time_place_and_pose():
     assert seen[0] == {"t": 0.0, "clock": clock, **line.place(3.0), "x": 1.0, "y": 2.0, "theta": 0.5}
     assert seen[1]["t"] == pytest.approx(0.02)
     assert seen[1]["x"] > 1.0
+
+
+class Wanders(StageEffect):
+    """Grip by chance: a trace would hold one throw for ever."""
+
+    def __init__(self):
+        self.rng = np.random.default_rng(1)
+
+    def tyres(self, xp, q):
+        q.F_fy = q.F_fy * self.rng.uniform(0.8, 1.0)
+
+
+class Tires(StageEffect):
+    """Loses grip with every call."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def tyres(self, xp, q):
+        self.calls += 1
+        q.F_fy = q.F_fy * (1.0 if self.calls < 50 else 0.5)
+
+
+class Branches(StageEffect):
+    """Has no drive force above a speed."""
+
+    def drive(self, xp, q):
+        if q.v_x > 1.99:
+            q.F_rx = 0.0 * q.F_rx
+
+
+@pytest.mark.parametrize("effect", [Wanders, Tires, Branches])
+def test_what_a_trace_cannot_hold_drives_by_its_own_code(effect, monkeypatch):
+    orca = load_vehicle("orca")
+    found = run(orca, "rk4", last=(effect(),))
+    assert not np.allclose(found, run(orca, "rk4"), rtol=0, atol=1e-6)
+    monkeypatch.setattr(compiled, "LIBRARY", None)
+    np.testing.assert_array_equal(found, run(orca, "rk4", last=(effect(),)))
