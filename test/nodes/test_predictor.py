@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,9 +14,9 @@ import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
 
-from benchmarks.endurance.live_run import isolated_environment, run_live
+from benchmarks.endurance.live_run import run_live
 from dynssm_ros.nodes.support import SENSOR_QOS
-from dynssm_ros.runtime.artifact import ONNX, open_artifact
+from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.predictor import Prediction, Predictor
 from dynssm_ros.runtime.replay import replay
@@ -425,32 +423,3 @@ def test_the_process_holds_no_torch(car) -> None:
 def test_simulated_time_without_a_clock_does_not_hinder_predictions(start_car) -> None:
     car = start_car(use_sim_time=True)
     assert car.drive_until_answered() == H
-
-
-@pytest.mark.parametrize(
-    ("parameters", "expected"),
-    [
-        ([], "parameter model: not set"),
-        (["model:=/nowhere"], "/nowhere: no such model folder"),
-        (["model:={model}", "model_root:=/nowhere"], "is not below /nowhere; expected a folder in it"),
-        (["model:={model}", "max_age:=abc"], "Trying to set parameter 'max_age' to 'abc' of type 'STRING'"),
-        (["model:={model}", "max_age:=100.0"], "Parameter max_age out of range Min: 0.01, Max: 10.0, value: 100.0"),
-        (["model:={model}", "tf:=true"], "parameter tf: needs tf2_ros, which comes with a ROS installation"),
-        (["model:={model}", "signals:=nothing"], "signals: 'nothing' is neither a file nor a shipped name"),
-        (["model:={model}", "signals:=av21"], "signals: missing throttle_command, steering_command"),
-    ],
-)
-def test_a_wrong_start_is_one_clear_line(
-    refused_start: Callable[..., str], small_model: Path, parameters: list[str], expected: str
-) -> None:
-    assert expected in refused_start("predictor", *(text.format(model=small_model) for text in parameters))
-
-
-def test_a_start_with_a_graph_that_takes_all_memory_is_refused(vast_model: Path) -> None:
-    command = [sys.executable, "-m", "dynssm_ros.nodes.predictor", "--ros-args", "-p", f"model:={vast_model}"]
-    done = subprocess.run(
-        command, env=os.environ | isolated_environment(), capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 1
-    assert done.stderr.startswith(f"error: {vast_model / ONNX}: ONNX Runtime refuses it (")
-    assert done.stderr.count("\n") == 1

@@ -15,7 +15,6 @@ from dynssm_ros.errors import DataWarning, RecordingError
 from dynssm_ros.signals.consistency import checked, contradictions
 from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.recording import Recording, RecordingInfo, concatenate
-from dynssm_ros.signals.spans import fitted
 from dynssm_ros.signals.standard import recording_to_bag
 
 T_S, WHEELBASE, UNDERSTEER, REAR_SLIP = 0.05, 2.6, 0.004, 0.01
@@ -47,15 +46,8 @@ def driven(
     delta = np.roll(WHEELBASE * curvature + UNDERSTEER * v_x**2 * curvature, -2)
     measured = np.stack([v_x, v_y, omega]) + noise * rng.standard_normal((3, len(t))) * np.array([[5.0], [1.0], [1.0]])
     columns = dict(zip(("v_x", "v_y", "omega"), measured, strict=True))
-    columns |= {
-        "r_fb": r,
-        "delta_fb": delta,
-        "r_cmd": 0 * r,
-        "delta_cmd": 0 * r,
-        "x": path.real,
-        "y": path.imag,
-        "theta": theta,
-    }
+    columns |= {"r_fb": r, "delta_fb": delta, "r_cmd": 0 * r, "delta_cmd": 0 * r}
+    columns |= {"x": path.real, "y": path.imag, "theta": theta}
     time = np.round(1.7e18 + t * 1e9).astype(np.int64)
     info = RecordingInfo(sampling_time=T_S, commands="none", source=("drive",))
     return Recording(info, time, np.zeros(len(t), np.int32), columns)
@@ -410,13 +402,6 @@ def test_spikes_are_told_with_their_rate_and_size(name: str, size: float, rows: 
     once[600:] += size / 100.0  # a step that stays is none, nor is a single spike
     once[300] += size
     assert contradictions(with_columns(drive, **{name: once})) == ()
-
-
-def test_a_steering_that_is_held_says_nothing_of_curvature() -> None:
-    rng = np.random.default_rng(0)
-    curvature = 0.03 + 0.01 * rng.standard_normal(400)
-    held = np.where(np.arange(400) < 40, -0.02, 0.3) + 1e-15 * rng.standard_normal(400)  # as means over spans come out
-    assert fitted(np.stack([np.ones(400), curvature], axis=1), held, np.arange(400) // 17) is None
 
 
 def test_the_sign_of_a_small_lateral_velocity_that_follows_the_yaw_rate_is_not_judged() -> None:

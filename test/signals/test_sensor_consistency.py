@@ -15,6 +15,7 @@ from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.resampling import Stream
 from dynssm_ros.signals.sensor_consistency import sensor_findings
 from dynssm_ros.signals.signal_map import SignalMap, load_signal_map
+from dynssm_ros.signals.spans import fitted
 from test.signals.test_consistency import driven
 
 DEFAULT = load_signal_map("default")
@@ -138,3 +139,10 @@ def test_of_sensors_that_are_wrong_nothing_else_is_said() -> None:
     info = wrong.info.model_copy(update={"findings": findings})
     wrong = type(wrong)(info, wrong.time, wrong.segment, wrong.columns | {"delta_fb": -wrong["delta_fb"]})
     assert checked(wrong).info.findings == findings
+
+
+def test_a_steering_that_is_held_says_nothing_of_curvature() -> None:
+    rng = np.random.default_rng(0)
+    curvature = 0.03 + 0.01 * rng.standard_normal(400)
+    held = np.where(np.arange(400) < 40, -0.02, 0.3) + 1e-15 * rng.standard_normal(400)  # as means over spans come out
+    assert fitted(np.stack([np.ones(400), curvature], axis=1), held, np.arange(400) // 17) is None
