@@ -244,18 +244,22 @@ void dynssm_seen(const Features *f, const double *windows, int64_t count, const 
     }
 }
 
+/* Covariance (n, n) times features (n). As it is symmetric, its rows are added up, several numbers at once. */
+WIDE static void spread_of(const double *covariance, const double *features, int64_t n, double *restrict spread) {
+    memset(spread, 0, n * sizeof(double));
+    for (int64_t j = 0; j < n; j++, covariance += n)
+        for (int64_t i = 0; i < n; i++) spread[i] += covariance[i] * features[j];
+}
+
 /* What is known before a step: weights (CHANNELS, n), the variances that OnlineState.variance computes and the limits (CHANNELS). */
 static void known(const Layer *layer, const double *features, double *weights, double *stated, double *limits) {
     const int64_t n = layer->n;
     memcpy(weights, layer->mean, CHANNELS * n * sizeof(double));
     for (int64_t c = 0; c < CHANNELS; c++) {
-        const double *P = layer->covariance + c * n * n, *f = features + c * n;
+        const double *f = features + c * n;
         double explained = 0.0;
-        for (int64_t i = 0; i < n; i++) {
-            double sum = 0.0;
-            for (int64_t j = 0; j < n; j++) sum += P[i * n + j] * f[j];
-            explained += sum * f[i];
-        }
+        spread_of(layer->covariance + c * n * n, f, n, layer->spread);
+        for (int64_t i = 0; i < n; i++) explained += layer->spread[i] * f[i];
         limits[c] = layer->limit * sqrt(layer->physics[c]);
         stated[c] = layer->width[c] * layer->width[c] * layer->recent[c] * (layer->noise[c] + explained);
     }
@@ -265,6 +269,12 @@ static void known(const Layer *layer, const double *features, double *weights, d
 void dynssm_known(const Layer *layer, const double *features, double *found) {
     const int64_t size = CHANNELS * layer->n;
     known(layer, features, found, found + size, found + size + CHANNELS);
+}
+
+/* A row of the covariance: what a step says is taken off, and a share of the prior's comes back. */
+WIDE static void less(double *restrict row, double gain, const double *spread, int64_t n, double kept,
+                      const double *widening) {
+    for (int64_t j = 0; j < n; j++) row[j] = kept * (row[j] - gain * spread[j]) + widening[j];
 }
 
 static inline double larger(double a, double b) { return a > b ? a : b; }
@@ -282,11 +292,9 @@ static int64_t update(Layer *layer, const double *features, const double *physic
         const double *f = features + c * n, *widening = layer->widening + c * n * n;
         const double *returning = layer->returning + c * n, noise = layer->noise[c], kept = layer->retained;
         double predicted = 0.0, said = 0.0;
+        spread_of(P, f, n, spread);
         for (int64_t i = 0; i < n; i++) {
-            double row = 0.0;
-            for (int64_t j = 0; j < n; j++) row += P[i * n + j] * f[j];
-            spread[i] = row;
-            predicted += row * f[i];
+            predicted += spread[i] * f[i];
             said += mean[i] * f[i];
         }
         const double error = target[c] - said, size = fabs(error) / sqrt(noise + predicted);
@@ -294,8 +302,7 @@ static int64_t update(Layer *layer, const double *features, const double *physic
         for (int64_t i = 0; i < n; i++) {
             const double gain = spread[i] / divisor;
             mean[i] = kept * (mean[i] + gain * error) + returning[i];
-            for (int64_t j = 0; j < n; j++)
-                P[i * n + j] = kept * kept * (P[i * n + j] - gain * spread[j]) + widening[i * n + j];
+            less(P + i * n, gain, spread, n, kept * kept, widening + i * n);
         }
         double *recent = layer->recent + c, *width = layer->width + c;
         const int missed = size > layer->quantile * *width * sqrt(*recent);

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+from functools import cached_property
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
@@ -71,7 +72,7 @@ def address(array: npt.NDArray[Any] | None) -> int | None:
 class Structure(ctypes.Structure):
     """A structure of the library whose arrays live as long as it does."""
 
-    @property
+    @cached_property
     def address(self) -> int:
         """Where it lies, which the library's functions take."""
         return ctypes.addressof(self)

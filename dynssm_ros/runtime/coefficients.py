@@ -124,8 +124,8 @@ class CoefficientEstimator:
         self._noise = self._usual.noise.copy()
         self.evidence = 0.0
         """Logarithm of the likelihood ratio of a changed car and the calibrated one."""
-        self._block: list[Vector] = []
-        self._whole: Vector | None = None
+        self._block: list[tuple[Vector, Vector]] = []
+        self._whole: list[tuple[Vector, Vector]] | None = None
         self._changed()
 
     @property
@@ -163,16 +163,17 @@ class CoefficientEstimator:
         self.finish()
         if not len(self.adapted):
             return
-        self._block.append(np.concatenate([row, increment]))
+        self._block.append((row, increment))
         if len(self._block) == self.rows:
-            self._whole = np.array(self._block)
-            self._block = []
+            self._whole, self._block = self._block, []
 
     def finish(self) -> None:
         """Learns from the block that is complete. The next step does it else, so that a prediction need not wait for it."""
         whole, self._whole = self._whole, None
-        if whole is not None and np.isfinite(whole).all():
-            self._update(whole[:, :7], whole[:, 7:])
+        if whole is not None:
+            rows, increments = map(np.array, zip(*whole, strict=True))
+            if np.isfinite(rows).all() and np.isfinite(increments).all():
+                self._update(rows, increments)
 
     def usual_errors(self, laps: Iterable[tuple[Indices, Measured]]) -> BlockErrors:
         """What is usual of the calibrated car, from laps that it was calibrated on.

@@ -36,12 +36,24 @@ _EXPLANATIONS = (Refusal.STANDS_STILL, Refusal.MAP_FRAME, Refusal.SPEED_SIGN, Re
 
 
 class _Passed(NamedTuple):
-    """A message, with the way until there as the velocities say it."""
+    """A message, with the ways until there as the velocities say them, complex ones as ``x + iy``."""
 
     stamp: int  # ns
     position: complex  # m
+    speed: float  # m/s
+    velocity: complex  # m/s, in the map's frame
+    body: complex  # m/s, in the car's
+    mirrored: complex  # m/s, in the map's frame with the lateral velocity's sign swapped
     way: float  # m
-    ways: tuple[complex, ...]  # m, in the map's frame: as it is, then under each explanation
+    moved: complex  # m, by `velocity`
+    moved_as_body: complex  # m, by `body`
+    moved_mirrored: complex  # m, by `mirrored`
+
+    def explained(self, since: _Passed) -> tuple[complex, ...]:
+        """The way ``since`` another message under each of the explanations (m)."""
+        moved = self.moved - since.moved
+        mirrored = self.moved_mirrored - since.moved_mirrored
+        return 0j, self.moved_as_body - since.moved_as_body, -moved, -mirrored, moved / 3.6
 
 
 class Consistency:
@@ -147,21 +159,23 @@ class Consistency:
         self._driven = self._driven[0] + way, self._driven[1] + turn
 
     def _pass(self, stamp: int, pose: Pose, seen: State) -> None:
-        ways, way = (0j,) * (1 + len(_EXPLANATIONS)), 0.0
+        turn, body = cmath.rect(1.0, pose.theta), complex(seen.v_x, seen.v_y)
+        velocity, mirrored = turn * body, turn * body.conjugate()
+        speed, way, ways = abs(body), 0.0, (0j, 0j, 0j)
         if self._last is not None:
-            then, was, had = self._last
-            half, last = (stamp - then) / 2e9, self._passed[-1]
-            moved = zip(last.ways, _velocities(was, had), _velocities(pose, seen), strict=True)
-            ways = tuple(sofar + half * (one + other) for sofar, one, other in moved)
-            way = last.way + half * (math.hypot(had.v_x, had.v_y) + math.hypot(seen.v_x, seen.v_y))
-            if pose == was:
-                self._still += 1
-            else:
-                self._still = 0
+            last = self._passed[-1]
+            half = (stamp - last.stamp) / 2e9
+            way = last.way + half * (last.speed + speed)
+            ways = (
+                last.moved + half * (last.velocity + velocity),
+                last.moved_as_body + half * (last.body + body),
+                last.moved_mirrored + half * (last.mirrored + mirrored),
+            )
+            self._still = self._still + 1 if pose == self._last[1] else 0
         if not self._still:
             self._still_since = stamp, way
         self._last = stamp, pose, seen
-        self._passed.append(_Passed(stamp, complex(pose.x, pose.y), way, ways))
+        self._passed.append(_Passed(stamp, complex(pose.x, pose.y), speed, velocity, body, mirrored, way, *ways))
         while len(self._passed) > 1 and self._is_far(self._passed[1]):
             self._passed.popleft()
 
@@ -186,10 +200,11 @@ class Consistency:
             self._different = 0
             return self._contradicted
         moved = newest.position - start.position
-        shares = tuple(abs(moved - (b - a)) / way for a, b in zip(start.ways, newest.ways, strict=True))
-        if shares[0] < _DIFFERENT:
+        share = abs(moved - (newest.moved - start.moved)) / way
+        if share < _DIFFERENT:
             self._different, self._in_doubt, self._contradicted = 0, False, None
             return None
+        shares = share, *(abs(moved - explained) / way for explained in newest.explained(start))
         if not self._different:
             self._since, self._squares = stamp, (0.0,) * len(shares)
         self._different += 1
@@ -211,10 +226,3 @@ class Consistency:
             what for what, square in zip(_EXPLANATIONS, explained, strict=True) if square < _EXPLAINED**2 * as_it_is
         }
         return explaining.pop() if len(explaining) == 1 else Refusal.CONTRADICTION
-
-
-def _velocities(pose: Pose, seen: State) -> tuple[complex, ...]:
-    """Velocity in the map's frame (m/s): as it is, then under each of the explanations."""
-    turn, body = cmath.rect(1.0, pose.theta), complex(seen.v_x, seen.v_y)
-    as_it_is = turn * body
-    return as_it_is, 0j, body, -as_it_is, -turn * body.conjugate(), as_it_is / 3.6

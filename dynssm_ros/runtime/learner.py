@@ -135,7 +135,7 @@ class OnlineLearner:
 
     def _completed(self, row: _Row, now: Vector, recut: Recut | None) -> _Row:
         """``row`` with its inputs as they are known now, ``now`` ``(7,)`` being about the same row."""
-        if recut is None or (now[CHANNELS:] == row.values[CHANNELS:]).all():
+        if recut is None or now[CHANNELS:].tolist() == row.values[CHANNELS:].tolist():
             return row
         window = recut()
         if window is None or np.array_equal(window[-1], row.values) or not self._is_fast(window):

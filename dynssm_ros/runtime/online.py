@@ -18,6 +18,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -138,7 +139,7 @@ class OnlineLayer:
     def acts(self, v_x: Vector) -> Mask:
         """Whether it learns and corrects at speeds ``v_x`` (m/s); not where that is not known."""
         if self.least >= 0.0:
-            return v_x >= max(self.minimum_speed, self.least)
+            return v_x >= self._slowest
         return (np.abs(v_x) >= self.minimum_speed) & (v_x >= self.least)
 
     @property
@@ -150,6 +151,16 @@ class OnlineLayer:
     def minimum_speed(self) -> float:
         """Below it the layer neither learns nor corrects (m/s)."""
         return self.vehicle.minimum_speed
+
+    @cached_property
+    def _slowest(self) -> float:
+        """Forwards, from which on it learns and corrects (m/s)."""
+        return max(self.minimum_speed, self.least)
+
+    @cached_property
+    def squares(self) -> Vector:
+        """s_delta squared, ``(3,)``."""
+        return np.square(self.scale)
 
     def estimator(self) -> CoefficientEstimator:
         """What follows the coefficients, as it begins."""
@@ -262,8 +273,8 @@ class OnlineState:
         """
         scale, (features, physics) = self.layer.scale, seen
         if compiled.LIBRARY is not None:
-            arrays = [np.ascontiguousarray(each) for each in (features, physics, increment)]
-            if compiled.LIBRARY.dynssm_update(self._structure().address, *map(address, arrays)):
+            arrays = map(address, map(np.ascontiguousarray, (features, physics, increment)))
+            if compiled.LIBRARY.dynssm_update(self._structure().address, *arrays):
                 self.coefficients.step(row, increment)
                 self.steps += 1
             return

@@ -56,12 +56,13 @@ class RolloutCorrection:
         """A model's prediction of the next step from ``windows`` ``(N, H, 7)``, as the layer has it."""
         assert prediction.seen is not None
         layer, now = self.layer, windows[:, -1, :3]
-        increments = self.increments(prediction.seen)
-        state = np.where(layer.acts(now[:, :1]), now + increments, prediction.state)
-        variance = self.learned.variance * layer.scale**2
-        if prediction.variance is not None:
-            variance = np.where(now[:, :1] >= layer.least, variance, prediction.variance)
-        return prediction._replace(state=state, variance=variance, theta=self.learned.theta)
+        state, variance = now + self.increments(prediction.seen), self.learned.variance * layer.squares
+        acts = layer.acts(now[:, :1])
+        if not acts.all():
+            state = np.where(acts, state, prediction.state)
+            if prediction.variance is not None:
+                variance = np.where(now[:, :1] >= layer.least, variance, prediction.variance)
+        return WindowPrediction(state, self.learned.theta, prediction.physics, variance, prediction.seen)
 
     def believed(self, trusted: bool) -> RolloutCorrection:
         """A copy that goes on from here, with the layer's paths believed or not."""

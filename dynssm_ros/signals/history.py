@@ -91,7 +91,7 @@ class RingBuffer:
     @property
     def oldest(self) -> float:
         """Time of the oldest sample, ``inf`` if empty."""
-        return float(self._times[self._next + self._capacity - self._count]) if self._count else np.inf
+        return self._times.item(self._next + self._capacity - self._count) if self._count else np.inf
 
     def place(self) -> tuple[int, int, int, bool]:
         """Where the compiled loop finds the samples: the oldest one's time and value, their number; whether it holds them."""
@@ -157,7 +157,6 @@ class History:
         inputs = [name for name in signal_map.active_signals() if name not in (*STATE_SIGNALS, *SENSORS)]
         self.names = (*STATE_SIGNALS, *inputs)
         self._buffers = {name: RingBuffer() for name in self.names if name not in ("x", "y", "theta")}
-        self._unbroken = dict.fromkeys(self._buffers, -np.inf)  # where each signal's gap-free stretch begins
         speaks = "speed" if "speed_feedback" in self._buffers else "throttle"
         actuators = [f"{of}_{kind}" for kind in ("feedback", "command") for of in (speaks, "brake", "steering")]
         ordered = [self._buffers.get(name) for name in (*STATE_SIGNALS, *actuators)]
@@ -176,6 +175,7 @@ class History:
         self._jump = float(signal_map.jump_ns)
         self._suspect: tuple[int, dict[str, float]] | None = None  # a message whose stamp (ns) may be an outlier
         self._epoch: int | None = None
+        self._latest = -np.inf  # stamp of a sample (ns since the epoch)
         self.resize(T_s, H, held)
 
     def resize(self, T_s: float, H: int, held: Collection[str] = ()) -> None:
@@ -186,6 +186,7 @@ class History:
         self._grid = address(self._offsets)
         self._span = H * T_s * 1e9 + self._max_age + self._max_gap
         self._slack = ROUNDING * T_s * 1e9
+        self._first = float(self._offsets[0]) + self._slack
 
     def add(self, stamp: int, values: dict[str, float]) -> Refusal | None:
         """Takes the samples of one message with header stamp ``stamp`` (ns), SI values by signal name; those not of the
@@ -218,19 +219,20 @@ class History:
         """How far a message's stamp is beyond what can follow the last ones (ns): negative back, positive ahead, else 0."""
         assert self._epoch is not None
         time = float(stamp - self._epoch)
+        if abs(time - self._latest) <= self._jump:
+            return 0.0
         newest = max((self._buffers[name].newest + self._delays[name] for name in values), default=-np.inf)
         if newest == -np.inf:
             return 0.0
         # a signal may be silent while others go on
-        latest = max(buffer.newest + self._delays[name] for name, buffer in self._buffers.items())
-        return min(time - (newest - self._jump), 0.0) or max(time - (latest + self._jump), 0.0)
+        return min(time - (newest - self._jump), 0.0) or max(time - (self._latest + self._jump), 0.0)
 
     def _take(self, stamp: int, values: dict[str, float]) -> Refusal | None:
         """Appends the samples of one message, as far as they are newer than all others of their signals."""
         assert self._epoch is not None
-        refusal = None
+        refusal, now = None, float(stamp - self._epoch)
         for name, value in values.items():
-            buffer, time = self._buffers[name], float(stamp - self._epoch) - self._delays[name]
+            buffer, time = self._buffers[name], now - self._delays[name]
             if not isfinite(value):
                 refusal = refusal or Refusal.NOT_FINITE
                 continue
@@ -238,8 +240,9 @@ class History:
                 refusal = refusal or Refusal.REPEATED
                 continue
             if time - buffer.newest > self._max_gap:
-                self._unbroken[name] = time
+                buffer.clear()  # no window goes across a gap
             buffer.append(time, value, self._span)
+            self._latest = max(self._latest, now)
         return refusal
 
     def clear(self) -> None:
@@ -247,7 +250,7 @@ class History:
         self._suspect = None
         for buffer in self._buffers.values():
             buffer.clear()
-        self._unbroken = dict.fromkeys(self._buffers, -np.inf)
+        self._latest = -np.inf
         self._epoch = None
 
     def window(self, stamp: int) -> Vector | Refusal:
@@ -257,13 +260,12 @@ class History:
         if self._epoch is None:
             return Refusal.MISSING
         now = float(stamp - self._epoch)
-        first = now + self._offsets[0] + self._slack
-        filling = False
-        for name, buffer in self._buffers.items():
+        first, filling = now + self._first, False
+        for buffer in self._buffers.values():
             age = now - buffer.newest
             if age > self._max_age:
                 return Refusal.MISSING if age == np.inf else Refusal.STALE
-            filling = filling or self._unbroken[name] > first or buffer.oldest > first
+            filling = filling or buffer.oldest > first
         if filling:
             return Refusal.FILLING
         window = np.empty((len(self._offsets), len(WINDOW_COLUMNS)))
