@@ -71,6 +71,17 @@ def test_between_two_speeds_the_drive_before_tells_the_gear() -> None:
     assert with_gears.max() < 0.01 < without[misled].max()
 
 
+def test_neither_another_recording_nor_what_was_before_a_gap_tells_the_gear() -> None:
+    shift = EFFECTS["gear_shift"](factor=0.7, up=34.0, down=24.0)
+    rows = np.zeros((7, 9))
+    rows[0] = [36.0, 30.0, 30.0, 25.0, 25.0, 23.0, 30.0, 28.0, 28.0]  # the last two parts begin below the middle
+    time, number = 0.02 * np.array([0, 1, 2, 0, 1, 2, 3, 9, 10]), np.repeat([0, 1], [3, 6])
+    told = RecordedRows(rows, {}, 0.02, time, number).told_by(shift)
+    assert told["gear_shift.gear"].tolist() == [1, 1, 1, 0, 0, 0, 0, 0, 0]
+    assert RecordedRows(rows, {}, 0.02, 0.02 * np.arange(9), 0 * number).told_by(shift)["gear_shift.gear"][3] == 1
+    assert RecordedRows(rows, {}, 0.02, time, number).told_by(EFFECTS["drag"](coefficient=0.1)) == {}
+
+
 def test_simulations_in_blocks_are_those_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     some, car = windows(AV21), CarEstimate.of(AV21)
     cars = [car.with_effect("steering_lag", {"time_constant": value}) for value in (0.05, 0.1)]

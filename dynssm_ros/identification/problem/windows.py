@@ -23,7 +23,7 @@ from dynssm_ros.signals.signal_map import Hold
 from dynssm_ros.vehicle import Applied, CarModel, Coefficients, State, Vehicle
 from dynssm_ros.vehicle.effects.step_errors import StepErrors
 from dynssm_ros.vehicle.integrators import Integrator
-from dynssm_ros.vehicle.single_track import settling_rate
+from dynssm_ros.vehicle.single_track import StageEffect, settling_rate
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,16 @@ class RecordedRows:
         return "s" in self.context and bool(np.ptp(self.context["lap_length"]) == 0.0)
 
     @cached_property
+    def _cut(self) -> Mask:
+        """Where a row is not the one a sampling time after the row before, or of another recording, ``(N - 1,)``."""
+        return np.asarray((np.diff(self.time) > 1.5 * self.T_s) | (np.diff(self.number) != 0))
+
+    def told_by(self, effect: StageEffect) -> dict[str, Vector]:
+        """What the drive until each row tells of the effect's own states; nothing of it is told across a gap."""
+        parts = [effect.before(part) for part in np.split(self.rows, np.flatnonzero(self._cut) + 1, axis=1)]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    @cached_property
     def applied(self) -> Vector:
         """Applied throttle and steering, shape ``(2, N)``."""
         return np.array(applied_inputs(self.rows), dtype=np.float64)
@@ -65,7 +75,7 @@ class RecordedRows:
         Rows that hold a sample tell when it was taken only where they change: a line begins as long before as samples are
         apart, and after the last change.
         """
-        cut = (np.diff(self.time) > 1.5 * self.T_s) | (np.diff(self.number) != 0)
+        cut = self._cut
         rows, lines = np.arange(len(self.time)), self.applied.copy()
         for held, apart in zip(lines, self.rows_per_sample, strict=True):
             ends = np.flatnonzero((np.diff(held) != 0) | cut) + 1
@@ -260,7 +270,7 @@ class SimulationWindows:
         """The other signals that effects of the car read, by row; ``context`` replaces them."""
         signals = self.data.context
         needs = dict.fromkeys(name for effect in car.effects for name in effect.needs if name in signals)
-        told = {name: values for effect in car.effects for name, values in effect.before(self.data.rows).items()}
+        told = {name: values for effect in car.effects for name, values in self.data.told_by(effect).items()}
         return told | {name: (context or {}).get(name, signals[name]) for name in needs}
 
     def _read(self, signals: Mapping[str, Any], k: int) -> dict[str, Any]:
