@@ -57,6 +57,12 @@ typedef struct {
 } Layer;
 
 typedef struct {
+    Features features;
+    double minimum_speed, least;
+    const double *alone; /* variances of what the physics alone says (CHANNELS) */
+} Step;
+
+typedef struct {
     Tape settle; /* signals, parameters -> effect states */
     Tape step;   /* signals, effect states, parameters -> state and effect states at the next row */
     int64_t signals; /* the measured state, both inputs, what effects read beside them */
@@ -320,6 +326,34 @@ static int64_t update(Layer *layer, const double *features, const double *physic
 
 int64_t dynssm_update(Layer *layer, const double *features, const double *physics, const double *increment) {
     return update(layer, features, physics, increment);
+}
+
+/* A row of a drive, of a model that is its physics and the layer: what the window (rows, COLUMNS) that ends with it shows, and
+   what follows. Where it follows on a row with `before` (features) and `physics`, the layer learns that step first; returns
+   whether that taught something. To row: features (CHANNELS, n) and weights (CHANNELS, n); the physics' increments, stated
+   variances and limits as known() has them, the next state, its variances and the state by the physics (CHANNELS each). */
+int64_t dynssm_step(const Step *s, Layer *layer, const double *window, const double *before, const double *physics,
+                    double *row) {
+    const Features *f = &s->features;
+    const int64_t n = f->n;
+    const double *now = window + (f->rows - 1) * COLUMNS, *last = now - COLUMNS;
+    double *weights = row + CHANNELS * n, *moved = weights + CHANNELS * n, *stated = moved + CHANNELS;
+    double *limits = stated + CHANNELS, *next = limits + CHANNELS, *variances = next + CHANNELS;
+    double *by_physics = variances + CHANNELS;
+    const double increment[CHANNELS] = {now[0] - last[0], now[1] - last[1], now[2] - last[2]};
+    const int64_t taught = before && update(layer, before, physics, increment);
+    const int acts = fabs(now[0]) >= s->minimum_speed && now[0] >= s->least;
+    dynssm_seen(f, window, 1, 0, row, moved);
+    known(layer, row, weights, stated, limits);
+    for (int64_t c = 0; c < CHANNELS; c++) {
+        const double scale = layer->scale[c];
+        double said = 0.0;
+        for (int64_t i = 0; i < n; i++) said += row[c * n + i] * weights[c * n + i];
+        by_physics[c] = now[c] + moved[c];
+        next[c] = acts ? now[c] + said * scale : by_physics[c];
+        variances[c] = now[0] >= s->least ? stated[c] * (scale * scale) : s->alone[c];
+    }
+    return taught;
 }
 
 /* Learns along rows, each from the one before if it `follows`; what is known at each goes to weights (count, CHANNELS, n),

@@ -25,6 +25,7 @@ _FUNCTIONS = {
     "dynssm_seen": "ppippp",
     "dynssm_known": "ppp",
     "dynssm_update": "pppp",
+    "dynssm_step": "pppppp",
     "dynssm_along": "ppppippppp",
     "dynssm_rollout": "ppippp",
     "dynssm_window": "ppddip",
@@ -143,6 +144,12 @@ class RolloutStructure(Structure):
         *_fields("", "", "far minimum_speed least fading"),
         *_fields("", "moved now constant"),
     ]
+
+
+class StepStructure(Structure):
+    """``Step`` of ``compiled.c``."""
+
+    _fields_ = [("features", FeaturesStructure), *_fields("", "", "minimum_speed least"), *_fields("", "alone")]
 
 
 class LayerStructure(Structure):

@@ -18,10 +18,11 @@ from dynssm_ros.errors import ArtifactError
 from dynssm_ros.runtime.along import Along
 from dynssm_ros.runtime.artifact import open_artifact
 from dynssm_ros.runtime.features import FeatureLayout, LayerFeatures
+from dynssm_ros.runtime.learner import OnlineLearner
 from dynssm_ros.runtime.online import Learned, Seen
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.path_judge import _FAR, _pair_steps
-from dynssm_ros.runtime.rollout import LayerRollout, RolloutCorrection, roll_out
+from dynssm_ros.runtime.rollout import LayerRollout, RolloutCorrection, roll_out, step_of
 from dynssm_ros.signals.history import History, Refusal
 from dynssm_ros.signals.signal_map import CONTEXT_SIGNALS, Commands, load_signal_map
 
@@ -106,6 +107,39 @@ def test_the_layer_learns_the_same_with_and_without(
         found[which] = (*Learned.joined(parts), *state.learned(seen.features[60]), along._state.steps, state.covariance)
     for own, plain in zip(found[library], found[None], strict=True):
         np.testing.assert_allclose(own, plain, rtol=1e-9, atol=1e-11)  # hundreds of steps on from the last digit
+
+
+def test_a_drive_is_followed_the_same_with_and_without(
+    rls_model: Path, library: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one call or in several: standing, slow, reversing, rows that do not follow, inputs that came late."""
+    model = OnnxModel(open_artifact(rls_model))
+    scales = model.card.normalisation
+    rng = np.random.default_rng(4)
+    drive = np.array(scales.input_mean) + np.array(scales.input_std) * np.cumsum(rng.normal(size=(400, 7)) / 20, axis=0)
+    drive[100:150, :3] = 0.0
+    drive[200:250, 0] *= -1.0
+    windows = np.lib.stride_tricks.sliding_window_view(drive, model.H, axis=0).swapaxes(1, 2)
+    windows = np.ascontiguousarray(windows)
+    late = windows - [0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0]
+    found = {}
+    for which in (None, library):
+        monkeypatch.setattr(compiled, "LIBRARY", which)
+        learner, said = OnlineLearner(model, model.online), []
+        for k, window in enumerate(windows):
+            if k == 40:
+                learner.interrupt()
+            given = late[k] if k % 5 == 0 else window
+            predicted, fast = learner.predict(given, lambda k=k: windows[k - 1], learns=k % 7 != 3)
+            said.append(np.concatenate([*(np.ravel(part) for part in predicted[:4]), [fast, learner.state.steps]]))
+            if k % 10 == 0:
+                step = step_of(model, learner.rollout())
+                said[-1] = np.append(said[-1], roll_out(step, np.concatenate([window, window])[None], model.H))
+            learner.finish()
+        found[which] = said
+    assert 100 < learner.state.steps < 300
+    for k, (own, plain) in enumerate(zip(found[library], found[None], strict=True)):
+        np.testing.assert_allclose(own, plain, rtol=1e-12 if k < 3 else 1e-8, atol=1e-12 if k < 3 else 1e-9)
 
 
 @pytest.mark.parametrize("effect", ["", "steering_lag", "tire_relaxation"])

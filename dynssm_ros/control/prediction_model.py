@@ -109,8 +109,7 @@ class Adaptive:
     def learn(self, rows: Vector) -> None:
         """See :class:`PredictionModel`."""
         if self._learner is not None and len(rows) >= self.H:
-            window = self._read_by(rows[None, -self.H :]).copy()
-            self._learner.learn(window[0], self._model.predict(window))
+            self._learner.predict(self._read_by(rows[None, -self.H :])[0].copy())
 
     def interrupt(self) -> None:
         """See :class:`PredictionModel`."""

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
 from dynssm_ros.arrays import Vector
 from dynssm_ros.runtime.contract import WindowPrediction, seen_by
+from dynssm_ros.runtime.layer_step import LayerStep
 from dynssm_ros.runtime.online import CHANNELS, Learned, OnlineLayer, OnlineState, Seen
 from dynssm_ros.runtime.onnx_model import OnnxModel
 from dynssm_ros.runtime.path_judge import PathJudge
 from dynssm_ros.runtime.rollout import RolloutCorrection
 
+_Row = tuple[Seen, Vector]
+"""What the layer sees of a row, ``N = 1``, and its values ``(7,)``; the next one is yet to come."""
 Recut = Callable[[], Vector | None]
 """The window ``(H, 7)`` of the last row as it is known now; ``None`` if it cannot be had any more."""
 
@@ -31,7 +33,6 @@ class OnlineLearner:
     """
 
     def __init__(self, model: OnnxModel, layer: OnlineLayer, judges: bool = True) -> None:
-        self.model = model
         self.layer = layer
         self.state: OnlineState = layer.start()
         self._judge = PathJudge(layer, self._see)
@@ -39,13 +40,20 @@ class OnlineLearner:
         self._last: _Row | None = None
         self._unjudged: tuple[Vector, Seen, Learned] | None = None
         self._known: tuple[Seen, Learned] | None = None
-        self._correction: RolloutCorrection | None = None
+        self._set_model(model)
 
     def continued_with(self, model: OnnxModel) -> OnlineLearner:
         """The learner of ``model``, which has the same prior: what was learned is kept."""
         self.judge_paths()
-        self.model, self._last = model, None
+        self._last = None
+        self._set_model(model)
         return self
+
+    def _set_model(self, model: OnnxModel) -> None:
+        self.model, features = model, model.layer_features
+        self._compiled: LayerStep | None = None
+        if features is not None:
+            self._compiled = LayerStep(features, self.layer, np.array(model.card.covariance), model.H)
 
     def reset(self) -> None:
         """Forgets the drive."""
@@ -57,49 +65,64 @@ class OnlineLearner:
         """The next row is not one T_s after the last one."""
         self._last = None
 
-    def learn(self, window: Vector, predicted: WindowPrediction, recut: Recut | None = None) -> bool:
-        """Learns the step from the last row to the next.
+    def predict(
+        self, window: Vector, recut: Recut | None = None, *, learns: bool = True
+    ) -> tuple[WindowPrediction, bool]:
+        """Learns the step from the last row to the next, and predicts the one after it; rollouts go on from there.
 
         Args:
             window: that ends with the next row, ``(H, 7)``.
-            predicted: by the model, from ``window``.
             recut: gives the last row with inputs that came after its odometry; till then the last ones were held.
+            learns: whether the next row is one T_s after the last one. Else it is only predicted from.
 
         Returns:
-            Whether the row after it can be learned: the car was not too slow.
+            What the model predicts, corrected by what was learned, and whether the row after it can be learned: the car
+            was not too slow.
         """
-        assert predicted.seen is not None
-        last, self._last, self._known = self._last, None, None
-        fast = self._is_fast(window)
+        fast, last = learns and self._is_fast(window), None
+        if learns:
+            last = self._followed(window, fast, recut)
+        said, known = self._step(window, last)
+        assert said.seen is not None
+        self._known = said.seen, known
+        if fast:
+            self._last = said.seen, window[-1]
+            if self._judges:
+                self._unjudged = window, said.seen, known
+        return said, fast
+
+    def _followed(self, window: Vector, fast: bool, recut: Recut | None) -> _Row | None:
+        """The row that the last one of ``window`` follows on, if there is one."""
+        self.judge_paths()
+        last, self._last = self._last, None
         if last is None or not fast:
             self.state.interrupt()
-            self.judge_paths()
             self._judge.interrupt()
-        else:
-            last = self._completed(last, window[-2], recut)
-            self.state.update(last.seen, last.values, window[-1, :CHANNELS] - window[-2, :CHANNELS])
-        if fast:
-            self._last = _Row.of(window, predicted)
-            if self._judges:
-                self.judge_paths()
-                known = self.learned(predicted.seen)
-                self._known = predicted.seen, known
-                self._unjudged = window, predicted.seen, known
-        return fast
+            return None
+        return self._completed(last, window[-2], recut)
 
-    def corrected(self, window: Vector, predicted: WindowPrediction) -> WindowPrediction:
-        """What the model predicts from ``window`` ``(H, 7)``, corrected by what was learned; rollouts go on from there."""
+    def _step(self, window: Vector, last: _Row | None) -> tuple[WindowPrediction, Learned]:
+        """What is predicted from ``window``, and what is known there, after the step from ``last`` was learned."""
+        if self._compiled is not None and self._compiled.is_possible:
+            return self._compiled(self.state, window, last, self._judge.trusted)
+        predicted = self.model.predict(window[None])
         assert predicted.seen is not None
-        seen, known = predicted.seen, self._known  # nothing was learned since
-        learned = self.learned(seen) if known is None or known[0] is not seen else known[1]
-        self._correction = RolloutCorrection(self.layer, learned)
-        return self._correction.corrected(predicted, window[None])
+        if last is not None:
+            seen, row = last
+            self.state.update(
+                Seen(seen.features[0], seen.physics[0]), row, window[-1, :CHANNELS] - window[-2, :CHANNELS]
+            )
+        known = self.learned(predicted.seen)
+        return RolloutCorrection(self.layer, known).corrected(predicted, window[None]), known
 
     def rollout(self) -> RolloutCorrection:
-        """Corrects the steps after the prediction that was :meth:`corrected` last."""
-        assert self._correction is not None
+        """Corrects the steps after the one that was predicted last."""
+        assert self._known is not None
         self.judge_paths()
-        return self._correction.believed(self._judge.trusted)
+        seen, known = self._known
+        correction = RolloutCorrection(self.layer, known._replace(trusted=np.array([float(self._judge.trusted)])))
+        correction.increments(seen)  # of the step that was predicted
+        return correction
 
     def afresh(self) -> RolloutCorrection:
         """Corrects a rollout that begins anew, by what is known now."""
@@ -133,25 +156,11 @@ class OnlineLearner:
         """Whether the layer acts throughout."""
         return bool(self.layer.acts(window[:, 0]).all())
 
-    def _completed(self, row: _Row, now: Vector, recut: Recut | None) -> _Row:
-        """``row`` with its inputs as they are known now, ``now`` ``(7,)`` being about the same row."""
-        if recut is None or now[CHANNELS:].tolist() == row.values[CHANNELS:].tolist():
-            return row
+    def _completed(self, last: _Row, now: Vector, recut: Recut | None) -> _Row:
+        """``last`` with its inputs as they are known now, ``now`` ``(7,)`` being about the same row."""
+        if recut is None or now[CHANNELS:].tolist() == last[1][CHANNELS:].tolist():
+            return last
         window = recut()
-        if window is None or np.array_equal(window[-1], row.values) or not self._is_fast(window):
-            return row
-        return _Row.of(window, self.model.predict(window[None]))
-
-
-class _Row(NamedTuple):
-    """A row that the layer has yet to see the next one of."""
-
-    seen: Seen
-    """Features ``(3, n)`` and physics ``(3,)``."""
-    values: Vector
-
-    @classmethod
-    def of(cls, window: Vector, predicted: WindowPrediction) -> _Row:
-        """The last row of a window."""
-        assert predicted.seen is not None
-        return cls(Seen(predicted.seen.features[0], predicted.seen.physics[0]), window[-1])
+        if window is None or np.array_equal(window[-1], last[1]) or not self._is_fast(window):
+            return last
+        return seen_by(self.model, window[None]), window[-1]

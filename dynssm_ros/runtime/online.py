@@ -157,11 +157,6 @@ class OnlineLayer:
         """Forwards, from which on it learns and corrects (m/s)."""
         return max(self.minimum_speed, self.least)
 
-    @cached_property
-    def squares(self) -> Vector:
-        """s_delta squared, ``(3,)``."""
-        return np.square(self.scale)
-
     def estimator(self) -> CoefficientEstimator:
         """What follows the coefficients, as it begins."""
         errors = BlockErrors(self.block_noise, self.block_slow)
@@ -241,7 +236,7 @@ class OnlineState:
         if compiled.LIBRARY is not None:
             size, features = self.mean.size, np.ascontiguousarray(features)
             known = np.empty((1, size + 2 * CHANNELS))
-            compiled.LIBRARY.dynssm_known(self._structure().address, address(features), address(known))
+            compiled.LIBRARY.dynssm_known(self.structure().address, address(features), address(known))
             weights = known[:, :size].reshape(1, *self.mean.shape)
             variance, limit = known[:, size:-CHANNELS], known[:, -CHANNELS:]
         else:
@@ -274,9 +269,8 @@ class OnlineState:
         scale, (features, physics) = self.layer.scale, seen
         if compiled.LIBRARY is not None:
             arrays = map(address, map(np.ascontiguousarray, (features, physics, increment)))
-            if compiled.LIBRARY.dynssm_update(self._structure().address, *arrays):
-                self.coefficients.step(row, increment)
-                self.steps += 1
+            if compiled.LIBRARY.dynssm_update(self.structure().address, *arrays):
+                self.taught(row, increment)
             return
         target = increment / scale
         if not math.isfinite(float(target.sum() + features.sum())):
@@ -299,6 +293,10 @@ class OnlineState:
         self.noise[...] = np.maximum(self.noise + self._forget * (square - self.noise), _SMALLEST**2)
         of_physics = ((increment - physics) / scale) ** 2
         self.physics += self._forget * (of_physics - self.physics)
+        self.taught(row, increment)
+
+    def taught(self, row: Vector, increment: Vector) -> None:
+        """The layer has learned the ``increment`` ``(3,)`` from a measured ``row`` ``(7,)``."""
         self.coefficients.step(row, increment)
         self.steps += 1
 
@@ -314,11 +312,11 @@ class OnlineState:
         inputs = [np.ascontiguousarray(each) for each in (seen.features, seen.physics, increments)]
         assert compiled.LIBRARY is not None
         others: list[npt.NDArray[Any]] = [follows.astype(np.uint8), taught, weights, stated, limits]
-        compiled.LIBRARY.dynssm_along(self._structure().address, *map(address, inputs), count, *map(address, others))
+        compiled.LIBRARY.dynssm_along(self.structure().address, *map(address, inputs), count, *map(address, others))
         self.steps += int(taught.sum())
         return weights, stated, limits, taught.astype(np.bool_)
 
-    def _structure(self) -> compiled.LayerStructure:
+    def structure(self) -> compiled.LayerStructure:
         """Where the compiled loop finds what it learns; it works in these arrays."""
         if self._compiled is None:
             self._compiled = compiled.LayerStructure()

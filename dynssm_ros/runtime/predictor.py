@@ -247,14 +247,12 @@ class Predictor:
             return window
         self._window = window
         self._rows.append((stamp, window[-1].copy()))
-        predicted = self.model.predict(window[None])
-        if self._learner is not None:
-            self._learn(self._learner, stamp, window, predicted)
-            predicted = self._learner.corrected(window, predicted)
+        learner = self._learner
+        predicted = self.model.predict(window[None]) if learner is None else self._learn(learner, stamp, window)
         state, theta, physics, variance = predicted[:4]
         now, (following, adapted, stated) = window[-1, :3].tolist(), predicted.numbers()
         self._measured = stamp, now
-        if not (_finite(following) and _finite(stated) and _finite(adapted)):
+        if not math.isfinite(sum(following) + sum(stated) + sum(adapted)):
             return Refusal.BAD_PREDICTION
         if words := self._plausibility.of_prediction(now, following, self.model.T_s, variance=stated, theta=adapted):
             self._plausibility.last = words
@@ -334,34 +332,34 @@ class Predictor:
             state = following
             yield state, pose
 
-    def _learn(self, learner: OnlineLearner, stamp: int, window: Vector, predicted: WindowPrediction) -> None:
-        """Lets the learner follow the drive up to the ``window`` at ``stamp`` (ns), in rows T_s apart.
+    def _learn(self, learner: OnlineLearner, stamp: int, window: Vector) -> WindowPrediction:
+        """Lets the learner follow the drive up to the ``window`` at ``stamp`` (ns), in rows T_s apart, and predict from it.
 
         These are those of the odometry where its rate is 1 / T_s. Else rows between the messages are cut from the
         history. After a gap and after rows that are too slow they start anew, with ``window``.
         """
         slack, last = self._period // 100, self._learned_at
-
-        def learns(row: Vector | Refusal, said: WindowPrediction | None = None) -> bool:
-            if isinstance(row, Refusal):
-                return False
-            return learner.learn(row, said or self.model.predict(row[None]), partial(self._recut, last))
-
         while last is not None and (due := last + self._period) < stamp - slack:
-            last = due if learns(self._history.window(due)) else None
+            row, recut = self._history.window(due), partial(self._recut, last)
+            last = due if not isinstance(row, Refusal) and learner.predict(row, recut)[1] else None
         if last is None:
             learner.interrupt()
-        if last is None or last + self._period <= stamp + slack:
-            last = stamp if learns(window, predicted) else None
+        learns = last is None or last + self._period <= stamp + slack
+        predicted, fast = learner.predict(window, partial(self._recut, last), learns=learns)
+        if learns:
+            last = stamp if fast else None
         self._learned_at = last
+        return predicted
 
     def _recut(self, stamp: int | None) -> Vector | None:
         window = Refusal.FILLING if stamp is None else self._history.window(stamp)
         return None if isinstance(window, Refusal) else window
 
     def _residual_share(self, now: list[float], following: list[float], physics: list[float]) -> float:
-        residual = sum(abs(a - b) / s for a, b, s in zip(following, physics, self._scale, strict=True))
-        explained = sum(abs(a - b) / s for a, b, s in zip(physics, now, self._scale, strict=True))
+        residual = explained = 0.0
+        for before, own, after, scale in zip(now, physics, following, self._scale, strict=True):
+            residual += abs(after - own) / scale
+            explained += abs(own - before) / scale
         return residual / (residual + explained) if residual > 0 else 0.0
 
 

@@ -5,7 +5,6 @@ The live horizon, the comparison of live paths, the evaluation and the decision 
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -56,19 +55,13 @@ class RolloutCorrection:
         """A model's prediction of the next step from ``windows`` ``(N, H, 7)``, as the layer has it."""
         assert prediction.seen is not None
         layer, now = self.layer, windows[:, -1, :3]
-        state, variance = now + self.increments(prediction.seen), self.learned.variance * layer.squares
+        state, variance = now + self.increments(prediction.seen), self.learned.variance * layer.scale**2
         acts = layer.acts(now[:, :1])
         if not acts.all():
             state = np.where(acts, state, prediction.state)
             if prediction.variance is not None:
                 variance = np.where(now[:, :1] >= layer.least, variance, prediction.variance)
         return WindowPrediction(state, self.learned.theta, prediction.physics, variance, prediction.seen)
-
-    def believed(self, trusted: bool) -> RolloutCorrection:
-        """A copy that goes on from here, with the layer's paths believed or not."""
-        copied = copy.copy(self)
-        copied.learned = self.learned._replace(trusted=np.full(len(self.learned.trusted), float(trusted)))
-        return copied
 
 
 def step_of(model: WindowModel, correction: RolloutCorrection | None = None) -> Step:

@@ -133,14 +133,7 @@ def _steady_windows(model: OnnxModel) -> Vector:
 
 def _predicted(model: OnnxModel, learner: OnlineLearner | None, windows: Vector) -> list[WindowPrediction]:
     """What the model says of successive windows ``(N, H, 7)``, corrected by what is learned from them."""
-    found = []
-    for window in windows:
-        predicted = model.predict(window[None])
-        if learner is not None:
-            learner.learn(window, predicted)
-            predicted = learner.corrected(window, predicted)
-        found.append(predicted)
-    return found
+    return [model.predict(window[None]) if learner is None else learner.predict(window)[0] for window in windows]
 
 
 def _seconds(model: OnnxModel) -> float:

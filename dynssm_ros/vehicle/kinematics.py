@@ -59,8 +59,9 @@ def advance_pose(xp: Any, pose: Pose, before: State, after: State, T_s: float, *
         T_s: length of the step (s).
         share: instant of the step whose velocity and heading carry the car: 0.5 its middle, 0 its start (forward Euler).
     """
-    v_x, v_y, omega = ((1 - share) * a + share * b for a, b in zip(before, after, strict=True))
-    turn = omega * T_s
+    left = 1 - share
+    v_x, v_y = left * before.v_x + share * after.v_x, left * before.v_y + share * after.v_y
+    turn = (left * before.omega + share * after.omega) * T_s
     x, y = world_velocity(xp, pose.theta + share * turn, v_x, v_y)
     return Pose(pose.x + T_s * x, pose.y + T_s * y, pose.theta + turn)
 
