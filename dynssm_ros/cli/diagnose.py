@@ -55,7 +55,7 @@ def diagnose(
     path = out / "vehicle.yaml"
     about = f"{result.car.vehicle.name}, extended by a diagnosis of {result.protocol['Recording']}: {result.verdict}."
     save_vehicle(result.vehicle, path, about)
-    diagnosis_report(result, result.anatomy).save(out / "report.html")
+    diagnosis_report(result, result.anatomy, result.ahead).save(out / "report.html")
     write_results(result.to_json(str(path)), out, json)
     say(as_text(result, result.anatomy))
     say(f"{path} written; {out / 'report.html'}: figures and how to read them")

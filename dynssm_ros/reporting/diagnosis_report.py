@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from dynssm_ros.evaluation.residuals.anatomy import ModelAnatomy
+from dynssm_ros.evaluation.residuals.patterns import Pattern
 from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED, Diagnosis
 from dynssm_ros.identification.result.improvement import Improvement
 from dynssm_ros.reporting import diagnosis_figures
@@ -26,7 +27,7 @@ from dynssm_ros.reporting.diagnosis_words import (
 )
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.page import Prose, Report, Section, State, Verdict, data_verdicts
-from dynssm_ros.reporting.residuals_report import pattern_sections, sentence
+from dynssm_ros.reporting.residuals_report import ahead_sections, pattern_sections, sentence
 from dynssm_ros.reporting.tables import Column, ColumnOf, Table
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 from dynssm_ros.vehicle import COEFFICIENT_UNITS, COEFFICIENTS
@@ -35,12 +36,12 @@ from dynssm_ros.vehicle.effects import EFFECTS
 _MOST_RECORDINGS = 6  # whose errors are drawn over time
 
 
-def diagnosis_report(diagnosis: Diagnosis, left: ModelAnatomy | None = None) -> Report:
-    """The report with figures; ``left`` are the one-step errors of the extended car."""
+def diagnosis_report(diagnosis: Diagnosis, left: ModelAnatomy | None = None, ahead: Sequence[Pattern] = ()) -> Report:
+    """The report with figures; ``left`` are the one-step errors of the extended car, ``ahead`` patterns at the horizon."""
     return Report(
         f"Diagnosis of {diagnosis.vehicle.name}",
         headline(diagnosis),
-        tuple(_sections(diagnosis, left)),
+        tuple(_sections(diagnosis, left, ahead)),
         diagnosis.protocol,
         _causes(diagnosis) if diagnosis.found else None,
         verdicts=(*data_verdicts(signal_findings(diagnosis)), *_lines(diagnosis, left)),
@@ -77,7 +78,7 @@ def _causes(diagnosis: Diagnosis) -> Table:
     )
 
 
-def _sections(diagnosis: Diagnosis, left: ModelAnatomy | None) -> Iterator[Section]:
+def _sections(diagnosis: Diagnosis, left: ModelAnatomy | None, ahead: Sequence[Pattern]) -> Iterator[Section]:
     improvement = diagnosis.improvement
     windows, horizon = improvement.windows, improvement.horizons[improvement.horizon]
     prose = Prose(
@@ -91,6 +92,7 @@ def _sections(diagnosis: Diagnosis, left: ModelAnatomy | None) -> Iterator[Secti
         pictures = diagnosis_figures.cause_pictures(windows, cause.without, with_it, effect)
         about = " ".join((f"{size_in_words(cause)}.", *cause_in_words(cause)))
         yield prose.section("cause", pictures, cause=cause.effect + recordings_of(cause), about=about)
+    yield from ahead_sections(ahead, float(horizon), MOST_PATTERNS)
     if left is not None:
         yield from pattern_sections("What is left", left, MOST_PATTERNS)
     yield prose.section("simulated", diagnosis_figures.simulated_and_measured(improvement))

@@ -194,6 +194,9 @@ def pattern_in_words(left: ExplainedVariance) -> str:
 def left_in_words(diagnosis: Diagnosis) -> str:
     """What the extended car gets wrong beyond noise; empty if there is nothing."""
     parts = []
+    for one in diagnosis.structure[:MOST_PATTERNS]:
+        ahead = f"{diagnosis.improvement.horizons[diagnosis.improvement.horizon]:.4g} s ahead"
+        parts.append(f"{ahead.capitalize()}, {one.words}: {percent(one.share)} of its squared error.")
     if diagnosis.left.is_there:
         parts.append(f"Systematic error that is left, and what it goes with: {pattern_in_words(diagnosis.left)}")
     if diagnosis.clustered.is_there:

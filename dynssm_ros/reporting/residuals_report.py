@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from dynssm_ros.evaluation.residuals.anatomy import Anatomy, ModelAnatomy
 from dynssm_ros.evaluation.residuals.patterns import Pattern
@@ -103,8 +103,19 @@ def pattern_sections(label: str, model: ModelAnatomy, most: int) -> Iterator[Sec
     prose = Prose("residuals")
     for pattern in [each for each in model.patterns if each.picture is not None][:most]:
         figure = residuals_figures.pattern_figure(pattern)
-        words = ". ".join(part.removesuffix(".") for part in (sentence(pattern), pattern.advice) if part)
-        yield prose.section(pattern.family, figure, model=label, channel=pattern.channel, words=words)
+        yield prose.section(pattern.family, figure, model=label, channel=pattern.channel, words=_advised(pattern))
+
+
+def ahead_sections(ahead: Sequence[Pattern], horizon: float, most: int) -> Iterator[Section]:
+    """A figure for each of the ``most`` largest patterns of errors ``horizon`` seconds ahead."""
+    prose = Prose("residuals", horizon=f"{horizon:.4g}")
+    for pattern in ahead[:most]:
+        figure = residuals_figures.pattern_figure(pattern)
+        yield prose.section("ahead", figure, channel=pattern.channel, words=_advised(pattern))
+
+
+def _advised(pattern: Pattern) -> str:
+    return ". ".join(part.removesuffix(".") for part in (sentence(pattern), pattern.advice) if part)
 
 
 def _sections(found: Anatomy, prose: Prose) -> Iterator[Section]:

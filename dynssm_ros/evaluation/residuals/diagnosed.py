@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dynssm_ros.arrays import Vector
+from dynssm_ros.evaluation.residuals.ahead import patterns_ahead
 from dynssm_ros.evaluation.residuals.anatomy import ModelAnatomy, model_anatomy
 from dynssm_ros.evaluation.residuals.errors import BLOCK_S, OneStepErrors, PhysicsResponse, central_differences
 from dynssm_ros.evaluation.residuals.evidence import FEWEST_BLOCKS
@@ -17,7 +18,7 @@ from dynssm_ros.extras import missing_libraries
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.recordings import RecordingSet
 from dynssm_ros.identification.problem.windows import SimulationWindows
-from dynssm_ros.identification.result.diagnosis import EXTENDED, Diagnosis
+from dynssm_ros.identification.result.diagnosis import EXTENDED, Diagnosis, Structure
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
@@ -28,16 +29,19 @@ class ExaminedDiagnosis(Diagnosis):
 
     Attributes:
         anatomy: of the errors of single steps; ``None`` if the fitted rows are less than 24 s.
+        ahead: patterns of the errors at the horizon; :attr:`structure` has their words.
     """
 
     anatomy: ModelAnatomy | None = None
+    ahead: tuple[Pattern, ...] = ()
 
     @classmethod
     def of(cls, diagnosis: Diagnosis) -> ExaminedDiagnosis:
-        """The diagnosis with :func:`left_by` it."""
-        return cls(
-            **{each.name: getattr(diagnosis, each.name) for each in fields(Diagnosis)}, anatomy=left_by(diagnosis)
-        )
+        """The diagnosis with :func:`left_by` it and :func:`left_ahead`."""
+        ahead = left_ahead(diagnosis)
+        found = replace(diagnosis, structure=tuple(Structure(one.channel, one.words, one.share) for one in ahead))
+        known = {each.name: getattr(found, each.name) for each in fields(Diagnosis)}
+        return cls(**known, anatomy=left_by(diagnosis), ahead=ahead)
 
     @property
     def patterns(self) -> tuple[Pattern, ...]:
@@ -73,6 +77,15 @@ def left_by(diagnosis: Diagnosis) -> ModelAnatomy | None:
     )
     response = PhysicsResponse(_derivatives(single, diagnosis.car))
     return model_anatomy(errors, situations(errors), response, learn=not missing_libraries("residuals"))
+
+
+def left_ahead(diagnosis: Diagnosis) -> tuple[Pattern, ...]:
+    """Patterns of the errors of the extended car at the horizon; none if the fitted rows are less than 24 s."""
+    windows = diagnosis.windows
+    if len(np.unique(windows.passed)) * windows.data.T_s < FEWEST_BLOCKS * BLOCK_S:
+        return ()
+    line = diagnosis.recordings.lines[0] if windows.data.on_one_lap else None
+    return patterns_ahead(windows, diagnosis.car, _one_after_the_other(diagnosis.recordings), line)
 
 
 def _derivatives(single: SimulationWindows, car: CarEstimate) -> Vector:

@@ -49,7 +49,8 @@ def periods(errors: OneStepErrors, values: Vector, channel: str) -> Iterator[Pat
         period, p = line
         if period * errors.T_s < _DRIVEN_ABOVE_S or not _is_driven(errors, grid, period):
             told = f"comes back every {period * errors.T_s:.4g} s"
-            yield _sine(errors, values, grid / period, channel, p, "period", told, {"period_s": period * errors.T_s})
+            size = {"period_s": period * errors.T_s}
+            yield sine(errors, values, grid / period, channel, p=p, kind="period", told=told, size=size)
     wheelbase = errors.wheelbase
     if wheelbase is not None:
         way = _way(errors)
@@ -57,7 +58,8 @@ def periods(errors: OneStepErrors, values: Vector, channel: str) -> Iterator[Pat
         if line is not None:
             length = line[0] * 0.05 * wheelbase
             told = f"comes back every {length:.3g} m of the way, as wheels turn"
-            yield _sine(errors, values, way / length, channel, line[1], "wheel_synchronous", told, {"period_m": length})
+            size = {"period_m": length}
+            yield sine(errors, values, way / length, channel, p=line[1], kind="wheel_synchronous", told=told, size=size)
 
 
 def _clock(errors: OneStepErrors, values: Vector, y: Vector, channel: str) -> Iterator[Pattern]:
@@ -197,10 +199,11 @@ def _is_driven(errors: OneStepErrors, grid: Indices, period: float) -> bool:
     return False
 
 
-def _sine(
-    errors: OneStepErrors, values: Vector, turns: Vector, channel: str, p: float, kind: str, told: str,
+def sine(
+    errors: OneStepErrors, values: Vector, turns: Vector, channel: str, *, p: float, kind: str, told: str,
     size: dict[str, float],
 ) -> Pattern:  # fmt: skip
+    """Errors that are the same at the same part of a period; ``turns`` counts periods, ``(N,)``."""
     order = np.arange(1, _HARMONICS + 1)
     angle = 2 * np.pi * turns[:, None] * order
     fitted, apart = regression(values, np.concatenate([np.cos(angle), np.sin(angle)], axis=1), errors.block)

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Vector
+from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.evaluation.regimes import COASTING, round_edges
 from dynssm_ros.evaluation.residuals.errors import OneStepErrors
 from dynssm_ros.evaluation.residuals.evidence import (
@@ -30,6 +30,7 @@ in the error too, shall not look like a pattern. Time over which the acceleratio
 _RATE_S = 0.1  # over which rates of the inputs are taken
 _STEP = 0.25  # of an input's usual range, within _RATE_S, that is a step of it
 _SINCE_S = (0.0, 0.1, 0.2, 0.4, 0.8)
+_LASTING_S = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
 _STRAIGHT = 0.15  # of the usual lateral acceleration, below which the car goes straight
 _NAMED = 0.01  # chance of a bin that is named beside the strongest
 
@@ -82,12 +83,12 @@ def situations(errors: OneStepErrors) -> list[Situation]:
         if since is not None:
             found.append(_after(f"a step of the {name}", *since))
     pedal = np.digitize(r, [-COASTING, np.nextafter(COASTING, 1.0)]) if log.info.set_point == "throttle" else None
-    bend = np.digitize(lateral, np.array([-1, 1]) * _STRAIGHT * max(float(np.percentile(np.abs(lateral), 95)), 1e-9))
+    bend = bends(lateral)
     speed = found[2]
     if pedal is not None:
         words = ("under braking", "coasting", "under throttle")
-        found += [_crossed(f"{each.name} and pedal", each, pedal, words) for each in (speed, *gears[:1])]
-    found.append(_crossed("speed and bend", speed, bend, ("in right bends", "on straights", "in left bends")))
+        found += [crossed(f"{each.name} and pedal", each, pedal, words) for each in (speed, *gears[:1])]
+    found.append(crossed("speed and bend", speed, bend, ("in right bends", "on straights", "in left bends")))
     if log.has_pose:
         turned = np.mod(log["theta"][errors.rows], 2 * np.pi)
         found.append(_bins("heading", np.degrees(turned), "°", _HEADINGS, (0.0, 360.0)))
@@ -97,53 +98,75 @@ def situations(errors: OneStepErrors) -> list[Situation]:
     return [each for each in found if len(each.labels) > 1 or each.name == "offset"]
 
 
-def regimes(errors: OneStepErrors, values: Vector, channel: str, sorted_by: list[Situation]) -> Iterator[Pattern]:
+def bends(lateral: Vector) -> Indices:
+    """Where a lateral acceleration is that of a right bend (0), a straight (1), a left bend (2), ``(N,)``."""
+    return np.digitize(lateral, np.array([-1, 1]) * _STRAIGHT * max(float(np.percentile(np.abs(lateral), 95)), 1e-9))
+
+
+def lasting(errors: OneStepErrors, name: str, there: Mask, sign: Vector | None = None) -> Situation:
+    """How long something had been going on at each row.
+
+    Args:
+        errors: at rows of a recording.
+        name: of what goes on, as in "in the bend".
+        there: at which rows of the recording it does, ``(M,)``.
+        sign: of each row of the recording, by which the error is taken, ``(M,)``.
+    """
+    starts = np.flatnonzero(there & ~np.concatenate([[False], there[:-1]]))
+    kinds = len(_LASTING_S)
+    if not len(starts):
+        return Situation(f"time {name}", np.zeros(len(errors), np.intp), ("",))
+    lasted = _since(errors, starts)[0]
+    kind = np.where(there[errors.rows], np.digitize(lasted, _LASTING_S) - 1, kinds)
+    labels = [f"{a:g} to {b:g} s" for a, b in pairwise(_LASTING_S)] + [f"{_LASTING_S[-1]:g} s and more"]
+    signs = None if sign is None else sign[errors.rows]
+    return Situation(f"time {name}", kind, tuple(f"after {each} {name}" for each in labels), sign=signs)
+
+
+def regimes(
+    errors: OneStepErrors, values: Vector, channel: str, sorted_by: list[Situation], *, ahead: bool = False
+) -> Iterator[Pattern]:
     """Looks for mean errors ``values`` ``(N,)`` that differ from zero somewhere.
 
-    Where they are the same everywhere, the offset explains as much with one number and is taken.
+    Where they are the same everywhere, the offset explains as much with one number and is taken. Told is where they are
+    surest or, of errors some steps ``ahead``, where most of the squared error is; the latter are no rates.
 
     Yields:
         A pattern for each quantity.
     """
     y = limited(values)
     y += float(np.median(values))
-    unit, T_s = COLUMN_UNITS[channel], errors.T_s
+    unit, T_s = (COLUMN_UNITS[channel], 1.0) if ahead else (per_second(COLUMN_UNITS[channel]), errors.T_s)
+    title = f"mean error of {channel} ({unit})"
     for each in sorted_by:
         kinds = len(each.labels)
         sign = 1.0 if each.sign is None else each.sign
         sums = block_sums(sign * y, errors.block, each.kind, kinds + 1)
         chance = chances(sums[:, :kinds])
-        best = int(np.argmin(chance))
         whole, apart = means_of_kinds(sign * values, errors.block, each.kind, kinds + 1)
         whole[kinds], apart[each.kind == kinds] = 0.0, 0.0
         share = share_explained(values, sign * apart)
+        weights = np.bincount(each.kind, minlength=kinds + 1) + 1e-9
+        best = int(np.argmax((weights * whole**2)[:kinds]) if ahead else np.argmin(chance))
         low, high = _neighbours(best, whole, chance, each.edges is None)
-        mean = float(
-            np.average(
-                whole[low : high + 1], weights=np.bincount(each.kind, minlength=kinds + 1)[low : high + 1] + 1e-9
-            )
-        )
-        told = f"{channel} errs by {mean / T_s:+.2g} {_per_second(unit)} {_range(each, low, high)}"
+        mean = float(np.average(whole[low : high + 1], weights=weights[low : high + 1]))
+        told = f"{channel} errs by {mean / T_s:+.2g} {unit} {_range(each, low, high)}"
+        shown, spread = whole[:kinds] / T_s, _spread(sums, each.kind, kinds) / T_s
         if each.edges is None:
-            picture = Picture("bars", np.arange(kinds, dtype=float), whole[:kinds] / T_s, each.name, _title(channel, unit),
-                              _spread(sums, each.kind, kinds) / T_s, each.labels, (low, high))  # fmt: skip
+            x = np.arange(kinds, dtype=float)
+            picture = Picture("bars", x, shown, each.name, title, spread, each.labels, (low, high))
         else:
-            title = f"{each.name} ({each.unit})" if each.unit else each.name
-            picture = Picture("bins", each.edges, whole[:kinds] / T_s, title, _title(channel, unit),
-                              _spread(sums, each.kind, kinds) / T_s, (),
-                              (float(each.edges[low]), float(each.edges[high + 1])))  # fmt: skip
+            name, mark = f"{each.name} ({each.unit})" if each.unit else each.name, each.edges[[low, high + 1]].tolist()
+            picture = Picture("bins", each.edges, shown, name, title, spread, (), (mark[0], mark[1]))
         yield Pattern(
             channel, "where", each.name.replace(" ", "_"), told, share, min(1.0, kinds * float(chance[best])), kinds,
-            {"error_per_s": round(mean / T_s, 6)}, sign * whole[each.kind], picture,
+            {} if ahead else {"error_per_s": round(mean / T_s, 6)}, sign * whole[each.kind], picture,
         )  # fmt: skip
 
 
-def _per_second(unit: str) -> str:
+def per_second(unit: str) -> str:
+    """The unit of a rate of change."""
     return f"{unit.partition('/')[0]}/s²"
-
-
-def _title(channel: str, unit: str) -> str:
-    return f"mean error of {channel} ({_per_second(unit)})"
 
 
 def _range(each: Situation, low: int, high: int) -> str:
@@ -192,7 +215,7 @@ def _bins(name: str, x: Vector, unit: str, most: int, ends: tuple[float, float] 
     return Situation(name, kind, labels, edges, unit)
 
 
-def _crossed(name: str, speed: Situation, other: Indices, words: tuple[str, ...]) -> Situation:
+def crossed(name: str, speed: Situation, other: Indices, words: tuple[str, ...]) -> Situation:
     """Each range of speed, or each gear, with each of other kinds."""
     ranges = speed.labels if speed.edges is None else [
         f"between {a:.4g} and {b:.4g} m/s" for a, b in pairwise(speed.edges)

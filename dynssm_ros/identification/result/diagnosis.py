@@ -91,6 +91,15 @@ class Conclusion(NamedTuple):
     """Share of the error on held-out laps that it takes away, as a mean of the channels, or that is left."""
 
 
+class Structure(NamedTuple):
+    """A pattern of the errors that are left at the horizon."""
+
+    channel: str
+    words: str
+    share: float
+    """Of the channel's squared error, on stretches that it was not fitted to."""
+
+
 class NotJudged(NamedTuple):
     """An effect that these recordings do not tell."""
 
@@ -123,6 +132,7 @@ class Diagnosis:
         formulas: terms that the extended car lacks, where it leaves errors that are no noise and no cause is named.
         recalibration: what is off in the vehicle file beside the causes; ``None``: nothing that is noticed on held-out laps.
         not_judged: effects that these recordings do not tell.
+        structure: patterns that take a noticeable part of an error at the horizon away, the largest share first.
     """
 
     found: tuple[Cause, ...]
@@ -141,6 +151,7 @@ class Diagnosis:
     formulas: tuple[Formula, ...] = ()
     recalibration: Recalibration | None = None
     not_judged: tuple[NotJudged, ...] = ()
+    structure: tuple[Structure, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -159,7 +170,7 @@ class Diagnosis:
     @property
     def is_left(self) -> bool:
         """Whether the extended car leaves errors that are no noise."""
-        return self.left.is_there or self.clustered.is_there
+        return self.left.is_there or self.clustered.is_there or bool(self.structure)
 
     @property
     def no_better(self) -> tuple[str, ...]:
@@ -180,8 +191,10 @@ class Diagnosis:
             explains = 0.0 if self.recalibration is None else self.recalibration.explains
             found.append(Conclusion("recalibration", "", explains))
         if self.is_left:
-            share = float(self.left.share.mean()) if self.left.is_there else 0.0
-            found.append(Conclusion("unexplained", "", float(1.0 - np.sqrt(1.0 - share))))
+            share = self.left.share if self.left.is_there else np.zeros(3)
+            told = [sum(one.share for one in self.structure if one.channel == channel) for channel in STATE_SIGNALS]
+            most = np.minimum(np.maximum(share, told), 1.0)
+            found.append(Conclusion("unexplained", "", float((1.0 - np.sqrt(1.0 - most)).mean())))
         found.sort(key=lambda one: -one.explains)
         return (*(Conclusion("no_better", channel, 0.0) for channel in self.no_better), *found)
 
@@ -232,6 +245,7 @@ class Diagnosis:
             },
             "recalibration": None if self.recalibration is None else _recalibration_to_json(self),
             "conclusions": [one._asdict() for one in self.conclusions],
+            "structure": [one._asdict() for one in self.structure],
             "not_judged": [one._asdict() for one in self.not_judged],
             "formulas": [
                 {
