@@ -286,7 +286,7 @@ class PredictorNode(ManagedNode):
             odometry.header.frame_id = message.header.frame_id
             odometry.child_frame_id = getattr(message, "child_frame_id", "")
         twist = odometry.twist.twist
-        twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in prediction.state)
+        twist.linear.x, twist.linear.y, twist.angular.z = prediction.state.tolist()
         odometry.twist.covariance = planar_covariance(prediction.variance)
         if prediction.pose is not None:
             set_pose(odometry.pose.pose, *prediction.pose)

@@ -25,6 +25,7 @@ MARKERS_TOPIC = "/dynssm/markers"
 
 UNKNOWN = 1e6
 """Variance of what nobody states: so large that who weighs by it gives it no weight (zero would mean certain)."""
+_UNSTATED = np.diag(np.full(6, UNKNOWN)).ravel()
 
 
 @cache
@@ -89,7 +90,7 @@ def planar_covariance(variances: Vector | None) -> Vector:
 
     What is not stated, as the vertical or all of it without variances, is :data:`UNKNOWN`.
     """
-    covariance = np.diag(np.full(6, UNKNOWN)).ravel()
+    covariance = _UNSTATED.copy()
     if variances is not None:
         covariance[[0, 7, 35]] = variances
     return covariance
