@@ -7,8 +7,8 @@ Each fold leaves out a lap of Putnam Park or a development log of the 1:10 car, 
 matrix. The car is calibrated and the layer fitted on the rest. There layers that did not know a stretch drive along it, and
 learners are fitted to what these leave of increments. On the left-out drive a learner's prediction is added to the physics,
 and the layer learns what is then left. ``--steps`` scores the layer with the throttle's steps, everywhere and where they earn
-their place, on the measured folds, all simulated cells with the usual noise, and further logs of the 1:10 car: those for
-development, or with ``--test`` those for publishing.
+their place, and trees beside it, on the measured folds, all simulated cells with the usual noise, and further logs of the
+1:10 car: those for development, or with ``--test`` those for publishing.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
 HORIZONS_S = (0.3, 0.6, 1.5)
+ERRORS = ("one step", *(f"path {horizon:g} s" for horizon in HORIZONS_S), "one step, first 10 s")
 _GATES_S = (28.6, 248.9, 409.0, np.inf)  # of Putnam Park's laps
 _SETTLED_S = 16.0  # before it the log's heading settles
 _DART = {
@@ -62,6 +63,8 @@ _SIMULATED = (
 """Development cells of the generalisation matrix, with noise: nothing bends in these cars, and some have changed."""
 _HISTORY_S = 0.64
 _STRIDE_S = 0.2  # between starts of paths
+_FIRST_S = 10.0  # of a drive, in which the layer meets what is new
+_RESAMPLED = 2000  # means over folds, for their interval
 _LIMIT = 4.0  # of inputs, whose usual size is one, and of corrections in their standard deviations
 
 Predict = Callable[[Vector], Vector]
@@ -114,7 +117,9 @@ def further_folds(data: Path, test: bool) -> dict[str, Callable[[], Fold]]:
     known = {Path(bag).name for bag in _DART.values()}
     logs = [log.name for log in season_logs(data, test) if log.name not in known]
     laps = {name: fold for name, fold in folds(data).items() if name.startswith(("putnam", "dart"))} if not test else {}
-    simulated = {f"cell_{cell.name}": partial(_cell, cell) for cell in cells}
+    simulated = {
+        f"{'same' if cell.change == 'none' else 'changed'}_{cell.name}": partial(_cell, cell) for cell in cells
+    }
     return {**laps, **simulated, **{f"season_{name}": partial(_season_log, name, data) for name in logs}}
 
 
@@ -152,6 +157,11 @@ class Study:
     @property
     def car(self) -> Vehicle:
         return self.base.vehicle
+
+    @property
+    def moves(self) -> bool:
+        """Whether the left-out drive has rows that are fast enough for the model."""
+        return len(self.fold.left_out.window_ends(self.base.H, min_speed=self.car.minimum_speed)) > 0
 
     def drive(self, log: Recording, ends: Indices, features: LayerFeatures) -> LayerDrive:
         """A log as a layer sees it."""
@@ -259,6 +269,7 @@ class Scored(NamedTuple):
     """Errors on the left-out drive."""
 
     rmse: Vector  # one step, (3,)
+    first: Vector  # the same in the first 10 s
     distances: Vector  # mean distance of paths, (starts, horizons) (m)
 
 
@@ -289,7 +300,9 @@ def score(
     predicted = log.windows(starts, H, steps)
     distances = path_errors(predicted[:, H - 1 : H, :3], roll_out(step, predicted, H), predicted[:, H:, :3], T_s)
     until = [round(horizon / T_s) for horizon in HORIZONS_S]
-    return Scored(np.sqrt(np.mean(errors**2, axis=0)), np.stack([distances[:, :k].mean(axis=1) for k in until], axis=1))
+    first = log.time[ends] < log.time[ends[0]] + 1e9 * _FIRST_S
+    one_step, at_first = (np.sqrt(np.mean(each**2, axis=0)) for each in (errors, errors[first]))
+    return Scored(one_step, at_first, np.stack([distances[:, :k].mean(axis=1) for k in until], axis=1))
 
 
 def judged(study: Study, features: LayerFeatures, layer: OnlineLayer) -> Vector:
@@ -303,9 +316,11 @@ def judged(study: Study, features: LayerFeatures, layer: OnlineLayer) -> Vector:
 
 
 def ratios(ours: Scored, alone: Scored) -> list[float]:
-    """Errors over those of the layer alone: one step, geometric mean over the channels, and paths."""
-    step = float(np.exp(np.mean(np.log(ours.rmse / alone.rmse))))
-    return [step, *(ours.distances.mean(axis=0) / alone.distances.mean(axis=0)).tolist()]
+    """Errors over those of the layer alone, see :data:`ERRORS`; one step as geometric mean over the channels."""
+    step, first = (
+        float(np.exp(np.mean(np.log(a / b)))) for a, b in ((ours.rmse, alone.rmse), (ours.first, alone.first))
+    )
+    return [step, *(ours.distances.mean(axis=0) / alone.distances.mean(axis=0)).tolist(), first]
 
 
 def scored(study: Study) -> dict[str, list[float]]:
@@ -314,24 +329,35 @@ def scored(study: Study) -> dict[str, list[float]]:
     layer, stretches = study.fitted(features)
     trusted = judged(study, features, layer)
     alone = score(study, features, layer, trusted)
-    left = np.concatenate([left_by(each, drive) for drive, each in stretches])
-    size = left.std(axis=0)
     found = {}
     looks = {"all features": study.everything, "operating point": study.operating_point}
     cases = [(name, look, fit) for name, look in looks.items() for fit in (ridge, trees, network)]
     for name, look, fit in [*cases, ("operating point, increments", study.with_increments, network)]:
-        H, log = study.base.H, study.fold.training
-        inputs = [look(log.windows(drive.ends, H), drive.see(slice(None))) for drive, _ in stretches]
-        predict = fit(np.concatenate(inputs), left / size)
-        learner = _learner(look, predict, size * layer.scale)
+        learner = learned(study, layer, stretches, look, fit)
         found[f"{fit.__name__}, {name}"] = ratios(score(study, features, layer, trusted, learner), alone)
     steps = study.base._replace(config=OnlineConfig(throttle_steps=True)).features(False)
     found["layer with the throttle's steps"] = ratios(score(study, steps, study.fitted(steps)[0], trusted), alone)
     return found
 
 
+def learned(
+    study: Study,
+    layer: OnlineLayer,
+    stretches: list[tuple[LayerDrive, OnlineLayer]],
+    look: Look,
+    fit: Callable[[Vector, Vector], Predict],
+) -> Look:
+    """What a learner adds to the physics; it is fitted to what the layers that did not know the stretches leave of them."""
+    H, log = study.base.H, study.fold.training
+    left = np.concatenate([left_by(each, drive) for drive, each in stretches])
+    inputs = [look(log.windows(drive.ends, H), drive.see(slice(None))) for drive, _ in stretches]
+    size = left.std(axis=0)
+    predict = fit(np.concatenate(inputs), left / size)
+    return lambda windows, seen: np.asarray(predict(look(windows, seen)) * size * layer.scale)
+
+
 def steps_scored(study: Study) -> dict[str, list[float]]:
-    """:func:`ratios` of the layer with the throttle's steps, and of the one that ``train`` gives."""
+    """:func:`ratios` of the layer with the throttle's steps, of the one that ``train`` gives, and of trees."""
     model = build_model(load_model_config("rls"), study.base.vehicle, study.base.normalisation)
 
     def fitted(steps: bool | None) -> tuple[LayerFeatures, OnlineLayer]:
@@ -344,12 +370,16 @@ def steps_scored(study: Study) -> dict[str, list[float]]:
     chosen = fitted(None)
     earned = chosen[0].layout.throttle
     layers = {earned: chosen, not earned: fitted(not earned)}
+    features = layers[False][0]
+    layer, stretches = study.fitted(features)
+    trusted = judged(study, features, layer)
+    alone = score(study, features, layer, trusted)
     forced = ratios(of(*layers[True]), of(*layers[False]))
-    return {"everywhere": forced, "where they earn it": forced if earned else [1.0] * len(forced)}
-
-
-def _learner(look: Look, predict: Predict, size: Vector) -> Look:
-    return lambda windows, seen: np.asarray(predict(look(windows, seen)) * size)
+    found = {"steps everywhere": forced, "steps where they earn it": forced if earned else [1.0] * len(forced)}
+    for name, look in (("all features", study.everything), ("operating point", study.operating_point)):
+        learner = learned(study, layer, stretches, look, trees)
+        found[f"trees, {name}"] = ratios(score(study, features, layer, trusted, learner), alone)
+    return found
 
 
 def main() -> None:
@@ -370,24 +400,30 @@ def main() -> None:
         file = out / f"{name}.json"
         if not file.is_file() and name.startswith(arguments.only):
             study = Study.of(fold(), out)
-            write_json(file, steps_scored(study) if arguments.steps else scored(study))
+            if study.moves:
+                write_json(file, steps_scored(study) if arguments.steps else scored(study))
         if file.is_file():
             known[name] = json.loads(file.read_text(encoding="utf-8"))
-    print(extremes(known) if arguments.steps else tables(known))
+    print(by_group(known) if arguments.steps else tables(known))
 
 
-def extremes(known: dict[str, dict[str, list[float]]]) -> str:
-    """Of the throttle's steps: geometric means of the ratios in each group of folds, the least and the largest."""
+def by_group(known: dict[str, dict[str, list[float]]]) -> str:
+    """Geometric means of the ratios in each group of folds with their interval over the folds, and the largest of all."""
     names = list(next(iter(known.values())))
     rows = []
     for group, name in product(dict.fromkeys(fold.partition("_")[0] for fold in known), names):
-        of = {fold: content[name] for fold, content in known.items() if fold.startswith(group)}
-        for k, what in enumerate(("one step", *(f"path {horizon:g} s" for horizon in HORIZONS_S))):
-            ranked = sorted(of, key=lambda fold: of[fold][k])
-            ends = [f"{of[fold][k]:.3f} ({fold.partition('_')[2]})" for fold in (ranked[0], ranked[-1])]
-            mean = float(np.exp(np.mean(np.log([ratio[k] for ratio in of.values()]))))
-            rows.append([group, str(len(of)), name, what, f"{mean:.3f}", *ends])
-    return table(["of", "folds", "steps", "error", "mean", "least", "largest"], rows)
+        of = {fold.partition("_")[2]: content[name] for fold, content in known.items() if fold.startswith(group)}
+        means = ["{:.3f} ({:.3f}-{:.3f})".format(*mean_over(np.array(each))) for each in zip(*of.values(), strict=True)]
+        worst, k = max(product(of, range(len(ERRORS))), key=lambda at: of[at[0]][at[1]])
+        rows.append([group, str(len(of)), name, *means, f"{of[worst][k]:.3f} ({worst}, {ERRORS[k]})"])
+    return table(["of", "folds", "beside the layer", *ERRORS, "largest"], rows)
+
+
+def mean_over(values: Vector) -> tuple[float, float, float]:
+    """The geometric mean over folds, and where it lies in 95 % of draws of as many folds with replacement."""
+    drawn = np.random.default_rng(0).integers(len(values), size=(_RESAMPLED, len(values)))
+    low, high = np.exp(np.percentile(np.log(values)[drawn].mean(axis=1), [2.5, 97.5]))
+    return float(np.exp(np.log(values).mean())), float(low), float(high)
 
 
 def tables(known: dict[str, dict[str, list[float]]]) -> str:
@@ -400,12 +436,7 @@ def tables(known: dict[str, dict[str, list[float]]]) -> str:
         for name in names:
             logs = np.log([content[name] for content in of.values()])
             rows.append([name, *(f"{value:.3f}" for value in (*np.exp(logs.mean(axis=0)), *np.exp(logs[:, 2])))])
-        heads = [
-            group,
-            "one step",
-            *(f"path {horizon:g} s" for horizon in HORIZONS_S),
-            *(f"0.6 s: {fold}" for fold in of),
-        ]
+        heads = [group, *ERRORS, *(f"0.6 s: {fold}" for fold in of)]
         parts.append(table(heads, rows))
     return "\n\n".join(parts)
 

@@ -32,16 +32,25 @@ def test_learners_find_a_planted_bend(fit: Any) -> None:
 
 
 def test_ratios_are_of_one_step_and_of_paths() -> None:
-    alone = Scored(np.array([1.0, 2.0, 3.0]), np.array([[1.0, 2.0, 4.0], [3.0, 2.0, 4.0]]))
-    ours = Scored(np.array([0.5, 2.0, 6.0]), np.array([[1.0, 1.0, 4.0], [1.0, 1.0, 8.0]]))
-    np.testing.assert_allclose(ratios(ours, alone), [1.0, 0.5, 0.5, 1.5])
-    text = tables({"putnam_1": {"ridge": [1.0, 0.9, 0.8, 0.7]}, "putnam_2": {"ridge": [1.0, 0.9, 0.2, 0.7]}})
-    assert "| ridge | 1.000 | 0.900 | 0.400 | 0.700 | 0.800 | 0.200 |" in text
+    alone = Scored(np.array([1.0, 2.0, 3.0]), np.ones(3), np.array([[1.0, 2.0, 4.0], [3.0, 2.0, 4.0]]))
+    ours = Scored(np.array([0.5, 2.0, 6.0]), np.full(3, 0.6), np.array([[1.0, 1.0, 4.0], [1.0, 1.0, 8.0]]))
+    np.testing.assert_allclose(ratios(ours, alone), [1.0, 0.5, 0.5, 1.5, 0.6])
+    text = tables({"putnam_1": {"ridge": [1.0, 0.9, 0.8, 0.7, 0.6]}, "putnam_2": {"ridge": [1.0, 0.9, 0.2, 0.7, 0.6]}})
+    assert "| ridge | 1.000 | 0.900 | 0.400 | 0.700 | 0.600 | 0.800 | 0.200 |" in text
 
 
-def test_the_least_and_the_largest_ratios_are_named() -> None:
-    known = {f"cell_{name}": {"steps": [value, 1.0, 1.0, 1.0]} for name, value in (("a", 0.5), ("b", 2.0), ("c", 1.0))}
-    assert "| cell | 3 | steps | one step | 1.000 | 0.500 (a) | 2.000 (b) |" in network.extremes(known)
+def test_the_mean_its_interval_and_the_largest_ratio_are_told_of_each_group() -> None:
+    values = {"same_a": 0.5, "same_b": 2.0, "same_c": 1.0, "season_d": 3.0}
+    text = network.by_group({name: {"steps": [value, *[1.0] * 4]} for name, value in values.items()})
+    ones = " | ".join(["1.000 (1.000-1.000)"] * 4)
+    assert f"| same | 3 | steps | 1.000 (0.500-2.000) | {ones} | 2.000 (b, one step) |" in text
+    assert "| season | 1 | steps | 3.000 (3.000-3.000) |" in text
+
+
+def test_the_interval_of_a_mean_narrows_with_the_folds() -> None:
+    few, many = (network.mean_over(np.exp(np.random.default_rng(0).normal(0.1, 0.1, size))) for size in (8, 200))
+    assert many[1] < np.exp(0.1) < many[2]
+    assert many[2] - many[1] < 0.5 * (few[2] - few[1])
 
 
 def test_development_and_test_folds_are_apart(data: Path) -> None:
