@@ -149,7 +149,9 @@ def _study(comparison: Comparison, results: Results, pictures: Mapping[str, str]
         }
         for base in comparison.bases
     ]
+    paper_model = tables.paper_model_table(comparison)
     return study.model_dump() | {
+        "paper_model": paper_model.markdown() if paper_model else "",
         "title": f"{study.title[0].upper()}{study.title[1:]}",
         "errors": tables.error_table(comparison).markdown(),
         "relative": tables.relative_table(comparison).markdown(),

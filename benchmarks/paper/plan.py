@@ -147,6 +147,9 @@ class Study(StrictModel):
     remark: Annotated[str, AfterValidator(_no_results)] = Field(
         default="", description="what its authors make of the outcome in words, with the date"
     )
+    wanted: dict[Literal["v_x", "v_y", "omega", "ADE", "FDE"], float] = Field(
+        default_factory=dict, description="errors that the paper's model should not exceed (m/s, m/s, rad/s, m, m)"
+    )
     data: Literal["development", "test"] = Field(
         default="development", description="whether decisions on models were taken with these data in sight"
     )

@@ -22,7 +22,8 @@ NOTE = (
 
 def fingerprint(plan: Plan) -> str:
     """SHA-256 of all settings that the results follow from: the plan, its models and its vehicles."""
-    studies = {name: study.model_dump(mode="json", exclude={"given", "remark"}) for name, study in plan.studies.items()}
+    said = {"given", "remark", "wanted"}
+    studies = {name: study.model_dump(mode="json", exclude=said) for name, study in plan.studies.items()}
     content = {
         "plan": plan.model_dump(mode="json", exclude={"studies", "models", "cars"}),
         "studies": studies,

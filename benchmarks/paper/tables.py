@@ -102,6 +102,26 @@ def error_table(comparison: Comparison) -> Table:
     )  # fmt: skip
 
 
+def paper_model_table(comparison: Comparison) -> Table | None:
+    """The paper's model beside DDM and FTHD and what is wanted of it; ``None`` if a study does not compare them."""
+    car = comparison.car
+    rivals = comparison.those(car.ddm, car.fthd)
+    if not (rivals and comparison.those(car.paper)):
+        return None
+    paper, wanted = str(car.paper), {str(error): value for error, value in comparison.study.wanted.items()}
+    columns = [Column(f"error of `{paper}`"), Column("mean"), *([Column("wanted at most")] if wanted else [])]
+    columns += [*(Column(f"over that of `{rival}`") for rival in rivals), Column("reached")]
+    rows: list[list[Value]] = []
+    theirs = [_errors(comparison, rival) for rival in rivals]
+    for k, (error, own) in enumerate(zip((*STATE_SIGNALS, *_ERRORS), _errors(comparison, paper), strict=True)):
+        over = [own / each[k] for each in theirs]
+        lacks = ["what is wanted"] if own > wanted.get(error, math.inf) else []
+        lacks += [f"`{rival}`" for rival, ratio in zip(rivals, over, strict=True) if not ratio < 1.0]
+        row: list[Value] = [TITLES.get(error, error), own, *([wanted.get(error)] if wanted else []), *over]
+        rows.append([*row, f"no: {', '.join(lacks)}" if lacks else "yes"])
+    return Table(tuple(columns), rows, "Reached: below what is wanted, where that is stated, and below DDM and FTHD.")
+
+
 def relative_table(comparison: Comparison) -> Table:
     """One-step RMSE as a multiple of persistence's, test by test."""
     columns = (

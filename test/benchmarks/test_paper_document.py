@@ -191,6 +191,20 @@ def test_reductions_are_shares_of_the_errors_of_ddm(make):
     assert cells(table, "DynSSM, the paper's abstract: up to, over DDM or FTHD")[1:4] == ["27.2", "73.9", "88.8"]
 
 
+def test_the_paper_s_model_is_told_what_it_misses(make):
+    results = make()
+    plain = tables.paper_model_table(results.comparisons[0])
+    assert plain is not None
+    assert cells(plain, "v_x") == ["0.404", "0.673", "yes"]
+    assert cells(plain, "ADE") == ["0.100", "1.00", "no: `ddm_av21`"]
+    study = results.plan.studies["unseen"].model_copy(update={"wanted": {"v_x": 0.4, "omega": 0.5}})
+    (comparison,) = make(plan=results.plan.model_copy(update={"studies": {"unseen": study}})).comparisons
+    wanted = tables.paper_model_table(comparison)
+    assert wanted is not None
+    assert cells(wanted, "v_x") == ["0.404", "0.400", "0.673", "no: what is wanted"]
+    assert cells(wanted, "ω") == ["0.404", "0.500", "0.673", "yes"]
+
+
 def test_the_paper_s_numbers_stand_beside_and_are_never_the_best(make):
     results = make()
     table = tables.ablation_table(results.comparisons[0], results, "dynssm_av21")
