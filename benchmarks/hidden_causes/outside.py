@@ -80,7 +80,7 @@ class FadingGrip(Fault):
 class ThrottleAndYaw(Fault):
     """A sideways acceleration of ``size`` times throttle and yaw rate (m/s)."""
 
-    SIZES = (5.0, 15.0)
+    SIZES = (12.0, 36.0)
     SHOWS: ClassVar = {"v_y": "throttle|pedal"}
 
     def forces(self, xp: Any, q: Motion) -> None:

@@ -182,7 +182,8 @@ def _drifts(errors: OneStepErrors, values: Vector, channel: str) -> Iterator[Pat
         drift = (signal / size * late)[:, None]
         weight = float((drift[:, 0] @ values) / (drift[:, 0] @ drift[:, 0]))
         unit = COLUMN_UNITS[channel]
-        words = f"{channel} errs {name}by {weight:+.2g} {unit} more at the end of the drive than at its middle (time)"
+        goes, by = f" that goes {name.strip()}" if name else "", f"{weight:+.2g} {unit}"
+        words = f"an error of {channel}{goes} grows with time, by {by} from the middle of the drive to its end"
         means = np.array([np.mean((signal / size * values)[parts == k]) for k in range(4)])
         picture = Picture("bins", edges, means, "time of the drive (s)", f"error of {channel} {name}({unit})")
         kind = f"drift_{name.replace(' ', '_')}".rstrip("_")
