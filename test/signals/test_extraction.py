@@ -365,7 +365,9 @@ def test_memory_does_not_grow_with_topics_that_are_not_mapped(make_bag: Any, dri
 @pytest.mark.slow
 def test_memory_grows_with_the_signals_only(make_bag: Any, drive: Any) -> None:
     """A step is 1050 bytes of messages and 10 samples of 16 bytes."""
-    steps = (1000, 4000)  # both longer than a chunk; far apart, as a peak varies by some 40 kB from run to run
+    # both longer than a chunk, and than the 80 s from which on the search for late inputs takes no more; far apart, as a peak
+    # varies by some 40 kB from run to run
+    steps = (8000, 16000)
     short, long = (make_bag(drive(n), f"bag{n}") for n in steps)
     peak(short)  # what is loaded once
     assert (peak(long) - peak(short)) / (steps[1] - steps[0]) < 2 * 10 * 16
