@@ -43,7 +43,7 @@ paper: $(STAMP) ## results.md and results_race.md of benchmarks/results measured
 docs: $(STAMP) ## the documentation as a site, out/site/index.html
 	@$(BIN)/sphinx-build -W --keep-going -q -b html docs out/site
 
-test: $(STAMP) ## style, types and tests, 8 to 15 minutes on two cores
+test: $(STAMP) ## style, types and tests, 7 to 15 minutes on two cores
 test-all: $(STAMP) ## the same with the slow tests, before a release
 test-all: SELECTED = -m ""
 

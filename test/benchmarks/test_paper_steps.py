@@ -174,15 +174,15 @@ def test_a_sweep_trains_one_model_at_each_rate_without_restarts():
     assert plain["model"]["training"] == same
 
 
-def test_a_search_trains_the_model_with_the_fields_of_each_try():
+@pytest.mark.parametrize("name", load_plan().searches)
+def test_a_search_trains_the_model_with_the_fields_of_each_try(name):
     plan = load_plan()
-    (search,) = plan.searches.values()
-    steps = by_key(steps_of(plan, None, {}))
+    search, steps = plan.searches[name], by_key(steps_of(plan, None, {}))
     own = steps[f"models/{search.split}.{search.commands}/{search.model}.0"].recipe()
-    for name, other in search.tries.items():
-        tried = steps[f"searches/{search.split}.{search.commands}/{search.model}.{name}.0"].recipe()
+    for attempt, other in search.tries.items():
+        tried = steps[f"searches/{search.split}.{search.commands}/{search.model}.{attempt}.0"].recipe()
         assert tried | {"model": own["model"]} == own
-        assert tried["model"] == merge(own["model"], other) != own["model"], name
+        assert tried["model"] == merge(own["model"], other) != own["model"], attempt
 
 
 def test_what_is_trained_on_decides_the_identity_of_a_training(plan):
