@@ -15,10 +15,9 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -26,8 +25,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from benchmarks.fold_tables import HORIZONS_S, by_group, tables
 from benchmarks.matrix.scored_cells import RACER, Cell, season_logs, simulated_cells, test_drive, training_drive
-from benchmarks.page import table
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.files import write_json
 from dynssm_ros.identification.result.calibration import calibrate
@@ -41,15 +40,13 @@ from dynssm_ros.runtime.along import Along
 from dynssm_ros.runtime.features import INPUT_CHANGE, LayerFeatures, throttle_steps
 from dynssm_ros.runtime.online import CHANNELS, Learned, OnlineLayer, Seen
 from dynssm_ros.runtime.path_judge import PathJudge
-from dynssm_ros.runtime.rollout import RolloutCorrection, path_errors, roll_out
+from dynssm_ros.runtime.rollout import RolloutCorrection, Step, path_errors, roll_out
 from dynssm_ros.signals.extraction import extract
 from dynssm_ros.signals.recording import Recording, concatenate
 from dynssm_ros.signals.signal_map import load_signal_map
 from dynssm_ros.vehicle import Vehicle, load_vehicle, save_vehicle
 from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S
 
-HORIZONS_S = (0.3, 0.6, 1.5)
-ERRORS = ("one step", *(f"path {horizon:g} s" for horizon in HORIZONS_S), "one step, first 10 s")
 _GATES_S = (28.6, 248.9, 409.0, np.inf)  # of Putnam Park's laps
 _SETTLED_S = 16.0  # before it the log's heading settles
 _DART = {
@@ -64,11 +61,12 @@ _SIMULATED = (
 _HISTORY_S = 0.64
 _STRIDE_S = 0.2  # between starts of paths
 _FIRST_S = 10.0  # of a drive, in which the layer meets what is new
-_RESAMPLED = 2000  # means over folds, for their interval
 _LIMIT = 4.0  # of inputs, whose usual size is one, and of corrections in their standard deviations
 
 Predict = Callable[[Vector], Vector]
 """From inputs ``(N, n)`` to what is left of increments, ``(N, 3)``, in their standard deviations."""
+Stretches = list[tuple[LayerDrive, OnlineLayer]]
+"""Parts of a training, each with a layer that did not know it."""
 Look = Callable[[Vector, Seen], Vector]
 """From windows ``(N, H, 7)`` and what the layer sees of them to inputs ``(N, n)``."""
 
@@ -167,7 +165,7 @@ class Study:
         """A log as a layer sees it."""
         return LayerDrive.of(log, ends, self.base.H, features.seen)
 
-    def fitted(self, features: LayerFeatures) -> tuple[OnlineLayer, list[tuple[LayerDrive, OnlineLayer]]]:
+    def fitted(self, features: LayerFeatures) -> tuple[OnlineLayer, Stretches]:
         """The layer of the training, and its stretches, each with a layer that did not know it."""
         log = self.fold.training
         ends = log.window_ends(self.base.H, min_speed=self.car.minimum_speed)
@@ -288,21 +286,28 @@ def score(
     starts = log.window_ends(H, steps, study.car.minimum_speed)[:: max(1, round(_STRIDE_S / T_s))]
     correction = RolloutCorrection(layer, known.at(np.searchsorted(ends, starts)))
 
+    predicted = log.windows(starts, H, steps)
+    states = roll_out(corrected(features, correction, T_s, learner), predicted, H)
+    distances = path_errors(predicted[:, H - 1 : H, :3], states, predicted[:, H:, :3], T_s)
+    until = [round(horizon / T_s) for horizon in HORIZONS_S]
+    first = log.time[ends] < log.time[ends[0]] + 1e9 * _FIRST_S
+    one_step, at_first = (np.sqrt(np.mean(each**2, axis=0)) for each in (errors, errors[first]))
+    return Scored(one_step, at_first, np.stack([distances[:, :k].mean(axis=1) for k in until], axis=1))
+
+
+def corrected(features: LayerFeatures, correction: RolloutCorrection, T_s: float, learner: Look | None) -> Step:
+    """The steps of rollouts with what a learner adds to the physics: it fades as the layer's correction does."""
+
     def step(windows: Vector) -> Vector:
         seen, k = features.seen(windows), correction.steps
         moved = windows[:, -1, :CHANNELS] + correction.increments(seen)
         if learner is None:
             return moved
-        share = min(max(2.0 - k * T_s / PATH_HORIZON_S, 0.0), 1.0)  # as the layer's correction
+        share = min(max(2.0 - k * T_s / PATH_HORIZON_S, 0.0), 1.0)
         acts = correction.learned.trusted[:, None] if k else 1.0
         return np.asarray(moved + share * acts * learner(windows, seen))
 
-    predicted = log.windows(starts, H, steps)
-    distances = path_errors(predicted[:, H - 1 : H, :3], roll_out(step, predicted, H), predicted[:, H:, :3], T_s)
-    until = [round(horizon / T_s) for horizon in HORIZONS_S]
-    first = log.time[ends] < log.time[ends[0]] + 1e9 * _FIRST_S
-    one_step, at_first = (np.sqrt(np.mean(each**2, axis=0)) for each in (errors, errors[first]))
-    return Scored(one_step, at_first, np.stack([distances[:, :k].mean(axis=1) for k in until], axis=1))
+    return step
 
 
 def judged(study: Study, features: LayerFeatures, layer: OnlineLayer) -> Vector:
@@ -316,7 +321,7 @@ def judged(study: Study, features: LayerFeatures, layer: OnlineLayer) -> Vector:
 
 
 def ratios(ours: Scored, alone: Scored) -> list[float]:
-    """Errors over those of the layer alone, see :data:`ERRORS`; one step as geometric mean over the channels."""
+    """Errors over those of the layer alone, see :data:`fold_tables.ERRORS`; one step as geometric mean over the channels."""
     step, first = (
         float(np.exp(np.mean(np.log(a / b)))) for a, b in ((ours.rmse, alone.rmse), (ours.first, alone.first))
     )
@@ -329,27 +334,34 @@ def scored(study: Study) -> dict[str, list[float]]:
     layer, stretches = study.fitted(features)
     trusted = judged(study, features, layer)
     alone = score(study, features, layer, trusted)
+    left = left_of(stretches)
     found = {}
     looks = {"all features": study.everything, "operating point": study.operating_point}
     cases = [(name, look, fit) for name, look in looks.items() for fit in (ridge, trees, network)]
     for name, look, fit in [*cases, ("operating point, increments", study.with_increments, network)]:
-        learner = learned(study, layer, stretches, look, fit)
+        learner = learned(study, layer, look, fit, stretches=stretches, left=left)
         found[f"{fit.__name__}, {name}"] = ratios(score(study, features, layer, trusted, learner), alone)
     steps = study.base._replace(config=OnlineConfig(throttle_steps=True)).features(False)
     found["layer with the throttle's steps"] = ratios(score(study, steps, study.fitted(steps)[0], trusted), alone)
     return found
 
 
+def left_of(stretches: Stretches) -> Vector:
+    """What the layers that did not know the stretches leave of their increments, ``(N, 3)``, in units of s_delta."""
+    return np.concatenate([left_by(layer, drive) for drive, layer in stretches])
+
+
 def learned(
     study: Study,
     layer: OnlineLayer,
-    stretches: list[tuple[LayerDrive, OnlineLayer]],
     look: Look,
     fit: Callable[[Vector, Vector], Predict],
+    *,
+    stretches: Stretches,
+    left: Vector,
 ) -> Look:
-    """What a learner adds to the physics; it is fitted to what the layers that did not know the stretches leave of them."""
+    """What a learner that is fitted to :func:`left_of` the stretches adds to the physics."""
     H, log = study.base.H, study.fold.training
-    left = np.concatenate([left_by(each, drive) for drive, each in stretches])
     inputs = [look(log.windows(drive.ends, H), drive.see(slice(None))) for drive, _ in stretches]
     size = left.std(axis=0)
     predict = fit(np.concatenate(inputs), left / size)
@@ -374,10 +386,11 @@ def steps_scored(study: Study) -> dict[str, list[float]]:
     layer, stretches = study.fitted(features)
     trusted = judged(study, features, layer)
     alone = score(study, features, layer, trusted)
+    left = left_of(stretches)
     forced = ratios(of(*layers[True]), of(*layers[False]))
     found = {"steps everywhere": forced, "steps where they earn it": forced if earned else [1.0] * len(forced)}
     for name, look in (("all features", study.everything), ("operating point", study.operating_point)):
-        learner = learned(study, layer, stretches, look, trees)
+        learner = learned(study, layer, look, trees, stretches=stretches, left=left)
         found[f"trees, {name}"] = ratios(score(study, features, layer, trusted, learner), alone)
     return found
 
@@ -395,50 +408,24 @@ def main() -> None:
     out = arguments.out / ("steps_test" if arguments.test else "steps") if arguments.steps else arguments.out
     out.mkdir(parents=True, exist_ok=True)
     wanted = further_folds(arguments.data, arguments.test) if arguments.steps else folds(arguments.data)
-    known: dict[str, dict[str, list[float]]] = {}
-    for name, fold in wanted.items():
-        file = out / f"{name}.json"
-        if not file.is_file() and name.startswith(arguments.only):
-            study = Study.of(fold(), out)
-            if study.moves:
-                write_json(file, steps_scored(study) if arguments.steps else scored(study))
-        if file.is_file():
-            known[name] = json.loads(file.read_text(encoding="utf-8"))
+    known = kept(wanted, steps_scored if arguments.steps else scored, out, arguments.only)
     print(by_group(known) if arguments.steps else tables(known))
 
 
-def by_group(known: dict[str, dict[str, list[float]]]) -> str:
-    """Geometric means of the ratios in each group of folds with their interval over the folds, and the largest of all."""
-    names = list(next(iter(known.values())))
-    rows = []
-    for group, name in product(dict.fromkeys(fold.partition("_")[0] for fold in known), names):
-        of = {fold.partition("_")[2]: content[name] for fold, content in known.items() if fold.startswith(group)}
-        means = ["{:.3f} ({:.3f}-{:.3f})".format(*mean_over(np.array(each))) for each in zip(*of.values(), strict=True)]
-        worst, k = max(product(of, range(len(ERRORS))), key=lambda at: of[at[0]][at[1]])
-        rows.append([group, str(len(of)), name, *means, f"{of[worst][k]:.3f} ({worst}, {ERRORS[k]})"])
-    return table(["of", "folds", "beside the layer", *ERRORS, "largest"], rows)
-
-
-def mean_over(values: Vector) -> tuple[float, float, float]:
-    """The geometric mean over folds, and where it lies in 95 % of draws of as many folds with replacement."""
-    drawn = np.random.default_rng(0).integers(len(values), size=(_RESAMPLED, len(values)))
-    low, high = np.exp(np.percentile(np.log(values)[drawn].mean(axis=1), [2.5, 97.5]))
-    return float(np.exp(np.log(values).mean())), float(low), float(high)
-
-
-def tables(known: dict[str, dict[str, list[float]]]) -> str:
-    """One step and path over :data:`HORIZONS_S` of each learner, by group of folds, and the path over 0.6 s by fold."""
-    parts = []
-    names = list(next(iter(known.values())))
-    for group in dict.fromkeys(name.partition("_")[0] for name in known):
-        of = {fold: content for fold, content in known.items() if fold.startswith(group)}
-        rows = []
-        for name in names:
-            logs = np.log([content[name] for content in of.values()])
-            rows.append([name, *(f"{value:.3f}" for value in (*np.exp(logs.mean(axis=0)), *np.exp(logs[:, 2])))])
-        heads = [group, *ERRORS, *(f"0.6 s: {fold}" for fold in of)]
-        parts.append(table(heads, rows))
-    return "\n\n".join(parts)
+def kept(
+    wanted: Mapping[str, Callable[[], Fold]], score: Callable[[Study], dict[str, list[float]]], out: Path, only: str
+) -> dict[str, dict[str, list[float]]]:
+    """Scores of the folds whose names begin with ``only``, and of those that lie in ``out``, where all are kept."""
+    known: dict[str, dict[str, list[float]]] = {}
+    for name, fold in wanted.items():
+        file = out / f"{name}.json"
+        if not file.is_file() and name.startswith(only):
+            study = Study.of(fold(), out)
+            if study.moves:
+                write_json(file, score(study))
+        if file.is_file():
+            known[name] = json.loads(file.read_text(encoding="utf-8"))
+    return known
 
 
 if __name__ == "__main__":

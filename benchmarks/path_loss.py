@@ -10,22 +10,35 @@ end, through the layer with what it had learned at their start: Gauss-Newton, de
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from benchmarks.network import Look, Study, folds, judged, left_by, limited, ratios, ridge, score, tables
+from benchmarks.fold_tables import tables
+from benchmarks.network import (
+    Look,
+    Stretches,
+    Study,
+    corrected,
+    folds,
+    judged,
+    kept,
+    learned,
+    left_of,
+    limited,
+    ratios,
+    ridge,
+    score,
+)
 from dynssm_ros.arrays import Vector
-from dynssm_ros.files import write_json
 from dynssm_ros.learning.online import LayerDrive
 from dynssm_ros.runtime.along import Along
 from dynssm_ros.runtime.features import LayerFeatures
-from dynssm_ros.runtime.online import CHANNELS, Learned, OnlineLayer, Seen
+from dynssm_ros.runtime.online import CHANNELS, Learned, OnlineLayer
 from dynssm_ros.runtime.rollout import RolloutCorrection, roll_out
-from dynssm_ros.vehicle.kinematics import PATH_HORIZON_S, path
+from dynssm_ros.vehicle.kinematics import path
 
 _ENDS_S = (0.3, 0.6)  # where paths are compared
 _STRIDE_S = 0.5  # between starts
@@ -44,9 +57,11 @@ class Fit:
         """Corrections ``(N, 3)`` (m/s, m/s, rad/s) with these weights."""
         return lambda windows, seen: np.asarray(limited(self.look(windows, seen) @ W) * self.size)
 
-    def fitted(self, stretches: list[tuple[LayerDrive, OnlineLayer]], start: Vector) -> Vector:
-        """Gauss-Newton from ``start``."""
-        W = start
+    def fitted(self, stretches: Stretches) -> Vector:
+        """Gauss-Newton from no correction."""
+        drive, _ = stretches[0]
+        some = drive.see(slice(0, 1))
+        W = np.zeros((self.look(drive.recording.windows(drive.ends[:1], self.study.base.H), some).shape[1], CHANNELS))
         for _ in range(_ROUNDS):
             A, b, count = np.zeros((W.size, W.size)), np.zeros(W.size), 0
             for residuals, J in self.linearised(stretches, W):
@@ -55,7 +70,7 @@ class Fit:
             W = W - np.linalg.solve(A + penalty, b + _PENALTY * count * W.ravel()).reshape(W.shape)
         return W
 
-    def linearised(self, stretches: list[tuple[LayerDrive, OnlineLayer]], W: Vector) -> Iterator[tuple[Vector, Vector]]:
+    def linearised(self, stretches: Stretches, W: Vector) -> Iterator[tuple[Vector, Vector]]:
         """Of each stretch: where paths end off the measured ones, over its RMS without a correction, and derivatives."""
         for drive, layer in stretches:
             starts, known = self.starts(drive, layer, W)
@@ -84,15 +99,8 @@ class Fit:
 
     def off(self, layer: OnlineLayer, known: Learned, rows: Vector, W: Vector) -> Vector:
         """Where paths end less where the measured ones do (m), ``(M, ends, 2)``, in the frame of their start."""
-        H, T_s, learner = self.study.base.H, self.study.car.sampling_time, self.learner(W)
-        correction = RolloutCorrection(layer, known)
-
-        def step(windows: Vector) -> Vector:
-            seen, k = self.features.seen(windows), correction.steps
-            share = min(max(2.0 - k * T_s / PATH_HORIZON_S, 0.0), 1.0)
-            moved = windows[:, -1, :CHANNELS] + correction.increments(seen)
-            return np.asarray(moved + share * learner(windows, seen))
-
+        H, T_s = self.study.base.H, self.study.car.sampling_time
+        step = corrected(self.features, RolloutCorrection(layer, known), T_s, self.learner(W))
         predicted = np.concatenate([rows[:, H - 1 : H, :3], roll_out(step, rows, H)], axis=1)
         apart = path(predicted, T_s) - path(rows[:, H - 1 :, :3], T_s)
         return np.asarray(apart[:, [round(end / T_s) - 1 for end in _ENDS_S]])
@@ -104,22 +112,11 @@ def scored(study: Study) -> dict[str, list[float]]:
     layer, stretches = study.fitted(features)
     trusted = judged(study, features, layer)
     alone = score(study, features, layer, trusted)
-    left = np.concatenate([left_by(each, drive) for drive, each in stretches])
-    size, H, log = left.std(axis=0) * layer.scale, study.base.H, study.fold.training
-    inputs = np.concatenate(
-        [study.operating_point(log.windows(drive.ends, H), drive.see(slice(None))) for drive, _ in stretches]
-    )
-    fit = Fit(study, features, study.operating_point, size)
-    W = fit.fitted(stretches, np.zeros((inputs.shape[1], CHANNELS)))
-    predict = ridge(inputs, left / left.std(axis=0))
-
-    def one_step(windows: Vector, seen: Seen) -> Vector:
-        return np.asarray(predict(study.operating_point(windows, seen)) * size)
-
-    return {
-        name: ratios(score(study, features, layer, trusted, learner), alone)
-        for name, learner in {"fitted to one step": one_step, "fitted to paths": fit.learner(W)}.items()
-    }
+    left, look = left_of(stretches), study.operating_point
+    one_step = learned(study, layer, look, ridge, stretches=stretches, left=left)
+    fit = Fit(study, features, look, left.std(axis=0) * layer.scale)
+    learners = {"fitted to one step": one_step, "fitted to paths": fit.learner(fit.fitted(stretches))}
+    return {name: ratios(score(study, features, layer, trusted, learner), alone) for name, learner in learners.items()}
 
 
 def main() -> None:
@@ -132,14 +129,8 @@ def main() -> None:
     torch.set_num_threads(1)
     out = arguments.out / "path_loss"
     out.mkdir(parents=True, exist_ok=True)
-    known: dict[str, dict[str, list[float]]] = {}
-    for name, fold in folds(arguments.data).items():
-        file = out / f"{name}.json"
-        if not file.is_file() and name.startswith(arguments.only) and not name.startswith("simulated"):
-            write_json(file, scored(Study.of(fold(), out)))
-        if file.is_file():
-            known[name] = json.loads(file.read_text(encoding="utf-8"))
-    print(tables(known))
+    measured = {name: fold for name, fold in folds(arguments.data).items() if not name.startswith("simulated")}
+    print(tables(kept(measured, scored, out, arguments.only)))
 
 
 if __name__ == "__main__":

@@ -64,6 +64,12 @@ def test_the_package_is_built_without_a_compiler(tmp_path: Path) -> None:
     assert not list((tmp_path / "dynssm_ros").glob("*.so"))
 
 
+def wandering(model: OnnxModel, seed: int) -> Vector:
+    """400 rows of a drive that wanders about the training's mean."""
+    scales, steps = model.card.normalisation, np.random.default_rng(seed).normal(size=(400, 7)) / 20
+    return np.array(scales.input_mean) + np.array(scales.input_std) * np.cumsum(steps, axis=0)
+
+
 def test_the_layer_sees_the_same_with_and_without(
     rls_model: Path, library: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -86,10 +92,8 @@ def test_the_layer_learns_the_same_with_and_without(
     rls_model: Path, library: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = OnnxModel(open_artifact(rls_model))
-    layer, scales = model.online, model.card.normalisation
+    layer, rows = model.online, wandering(model, seed=1)
     assert layer is not None
-    rng = np.random.default_rng(1)
-    rows = np.array(scales.input_mean) + np.array(scales.input_std) * np.cumsum(rng.normal(size=(400, 7)) / 20, axis=0)
     windows = np.lib.stride_tricks.sliding_window_view(rows, model.H, axis=0).swapaxes(1, 2)[:-1]
     increments = np.diff(rows[model.H - 1 :, :3], axis=0)
     increments[50] *= 30.0  # an outlier
@@ -114,9 +118,7 @@ def test_a_drive_is_followed_the_same_with_and_without(
 ) -> None:
     """In one call or in several: standing, slow, reversing, rows that do not follow, inputs that came late."""
     model = OnnxModel(open_artifact(rls_model))
-    scales = model.card.normalisation
-    rng = np.random.default_rng(4)
-    drive = np.array(scales.input_mean) + np.array(scales.input_std) * np.cumsum(rng.normal(size=(400, 7)) / 20, axis=0)
+    drive = wandering(model, seed=4)
     drive[100:150, :3] = 0.0
     drive[200:250, 0] *= -1.0
     windows = np.lib.stride_tricks.sliding_window_view(drive, model.H, axis=0).swapaxes(1, 2)

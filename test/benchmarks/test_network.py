@@ -1,5 +1,6 @@
 """What a network beside the online layer could earn: the learners find a planted bend, and the ratios are what they say."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,11 @@ import pytest
 import torch
 
 from benchmarks import network
-from benchmarks.network import Fold, Scored, Study, ratios, tables
+from benchmarks.fold_tables import by_group, mean_over, tables
+from benchmarks.network import Scored, Study, ratios
 from dynssm_ros.runtime.features import throttle_steps
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.vehicle import Vehicle, save_vehicle
+from dynssm_ros.vehicle import Vehicle
 
 
 @pytest.mark.parametrize("fit", [network.ridge, network.trees, network.network])
@@ -41,14 +43,14 @@ def test_ratios_are_of_one_step_and_of_paths() -> None:
 
 def test_the_mean_its_interval_and_the_largest_ratio_are_told_of_each_group() -> None:
     values = {"same_a": 0.5, "same_b": 2.0, "same_c": 1.0, "season_d": 3.0}
-    text = network.by_group({name: {"steps": [value, *[1.0] * 4]} for name, value in values.items()})
+    text = by_group({name: {"steps": [value, *[1.0] * 4]} for name, value in values.items()})
     ones = " | ".join(["1.000 (1.000-1.000)"] * 4)
     assert f"| same | 3 | steps | 1.000 (0.500-2.000) | {ones} | 2.000 (b, one step) |" in text
     assert "| season | 1 | steps | 3.000 (3.000-3.000) |" in text
 
 
 def test_the_interval_of_a_mean_narrows_with_the_folds() -> None:
-    few, many = (network.mean_over(np.exp(np.random.default_rng(0).normal(0.1, 0.1, size))) for size in (8, 200))
+    few, many = (mean_over(np.exp(np.random.default_rng(0).normal(0.1, 0.1, size))) for size in (8, 200))
     assert many[1] < np.exp(0.1) < many[2]
     assert many[2] - many[1] < 0.5 * (few[2] - few[1])
 
@@ -61,15 +63,13 @@ def test_development_and_test_folds_are_apart(data: Path) -> None:
 
 
 def test_a_learner_that_adds_nothing_changes_nothing_and_the_truth_leaves_less(
-    drive: Any, orca: Vehicle, tmp_path: Path
+    drive: Any, orca: Vehicle, study_of: Callable[..., Study], pushed: Callable[..., Recording]
 ) -> None:
     noise = (0.003, 0.003, 0.02)
     training, left_out = (drive(orca, 800, seed=seed, noise=noise) for seed in (0, 1))
     steady = np.where(np.arange(len(left_out)) % 20 < 10, 0.01, -0.01)  # pushes of v_x that no layer follows at once
-    columns = left_out.columns | {"v_x": left_out["v_x"] + np.cumsum(steady)}
-    left_out = Recording(left_out.info, left_out.time, left_out.segment, columns)
-    save_vehicle(orca, tmp_path / "f.yaml")
-    study = Study.of(Fold("f", "orca", training, left_out), tmp_path)
+    left_out = pushed(left_out, steady)
+    study = study_of(training, left_out)
     features = study.base.features(False)
     layer, stretches = study.fitted(features)
     assert len(stretches) == study.base.config.folds

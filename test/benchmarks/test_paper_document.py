@@ -198,8 +198,8 @@ def test_the_paper_s_model_is_told_what_it_misses(make):
     assert cells(plain, "v_x") == ["0.404", "0.673", "yes"]
     assert cells(plain, "ADE") == ["0.100", "1.00", "no: `ddm_av21`"]
     study = results.plan.studies["unseen"].model_copy(update={"wanted": {"v_x": 0.4, "omega": 0.5}})
-    (comparison,) = make(plan=results.plan.model_copy(update={"studies": {"unseen": study}})).comparisons
-    wanted = tables.paper_model_table(comparison)
+    (other,) = make(plan=results.plan.model_copy(update={"studies": {"unseen": study}})).comparisons
+    wanted = tables.paper_model_table(other)
     assert wanted is not None
     assert cells(wanted, "v_x") == ["0.404", "0.400", "0.673", "no: what is wanted"]
     assert cells(wanted, "ω") == ["0.404", "0.500", "0.673", "yes"]
@@ -423,14 +423,10 @@ def test_learning_rates_that_were_tried_are_shown_with_the_chosen_one(make, tmp_
 
 
 def test_settings_that_were_tried_are_shown_below_the_model_as_it_is(make):
-    search = Search(
-        split="ethz", commands="topics", model="dynssm_orca_paper",
-        tries={"weak": {"loss": {"parameters": 1e-5}, "training": {"batch_size": 64}}},
-    )  # fmt: skip
-    found = {
-        "history": {"validation/prediction": [3.0, 1.0, 2.0]}, "best_epoch": 2,
-        "validation_rmse": dict(zip(STATE_SIGNALS, (0.1, 0.2, 0.3), strict=True)),
-    }  # fmt: skip
+    weak = {"loss": {"parameters": 1e-5}, "training": {"batch_size": 64}}
+    search = Search(split="ethz", commands="topics", model="dynssm_orca_paper", tries={"weak": weak})
+    rmse = dict(zip(STATE_SIGNALS, (0.1, 0.2, 0.3), strict=True))
+    found = {"history": {"validation/prediction": [3.0, 1.0, 2.0]}, "best_epoch": 2, "validation_rmse": rmse}
     results = make(tries={"orca": {"": [found], "weak": [found | {"best_epoch": 3}, found]}})
     results = replace(results, plan=results.plan.model_copy(update={"searches": {"orca": search}}))
     assert [[cell.text for cell in row] for row in tables.search_table(results).cells] == [
@@ -446,9 +442,8 @@ def test_a_page_is_marked_stale_as_soon_as_a_setting_changes(make, tmp_path):
     document.write(results, tmp_path / "results.md")
     page = (tmp_path / "results.md").read_text()
     assert marked(page, results.plan) == page
-    changed = dict(results.plan.models)
-    changed["dynssm_av21"] = changed["dynssm_av21"].model_copy(update={"change": {"history": 0.8}})
-    other = results.plan.model_copy(update={"models": changed})
+    changed = results.plan.models["dynssm_av21"].model_copy(update={"change": {"history": 0.8}})
+    other = results.plan.model_copy(update={"models": results.plan.models | {"dynssm_av21": changed}})
     stale = marked(page, other)
     assert stale.startswith(f"# Results\n\n{NOTE}\n\n")
     assert marked(stale, other) == stale

@@ -1,24 +1,24 @@
 """A correction that is fitted to paths finds a planted bend, and the paths end nearer."""
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from benchmarks.network import Fold, Study
+from benchmarks.network import Study
 from benchmarks.path_loss import Fit
 from dynssm_ros.signals.recording import Recording
-from dynssm_ros.vehicle import Vehicle, save_vehicle
+from dynssm_ros.vehicle import Vehicle
 
 
-def test_paths_end_nearer_with_what_was_fitted_to_them(drive: Any, orca: Vehicle, tmp_path: Path) -> None:
+def test_paths_end_nearer_with_what_was_fitted_to_them(
+    drive: Any, orca: Vehicle, study_of: Callable[..., Study], pushed: Callable[..., Recording]
+) -> None:
     laps = drive(orca, 700, seed=2, noise=(0.001, 0.001, 0.004))
     applied = laps["r_fb"] + laps["r_cmd"]
     bend = np.where(np.arange(len(laps)) % 40 < 20, 0.015, -0.015) * np.tanh((applied - 0.32) / 0.02)
-    columns = laps.columns | {"v_x": laps["v_x"] + np.cumsum(bend)}
-    laps = Recording(laps.info, laps.time, laps.segment, columns)
-    save_vehicle(orca, tmp_path / "f.yaml")
-    study = Study.of(Fold("f", "orca", laps, laps), tmp_path)
+    laps = pushed(laps, bend)
+    study = study_of(laps, laps)
     features = study.base.features(False)
     _, stretches = study.fitted(features)
     signs = {row[3:].tobytes(): sign for row, sign in zip(laps.matrix, np.sign(np.roll(bend, -1)), strict=True)}
@@ -28,7 +28,7 @@ def test_paths_end_nearer_with_what_was_fitted_to_them(drive: Any, orca: Vehicle
 
     fit = Fit(study, features, look, np.array([0.01, 0.003, 0.01]))
     nothing = np.zeros((2, 3))
-    W = fit.fitted(stretches, nothing)
+    W = fit.fitted(stretches)
     before, after = (
         sum(float(residuals @ residuals) for residuals, _ in fit.linearised(stretches, each)) for each in (nothing, W)
     )

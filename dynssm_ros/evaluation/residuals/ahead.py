@@ -11,14 +11,14 @@ force last for seconds.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from dynssm_ros.arrays import Indices, Vector, sums_by
+from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.evaluation.regimes import COASTING
 from dynssm_ros.evaluation.residuals.errors import OneStepErrors
-from dynssm_ros.evaluation.residuals.evidence import limited
+from dynssm_ros.evaluation.residuals.evidence import limited, sums_of_blocks
 from dynssm_ros.evaluation.residuals.patterns import Pattern, Picture
 from dynssm_ros.evaluation.residuals.periods import sine
 from dynssm_ros.evaluation.residuals.regimes import (
@@ -47,14 +47,6 @@ _FINER = 41  # between those beside the best, that are tried then
 _AROUND = 12  # of those that it tells apart, to each side: the surroundings of a line
 _BY_CHANCE = 1e-4  # that the highest line of a spectrum is as high
 _DRIVEN = 4.0  # times above its surroundings, from which on a line of the driving makes a swing its own
-
-
-@dataclass(frozen=True)
-class _Fitted:
-    """What columns say of errors: fitted to all, and to all blocks but those around, ``(N,)``."""
-
-    whole: Vector
-    apart: Vector
 
 
 def patterns_ahead(
@@ -138,17 +130,21 @@ def _tried(errors: OneStepErrors, values: Vector, c: int, sorted_by: list[Situat
 def _held(errors: OneStepErrors, values: Vector, pattern: Pattern, columns: Vector) -> Iterator[Pattern]:
     """The pattern with what ``columns`` ``(N, k)`` take off, if it does so surely and in most blocks."""
     block = errors.block
-    fitted = _fit(values, columns, block)
-    gain = sums_by(block, values**2 - (values - fitted.apart) ** 2)
+    whole, apart = _fit(values, columns, block)
+    gain = sums_of_blocks(values**2 - (values - apart) ** 2, block)
     gain = gain[gain != 0.0]
     share = float(gain.sum() / np.sum(values**2))
     sure = gain.sum() > _STANDARD_ERRORS * np.sqrt((gain**2).sum())
     if sure and np.mean(gain > 0.0) >= _OF_BLOCKS:
-        yield replace(pattern, share=share, fitted=fitted.whole)
+        yield replace(pattern, share=share, fitted=whole)
 
 
-def _fit(values: Vector, columns: Vector, block: Indices) -> _Fitted:
-    """Least squares, with as much weight on 0 as half a block has."""
+def _fit(values: Vector, columns: Vector, block: Indices) -> tuple[Vector, Vector]:
+    """Least squares on ``columns`` ``(N, k)``, with as much weight on 0 as half a block has.
+
+    Returns:
+        What is fitted to all, and to all blocks but those around, each ``(N,)``.
+    """
     count = int(block[-1]) + 1
     gram = np.zeros((count, columns.shape[1], columns.shape[1]))
     moment = np.zeros((count, columns.shape[1]))
@@ -161,7 +157,7 @@ def _fit(values: Vector, columns: Vector, block: Indices) -> _Fitted:
         near = slice(max(b - 1, 0), b + 2)
         weights = np.linalg.solve(usual - gram[near].sum(axis=0) + least, moment.sum(axis=0) - moment[near].sum(axis=0))
         apart[block == b] = columns[block == b] @ weights
-    return _Fitted(columns @ np.linalg.solve(usual + least, moment.sum(axis=0)), apart)
+    return columns @ np.linalg.solve(usual + least, moment.sum(axis=0)), apart
 
 
 def _drifts(errors: OneStepErrors, values: Vector, channel: str) -> Iterator[Pattern]:

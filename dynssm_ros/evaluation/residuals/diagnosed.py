@@ -18,7 +18,7 @@ from dynssm_ros.extras import missing_libraries
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.recordings import RecordingSet
 from dynssm_ros.identification.problem.windows import SimulationWindows
-from dynssm_ros.identification.result.diagnosis import EXTENDED, Diagnosis, Structure
+from dynssm_ros.identification.result.diagnosis import EXTENDED, Diagnosis, PatternAhead
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
@@ -39,7 +39,7 @@ class ExaminedDiagnosis(Diagnosis):
     def of(cls, diagnosis: Diagnosis) -> ExaminedDiagnosis:
         """The diagnosis with :func:`left_by` it and :func:`left_ahead`."""
         ahead = left_ahead(diagnosis)
-        found = replace(diagnosis, structure=tuple(Structure(one.channel, one.words, one.share) for one in ahead))
+        found = replace(diagnosis, structure=tuple(PatternAhead(one.channel, one.words, one.share) for one in ahead))
         known = {each.name: getattr(found, each.name) for each in fields(Diagnosis)}
         return cls(**known, anatomy=left_by(diagnosis), ahead=ahead)
 

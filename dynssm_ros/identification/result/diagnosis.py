@@ -91,7 +91,7 @@ class Conclusion(NamedTuple):
     """Share of the error on held-out laps that it takes away, as a mean of the channels, or that is left."""
 
 
-class Structure(NamedTuple):
+class PatternAhead(NamedTuple):
     """A pattern of the errors that are left at the horizon."""
 
     channel: str
@@ -151,7 +151,7 @@ class Diagnosis:
     formulas: tuple[Formula, ...] = ()
     recalibration: Recalibration | None = None
     not_judged: tuple[NotJudged, ...] = ()
-    structure: tuple[Structure, ...] = ()
+    structure: tuple[PatternAhead, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
