@@ -52,7 +52,7 @@ def _lines(diagnosis: Diagnosis, left: ModelAnatomy | None) -> Iterator[Verdict]
     """The first screen: a line for each finding."""
     look: dict[str, tuple[str, State]] = {
         "no_better": ("input", "wrong"), "cause": ("cause", "look"), "recalibration": ("file", "look"),
-        "unexplained": ("left", "look"), "small": ("small", "ok"),
+        "unexplained": ("left", "look"), "small": ("small", "ok"), "nearest": ("near", "look"),
     }  # fmt: skip
     for one in diagnosis.conclusions:
         yield Verdict(*look[one.kind], conclusion_in_words(diagnosis, one))
@@ -65,7 +65,8 @@ def _lines(diagnosis: Diagnosis, left: ModelAnatomy | None) -> Iterator[Verdict]
 def _causes(diagnosis: Diagnosis) -> Table:
     return Table.of(
         diagnosis.found,
-        (Column("cause"), lambda cause: cause.effect + recordings_of(cause)),
+        (Column("effect"), lambda cause: cause.effect + recordings_of(cause)),
+        (Column("told as"), lambda cause: cause.kind),
         (Column("size"), size_in_words),
         (Column("better by", group="left-out parts"), lambda cause: cause.confirmation.total),
         (Column("±", group="left-out parts"), lambda cause: cause.confirmation.std),

@@ -41,10 +41,13 @@ def as_text(diagnosis: Diagnosis, left: ModelAnatomy | None = None) -> str:
     for number, one in enumerate(diagnosis.conclusions, 1):
         lines += textwrap.wrap(f"{number}. {conclusion_in_words(diagnosis, one)}", _WIDTH, subsequent_indent="   ")
     if left is not None and left.patterns:
-        lines += ["What single steps of the extended car still get wrong, by its share of the squared error:"]
+        lines += ["What single steps of the car with the named causes get wrong, by its share of the squared error:"]
         lines += pattern_lines(left, MOST_PATTERNS)
     for cause in diagnosis.found:
-        lines += ["", f"{cause.effect}{recordings_of(cause)}"]
+        lines += [
+            "",
+            f"{cause.effect}{recordings_of(cause)}{', the nearest effect' if cause.kind == 'nearest' else ''}",
+        ]
         lines += [f"   {line}" for words in cause_in_words(cause) for line in textwrap.wrap(words, _WIDTH)]
     lines += ["", *improvement_in_words(diagnosis)]
     for words in (
@@ -82,7 +85,7 @@ def headline(diagnosis: Diagnosis) -> str:
     """The verdict in a sentence."""
     return {
         "cause": f"The simulation lacks: {', '.join(cause.effect + recordings_of(cause) for cause in diagnosis.causes)}.",
-        "unexplained": "Something is wrong that no effect of the library explains.",
+        "unexplained": "Something is wrong that no effect of the library explains" + nearest_in_words(diagnosis) + ".",
         "recalibrate": f"{'Coefficients of the vehicle file are' if diagnosis.moved else 'The vehicle file is'} off. "
         "Recalibrated, the simulation is right within the noise of the measurement.",
         "healthy": "The simulation is right within the noise of the measurement, and the vehicle file's coefficients hold.",
@@ -104,7 +107,14 @@ def conclusion_in_words(diagnosis: Diagnosis, one: Conclusion) -> str:
         (cause.heldout_improvement, "a recalibrated one {}"),
     )
     gone = ", ".join(words.format(_less(share)) for share, words in cars)
-    return f"{sure}{cause.effect}{recordings_of(cause)}: {size_in_words(cause)}; with it {gone}."
+    near = ", but it leaves errors of the same kind: it stands for something else" if cause.kind == "nearest" else ""
+    return f"{sure}{cause.effect}{recordings_of(cause)}: {size_in_words(cause)}; with it {gone}{near}."
+
+
+def nearest_in_words(diagnosis: Diagnosis) -> str:
+    """The nearest effects, to end a sentence; empty without."""
+    names = " and ".join(cause.effect + recordings_of(cause) for cause in diagnosis.nearest_effects)
+    return f"; nearest is {names}" if names else ""
 
 
 def _no_better_in_words(diagnosis: Diagnosis, channel: str) -> str:
@@ -192,7 +202,7 @@ def pattern_in_words(left: ExplainedVariance) -> str:
 
 
 def left_in_words(diagnosis: Diagnosis) -> str:
-    """What the extended car gets wrong beyond noise; empty if there is nothing."""
+    """What the car with the named causes gets wrong beyond noise; empty if there is nothing."""
     parts = []
     for one in diagnosis.structure[:MOST_PATTERNS]:
         ahead = f"{diagnosis.improvement.horizons[diagnosis.improvement.horizon]:.4g} s ahead"

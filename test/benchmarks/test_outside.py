@@ -26,6 +26,12 @@ def test_a_sensor_that_is_loose_swings_for_seconds() -> None:
 
 
 @pytest.mark.slow
+def test_where_no_effect_fits_the_nearest_is_no_cause() -> None:
+    (answer,) = outside.answers(1, 1, only=["throttle_and_yaw"])
+    assert (answer.verdict, answer.named, answer.shown) == ("unexplained", (), True)
+
+
+@pytest.mark.slow
 def test_a_sensor_that_pitches_is_unexplained_with_the_right_picture() -> None:
     (answer,) = outside.answers(9, 1)
     assert answer.fault == "pitching_sensor"

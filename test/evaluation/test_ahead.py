@@ -34,6 +34,17 @@ def found(log: Recording, **changed: Vector) -> list[Pattern]:
     return list(patterns_ahead(windows, CarEstimate.of(AV21), spoilt, TRACK.centre))
 
 
+def swinging(force: Vector, T_s: float) -> Vector:
+    """Speed of a mass on a spring of 0.6 Hz that a force shakes, an explicit step of each sampling time."""
+    aside, speed, w = 0.0, 0.0, 2 * np.pi * 0.6
+    out = np.empty_like(force)
+    for k, each in enumerate(force):
+        speed += T_s * (each - w**2 * aside - 0.2 * w * speed)
+        aside += T_s * speed
+        out[k] = 0.05 * speed
+    return out
+
+
 def test_nothing_is_found_where_only_the_sensors_are_noisy(log: Recording) -> None:
     assert found(log) == []
 
@@ -52,9 +63,10 @@ def test_nothing_is_found_where_only_the_sensors_are_noisy(log: Recording) -> No
             "throttle|acceleration|braking",
         ),
         ("omega", lambda log: log["omega"] * (0.9 + 0.0025 * log.elapsed), "time"),
+        ("v_y", lambda log: log["v_y"] + 2.0 * swinging(log["v_x"] * log["omega"], log.T_s), "steering"),
         ("v_x", lambda log: log["v_x"] + lfilter([0.02], [1.0, -0.92], log["r_fb"] < -0.02), "braking|throttle"),
     ],
-    ids=["swing", "pitching", "drift", "brakes"],
+    ids=["swing", "pitching", "drift", "slosh", "brakes"],
 )
 def test_what_is_planted_is_the_largest_pattern_of_its_channel(
     log: Recording, channel: str, spoil: Callable[[Recording], Vector], words: str

@@ -19,6 +19,7 @@ from dynssm_ros.identification.problem.fit import IdentificationProblem
 from dynssm_ros.identification.problem.recordings import RecordingSet
 from dynssm_ros.identification.result.diagnose import _moved_together, diagnose
 from dynssm_ros.identification.result.diagnosis import Cause, Diagnosis
+from dynssm_ros.identification.result.gate import stands_for_else
 from dynssm_ros.identification.result.improvement import mean_reduction
 from dynssm_ros.identification.search.candidates import Responses, ScoreTest, candidates
 from dynssm_ros.identification.tuning import DECISIVE_DELTA_BIC
@@ -159,7 +160,7 @@ def test_the_json_is_that_of_the_contract(lagging: tuple[Recording, Vehicle, Dia
     content = json.loads(json.dumps(lagging[2].to_json("out/vehicle.yaml"), allow_nan=False))
     assert content["verdict"] == "cause"
     (cause,) = content["causes"]
-    assert content["small_effects"] == []
+    assert content["small_effects"] == content["nearest_effects"] == []
     assert set(cause) == {"effect", "parameters", "evidence", "on_bound", "alternatives", "only_in", "level", "small"}
     assert set(cause["parameters"]["time_constant"]) == {"value", "std", "unit"}
     assert cause["parameters"]["time_constant"]["unit"] == "s"
@@ -197,6 +198,27 @@ def test_what_takes_little_off_every_channel_is_small_unless_what_was_known_tell
     assert "Sure but small, within the structure of the model: steering_lag: " in " ".join(as_text(little).split())
     content = little.to_json("vehicle.yaml")
     assert (content["causes"], [one["effect"] for one in content["small_effects"]]) == ([], ["steering_lag"])
+
+
+def test_what_leaves_much_of_what_it_explains_is_the_nearest_effect(
+    lagging: tuple[Recording, Vehicle, Diagnosis],
+) -> None:
+    found = lagging[2]
+    (one,) = found.selection.chosen
+    assert one.confirmation is not None
+    of_yaw = replace(one, confirmation=replace(one.confirmation, share=np.array([0.0, 0.1, 0.8])))
+    assert not stands_for_else(of_yaw, np.array([0.9, 0.9, 0.49])), "0.098 of 0.8 is left, of a channel that counts"
+    assert stands_for_else(of_yaw, np.array([0.0, 0.0, 0.51]))
+    known = replace(one, confirmation=replace(one.confirmation, share=np.array([0.0, 0.05, 0.05])))
+    assert not stands_for_else(known, np.ones(3)), "it explains nothing of which a part could be left"
+
+    nearest = replace(found, found=(replace(found.causes[0], nearest=True),))
+    assert (nearest.verdict, nearest.causes) == ("unexplained", ())
+    assert "no effect of the library explains; nearest is steering_lag." in as_text(nearest)
+    assert "it stands for something else." in " ".join(as_text(nearest).split())
+    content = nearest.to_json("vehicle.yaml")
+    assert ([each["effect"] for each in content["nearest_effects"]], content["causes"]) == (["steering_lag"], [])
+    assert next(each for each in content["conclusions"] if each["subject"] == "steering_lag")["kind"] == "nearest"
 
 
 def test_words_name_cause_size_gain_and_advice(lagging: tuple[Recording, Vehicle, Diagnosis]) -> None:

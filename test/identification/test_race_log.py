@@ -41,14 +41,14 @@ def test_where_nothing_is_known_yaw_is_found_to_come_late(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_from_the_shipped_file_the_extended_car_also_errs_less_sideways(recording: Recording) -> None:
+def test_from_the_shipped_file_the_extended_car_errs_less_sideways(recording: Recording) -> None:
     found = diagnose(recording, load_vehicle("av21"), horizon=0.6, integrator="rk4")
     assert found.verdict == "cause"
     assert found.causes[0].effect in LATE_OR_ELSEWHERE
     at = found.improvement.horizon
     assert found.improvement.horizons[at] == pytest.approx(0.6)
+    # how much of that a recalibration takes hangs on which of two cars, equally likely, is found
     assert found.improvement.reduction[at, 1] >= 0.3
-    assert found.improvement.reduction_from(RECALIBRATED)[at, 1] >= 0.3
 
 
 @pytest.mark.slow

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dynssm_ros.identification.problem.windows import RecordedRows, SimulationWindows
-from dynssm_ros.identification.result.residuals import clustered, explained_variance
+from dynssm_ros.identification.result.residuals import clustered, explained_variance, lasting
 
 N, K = 6000, 10
 
@@ -45,6 +47,16 @@ def test_an_error_that_follows_a_signal_is_seen_and_the_signal_is_named() -> Non
     np.testing.assert_allclose(found.share, 0.45, atol=0.1)  # half, less what estimating costs
     assert next(iter(found.pattern["v_y"])) == "speed"
     assert np.isnan(found.by_place).all()
+
+
+def test_what_lasts_is_the_share_that_a_simulation_and_the_next_have_in_common() -> None:
+    windows, rng = driven(), np.random.default_rng(2)
+    slow = np.repeat(rng.standard_normal(len(windows) // 50 + 1), 50)[: len(windows)]
+    share = np.array([0.0, 0.25, 0.8])
+    planted = np.sqrt(1.0 - share) * rng.standard_normal((len(windows), 3)) + np.sqrt(share) * slow[:, None]
+    np.testing.assert_allclose(lasting(windows, planted), share, atol=0.1)
+    apart, every = replace(windows, starts=windows.starts[::2]), planted[::2]
+    assert (lasting(apart, every) == 0.0).all(), "simulations with a gap between them are of another moment"
 
 
 def test_an_error_that_repeats_at_a_place_is_seen_as_such() -> None:

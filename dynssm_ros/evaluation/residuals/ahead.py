@@ -2,7 +2,8 @@
 
 A force of 0.3 m/s² is a hundredth of the squared error of a step of 20 ms, and most of that after half a second. Errors of
 simulations from measured rows are sorted by what was going on half the way, as those of single steps are, and by how long it
-had been going on. Beside these are looked for a swing that neither inputs nor bends have, and what changes with time.
+had been going on. Beside these are looked for a swing that is not of the driving, for what changes with time, and for an
+answer to inputs that the car does not have: the error goes with how the input changes.
 
 A pattern counts by what it takes off blocks of time to which it was not fitted, nor to those beside them: errors of a missing
 force last for seconds.
@@ -46,7 +47,10 @@ _OVERSAMPLED = 4  # frequencies tried for each that a drive tells apart
 _FINER = 41  # between those beside the best, that are tried then
 _AROUND = 12  # of those that it tells apart, to each side: the surroundings of a line
 _BY_CHANCE = 1e-4  # that the highest line of a spectrum is as high
-_DRIVEN = 4.0  # times above its surroundings, from which on a line of the driving makes a swing its own
+_DRIVEN = (
+    4.0  # times as far above its surroundings as any line of the driving: an answer to that would be as far at most
+)
+_FAR = 4.0  # standard deviations, from which on a change of an input counts no more
 
 
 def patterns_ahead(
@@ -125,6 +129,7 @@ def _tried(errors: OneStepErrors, values: Vector, c: int, sorted_by: list[Situat
         yield from _held(errors, values, pattern, columns)
     yield from _drifts(errors, values, channel)
     yield from _swings(errors, values, channel)
+    yield from _answers(errors, values, channel)
 
 
 def _held(errors: OneStepErrors, values: Vector, pattern: Pattern, columns: Vector) -> Iterator[Pattern]:
@@ -202,6 +207,40 @@ def _swings(errors: OneStepErrors, values: Vector, channel: str) -> Iterator[Pat
     yield from _held(errors, values, replace(found, words=words, terms=2), columns)
 
 
+def _answers(errors: OneStepErrors, values: Vector, channel: str) -> Iterator[Pattern]:
+    """Errors that go with how steering or throttle change: the car answers with a swing or a lag that is not simulated."""
+    log, unit = errors.recording, COLUMN_UNITS[channel]
+    width = max(1, round(_SMOOTH_S / log.T_s))
+
+    def change(signal: Vector) -> Vector:
+        return np.convolve(np.gradient(signal, log.T_s), np.full(width, 1.0 / width), mode="same")
+
+    inputs = {"steering": errors.inputs["steering"] * log["v_x"] ** 2}  # that the tyres would answer with a like force
+    if log.info.set_point == "throttle":
+        inputs["throttle"] = errors.inputs["throttle"]
+    for name, signal in inputs.items():
+        first = change(np.convolve(signal, np.full(width, 1.0 / width), mode="same"))
+        columns = np.stack([first, change(first)], axis=1)[errors.rows]
+        spread = columns.std(axis=0)
+        if (spread <= 0.0).any():
+            continue
+        columns = np.clip(columns / spread, -_FAR, _FAR)
+        weights = np.linalg.lstsq(columns, values, rcond=None)[0]
+        most = int(np.argmax(np.abs(weights)))
+        way = ("speed", "acceleration")[most]
+        words = (
+            f"an error of {channel} goes with the {way} of the {name}, {weights[most]:+.2g} {unit} at its usual size"
+        )
+        edges = np.quantile(columns[:, most], np.linspace(0.0, 1.0, 7))
+        part = np.clip(np.searchsorted(edges, columns[:, most], side="right") - 1, 0, 5)
+        means = np.array([np.mean(values[part == k]) if (part == k).any() else 0.0 for k in range(6)])
+        picture = Picture(
+            "bins", edges, means, f"{way} of the {name} (standard deviations)", f"error of {channel} ({unit})"
+        )
+        pattern = Pattern(channel, "delay", f"answer_to_{name}", words, 0.0, 1.0, 2, {}, None, picture)
+        yield from _held(errors, values, pattern, columns)
+
+
 def _highest(errors: OneStepErrors, y: Vector) -> float | None:
     """Period of the line that is highest above those around (s)."""
     t = errors.seconds - errors.seconds[0]
@@ -216,7 +255,7 @@ def _highest(errors: OneStepErrors, y: Vector) -> float | None:
         return None
     driven = (*errors.applied.T, errors.driven[:, 0], errors.driven[:, 2])
     near = slice(max(best - _OVERSAMPLED, 0), best + _OVERSAMPLED + 1)
-    if any(_above(wave @ (x - x.mean()))[near].max() > _DRIVEN for x in driven):
+    if any(_DRIVEN * _above(wave @ (x - x.mean()))[near].max() > above[best] for x in driven):
         return None
     finer = f[best] + np.linspace(-1.0, 1.0, _FINER) / whole
     return float(1.0 / finer[np.argmax(np.abs(np.exp(-2j * np.pi * finer[:, None] * t) @ y))])

@@ -18,14 +18,14 @@ from dynssm_ros.extras import missing_libraries
 from dynssm_ros.identification.problem.car import CarEstimate
 from dynssm_ros.identification.problem.recordings import RecordingSet
 from dynssm_ros.identification.problem.windows import SimulationWindows
-from dynssm_ros.identification.result.diagnosis import EXTENDED, Diagnosis, PatternAhead
+from dynssm_ros.identification.result.diagnosis import EXTENDED, RECALIBRATED, Diagnosis, PatternAhead
 from dynssm_ros.signals.recording import Recording
 from dynssm_ros.signals.signal_map import STATE_SIGNALS
 
 
 @dataclass(frozen=True)
 class ExaminedDiagnosis(Diagnosis):
-    """A diagnosis with what its extended car leaves.
+    """A diagnosis with what its car with the named causes leaves.
 
     Attributes:
         anatomy: of the errors of single steps; ``None`` if the fitted rows are less than 24 s.
@@ -54,7 +54,7 @@ class ExaminedDiagnosis(Diagnosis):
 
 
 def left_by(diagnosis: Diagnosis) -> ModelAnatomy | None:
-    """Takes the errors of the extended car apart, single steps from each row that was fitted, stepped as the data ask for.
+    """Takes the errors of the car with the named causes apart: single steps from each fitted row, as the data ask for them.
 
     Boosted trees are asked where scikit-learn is installed.
 
@@ -68,24 +68,24 @@ def left_by(diagnosis: Diagnosis) -> ModelAnatomy | None:
     single = windows.single_steps(rows)
     log = _one_after_the_other(diagnosis.recordings)
     errors = OneStepErrors(
-        EXTENDED,
+        RECALIBRATED if diagnosis.nearest_effects else EXTENDED,
         log,
         rows,
-        single.errors(diagnosis.car)[:, 0],
+        single.errors(diagnosis.named)[:, 0],
         diagnosis.recordings.lines[0] if windows.data.on_one_lap else None,
         diagnosis.vehicle.constants.wheelbase,
     )
-    response = PhysicsResponse(_derivatives(single, diagnosis.car))
+    response = PhysicsResponse(_derivatives(single, diagnosis.named))
     return model_anatomy(errors, situations(errors), response, learn=not missing_libraries("residuals"))
 
 
 def left_ahead(diagnosis: Diagnosis) -> tuple[Pattern, ...]:
-    """Patterns of the errors of the extended car at the horizon; none if the fitted rows are less than 24 s."""
+    """Patterns of the errors of the car with the named causes at the horizon; none if the fitted rows are less than 24 s."""
     windows = diagnosis.windows
     if len(np.unique(windows.passed)) * windows.data.T_s < FEWEST_BLOCKS * BLOCK_S:
         return ()
     line = diagnosis.recordings.lines[0] if windows.data.on_one_lap else None
-    return patterns_ahead(windows, diagnosis.car, _one_after_the_other(diagnosis.recordings), line)
+    return patterns_ahead(windows, diagnosis.named, _one_after_the_other(diagnosis.recordings), line)
 
 
 def _derivatives(single: SimulationWindows, car: CarEstimate) -> Vector:

@@ -13,6 +13,7 @@ Family = Literal["time", "size", "where", "delay", "learner"]
 _RECURRING = "Find what runs at that period: a sensor or filter that corrects the estimate, a task that comes late."
 _GEARS = "Take gears and the gap of a change into the model (effect gear_shift)."
 _LATE = "Check the actuator and the stamps; take the delay into the signal map or an effect (*_lag, odometry_delay)."
+_ANSWER = "Look for what swings, gives way or has play between the input and the tyres."
 _WORLD = "It stays with the road or the hall: bank, grade, wind, cameras, or the floor."
 _SPIKES = "Look at the raw samples there: drop-outs of a sensor, or gears at the speeds named."
 _FORCE = "Look for a resistance or a drive force that the car has there (effects drag, drive_map, gear_shift)."
@@ -22,7 +23,8 @@ ADVICE = {
     "wheel_synchronous": "Compare the way with the wheels' circumference: balance them, check rims and wheel-speed sensors.",
     "spikes": _SPIKES, "repeated": "Record the sensor at its own rate.",
     "quantised": "Take the signal with more digits.", "clipped": "Widen the range of the sensor or of its message.",
-    "steering_delay": _LATE, "throttle_delay": _LATE, "integrator": "Calibrate with that integrator.",
+    "steering_delay": _LATE, "throttle_delay": _LATE, "answer_to_steering": _ANSWER,
+    "answer_to_throttle": _ANSWER, "integrator": "Calibrate with that integrator.",
     "gear": _GEARS, "gear_and_pedal": _GEARS,
     "time_since_a_change_up_of_the_gear": _GEARS, "time_since_a_change_down_of_the_gear": _GEARS,
     "heading": _WORLD, "place_on_the_lap": _WORLD,

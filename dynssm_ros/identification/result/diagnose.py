@@ -97,8 +97,8 @@ def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle
     covariance = problem.covariance(fit)
     std = np.sqrt(np.diag(covariance))
     causes = [
-        _cause(one, rest, selection, at.recordings, std)
-        for one, rest in zip(selection.chosen, gate.without, strict=True)
+        replace(_cause(one, rest, selection, at.recordings, std), nearest=nearest)
+        for one, rest, nearest in zip(selection.chosen, gate.without, gate.nearest, strict=True)
     ]
     small = [cause.effect for cause in causes if cause.small]
     off = recalibration(problem, fit, at.car, gate.improvement, small=small)
@@ -112,8 +112,8 @@ def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle
     extended = extended.model_copy(update={"integrator": windows.integrator})
     extended = extended.calibrated_on(at.recordings.recording.select(~at.recordings.held_out).fingerprints, vehicle)
     extended = extended.with_held_out(at.recordings.shares)
-    has_no_name = gate.left.is_there and all(cause.small for cause in causes)
-    terms = _formulas(windows, fit.car, at.left_out, at.notes, on_progress) if has_no_name else ()
+    has_no_name = gate.left.is_there and all(cause.small or cause.nearest for cause in causes)
+    terms = _formulas(windows, gate.named, at.left_out, at.notes, on_progress) if has_no_name else ()
     notes = (
         *at.notes,
         *_steps_otherwise(vehicle, windows, fit.car, live),
@@ -124,7 +124,7 @@ def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle
         *_not_written(fit.car, extended),
     )
     return Diagnosis(
-        tuple(sorted(causes, key=lambda cause: cause.small)),
+        tuple(sorted(causes, key=lambda cause: (cause.small, cause.nearest))),
         _moved(fit.car, off),
         extended,
         gate.improvement,
@@ -133,6 +133,7 @@ def _diagnosis(at: _Prepared, found: SearchResult, gate: Gated, vehicle: Vehicle
         sizes,
         selection,
         fit.car,
+        gate.named,
         notes,
         at.protocol | {"Integrator": windows.integrator, "Inputs between samples": _HELD[windows.hold]},
         windows,

@@ -25,7 +25,7 @@ from dynssm_ros.vehicle import Vehicle
 from dynssm_ros.vehicle.effects import EFFECTS
 
 Verdict = Literal["cause", "unexplained", "recalibrate", "healthy"]
-ConclusionKind = Literal["no_better", "cause", "recalibration", "unexplained", "small"]
+ConclusionKind = Literal["no_better", "cause", "nearest", "recalibration", "unexplained", "small"]
 
 GIVEN, RECALIBRATED, EXTENDED = "as given", "recalibrated", "extended"
 
@@ -48,6 +48,7 @@ class Cause:
         level: what these recordings are.
         without: what the car with all other causes errs on the held-out rows, at the horizon, ``(W, 3)``.
         of_given: share of the error that is gone by it while the coefficients are those of the vehicle file.
+        nearest: whether it is but the nearest effect: so much of what it explains is left that it stands for something else.
     """
 
     effect: str
@@ -62,11 +63,17 @@ class Cause:
     level: Level = "car"
     without: Vector = field(default_factory=lambda: np.empty((0, 3)), repr=False)
     of_given: float = 0.0
+    nearest: bool = False
 
     @property
     def explains(self) -> float:
         """Share of the error on the held-out rows that it takes off the vehicle file's car, or off a recalibrated one."""
         return max(self.of_given, self.heldout_improvement)
+
+    @property
+    def kind(self) -> Literal["cause", "nearest", "small"]:
+        """As what it is told."""
+        return "small" if self.small else "nearest" if self.nearest else "cause"
 
     @property
     def small(self) -> bool:
@@ -114,17 +121,18 @@ class Diagnosis:
     """What the simulation gets wrong, and why.
 
     Attributes:
-        found: the causes and then the small effects, the strongest of each first.
+        found: the causes, then the nearest effects and the small ones, the strongest of each first.
         moved: coefficients, and ``m``, that are now more than three of the stated standard deviations off what the vehicle
             file has, or that :attr:`recalibration` names; by name, how many.
         vehicle: the vehicle with effects and refitted nominal values.
         improvement: on the held-out rows.
-        left: what is systematic in the errors of the extended car, on the rows of the fit.
+        left: what is systematic in the errors of the car with the causes alone, on the rows of the fit.
         clustered: how those errors are spread over time.
         minimum_detectable: how far off neutral each effect that is not named would have to be to be named (the unit of its
             first parameter).
         selection: how it was found.
         car: the extended car as fitted.
+        named: that with the causes and small effects alone.
         notes: what limits the diagnosis.
         protocol: how it was obtained, by name.
         windows: of the fit.
@@ -144,6 +152,7 @@ class Diagnosis:
     minimum_detectable: Mapping[str, float]
     selection: Selection
     car: CarEstimate
+    named: CarEstimate
     notes: tuple[str, ...]
     protocol: Mapping[str, str]
     windows: SimulationWindows
@@ -163,13 +172,13 @@ class Diagnosis:
         """
         if self.causes:
             return "cause"
-        if self.is_left or self.no_better:
+        if self.nearest_effects or self.is_left or self.no_better:
             return "unexplained"
         return "recalibrate" if self.moved or self.improvement.is_noticed else "healthy"
 
     @property
     def is_left(self) -> bool:
-        """Whether the extended car leaves errors that are no noise."""
+        """Whether the car with the causes leaves errors that are no noise."""
         return self.left.is_there or self.clustered.is_there or bool(self.structure)
 
     @property
@@ -186,7 +195,7 @@ class Diagnosis:
     @property
     def conclusions(self) -> tuple[Conclusion, ...]:
         """The findings: what is no better than persistence first, then the rest, that which explains most error first."""
-        found = [Conclusion("small" if cause.small else "cause", cause.effect, cause.explains) for cause in self.found]
+        found = [Conclusion(cause.kind, cause.effect, cause.explains) for cause in self.found]
         if self.moved:
             explains = 0.0 if self.recalibration is None else self.recalibration.explains
             found.append(Conclusion("recalibration", "", explains))
@@ -201,7 +210,12 @@ class Diagnosis:
     @property
     def causes(self) -> tuple[Cause, ...]:
         """What is wrong, the strongest first."""
-        return tuple(cause for cause in self.found if not cause.small)
+        return tuple(cause for cause in self.found if cause.kind == "cause")
+
+    @property
+    def nearest_effects(self) -> tuple[Cause, ...]:
+        """What stands for something that no effect has, the strongest first."""
+        return tuple(cause for cause in self.found if cause.kind == "nearest")
 
     @property
     def small_effects(self) -> tuple[Cause, ...]:
@@ -225,6 +239,7 @@ class Diagnosis:
         return {
             "verdict": self.verdict,
             "causes": [_cause_to_json(cause) for cause in self.causes],
+            "nearest_effects": [_cause_to_json(cause) for cause in self.nearest_effects],
             "small_effects": [_cause_to_json(cause) for cause in self.small_effects],
             "improvement": {
                 "horizon_s": float(improvement.horizons[at]),

@@ -10,12 +10,12 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.identification import tuning
 from dynssm_ros.identification.problem.car import CarEstimate
-from dynssm_ros.identification.problem.fit import IdentificationProblem
+from dynssm_ros.identification.problem.fit import Fit, IdentificationProblem
 from dynssm_ros.identification.problem.noise import weights
 from dynssm_ros.identification.problem.windows import SimulationWindows
 from dynssm_ros.identification.result.diagnosis import EXTENDED, GIVEN, RECALIBRATED
 from dynssm_ros.identification.result.improvement import Improvement, mean_reduction, measure_improvement
-from dynssm_ros.identification.result.residuals import Left, clustered, explained_variance
+from dynssm_ros.identification.result.residuals import Left, clustered, explained_variance, lasting
 from dynssm_ros.identification.search.integrator import SearchResult
 from dynssm_ros.identification.search.selection import Refined, Search, Selection
 
@@ -37,12 +37,16 @@ class Gated(NamedTuple):
     Attributes:
         selection: the causes.
         without: the car without each of them, in the same order.
-        left: what the car with all of them leaves on the rows of the fit.
-        improvement: on the held-out rows.
+        nearest: whether each of them stands for something that no effect has, in the same order.
+        named: the car with the others alone.
+        left: what that car leaves on the rows of the fit.
+        improvement: on the held-out rows, of the car with all of them.
     """
 
     selection: Selection
     without: tuple[Without, ...]
+    nearest: tuple[bool, ...]
+    named: CarEstimate
     left: Left
     improvement: Improvement
 
@@ -60,7 +64,7 @@ def gated(found: SearchResult, given: CarEstimate, windows: SimulationWindows, s
     selection = found.selection
     while True:
         without = _without_each(selection, found.search, given, windows, steps)
-        left = _left(found.problem, selection)
+        left = _left(found.problem, selection.fit)
         strange = [one.candidate.effect for one in selection.chosen if not one.is_met]
         worst = min(zip(without, selection.candidates, strict=True), key=lambda pair: pair[0].improvement, default=None)
         if worst is not None and worst[0].improvement <= -tuning.NEGLIGIBLE_SHARE:
@@ -80,8 +84,45 @@ def gated(found: SearchResult, given: CarEstimate, windows: SimulationWindows, s
     if selection.chosen and _worse(improvement):
         notes.append(_not_kept(", ".join(one.effect for one in selection.candidates)))
         none = found.search.eliminated(())
-        return Gated(none, (), _left(found.problem, none), improvement.ending_with(RECALIBRATED))
-    return Gated(selection, without, left, improvement)
+        left = _left(found.problem, none.fit)
+        return Gated(none, (), (), none.fit.car, left, improvement.ending_with(RECALIBRATED))
+    return _beside_nearest(found.problem, Gated(selection, without, (), selection.fit.car, left, improvement))
+
+
+def _beside_nearest(problem: IdentificationProblem, gate: Gated) -> Gated:
+    """Tells apart what is a cause and what is the effect nearest to something else.
+
+    A cause takes what it explains away. A nearest effect leaves a part of it, which lasts from a simulation to the next.
+    """
+    selection, fit = gate.selection, gate.selection.fit
+    lasts = (
+        lasting(problem.windows, _ends(problem, fit))
+        if selection.inflation > tuning.EXPLAINED_INFLATION
+        else np.zeros(3)
+    )
+    nearest = tuple(stands_for_else(one, lasts) for one in selection.chosen)
+    if not any(nearest):
+        return gate._replace(nearest=nearest)
+    out = [one.candidate.effect for one, else_ in zip(selection.chosen, nearest, strict=True) if else_]
+    car = fit.car
+    for effect in out:
+        car = car.without(effect)
+    named = problem.fit(car, tuple(pair for pair in fit.free if pair[0] not in out), fit)
+    return gate._replace(nearest=nearest, named=named.car, left=_left(problem, named))
+
+
+def stands_for_else(one: Refined, lasts: Vector) -> bool:
+    """Whether too much of what a cause explains is left, in the channels in which it explains most.
+
+    What is named because coefficients are known explains nothing that could be left.
+    """
+    assert one.confirmation is not None
+    explains = np.maximum(one.confirmation.share, 0.0)
+    if explains.max() <= tuning.SMALL_SHARE:
+        return False
+    most = explains >= explains.max() / 2
+    left = lasts * (1.0 - explains)
+    return bool(left[most].sum() > tuning.NEAREST_SHARE * explains[most].sum())
 
 
 def _without_each(
@@ -100,14 +141,18 @@ def _without_each(
     return tuple(map(one, selection.chosen))
 
 
-def _left(problem: IdentificationProblem, selection: Selection) -> Left:
-    windows, fit = problem.windows, selection.fit
+def _ends(problem: IdentificationProblem, fit: Fit) -> Vector:
+    """Errors at the end of the simulations of a fit, ``(W, 3)``."""
+    return np.asarray(fit.errors.reshape(len(problem.windows), -1, 3)[:, -1])
+
+
+def _left(problem: IdentificationProblem, fit: Fit) -> Left:
+    windows = problem.windows
     white = fit.noise.whiten(fit.errors)
     size = weights(white) * (white**2).mean(axis=1)
     size = size / (np.bincount(windows.number, size) / np.bincount(windows.number))[windows.number]
-    ends = fit.errors.reshape(len(windows), -1, 3)[:, -1]
-    together = clustered(size, windows.time, windows.block, selection.inflation)
-    return Left(explained_variance(windows, ends, windows.block), together)
+    together = clustered(size, windows.time, windows.block, problem.inflation(fit))
+    return Left(explained_variance(windows, _ends(problem, fit), windows.block), together)
 
 
 def _not_kept(effects: str) -> str:

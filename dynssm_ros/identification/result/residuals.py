@@ -93,6 +93,20 @@ def clustered(sizes: Vector, time: Vector, block: Indices, inflation: float) -> 
     return ClusteredResiduals(float(sure), inflation, (float(worst.min()), float(worst.max())))
 
 
+def lasting(windows: SimulationWindows, errors: Vector) -> Vector:
+    """Share of the squared error that a simulation and the next have in common, ``(3,)``: noise is of one alone.
+
+    Args:
+        windows: the simulations.
+        errors: at their ends, shape ``(W, 3)``.
+    """
+    y = errors / np.maximum(np.sqrt((errors**2).mean(axis=0)), 1e-12)
+    y = np.clip(y, -tuning.FAR_SPREADS, tuning.FAR_SPREADS)
+    follows = (np.diff(windows.starts) <= windows.steps) & (np.diff(windows.number) == 0)
+    together = (y[:-1] * y[1:])[follows].sum(axis=0) / max(1, int(follows.sum()))
+    return np.asarray(np.maximum(together / (y**2).mean(axis=0), 0.0))
+
+
 def explained_variance(windows: SimulationWindows, errors: Vector, block: Indices) -> ExplainedVariance:
     """Explains errors by what was going on and where.
 

@@ -139,7 +139,7 @@ def _without(problem: IdentificationProblem, near: Fit, out: Mask) -> tuple[Vect
     rest, unseen = problem.select(~out), problem.select(out)
     start = replace(near, errors=near.errors[~out], jacobian=near.jacobian[~out])
     noise = Noise(rest.spread, near.noise.v)
-    found = rest.fit(near.car, near.free, start, rounds=tuning.LEFT_OUT_ROUNDS, rough=True, noise=noise)
+    found = rest.fit(near.car, near.free, start, rough=True, noise=noise)
     errors = unseen.errors(found.car)
     return unseen.log_likelihood(errors, Noise(unseen.spread, near.noise.v)), errors[:, -3:] ** 2
 
