@@ -24,6 +24,7 @@ from dynssm_ros.reporting.diagnosis_words import (
     recordings_of,
     signal_findings,
     size_in_words,
+    title_of,
 )
 from dynssm_ros.reporting.evaluation_figures import UNITS
 from dynssm_ros.reporting.page import Prose, Report, Section, State, Verdict, data_verdicts
@@ -92,7 +93,7 @@ def _sections(diagnosis: Diagnosis, left: ModelAnatomy | None, ahead: Sequence[P
         effect, with_it = EFFECTS[cause.effect](**cause.values), improvement.errors[EXTENDED][:, improvement.horizon]
         pictures = diagnosis_figures.cause_pictures(windows, cause.without, with_it, effect)
         about = " ".join((f"{size_in_words(cause)}.", *cause_in_words(cause)))
-        yield prose.section("cause", pictures, cause=cause.effect + recordings_of(cause), about=about)
+        yield prose.section("cause", pictures, cause=title_of(cause), about=about)
     yield from ahead_sections(ahead, float(horizon), MOST_PATTERNS)
     if left is not None:
         yield from pattern_sections("What is left", left, MOST_PATTERNS)

@@ -44,10 +44,7 @@ def as_text(diagnosis: Diagnosis, left: ModelAnatomy | None = None) -> str:
         lines += ["What single steps of the car with the named causes get wrong, by its share of the squared error:"]
         lines += pattern_lines(left, MOST_PATTERNS)
     for cause in diagnosis.found:
-        lines += [
-            "",
-            f"{cause.effect}{recordings_of(cause)}{', the nearest effect' if cause.kind == 'nearest' else ''}",
-        ]
+        lines += ["", title_of(cause)]
         lines += [f"   {line}" for words in cause_in_words(cause) for line in textwrap.wrap(words, _WIDTH)]
     lines += ["", *improvement_in_words(diagnosis)]
     for words in (
@@ -187,6 +184,11 @@ def recordings_of(cause: Cause) -> str:
     return f" (only in {' and '.join(cause.only_in)}{together})" if cause.only_in else ""
 
 
+def title_of(cause: Cause) -> str:
+    """What stands above all that is said of it."""
+    return f"{cause.effect}{recordings_of(cause)}{', the nearest effect' if cause.kind == 'nearest' else ''}"
+
+
 def pattern_in_words(left: ExplainedVariance) -> str:
     """What systematic error goes with, and where on the lap it is farthest off."""
     parts = []
@@ -310,7 +312,10 @@ def cause_in_words(cause: Cause) -> Iterator[str]:
     effect = EFFECTS[cause.effect]
     yield effect.SUMMARY
     yield f"Evidence: {evidence_in_words(cause)}."
-    yield f"What to do: {effect.ADVICE}"
+    if cause.kind == "nearest":
+        yield "What to do: look for what the errors that are left go with; predictions gain by the effect until then."
+    else:
+        yield f"What to do: {effect.ADVICE}"
     if cause.alternatives:
         ways = "; ".join(f"{name}: {EFFECTS[name].MANOEUVRE}" for name in (cause.effect, *cause.alternatives))
         yield f"The data fit {' or '.join(cause.alternatives)} as well. To tell them apart, drive ({ways})."

@@ -216,6 +216,7 @@ def test_what_leaves_much_of_what_it_explains_is_the_nearest_effect(
     assert (nearest.verdict, nearest.causes) == ("unexplained", ())
     assert "no effect of the library explains; nearest is steering_lag." in as_text(nearest)
     assert "it stands for something else." in " ".join(as_text(nearest).split())
+    assert EFFECTS["steering_lag"].ADVICE not in as_text(nearest)
     content = nearest.to_json("vehicle.yaml")
     assert ([each["effect"] for each in content["nearest_effects"]], content["causes"]) == (["steering_lag"], [])
     assert next(each for each in content["conclusions"] if each["subject"] == "steering_lag")["kind"] == "nearest"
