@@ -113,6 +113,7 @@ def _diagnosis(out: Path, of: dict[str, list[StepRecord]]) -> Verdict:
         f"{cause['effect']} ({', '.join(_value(name, value) for name, value in cause['parameters'].items())})"
         for cause in found["causes"]
     )
+    nearest = " and ".join(effect["effect"] for effect in found["nearest_effects"])
     off = found["moved"] or [effect["effect"] for effect in found["small_effects"]]
     state, words = {
         "cause": ("look", f"the simulation lacks {causes}; the model's car has it"),
@@ -121,7 +122,11 @@ def _diagnosis(out: Path, of: dict[str, list[StepRecord]]) -> Verdict:
             "look",
             f"off in the calibrated car: {', '.join(off)}; the model's car is recalibrated",
         ),
-        "unexplained": ("look", "something is systematically wrong that no effect of the library explains"),
+        "unexplained": (
+            "look",
+            "something is systematically wrong that no effect of the library explains"
+            + (f"; nearest is {nearest}, which the model's car has" if nearest else ""),
+        ),
     }[found["verdict"]]
     return Verdict("diagnosis", state, words, link)  # type: ignore[arg-type]
 

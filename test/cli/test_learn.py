@@ -23,7 +23,7 @@ STATES = {"v_x": 0.1, "v_y": 0.1, "omega": 0.1}
 RESULTS: dict[str, dict[str, object]] = {
     "inspect": {},
     "calibrate": {"rmse_ahead": STATES, "persistence": dict.fromkeys(STATES, 0.5), "on_bound": [], "horizon_s": 0.5},
-    "diagnose": {"verdict": "healthy", "causes": [], "small_effects": [], "moved": {}},
+    "diagnose": {"verdict": "healthy", "causes": [], "nearest_effects": [], "small_effects": [], "moved": {}},
     "evaluate": {
         "horizon_s": 0.6,
         "models": {"model": {"ade": 0.01}, "single_track": {"ade": 0.02}, "persistence": {"ade": 0.1}},
@@ -165,7 +165,7 @@ def test_signals_that_contradict_each_other_are_wrong(
     [
         ("calibrate", {"on_bound": ["D_f"]}, "car", "look"),
         ("calibrate", {"rmse_ahead": dict.fromkeys(STATES, 0.6)}, "car", "wrong"),
-        ("diagnose", {"verdict": "unexplained"}, "diagnosis", "look"),
+        ("diagnose", {"verdict": "unexplained", "nearest_effects": [{"effect": "drag"}]}, "diagnosis", "look"),
         ("diagnose", {"verdict": "recalibrate", "moved": {"D_r": {}}}, "diagnosis", "look"),
         ("evaluate", {"not_tests": ["model was trained on it"]}, "model", "look"),
         ("evaluate", {"models": {"m": {"ade": 0.3}, "single_track": {"ade": 0.2}, "persistence": {"ade": 0.25}}},
