@@ -192,6 +192,15 @@ def test_every_shipped_effect_is_fully_described(name: str) -> None:
         assert not all(effect.PARAMETERS[key].shape for key in variant)
 
 
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_each_set_of_parameters_that_is_tried_has_a_size(name: str) -> None:
+    for parameters in EFFECTS[name].variants():
+        about = {p: EFFECTS[name].PARAMETERS[p] for p in parameters}
+        assert EFFECTS[name].amount({p: each.neutral for p, each in about.items()}) == 0.0
+        there = {p: each.neutral if each.shape else (each.lower + 2 * each.upper) / 3 for p, each in about.items()}
+        assert EFFECTS[name].amount(there) > 0.0, parameters
+
+
 def test_the_library_is_complete() -> None:
     assert set(EFFECTS) == {
         "steering_offset", "steering_gain", "steering_lag", "throttle_lag", "drag", "rolling_resistance", "drive_gain",

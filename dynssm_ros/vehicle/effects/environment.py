@@ -126,7 +126,9 @@ class RoadGrade(RoadAngle):
 
     @classmethod
     def amount(cls, values: Mapping[str, float]) -> float:
-        """The amplitude of such a wave."""
+        """The amplitude of such a wave, where the grade is a curve."""
+        if not set(_KNOTS) <= set(values):
+            return super().amount(values)
         knots = [values[name] for name in _KNOTS]
         return math.sqrt(2.0 / _PIECES) * math.hypot(sum(knots), *knots)
 
