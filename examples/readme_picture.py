@@ -1,4 +1,4 @@
-"""The picture of the README: what a named cause is worth on a real race log. About eight minutes on two cores.
+"""The picture of the README: what a diagnosis is worth on a real race log. About three minutes.
 
 python -m examples.readme_picture PUTNAM_PARK_BAG docs/_static/diagnosis.png
 """
@@ -18,14 +18,14 @@ from dynssm_ros.files import protecting
 from dynssm_ros.identification.result.diagnosis import Diagnosis
 
 CARS = {"recalibrated": "#d55e00", "extended": "#0072b2"}
-LEGEND = {"recalibrated": "best fit without a cause", "extended": "with the named causes"}
+LEGEND = {"recalibrated": "best fit without a cause", "extended": "extended by the diagnosis"}
 SECONDS = 16.0
 
 
 def main(bag: Path, picture: Path) -> Diagnosis:
     """Calibrates and diagnoses the log, draws the picture and returns the diagnosis."""
     laps = extract([bag], signals="av21", rate=25.0)
-    with protecting((), force=True):  # v_y errs more than if nothing changed, until its cause is named
+    with protecting((), force=True):  # v_y errs more than if nothing changed, until the late yaw rate is named
         car = calibrate(laps, "av21", holdout=0.25, integrator="rk4").vehicle
     found = diagnose(laps, car, horizon=0.6)
     figure = draw(found)
@@ -74,5 +74,5 @@ def draw(found: Diagnosis) -> Figure:
 
 if __name__ == "__main__":
     diagnosis = main(Path(sys.argv[1]), Path(sys.argv[2]))
-    for cause in diagnosis.causes:
-        print(cause.effect, cause.values, cause.std)
+    for cause in diagnosis.found:
+        print(cause.kind, cause.effect, cause.values, cause.std)
