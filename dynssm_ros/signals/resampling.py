@@ -171,8 +171,14 @@ def _with_interpolated(
         slow = (between > SLOW * period) & (np.abs(stream.stamps[after] - rows) > ROUNDING * period)
         if slow.mean() > _FEW:
             shares[name] = round(float(slow.mean()), 3)
-            rate = f"{1e9 / float(np.median(between[slow])):.3g}"
-            what = f"{100 * shares[name]:.0f} % of the rows lie between samples at {rate} Hz"
-            told.setdefault(f"{what}, so that errors on them come out too small (--rate {rate})", []).append(name)
+            usual, apart = (float(np.median(each)) / 1e9 for each in (np.diff(stream.stamps), between[slow]))
+            where, mended = f"between samples at {1 / apart:.3g} Hz", f"--rate {1 / apart:.3g}"
+            if usual <= SLOW * period / 1e9:  # the signal is fast enough, but has holes
+                where, mended = (
+                    f"in holes of {apart:.2g} s between samples",
+                    "a shorter max_gap of the map leaves them out",
+                )
+            what = f"{100 * shares[name]:.0f} % of the rows lie {where}, so that errors on them come out too small ({mended})"
+            told.setdefault(what, []).append(name)
     notes = tuple(f"{', '.join(names)}: {what}" for what, names in told.items())
     return info.model_copy(update={"interpolated": shares, "notes": (*info.notes, *notes)})

@@ -232,3 +232,11 @@ def test_rows_between_slower_samples_are_counted_and_the_rate_is_named(
     (note,) = info.notes
     assert f"of the rows lie between samples at {told} Hz" in note
     assert f"(--rate {told})" in note
+
+
+def test_holes_of_a_fast_signal_are_told_as_holes(make_bag: Any, drive: Any) -> None:
+    records = [r for r in drive(401) if not (r[0] == ODOMETRY and 0 < (r[2] - drive(1)[0][2]) % 10**9 < 2 * 10**8)]
+    (note,) = extract([make_bag(records)], DEFAULT, 50.0).info.notes
+    assert "% of the rows lie in holes of 0.21 s between samples" in note
+    assert "max_gap" in note
+    assert "--rate" not in note
