@@ -22,9 +22,6 @@ _SPAN_S = 0.4
 """Of steering and curvature that are compared (s)."""
 _GENTLE = 0.5
 """Share of the 99th percentile of the lateral acceleration, up to which tyres count as linear."""
-_CLEARLY = 0.5
-"""Of the standard deviation of ``L`` in gentle driving, below which all driving with tyres at their limit determines it. Of
-20 simulated drives that counts for 12, and the root mean square error there is 0.11 of the wheelbase, before 0.64."""
 UNDERSTEER = (-0.4, 4.0)
 """Understeer ``K v^2`` over wheelbase that cars have: below -1 they are unstable, above 4 they push straight on."""
 _ENOUGH_SPANS = 40
@@ -64,7 +61,8 @@ def understeer(steering: Vector, curvature: Vector, speed: Vector, *, block: Ind
     """``delta = offset + L k + K v^2 k`` from steering (as recorded), curvature (1/m) and speed (m/s), each ``(n,)``.
 
     ``block`` numbers neighbours. Tyres at their limit add a term of the third order in ``v^2 k``: of gentle driving without
-    it or all driving with it, ``K`` then at the root mean square of ``v^2 k``.
+    it and all driving with it, ``K`` then at the root mean square of ``v^2 k``, that which knows ``L`` better. Half of what
+    they are apart counts as a standard deviation beside its own.
     ``None`` where the rows determine neither.
     """
     lateral = curvature * speed**2
@@ -75,9 +73,13 @@ def understeer(steering: Vector, curvature: Vector, speed: Vector, *, block: Ind
     fit = fitted(linear[gentle], steering[gentle], block[gentle])
     bent = lateral**3 / max(float(np.mean(lateral**2)), 1e-300)
     full = fitted(np.concatenate([linear, bent[:, None]], axis=1), steering, block)
-    if full is None or (fit is not None and full.std[1] > _CLEARLY * fit.std[1]):
+    if full is None:
         return fit
-    return Fitted(np.append(full.values[:2], full.values[2] + full.values[3]), full.std[:3], full.share)
+    full = Fitted(np.append(full.values[:2], full.values[2] + full.values[3]), full.std[:3], full.share)
+    if fit is None:
+        return full
+    better = min(fit, full, key=lambda each: float(each.std[1]))
+    return Fitted(better.values, np.hypot(better.std, (full.values - fit.values) / 2.0), better.share)
 
 
 def turns_both_ways(drive: Drive) -> bool:

@@ -21,9 +21,11 @@ _THOUSANDS = r"^[+-]?\d{1,3}(?:\.\d{3})+(?:,\d*)?$"  # with a decimal comma
 _COMMAS = r"^[+-]?\d{1,3}(?:,\d{3})+(?:\.\d*)?$"  # between thousands, with a decimal point
 _SURELY_COMMAS = re.compile(r"^[+-]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:,\d{3}){2,})$")  # where 1,234 may be a decimal
 _SWITCHES = {"true": "1", "false": "0"}
+_TOLD = 40  # characters of a cell that are told, as long as a date with its zone
+_WHOLE_HOURS = 24  # a time zone below is written without minutes
 _LONG = 15  # digits, from which on a double is no longer exact
 _CLOCK = r"(?P<hour>\d{1,2}):(?P<minute>\d{1,2}):(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d{1,9}))?"
-_HALF, _ZONE = r"(?: ?(?P<half>[AaPp])[Mm])?", r" ?(?:Z|(?P<zone>[+-]\d{2}:?\d{2}))?"
+_HALF, _ZONE = r"(?: ?(?P<half>[AaPp])[Mm])?", r" ?(?:Z|UTC|GMT|(?P<zone>[+-]\d{2}(?::?\d{2})?))?"
 _DATES = {
     "date": rf"^(?P<year>\d{{4}})[-/.](?P<month>\d{{1,2}})[-/.](?P<day>\d{{1,2}})[T ]+{_CLOCK}{_ZONE}$",
     "date, day first": rf"^(?P<day>\d{{1,2}})[.](?P<month>\d{{1,2}})[.](?P<year>\d{{4}}),? +{_CLOCK}$",
@@ -39,6 +41,7 @@ _ALIASES = {
     "dps": "deg/s", "degps": "deg/s", "radps": "rad/s", "rad/sec": "rad/s", "percent": "%", "pct": "%", "prozent": "%",
     "meter": "m", "meters": "m", "metres": "m", "sec": "s", "second": "s", "seconds": "s", "msec": "ms",
     "milliseconds": "ms", "usec": "us", "µs": "us", "μs": "us", "nsec": "ns", "nanoseconds": "ns", "day": "days",
+    "minute": "min", "minutes": "min", "mins": "min", "hour": "h", "hours": "h", "hr": "h", "hrs": "h",
 }  # fmt: skip
 _BRACKETS = re.compile(r"^(?P<bare>.*?)\s*[\[(<{]\s*(?P<unit>[^\[\](){}<>]*?)\s*[\])>}]\s*$")
 _UNIT_LIKE = re.compile(r"^(?:[^\W\d]{1,4}|.*[/^²°%·*].*)$")
@@ -171,6 +174,7 @@ def _nanoseconds(text: Any, kind: str) -> Any:
     seconds = ((days * 24 + hour) * 60 + whole("minute")) * 60 + whole("second")
     if "zone" in fields:
         zone = np.asarray(pc.cast(pc.replace_substring_regex(_or_zero(fields["zone"]), "[+:]", ""), pa.int64()))
+        zone = np.where(np.abs(zone) < _WHOLE_HOURS, 100 * zone, zone)
         seconds -= np.sign(zone) * (np.abs(zone) // 100 * 60 + np.abs(zone) % 100) * 60
     return pa.array(seconds * 1_000_000_000 + fraction, mask=~valid)
 
@@ -189,7 +193,7 @@ def typed_column(array: Any, kind: str, bad: str = "") -> LogColumn:
     if not present.any():
         return LogColumn(kind, nothing, present, reason="no cell has a value")
     if pa.types.is_string(array.type) or pa.types.is_large_string(array.type):
-        first = str(array[int(np.argmax(present))])[:20]
+        first = str(array[int(np.argmax(present))])[:_TOLD]
         found = kind_of([str(one) for one in array.drop_null()[:50]], False)
         if found == "text":
             return LogColumn(kind, nothing, present, reason=f"text, '{first}' first")
@@ -229,5 +233,5 @@ def told_bad(text: Any, bad: Any, row: int = 0) -> str:
     where = np.flatnonzero(np.asarray(pc.fill_null(bad, False)))
     if not len(where):
         return ""
-    first = f"'{str(text[int(where[0])])[:20]}' in row {row + int(where[0]) + 1}"
+    first = f"'{str(text[int(where[0])])[:_TOLD]}' in row {row + int(where[0]) + 1}"
     return f"{len(where)} of its cells {'is' if len(where) == 1 else 'are'} no number, first {first}"

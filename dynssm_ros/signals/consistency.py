@@ -14,8 +14,14 @@ import numpy as np
 from dynssm_ros.signals.actuation import check_related, check_steering, check_throttle, steering_sign
 from dynssm_ros.signals.findings import Finding
 from dynssm_ros.signals.lever import check_lever
-from dynssm_ros.signals.liveness import check_liveness
-from dynssm_ros.signals.motion import check_direction, check_path_speed, check_side_slip, check_turning
+from dynssm_ros.signals.liveness import check_liveness, check_wild
+from dynssm_ros.signals.motion import (
+    check_direction,
+    check_path_speed,
+    check_side_slip,
+    check_turning,
+    turned_remedy,
+)
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 from dynssm_ros.signals.sensor_consistency import BESIDE, SENSED
 from dynssm_ros.signals.spans import Drive, Signal
@@ -30,6 +36,8 @@ OF_LOG = (*CLOCKS, *SENSED)
 """Findings that a log tells, and a recording of it no more."""
 _OF_VELOCITIES = ("pose_speed", "omega_", "v_x_", "v_y_", "twist_", "odometry_")
 """How findings of measured velocities begin."""
+_DEAD = ("_constant", "_frozen")
+"""How findings of signals end that do not live, throughout or for long."""
 _LEAST_S = 10.0
 """Seconds of a recording, below which nothing is said."""
 _MOST_ROWS, _STRETCHES = 30_000, 8
@@ -70,23 +78,27 @@ def _velocities_from(info: RecordingInfo) -> tuple[str, ...]:
 def _of_recording(recording: Recording, of_log: tuple[Finding, ...], wheelbase: float | None) -> tuple[Finding, ...]:
     """What contradicts within a recording, after what its log told."""
     drive = _on_one_clock(Drive.of(_parts(recording)), of_log)
-    if not len(drive) or drive.stands:
+    if not len(drive):
         return of_log
-    found = [*of_log, *check_liveness(drive)]
-    dead = {each.what for each in found}
-    more, drive = check_times(drive)
+    wild, drive = check_wild(drive)
+    found = [*of_log, *wild]
+    if drive.stands:
+        return tuple(found)
+    found += check_liveness(drive)
+    dead = {each.what.removesuffix(end) for each in found for end in _DEAD if each.what.endswith(end)}
+    more, drive = check_times(drive, dead=dead)
     found += more
-    position = None if dead & {"pose_constant", "theta_constant"} else drive.position
+    position = None if dead & {"pose", "theta"} else drive.position
     moves = position is not None and bool(np.ptp(np.abs(position)) > 0)
     alternative = None
     if moves:
-        more, drive, alternative = _poses(drive, "omega_constant" not in dead)
+        more, drive, alternative = _poses(drive, "omega" not in dead)
         found += more
     else:
         for check in (check_ranges, check_axis):
             more, drive = check(drive)
             found += more
-    if "omega_constant" not in dead and not any(each.what == "v_x_range" for each in found):
+    if not dead & {"steering", "omega"} and not any(each.what == "v_x_range" for each in found):
         more, drive = check_steering(drive, wheelbase)
         more = more or ([] if len(found) > len(of_log) else check_related(drive))
         if alternative is not None and not _is_scaled(check_steering(alternative(drive), wheelbase)[0]):
@@ -130,10 +142,14 @@ def _poses(drive: Drive, turns: bool) -> tuple[list[Finding], Drive, Callable[[D
     if turns:
         more, drive = check_turning(drive, steering_sign(drive, either_way=True)[0])
         found += more
-    more, drive = check_direction(drive, steering_sign(drive)[0])
-    found += more
-    more, drive = check_side_slip(drive)
-    return [*found, *more], drive, alternative
+    turned, drive = check_direction(drive, steering_sign(drive)[0])
+    slip, drive = check_side_slip(drive)
+    if {each.what for each in (*turned, *slip)} == {
+        "twist_turned",
+        "v_y_sign",
+    }:  # v_x and v_y are each other's, one fault
+        turned, slip = [turned[0].model_copy(update={"remedy": turned_remedy(turned[0].size, mirrored=True)})], []
+    return [*found, *turned, *slip], drive, alternative
 
 
 def _is_scaled(found: list[Finding]) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 
 from dynssm_ros.arrays import Mask, Vector
 from dynssm_ros.signals.findings import Finding, number
-from dynssm_ros.signals.motion import WITHOUT_V_Y
+from dynssm_ros.signals.motion import WITHOUT_V_Y, Checked
 from dynssm_ros.signals.spans import SIGMAS, Drive, varies
 
 _TURNS_RAD_S, _BOTH_WAYS = 0.02, 0.3
@@ -18,11 +18,15 @@ _CLIPPED_SHARE, _CLIPPED_S = 0.01, 0.2
 _FROZEN_S = 1.0
 """Time at a stretch for which no odometry of a driving car repeats itself; slow ones are interpolated between samples."""
 _DEAD_S = 5.0
-"""Likewise of a steering while the car turns to both sides; those of circles and long straights stay as long."""
+"""Likewise of a single signal while the car turns to both sides, or its speed swings: on circles and straights it may."""
 _STEP = 0.3
 """Step of a signal in units of its standard deviation, from which on it is coarse."""
 _SPIKE, _SPIKE_SHARE = 15.0, 0.05
 """How far off its neighbours a spike is: in standard deviations of that, and as a share of the signal's usual range."""
+_IMPOSSIBLE = {"v_x": 150.0, "v_y": 150.0, "omega": 50.0, "steering": 1.6, "throttle": 1.5}
+"""Larger values no car has, in SI units; what other units are taken for is larger throughout."""
+_WILD, _WILD_SHARE = 5.0, 0.02
+"""Range of the usual values, beyond which an impossible one is wild; share of rows that is left out of that range."""
 _SPIKES, _SPIKES_SHARE = 5, 0.01
 """How many make a finding (a healthy motion capture log has four), and how many a row there are at most: more are noise."""
 
@@ -36,6 +40,35 @@ def check_liveness(drive: Drive) -> list[Finding]:
         if name not in dead and varies(values):
             found += _coarse(name, values) or _clipped(name, values, drive) or _spikes(name, values, drive)
     return found
+
+
+def check_wild(drive: Drive) -> Checked:
+    """A few values that no car has among others, as logs write where a value is missing (9999, 655.35).
+
+    Each stands for thousands of rows in whatever is averaged. The drive comes back with what is between its neighbours.
+    """
+    found = []
+    mended: dict[str, Vector] = {}
+    signals = {"v_x": drive.velocity.real, "v_y": drive.velocity.imag, "omega": drive.omega}
+    signals |= {"steering": drive.steering, "throttle": drive.throttle}
+    for name, values in signals.items():
+        low, high = np.percentile(values, [100.0 * _WILD_SHARE, 100.0 * (1.0 - _WILD_SHARE)])
+        beyond = np.maximum(low - values, values - high) > _WILD * (high - low)
+        wild = beyond & (np.abs(values) > _IMPOSSIBLE[name])
+        if not wild.any():
+            continue
+        rows, share, most = np.arange(len(values)), float(wild.mean()), float(values[np.argmax(np.abs(values))])
+        mended[name] = np.interp(rows, rows[~wild], values[~wild])
+        found.append(
+            Finding(
+                what=f"{name}_spikes", told=f"{name} is up to {number(most)} in {100 * share:.2g} % of the rows, "
+                f"{number(float(low))} to {number(float(high))} else", size=share, low=share, high=share,
+                expected="values that a car has",
+                remedy="find what the log writes where a value is missing, and leave those cells empty",
+            )
+        )  # fmt: skip
+    velocity = mended.pop("v_x", signals["v_x"]) + 1j * mended.pop("v_y", signals["v_y"])
+    return found, drive.changed(velocity=velocity, **mended) if found else drive
 
 
 def _constants(drive: Drive) -> list[Finding]:
@@ -105,22 +138,34 @@ def _frozen(drive: Drive) -> list[Finding]:
 
 
 def _dies(drive: Drive) -> list[Finding]:
-    """A steering that stays as it is for long while the car turns to both sides."""
-    first, last = _longest_at(_repeats(drive, drive.steering))
-    if (last - first) * drive.T_s < _DEAD_S:
-        return []
-    turn = _turn_rate(drive)[first:last]
-    low, high = np.percentile(turn, [5.0, 95.0])
-    if float(np.sqrt(np.mean(turn**2))) < _TURNS_RAD_S or min(-low, high) < _BOTH_WAYS * max(-low, high):
-        return []
-    seconds = (last - first) * drive.T_s
-    stays = f"steering stays at {number(float(drive.steering[first]))} for {seconds:.3g} s"
-    return [
-        Finding(
-            what="steering_frozen", told=f"{stays} although the car turns to both sides", size=seconds, low=seconds,
-            high=seconds, unit="s", expected="a signal that lives", remedy="find why it stops, or leave those rows out",
-        )
-    ]  # fmt: skip
+    """A signal that stays as it is for long: a steering while the car turns to both sides, a yaw rate while the heading
+    turns faster and slower, a throttle while the speed swings.
+    """
+    inputs = {"steering": drive.steering, "throttle": drive.throttle}
+    has_heading = drive.theta is not None and np.ptp(drive.theta) > 0
+    found = []
+    for name, values in (inputs | {"omega": drive.omega} if has_heading else inputs).items():
+        first, last = _longest_at(_repeats(drive, values))
+        seconds = (last - first) * drive.T_s
+        if seconds < _DEAD_S:
+            continue
+        turn = _turn_rate(drive)[first:last]
+        low, high = np.percentile(turn, [5.0, 95.0])
+        turns, most = float(np.sqrt(np.mean(turn**2))) >= _TURNS_RAD_S, _BOTH_WAYS * max(-low, high)
+        does = {
+            "steering": "turns to both sides" if turns and min(-low, high) >= most else "",
+            "omega": "turns faster and slower" if turns and high - low >= most else "",
+            "throttle": "gains and loses speed" if _swings(drive, slice(first, last)) >= _SWINGS else "",
+        }[name]
+        if does:
+            stays = f"{name} stays at {number(float(values[first]))} for {seconds:.3g} s"
+            found.append(
+                Finding(
+                    what=f"{name}_frozen", told=f"{stays} although the car {does}", size=seconds, low=seconds, high=seconds,
+                    unit="s", expected="a signal that lives", remedy="find why it stops, or leave those rows out",
+                )
+            )  # fmt: skip
+    return found
 
 
 def _repeats(drive: Drive, *signals: Vector) -> Mask:
@@ -140,9 +185,9 @@ def _turn_rate(drive: Drive) -> Vector:
     return drive.omega if np.ptp(drive.omega) > 0 else drive.steering
 
 
-def _swings(drive: Drive) -> int:
-    """How often the speed goes up or down by a share of its largest."""
-    speed = drive.speed[:: max(1, round(0.2 / drive.T_s))]
+def _swings(drive: Drive, rows: slice = slice(None)) -> int:
+    """How often the speed goes up or down by a share of its largest, in some ``rows``."""
+    speed = drive.speed[rows][:: max(1, round(0.2 / drive.T_s))]
     least, count, way = _SWING * float(np.percentile(drive.speed, 99)), 0, 0
     low = high = float(speed[0]) if len(speed) else 0.0
     for value in speed.tolist():

@@ -66,7 +66,10 @@ UNITS = {
     "m/s^2": 1.0, "g": 9.80665, "rpm": math.pi / 30,
 }  # fmt: skip
 """Units of fields and columns, and what one is in SI units."""
-TIME_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1, "days": 86_400_000_000_000}
+TIME_UNITS = {
+    "s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1, "min": 60_000_000_000, "h": 3_600_000_000_000,
+    "days": 86_400_000_000_000,
+}  # fmt: skip
 """Units of time columns, and what one is in ns."""
 
 Accessor = Callable[[Any], float | None]
@@ -83,7 +86,7 @@ class TimeColumn(StrictModel):
     """The time column of a table."""
 
     column: str = Field(min_length=1, description="its heading")
-    unit: Literal["s", "ms", "us", "ns", "days"] | None = Field(
+    unit: Literal["s", "ms", "us", "ns", "min", "h", "days"] | None = Field(
         default=None, description="of its numbers; null for dates and times of day, and where its steps tell"
     )
     nanoseconds: str | None = Field(default=None, description="column of the ns beside whole seconds, as in ROS stamps")

@@ -85,7 +85,7 @@ class Drive:
         slow, rows = self._velocities_of_seconds, max(1, round(1.0 / self.T_s))
         if not len(slow):
             return False
-        fast = self.velocity[: len(slow) * rows]
+        fast = self._limited_velocity[: len(slow) * rows]
         return not float(np.mean(np.abs(slow) ** 2)) > _STANDS * float(np.mean(np.abs(fast) ** 2))
 
     @property
@@ -98,7 +98,14 @@ class Drive:
     def _velocities_of_seconds(self) -> Complex:
         """Mean velocity of each second, one after the other (m/s)."""
         rows = max(1, round(1.0 / self.T_s))
-        found: Complex = self.velocity[: len(self) // rows * rows].reshape(-1, rows).mean(axis=1)
+        found: Complex = self._limited_velocity[: len(self) // rows * rows].reshape(-1, rows).mean(axis=1)
+        return found
+
+    @cached_property
+    def _limited_velocity(self) -> Complex:
+        """The velocity, no faster than the speed that 2 % of the rows exceed: single wild values weigh nothing (m/s)."""
+        limit = float(np.percentile(self.speed, 98)) if len(self) else 0.0
+        found: Complex = self.velocity * (limit / np.maximum(self.speed, max(limit, 1e-300)))
         return found
 
     def changed(self, **signals: Any) -> Drive:

@@ -15,6 +15,8 @@ from dynssm_ros.signals.contents import TopicContent, spread
 from dynssm_ros.signals.signal_map import UNITS
 from dynssm_ros.signals.spans import blocks
 
+STRANGE = (TOO_FAST := "too fast for m/s: find its unit", TOO_LARGE := "large for rad: deg?")
+"""Notes of velocities whose unit must be wrong."""
 _RADIANS = 1.6  # larger values are no road-wheel angle in rad
 _AGREES = 0.5  # correlation with the curvature, from which on a scale is told
 _DEGREES = (0.67, 1.5)  # share of what degrees need, within which a steering is taken for them
@@ -48,6 +50,8 @@ class _Driven(NamedTuple):
 def scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], wheelbase: float | None) -> Suggestion:
     """The steering in rad at the road wheel, 0 straight ahead, as far as the curvature that it drives tells."""
     suggestion = replace(suggestion, scale=1.0)
+    if strange := [f"{name} ({signals[name].note})" for name in ("v_x", "omega") if _is_strange(signals.get(name))]:
+        return replace(suggestion, note=f"its scale is not known before {', '.join(strange)} is right")
     seen, values = _driven(suggestion, signals), suggestion.values
     if seen is None:
         large = float(np.nanmax(np.abs(values), initial=0.0)) > _RADIANS
@@ -57,6 +61,11 @@ def scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], whee
     if wheelbase is None:
         return replace(suggestion, note=f"{told}: the scale is about that times the wheelbase")
     return _straightened(_scaled(suggestion, told, *(each * wheelbase for each in seen.slope)), suggestion, seen)
+
+
+def _is_strange(suggestion: Suggestion | None) -> bool:
+    """Whether a velocity is none in its unit, so that no curvature follows from it."""
+    return suggestion is not None and suggestion.note in STRANGE
 
 
 def _scaled(suggestion: Suggestion, told: str, scale: float, low: float, high: float) -> Suggestion:

@@ -15,7 +15,7 @@ from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.sensor_topics import COLUMNS, of_use, sensors
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals, set_point_of, yaw_of
 from dynssm_ros.signals.stamps import clock_notes, frames_note, log_time_note
-from dynssm_ros.signals.steering_scale import Suggestion, scaled_steering
+from dynssm_ros.signals.steering_scale import TOO_FAST, TOO_LARGE, Suggestion, scaled_steering
 
 _MOTION = {
     "v_y": (r"(^|_)(v|vel|velocity|linear)_?(y|lat\w*)$|^v?_?lat\w*_(vel\w*|speed)$|^vlat|quergeschw",),
@@ -96,6 +96,12 @@ def suggest(
     return signals
 
 
+def _fastest(values: Vector) -> float:
+    """Speed that 2 % of the rows exceed, which may be no speeds at all; 0 of none."""
+    known = np.abs(values[np.isfinite(values)])
+    return float(np.percentile(known, 98)) if len(known) else 0.0
+
+
 def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Suggestion]:
     """Velocities and poses among the columns of a table, by their headings."""
     found: dict[str, Suggestion] = {}
@@ -142,13 +148,13 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
         notes.append("no column tells where the car is or how fast; find v_x, v_y and omega, or x, y and theta")
     if "v_y" in found and spread(found["v_y"].values) == 0:
         notes.append(f"{found['v_y'].field}: v_y is constant, so that nothing is known of how the car slides{_LEAVE}")
-    if "v_x" in found and float(np.nanmax(np.abs(found["v_x"].values), initial=0.0)) > _FASTEST:
-        found["v_x"] = replace(found["v_x"], note="too fast for m/s: find its unit")
+    if "v_x" in found and _fastest(found["v_x"].values) > _FASTEST:
+        found["v_x"] = replace(found["v_x"], note=TOO_FAST)
     if "theta" in found and found["theta"].unit == "1" and _wraps_at_360(found["theta"].values):
         found["theta"] = replace(found["theta"], unit="deg", note="taken for degrees: it wraps by 360")
     for name in ("omega", "theta"):
         if name in found and found[name].unit == "1" and spread(found[name].values) > _MOST[name]:
-            found[name] = replace(found[name], note="large for rad: deg?")
+            found[name] = replace(found[name], note=TOO_LARGE)
     return found
 
 

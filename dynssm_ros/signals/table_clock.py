@@ -24,10 +24,10 @@ _SECONDS, _NANOSECONDS = (
     re.compile(r"sec(s|onds)?$", re.IGNORECASE),
     ("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds"),
 )
-_RISES = 0.5  # share of rows that are later than the one before, in a time column at all
+_RISES = 0.3  # share of rows that are later than the one before, in a time column at all: each may be there three times
 _STEPS = {"days": 0.0, "s": 5e-5, "ms": 0.3, "us": 300.0, "ns": 3e5}  # least step of a log, 0.3 ms, in each unit
 _EPOCH_S, _SLOWEST_S = (9e8, 4.1e9), 10.0  # seconds since 1970 of the years 1998 to 2099; between rows
-_DAY = 86_400_000_000_000
+_DAY, _HOUR = 86_400_000_000_000, 3_600_000_000_000
 _DATENUM, _EXCEL = 719_529, 25_569  # 1970-01-01 in days of MATLAB and of Excel
 _PANDAS = "__index_level_"  # how pandas begins the name of an index that has none
 _MIDNIGHT = 240_000  # in hhmmss
@@ -167,14 +167,16 @@ def _clock(table: LogTable, name: str, column: LogColumn, unit: str | None) -> C
     known = np.isfinite(column.values)
     if column.is_time:
         stamps = np.zeros(len(known), np.int64) if column.exact is None else column.exact.copy()
-        if "time of day" in column.type:
-            stamps[known] = _past_midnight(stamps[known])
+        for kind, turn in (("time of day", _DAY), ("minutes", _HOUR)):
+            if kind in column.type:
+                stamps[known] = _turned_over(stamps[known], turn)
         return Clock(name, None, stamps, known, f"time from column '{name}' ({column.type})")
     if unit is None and (digits := _of_digits(column.values[known])) is not None:
         stamps = np.zeros(len(known), np.int64)
         stamps[known] = digits
         return Clock(name, None, stamps, known, f"time of day, hhmmss, from column '{name}'")
-    headed = known_unit(table.headings[name].unit)
+    written = table.headings[name].unit
+    headed = known_unit(written)
     by_heading = headed if headed in TIME_UNITS and _may_be(column.values[known], TIME_UNITS[headed]) else None
     chosen = unit or by_heading or _unit_by_steps(column.values[known])
     values = np.where(known, column.values, 0.0)
@@ -192,14 +194,15 @@ def _clock(table: LogTable, name: str, column: LogColumn, unit: str | None) -> C
         stamps = whole.astype(np.int64) * factor + np.rint((np.where(known, values, 0.0) - whole) * factor).astype(
             np.int64
         )
-    guessed = "" if unit or by_heading else ", by its steps"
+    strange = f", as nobody knows its unit '{written}'" if written and headed not in TIME_UNITS else ""
+    guessed = "" if unit or by_heading else f", by its steps{strange}"
     return Clock(name, chosen, stamps, known, f"time in {chosen} from column '{name}'{guessed}")
 
 
-def _past_midnight(stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Times of day that go on after midnight (ns)."""
-    back = np.diff(stamps, prepend=stamps[:1]) < -_DAY // 2
-    return stamps + np.cumsum(back) * _DAY
+def _turned_over(stamps: npt.NDArray[np.int64], turn: int) -> npt.NDArray[np.int64]:
+    """Times of day that go on after midnight, or minutes after the full hour (ns)."""
+    back = np.diff(stamps, prepend=stamps[:1]) < -turn // 2
+    return stamps + np.cumsum(back) * turn
 
 
 def _of_digits(values: npt.NDArray[np.float64]) -> npt.NDArray[np.int64] | None:
@@ -213,7 +216,8 @@ def _of_digits(values: npt.NDArray[np.float64]) -> npt.NDArray[np.int64] | None:
     next_minute = (np.diff(seconds) == -59) & (np.diff(60 * hours + minutes) % 1440 == 1)
     if (minutes > 59).any() or (seconds > 59).any() or not next_minute.any():
         return None
-    return _past_midnight(np.rint((3600 * hours + 60 * minutes + seconds + values - whole) * 1e9).astype(np.int64))
+    stamps = np.rint((3600 * hours + 60 * minutes + seconds + values - whole) * 1e9).astype(np.int64)
+    return _turned_over(stamps, _DAY)
 
 
 def _may_be(values: npt.NDArray[np.float64], factor: int) -> bool:

@@ -69,7 +69,9 @@ DATES = {
     "2026-11-29 23:59:59.{:03d}": 1_795_996_799, "2026-11-29T23:59:59.{:03d}Z": 1_795_996_799,
     "2026-11-30T01:59:59.{:03d}+02:00": 1_795_996_799, "29.11.2026 23:59:59,{:03d}": 1_795_996_799,
     "11/29/2026 11:59:59.{:03d} PM": 1_795_996_799, "29/11/2026 23:59:59.{:03d}": 1_795_996_799, "23:59:59.{:03d}": 86_399,
-    "23:59:59:{:03d}": 86_399, "59:59.{:03d}": 3_599, "11:59:59.{:03d} pm": 86_399,
+    "2026-11-30T01:59:59.{:03d}+02": 1_795_996_799, "2026-11-29 19:29:59.{:03d} -0430": 1_795_996_799,
+    "2026-11-29 23:59:59.{:03d} UTC": 1_795_996_799, "23:59:59:{:03d}": 86_399, "59:59.{:03d}": 3_599,
+    "11:59:59.{:03d} pm": 86_399,
 }  # fmt: skip
 
 
@@ -79,6 +81,38 @@ def test_dates_and_times_of_day_are_read(tmp_path: Path, columns: Any, form: str
     found = extract([tmp_path / "log.csv"], table_map(), 40.0)
     assert found.time[0] == DATES[form] * 1_000_000_000
     assert len(found) == 24
+
+
+@pytest.mark.parametrize(
+    ("heading", "seconds"), [("Time [min]", 60.0), ("elapsed (h)", 3600.0), ("Time [minutes]", 60.0)]
+)
+def test_minutes_and_hours_are_units_of_time(tmp_path: Path, columns: Any, heading: str, seconds: float) -> None:
+    del columns["time"]
+    write_csv(tmp_path / "log.csv", columns | {heading: np.arange(N) / 100.0 / seconds})
+    for time in (None, inspect(tmp_path / "log.csv").time):
+        assert extract([tmp_path / "log.csv"], table_map(time=time), 40.0).duration == pytest.approx(0.6, abs=1e-3)
+
+
+def test_a_unit_of_time_that_is_unknown_is_told(tmp_path: Path, columns: Any) -> None:
+    del columns["time"]
+    write_csv(tmp_path / "log.csv", columns | {"Time [tick]": np.arange(N) / 100.0})
+    (note,) = [each for each in inspect(tmp_path / "log.csv").notes if "time in s" in each]
+    assert "nobody knows its unit 'tick'" in note
+
+
+def test_minutes_go_on_past_the_hour(tmp_path: Path, columns: Any) -> None:
+    stamps = [f"{'59:59' if k < 30 else '00:00'}.{(700 + 10 * k) % 1000:03d}" for k in range(N)]
+    write_csv(tmp_path / "log.csv", columns | {"time": stamps})
+    found = extract([tmp_path / "log.csv"], table_map(), 40.0)
+    assert (len(found), set(found.segment)) == (24, {0})
+
+
+@pytest.mark.parametrize("times", [2, 3])
+def test_rows_that_are_there_several_times_can_be_dropped(tmp_path: Path, columns: Any, times: int) -> None:
+    write_csv(tmp_path / "log.csv", {name: np.repeat(each, times) for name, each in columns.items()})
+    with pytest.raises(BagError, match=r"with a repeated stamp \(\d+ such\).*--drop-bad"):
+        extract([tmp_path / "log.csv"], table_map(), 40.0)
+    assert len(extract([tmp_path / "log.csv"], table_map(), 40.0, drop_bad=True)) == 24
 
 
 def test_seconds_and_nanoseconds_may_stand_in_two_columns(tmp_path: Path, columns: Any) -> None:

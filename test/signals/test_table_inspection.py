@@ -206,6 +206,8 @@ def test_a_fast_speed_and_large_angles_without_units_are_asked_about(tmp_path: P
     assert any(note.startswith(told) for note in inspect(still).notes)
     assert "# too fast for m/s: find its unit\n  v_x: {column: speed}" in text
     assert "# large for rad: deg?\n  omega: {column: yaw_rate}" in text
+    assert "# its scale is not known before v_x (too fast" in text
+    assert "steering_feedback: {column: steering}" in text
 
 
 def test_what_no_signal_can_be_disturbs_no_suggestion(tmp_path: Path) -> None:
