@@ -87,11 +87,11 @@ class Table:
 
     @property
     def cells(self) -> list[list[Cell]]:
-        """The rows as shown, the best value of each column marked."""
+        """The rows as shown, marked what looks like the best value of its column."""
         best = [self._best(k) for k in range(len(self.columns))]
         return [
             [
-                Cell(text(value), _spread(value), best[k] is not None and _number(value) == best[k])
+                Cell(text(value), _spread(value), text(value) == best[k])
                 for k, value in enumerate(row)
             ]
             for row in self.rows
@@ -142,13 +142,14 @@ class Table:
         """Whether column ``k`` holds numbers, which are aligned at the right."""
         return any(not isinstance(row[k], str) for row in self.rows)
 
-    def _best(self, k: int) -> float | None:
+    def _best(self, k: int) -> str | None:
+        """The best value of a column as shown; ``None`` where nothing is best."""
         goal = self.columns[k].best
         numbers = [_number(row[k]) for row in self.rows]
         known = [number for number in numbers if number is not None and math.isfinite(number)]
         if goal is None or len(known) < 2:
             return None
-        return min(known) if goal == "min" else max(known)
+        return text(min(known) if goal == "min" else max(known))
 
 
 def text(value: Value) -> str:

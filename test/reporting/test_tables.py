@@ -64,6 +64,12 @@ def test_a_spread_over_seeds_has_the_decimals_of_its_mean(value, shown):
     assert cell.text == shown
 
 
+def test_values_that_look_alike_share_the_mark():
+    columns = (Column("model"), Column("v_x", best="min"))
+    table = Table(columns, [["a", 1.0 / 3.0], ["b", SeedSpread(1.0 / 3.0 + 1e-15, 1e-16, 3)], ["c", 0.334]])
+    assert marked(table) == {(0, 1), (1, 1)}
+
+
 def test_spreads_are_compared_by_their_means():
     columns = (Column("model"), Column("v_x", best="min"))
     table = Table(columns, [["a", SeedSpread(0.02, 0.5, 2)], ["b", SeedSpread(0.03, 0.0, 1)], ["c", 0.025]])
