@@ -29,6 +29,7 @@ from dynssm_ros.signals.signal_map import STATE_SIGNALS
 _MARKERS = "osD^vPX*<>"
 _STYLES = ("--", ":")
 _CLOSE = 0.3  # s between level lines of which the lower one has its words below
+_FAR = 20.0  # times the least error that the largest is, from which on they are drawn along a logarithm
 
 
 @styled
@@ -69,6 +70,8 @@ def against_the_full_model(full: Sequence[SeedSpread], ablations: Mapping[str, S
         axis.axvline(1.0, color=NO_MODEL, linestyle="--")
         ratios, spreads = zip(*((each[k].mean / mean, each[k].std / mean) for each in ablations.values()), strict=True)
         axis.errorbar(ratios, np.arange(len(ablations)), xerr=spreads, fmt="o", color=PALETTE[0], capsize=2.5)
+        if max(ratios) > _FAR * min(ratios):
+            axis.set_xscale("log")
     axes[1].set_xlabel("one-step RMSE over that of the full model (band and whiskers: standard deviation over seeds)")
     return figure
 

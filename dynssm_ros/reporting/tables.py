@@ -90,10 +90,7 @@ class Table:
         """The rows as shown, marked what looks like the best value of its column."""
         best = [self._best(k) for k in range(len(self.columns))]
         return [
-            [
-                Cell(text(value), _spread(value), text(value) == best[k])
-                for k, value in enumerate(row)
-            ]
+            [Cell(text(value), _spread(value), text(value) == best[k]) for k, value in enumerate(row)]
             for row in self.rows
         ]
 
