@@ -45,9 +45,10 @@ def check_liveness(drive: Drive) -> list[Finding]:
 def check_wild(drive: Drive) -> Checked:
     """A few values that no car has among others, as logs write where a value is missing (9999, 655.35).
 
-    Each stands for thousands of rows in whatever is averaged. The drive comes back with what is between its neighbours.
+    Each stands for thousands of rows in whatever is averaged. The drive comes back with what is between its neighbours, also
+    where they are too few to be told.
     """
-    found = []
+    found: list[Finding] = []
     mended: dict[str, Vector] = {}
     signals = {"v_x": drive.velocity.real, "v_y": drive.velocity.imag, "omega": drive.omega}
     signals |= {"steering": drive.steering, "throttle": drive.throttle}
@@ -59,6 +60,8 @@ def check_wild(drive: Drive) -> Checked:
             continue
         rows, share, most = np.arange(len(values)), float(wild.mean()), float(values[np.argmax(np.abs(values))])
         mended[name] = np.interp(rows, rows[~wild], values[~wild])
+        if wild.sum() < _SPIKES:
+            continue
         found.append(
             Finding(
                 what=f"{name}_spikes", told=f"{name} is up to {number(most)} in {100 * share:.2g} % of the rows, "
@@ -68,7 +71,7 @@ def check_wild(drive: Drive) -> Checked:
             )
         )  # fmt: skip
     velocity = mended.pop("v_x", signals["v_x"]) + 1j * mended.pop("v_y", signals["v_y"])
-    return found, drive.changed(velocity=velocity, **mended) if found else drive
+    return found, drive.changed(velocity=velocity, **mended)
 
 
 def _constants(drive: Drive) -> list[Finding]:

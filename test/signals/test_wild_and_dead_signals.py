@@ -62,6 +62,13 @@ def test_values_that_stand_for_nothing_are_named_and_change_no_other_check(
     assert not Drive.of(changed(**{column: values})).stands
 
 
+def test_a_single_wild_value_is_left_to_the_ranges_of_the_car() -> None:
+    """With which ``calibrate`` names its row; it changes no other check either."""
+    values = driven()["delta_fb"].copy()
+    values[500] = 655.35
+    assert found_in(changed(delta_fb=values)) == {}
+
+
 def test_a_steering_that_jumps_to_its_lock_is_no_wild_value() -> None:
     """As of a radio, that rests nearly always."""
     steering = np.where(np.arange(len(driven())) % 100 == 0, 0.4, 0.0)
