@@ -188,8 +188,8 @@ def _scale(drive: Drive, fit: Fitted | None, wheelbase: float | None) -> Finding
         return None
     if largest > _LARGE_RAD:
         return Finding(
-            what="steering_range", told=f"delta_fb is up to {number(largest)}", size=math.pi / 180, low=0.0,
-            high=_LARGE_RAD / largest, unit="1", expected=f"below {_LARGE_RAD:g} rad at the road wheel",
+            what="steering_range", told=f"delta_fb is up to {number(largest)}", size=largest, low=largest,
+            high=largest, unit="1", expected=f"below {_LARGE_RAD:g} rad at the road wheel",
             remedy="steering_feedback: unit: deg, or scale: 1 over the ratio of the steering",
         )  # fmt: skip
     return None

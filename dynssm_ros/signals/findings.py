@@ -23,8 +23,10 @@ class Finding(StrictModel):
 
     @property
     def words(self) -> str:
-        """One line: what, size, what was expected, and the remedy."""
-        return f"{self.told} ({number(self.low)} to {number(self.high)}); expected {self.expected}: {self.remedy}"
+        """One line: what, size with its interval if it has one, what was expected, and the remedy."""
+        low, high = number(self.low), number(self.high)
+        between = f" ({low} to {high})" if low != high else ""
+        return f"{self.told}{between}; expected {self.expected}: {self.remedy}"
 
     @property
     def line(self) -> str:

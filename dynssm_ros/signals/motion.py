@@ -325,11 +325,12 @@ def check_direction(drive: Drive, steering_sign: int = 0) -> Checked:
     if scatter < max(_SCATTER, scatter_in_map / _CLEARER):
         return _turned(mean, error, spans, drive, steering_sign)
     if scatter_in_map < ALIGNED and scatter_in_map < scatter / _CLEARER:
-        low, high = _mean_interval(np.cos(np.angle(error)), spans)
+        cosine = np.cos(np.angle(error))
+        size, (low, high) = float(cosine.mean()), _mean_interval(cosine, spans)
         found = Finding(
             what="twist_in_map_frame",
-            told=f"v_x, v_y point along the path without theta; with it the cosine of their angle is {number(abs(mean))}",
-            size=abs(mean), low=low, high=high, expected="1",
+            told=f"v_x, v_y point along the path without theta; with it the cosine of their angle is {number(size)}",
+            size=size, low=low, high=high, expected="1",
             remedy="v_x, v_y in the frame of the car: turn them by -theta in the odometry, or `velocities:` from the poses",
         )  # fmt: skip
         return [found], drive.changed(velocity=drive.velocity * np.exp(-1j * drive.theta))

@@ -199,7 +199,8 @@ def _scale(name: str, fit: Fitted, quantity: str, unit: str) -> Finding:
     remedy = (
         f"{signal}: unit: {unit}" if unit else f"{name}: scale: {number(1 / ratio)}, or find what {_CAUSES[name]} lacks"
     )
+    size = UNITS[unit] if unit else 1 / ratio
     return Finding(
-        what=what, told=f"{name} over {_CAUSES[name]} is {number(ratio)}", size=UNITS[unit] if unit else 1 / ratio,
+        what=what, told=f"{name} over {_CAUSES[name]} is {number(ratio)}: a factor of {number(size)} is missing", size=size,
         low=1 / high if not unit else UNITS[unit], high=1 / low if not unit else UNITS[unit], expected="1", remedy=remedy,
     )  # fmt: skip
