@@ -18,6 +18,7 @@ from dynssm_ros.signals.resampling import Stamps, Stream
 from dynssm_ros.signals.signal_map import JUMP_NS, SignalMap
 
 _LARGEST = 1e12  # in any unit; coordinates of maps in mm are 1e10
+_A_PART = 0.1  # of the samples lie ahead of those that follow, from which on they are a drive of their own
 _SEVERAL = 0.1  # of the steps go back, from which on several publishers are likelier than a fault
 _APART = 0.2  # s by which clocks may be apart; what is measured late is rarely later than that
 _DRIFT = 0.1  # s by which clocks may come apart over a log
@@ -65,6 +66,9 @@ def clean(stream: Stream, where: str, drop_bad: bool, jump: int = JUMP_NS) -> tu
     }
     back = int((np.diff(stamps[finite]) < 0).sum())
     several = "; do several nodes publish the topic?" if back > max(_SEVERAL * len(stamps), 2) else ""
+    if not several and back and (finite & ~believed).sum() > _A_PART * len(stamps):
+        anew = int(np.argmin(np.diff(stamps))) + 1
+        several = f"; the clock starts anew at sample {anew}: two drives in one log, which are better cut apart there"
     dropped: list[str] = []
     for kind, bad in kinds.items():
         if not bad.any():

@@ -115,6 +115,14 @@ def test_rows_that_are_there_several_times_can_be_dropped(tmp_path: Path, column
     assert len(extract([tmp_path / "log.csv"], table_map(), 40.0, drop_bad=True)) == 24
 
 
+def test_two_drives_in_one_table_are_told(tmp_path: Path, columns: Any) -> None:
+    write_csv(
+        tmp_path / "log.csv", columns | {"time": np.r_[0:25, 0 : N - 25] / 100.0 + np.r_[25 * [9.0], (N - 25) * [0.0]]}
+    )
+    with pytest.raises(BagError, match=r"25 such; the clock starts anew at sample 25"):
+        extract([tmp_path / "log.csv"], table_map(), 40.0)
+
+
 def test_seconds_and_nanoseconds_may_stand_in_two_columns(tmp_path: Path, columns: Any) -> None:
     stamps = columns.pop("time")
     write_csv(tmp_path / "log.csv", columns | {"stamp.sec": stamps // 10**9, "stamp.nanosec": stamps % 10**9})
