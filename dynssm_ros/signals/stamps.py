@@ -18,6 +18,7 @@ from dynssm_ros.signals.resampling import Stamps, Stream
 from dynssm_ros.signals.signal_map import JUMP_NS, SignalMap
 
 _LARGEST = 1e12  # in any unit; coordinates of maps in mm are 1e10
+_AHEAD = "with a stamp far ahead of those that follow"
 _A_PART = 0.1  # of the samples lie ahead of those that follow, from which on they are a drive of their own
 _SEVERAL = 0.1  # of the steps go back, from which on several publishers are likelier than a fault
 _APART = 0.2  # s by which clocks may be apart; what is measured late is rarely later than that
@@ -62,28 +63,34 @@ def clean(stream: Stream, where: str, drop_bad: bool, jump: int = JUMP_NS) -> tu
         "larger than any signal": np.isfinite(values) & ~finite,
         "with a repeated stamp": finite & (stamps == newest),
         "with a stamp that runs backwards": finite & (stamps < newest),
-        "with a stamp far ahead of those that follow": finite & ~believed & (stamps > newest),
+        _AHEAD: finite & ~believed & (stamps > newest),
     }
     back = int((np.diff(stamps[finite]) < 0).sum())
     several = "; do several nodes publish the topic?" if back > max(_SEVERAL * len(stamps), 2) else ""
-    if not several and back and (finite & ~believed).sum() > _A_PART * len(stamps):
-        anew = int(np.argmin(np.diff(stamps))) + 1
-        several = f"; the clock starts anew at sample {anew}: two drives in one log, which are better cut apart there"
     dropped: list[str] = []
     for kind, bad in kinds.items():
         if not bad.any():
             continue
         k = int(np.flatnonzero(bad)[0])
         if not drop_bad:
+            hint = several or (_anew(stamps, bad) if kind == _AHEAD else "")
             raise BagError(
                 f"{where}: sample {k} at {stamps[k] / 1e9:.3f} s, value {values[k]:g}, is {kind} ({bad.sum()} such"
-                f"{several}); expected finite values at increasing stamps (--drop-bad leaves such samples out)"
+                f"{hint}); expected finite values at increasing stamps (--drop-bad leaves such samples out)"
             )
         dropped.append(f"{bad.sum()} samples {kind}")
     if not dropped:
         return stream, ""
     keep = ~np.logical_or.reduce(list(kinds.values()))
     return Stream(stamps[keep], values[keep]), ", ".join(dropped) + several
+
+
+def _anew(stamps: Stamps, ahead: npt.NDArray[np.bool_]) -> str:
+    """Where the clock starts anew, if more than a few samples are ``ahead`` of those that follow; empty if not."""
+    if ahead.sum() <= _A_PART * len(stamps):
+        return ""
+    first = int(np.argmin(np.diff(stamps))) + 1
+    return f"; the clock starts anew at sample {first}: two drives in one log, which are better cut apart there"
 
 
 def _in_line(stamps: Stamps, jump: int) -> npt.NDArray[np.bool_]:
