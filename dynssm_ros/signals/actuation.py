@@ -25,7 +25,7 @@ _GENTLE = 0.5
 UNDERSTEER = (-0.4, 4.0)
 """Understeer ``K v^2`` over wheelbase that cars have: below -1 they are unstable, above 4 they push straight on."""
 _ENOUGH_SPANS = 40
-_LARGE_RAD = 1.6
+LARGE_RAD = 1.6
 """Larger values are no road-wheel angle in rad."""
 SCALES = (0.5, 2.0)
 """Steering scales that are left alone: hidden gains of a steering, a wrong wheelbase and tyres at their limit are within."""
@@ -186,10 +186,11 @@ def _scale(drive: Drive, fit: Fitted | None, wheelbase: float | None) -> Finding
                 remedy=_scale_remedy(scale) + ("" if drive.position is not None else _or_unit(scale)),
             )  # fmt: skip
         return None
-    if largest > _LARGE_RAD:
+    if largest > LARGE_RAD:
         return Finding(
-            what="steering_range", told=f"delta_fb is up to {number(largest)}", size=largest, low=largest,
-            high=largest, unit="1", expected=f"below {_LARGE_RAD:g} rad at the road wheel",
+            what="steering_range", told=f"delta_fb is up to {number(largest)}, which asks for a factor of "
+            f"{number(LARGE_RAD / largest)} or less", size=math.pi / 180, low=0.0,
+            high=LARGE_RAD / largest, unit="1", expected=f"below {LARGE_RAD:g} rad at the road wheel",
             remedy="steering_feedback: unit: deg, or scale: 1 over the ratio of the steering",
         )  # fmt: skip
     return None

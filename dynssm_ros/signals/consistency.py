@@ -20,6 +20,7 @@ from dynssm_ros.signals.motion import (
     check_path_speed,
     check_side_slip,
     check_turning,
+    is_quarter,
     turned_remedy,
 )
 from dynssm_ros.signals.recording import Recording, RecordingInfo
@@ -86,7 +87,9 @@ def _of_recording(recording: Recording, of_log: tuple[Finding, ...], wheelbase: 
         return tuple(found)
     found += check_liveness(drive)
     dead = {each.what.removesuffix(end) for each in found for end in _DEAD if each.what.endswith(end)}
-    more, drive = check_times(drive, dead=dead)
+    rests = np.zeros(len(drive))  # as which an input that does not live tells the other checks nothing
+    drive = drive.changed(**{name: rests for name in ("steering", "throttle") if name in dead})
+    more, drive = check_times(drive)
     found += more
     position = None if dead & {"pose", "theta"} else drive.position
     moves = position is not None and bool(np.ptp(np.abs(position)) > 0)
@@ -98,7 +101,7 @@ def _of_recording(recording: Recording, of_log: tuple[Finding, ...], wheelbase: 
         for check in (check_ranges, check_axis):
             more, drive = check(drive)
             found += more
-    if not dead & {"steering", "omega"} and not any(each.what == "v_x_range" for each in found):
+    if "omega" not in dead and not any(each.what == "v_x_range" for each in found):
         more, drive = check_steering(drive, wheelbase)
         more = more or ([] if len(found) > len(of_log) else check_related(drive))
         if alternative is not None and not _is_scaled(check_steering(alternative(drive), wheelbase)[0]):
@@ -144,10 +147,8 @@ def _poses(drive: Drive, turns: bool) -> tuple[list[Finding], Drive, Callable[[D
         found += more
     turned, drive = check_direction(drive, steering_sign(drive)[0])
     slip, drive = check_side_slip(drive)
-    if {each.what for each in (*turned, *slip)} == {
-        "twist_turned",
-        "v_y_sign",
-    }:  # v_x and v_y are each other's, one fault
+    whats = [each.what for each in (*turned, *slip)]
+    if whats == ["twist_turned", "v_y_sign"] and is_quarter(turned[0].size):  # v_x and v_y are each other's, one fault
         turned, slip = [turned[0].model_copy(update={"remedy": turned_remedy(turned[0].size, mirrored=True)})], []
     return [*found, *turned, *slip], drive, alternative
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dynssm_ros.arrays import Mask, Vector
+from dynssm_ros.signals.actuation import LARGE_RAD
 from dynssm_ros.signals.findings import Finding, number
 from dynssm_ros.signals.motion import WITHOUT_V_Y, Checked
 from dynssm_ros.signals.spans import SIGMAS, Drive, varies
@@ -23,7 +24,7 @@ _STEP = 0.3
 """Step of a signal in units of its standard deviation, from which on it is coarse."""
 _SPIKE, _SPIKE_SHARE = 15.0, 0.05
 """How far off its neighbours a spike is: in standard deviations of that, and as a share of the signal's usual range."""
-_IMPOSSIBLE = {"v_x": 150.0, "v_y": 150.0, "omega": 50.0, "steering": 1.6, "throttle": 1.5}
+_IMPOSSIBLE = {"v_x": 150.0, "v_y": 150.0, "omega": 50.0, "steering": LARGE_RAD, "throttle": 1.5}
 """Larger values no car has, in SI units; what other units are taken for is larger throughout."""
 _WILD, _WILD_SHARE = 5.0, 0.02
 """Range of the usual values, beyond which an impossible one is wild; share of rows that is left out of that range."""

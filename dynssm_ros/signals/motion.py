@@ -368,10 +368,14 @@ def _turned(mean: complex, error: Vector, spans: Spans, drive: Drive, steering_s
     return [found], drive.changed(theta=drive.theta + angle)  # type: ignore[operator]
 
 
+def is_quarter(angle: float) -> bool:
+    """Whether an angle (rad) is a quarter of a turn, to either side."""
+    return abs(abs(angle) - math.pi / 2) < _ANGLE_TOLERANCE_RAD
+
+
 def turned_remedy(angle: float, *, mirrored: bool = False) -> str:
     """What to write where a twist is to be turned by an angle (rad), and its v_y is ``mirrored`` then."""
-    quarter = abs(abs(angle) - math.pi / 2) < _ANGLE_TOLERANCE_RAD
-    if not quarter:
+    if not is_quarter(angle):
         return f"turn v_x, v_y by {number(angle)} rad in the odometry, or `velocities:` from the poses"
     x = "scale: -1 of the field of v_y" if angle > 0 else "the field of v_y"
     y = "that of v_x" if (angle > 0) != mirrored else "scale: -1 of that of v_x"

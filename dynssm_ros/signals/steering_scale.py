@@ -10,14 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.signals.actuation import OFFSET_RAD, SCALES, UNDERSTEER, believable, understeer
+from dynssm_ros.signals.actuation import LARGE_RAD, OFFSET_RAD, SCALES, UNDERSTEER, believable, understeer
 from dynssm_ros.signals.contents import TopicContent, spread
 from dynssm_ros.signals.signal_map import UNITS
 from dynssm_ros.signals.spans import blocks
 
 STRANGE = (TOO_FAST := "too fast for m/s: find its unit", TOO_LARGE := "large for rad: deg?")
 """Notes of velocities whose unit must be wrong."""
-_RADIANS = 1.6  # larger values are no road-wheel angle in rad
 _AGREES = 0.5  # correlation with the curvature, from which on a scale is told
 _DEGREES = (0.67, 1.5)  # share of what degrees need, within which a steering is taken for them
 _DRIVING = 0.3  # of the largest speed, from which on curvature is compared
@@ -54,7 +53,7 @@ def scaled_steering(suggestion: Suggestion, signals: dict[str, Suggestion], whee
         return replace(suggestion, note=f"its scale is not known before {', '.join(strange)} is right")
     seen, values = _driven(suggestion, signals), suggestion.values
     if seen is None:
-        large = float(np.nanmax(np.abs(values), initial=0.0)) > _RADIANS
+        large = float(np.nanmax(np.abs(values), initial=0.0)) > LARGE_RAD
         note = "too large for rad at the road wheel: find its scale" if large else suggestion.note
         return replace(suggestion, note=note)
     told = f"the curvature follows it with {seen.slope[0]:.4g} 1/m per unit, understeer taken off"

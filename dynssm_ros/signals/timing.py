@@ -4,7 +4,7 @@ velocities.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -114,18 +114,14 @@ def _smoothed(values: Vector, half: int) -> Vector:
     return found
 
 
-def check_times(drive: Drive, *, dead: Collection[str] = ()) -> Checked:
+def check_times(drive: Drive) -> Checked:
     """Steering against yaw rate, throttle against acceleration, poses against velocities: the lag of each.
 
-    An input that is ``dead`` tells nothing. The drive comes back with lags that are well known taken off, also those that
-    cars have.
+    The drive comes back with lags that are well known taken off, also those that cars have.
     """
-    lags: dict[Signal, Lag | None] = {
-        "steering": None if "steering" in dead else steering_lag(drive),
-        "throttle": None if "throttle" in dead else throttle_lag(drive),
-    }
+    lags: dict[Signal, Lag | None] = {"steering": steering_lag(drive), "throttle": throttle_lag(drive)}
     if (far := _far_lag(drive, lags["steering"])) is not None:
-        lags = {"steering": far, "throttle": None if "throttle" in dead else throttle_lag(drive, _FARTHEST_S)}
+        lags = {"steering": far, "throttle": throttle_lag(drive, _FARTHEST_S)}
     off = [name for name, lag in lags.items() if is_off(lag, _EXPECTED_S)]
     pose = pose_lag(drive) if drive.position is not None else None
     found: list[Finding] = []

@@ -110,6 +110,12 @@ def test_exchanged_velocities_are_one_fault_with_the_sign_of_each(v_x: str, v_y:
     assert found["twist_turned"].remedy == remedy
 
 
+def test_a_turned_sensor_whose_v_y_points_right_has_both_faults() -> None:
+    """Where no exchange of fields mends them."""
+    turned = np.exp(-0.8j) * (driven()["v_x"] - 1j * driven()["v_y"])
+    assert list(found_in(changed(v_x=turned.real, v_y=turned.imag))) == ["twist_turned", "v_y_sign"]
+
+
 @pytest.mark.parametrize("rows", [-1, 0, 1, 2])
 def test_the_scale_of_the_steering_does_not_hang_on_a_row_of_lag(rows: int) -> None:
     fit = steering_fit(Drive.of(driven()).earlier(rows, "steering"))
