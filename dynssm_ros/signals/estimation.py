@@ -160,8 +160,8 @@ def require_degrees(streams: Mapping[str, Stream], where: str) -> None:
         largest = float(np.abs(streams[name].values).max(initial=0.0)) if name in streams else 0.0
         if largest > most:
             raise RecordingError(
-                f"{where}: {name} is up to {largest:.7g}; expected at most {most:g} degrees (of NMEA's degrees and minutes, "
-                "4807.038, first make 48 + 7.038 / 60)"
+                f"{where}: {name} is up to {largest:.7g}; expected at most {most:g} degrees (is it the other one? "
+                "Of NMEA's degrees and minutes, 4807.038, first make 48 + 7.038 / 60)"
             )
 
 

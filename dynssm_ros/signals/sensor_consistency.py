@@ -16,15 +16,23 @@ import numpy as np
 from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.estimation import positions_of
 from dynssm_ros.signals.findings import Finding, number
-from dynssm_ros.signals.motion import check_course, check_path_speed, in_unit
-from dynssm_ros.signals.resampling import Stream
+from dynssm_ros.signals.motion import (
+    SPEED_TOLERANCE,
+    Checked,
+    check_course,
+    check_path_speed,
+    course_spans,
+    in_unit,
+    ratio_of,
+)
+from dynssm_ros.signals.resampling import Stamps, Stream
 from dynssm_ros.signals.signal_map import COMPARED, UNITS, SignalMap
-from dynssm_ros.signals.spans import Drive, Fitted, Spans, fitted, varies
+from dynssm_ros.signals.spans import SIGMAS, Drive, Fitted, Spans, fitted, varies
 
 _AXES = "acceleration_axes"
 BESIDE = ("a_x_scale", "a_y_scale", "a_x_sign", "a_y_sign", _AXES, "wheel_speed_scale", "wheel_speed_sign")
 """Findings of what no velocity comes from where all of them are measured."""
-SENSED = ("speed_scale", "gyro_scale", "gyro_sign", *BESIDE)
+SENSED = ("fix_axes", "speed_scale", "gyro_scale", "gyro_sign", *BESIDE)
 """Findings of this module."""
 _LEAST_S, _SPAN_S, _FEWEST_SPANS = 10.0, 0.4, 40
 _MOST_ROWS = 30_000
@@ -50,11 +58,12 @@ def sensor_findings(streams: Mapping[str, Stream], signal_map: SignalMap) -> tup
     estimates = "v_y" not in streams
     if not (estimates or sensed):
         return ()
-    drive, compared = _drive(streams, signal_map, sensed)
+    drive, compared, stamps = _drive(streams, signal_map, sensed)
     if len(drive) * drive.T_s < _LEAST_S or not drive.speed.max() > 0:
         return ()
     found: list[Finding] = []
     if estimates and drive.position is not None and np.ptp(np.abs(drive.position)) > 0:
+        found, drive = _check_fixes(drive, streams, stamps)
         more, drive = check_path_speed(drive)
         found += [_renamed(each, "speed_scale", "v_x") for each in more]
         more, drive = check_course(drive)
@@ -66,6 +75,44 @@ def sensor_findings(streams: Mapping[str, Stream], signal_map: SignalMap) -> tup
     return (*found, *_wheels(spans, compared.get("wheel_speed")))
 
 
+def _check_fixes(drive: Drive, streams: Mapping[str, Stream], at: Stamps) -> Checked:
+    """Whether longitudes are called latitudes: a degree of them has other metres, so the path would be stretched.
+
+    Near the equator and the meridian of Greenwich it is only mirrored.
+    """
+    if not {"latitude", "longitude"} <= set(streams) or np.abs(streams["longitude"].values).max() >= 90.0:
+        return [], drive
+    stretch = math.prod(math.cos(math.radians(float(streams[one].values[0]))) for one in ("latitude", "longitude"))
+    if stretch > 1.0 - SPEED_TOLERANCE:
+        return [], drive
+    exchanged = {**streams, "latitude": streams["longitude"], "longitude": streams["latitude"]}
+    other = drive.changed(position=_position(exchanged, at))
+    misfits = [_stretch(one) for one in (drive, other)]
+    if misfits[0] is None or misfits[1] is None:
+        return [], drive
+    worse = misfits[0] - misfits[1]
+    low, high = (float(worse.mean() + side * SIGMAS * worse.std(ddof=1) / math.sqrt(len(worse))) for side in (-1, 1))
+    if not low > 0:
+        return [], drive
+    told = f"with longitude as latitude the path is nearer to v_x, by {number(float(worse.mean()))} of its mean square"
+    found = Finding(
+        what="fix_axes", told=told, size=float(worse.mean()), low=low, high=high, expected="0 or less",
+        remedy="latitude: the field of longitude, longitude: that of latitude",
+    )  # fmt: skip
+    return [found], other
+
+
+def _stretch(drive: Drive) -> Vector | None:
+    """How far the path is from what ``v_x`` makes of it, mean square of each block of a drive as a share of the way's."""
+    spans = course_spans(drive)
+    way, moved = spans.integral(drive.speed), np.abs(spans.change(drive.position))
+    fit = ratio_of(moved, way, spans)
+    if fit is None:
+        return None
+    error = np.square(moved / float(fit.values[0]) - way) / np.mean(np.square(way))
+    return np.array([error[spans.block == number].mean() for number in np.unique(spans.block)])
+
+
 def _renamed(finding: Finding, what: str, signal: str) -> Finding:
     """A finding of odometry, of a sensor."""
     remedy = finding.remedy.replace("v_x, v_y", signal).partition(", or x, y")[0]
@@ -75,8 +122,8 @@ def _renamed(finding: Finding, what: str, signal: str) -> Finding:
 
 def _drive(
     streams: Mapping[str, Stream], signal_map: SignalMap, sensed: Sequence[str]
-) -> tuple[Drive, dict[str, Vector]]:
-    """Velocities, gyro and positions at the stamps of the gyro, and what else is ``sensed`` there."""
+) -> tuple[Drive, dict[str, Vector], Stamps]:
+    """Velocities, gyro and positions at stamps of the gyro, what else is ``sensed`` there, and the stamps."""
     stamps = streams["omega"].stamps
     step = max(1, -(-len(stamps) // _MOST_ROWS))
     first, last = (edge(one.stamps[0 if edge is max else -1] for one in streams.values()) for edge in (max, min))
@@ -86,20 +133,25 @@ def _drive(
     def sampled(stream: Stream) -> Vector:
         return np.interp(at, stream.stamps, stream.values)
 
-    position = None
-    fixes = positions_of({name: (one.stamps, one.values) for name, one in streams.items()})
-    if fixes is not None and len(fixes[0]):
-        fixed, x, y = fixes
-        position = np.asarray(np.interp(at, fixed, x) + 1j * np.interp(at, fixed, y), np.complex128)
     apart = np.diff(at, prepend=at[:1])
     segment = np.cumsum(apart > signal_map.max_gap_ns + step * np.median(apart)).astype(np.int32)
     zeros = np.zeros(len(at))
     across = sampled(streams["v_y"]) if "v_y" in streams else zeros
     drive = Drive(
         float(np.median(np.diff(at))) / 1e9 if len(at) > 1 else 1.0, segment, sampled(streams["v_x"]) + 1j * across,
-        sampled(streams["omega"]), zeros, zeros, position,
+        sampled(streams["omega"]), zeros, zeros,
+        _position(streams, at),
     )  # fmt: skip
-    return drive, {name: sampled(streams[name]) for name in sensed}
+    return drive, {name: sampled(streams[name]) for name in sensed}, at
+
+
+def _position(streams: Mapping[str, Stream], at: Stamps) -> Vector | None:
+    """Where the car is at some stamps, ``x + iy`` (m) ``(N,)``; ``None`` where nothing tells."""
+    fixes = positions_of({name: (one.stamps, one.values) for name, one in streams.items()})
+    if fixes is None or not len(fixes[0]):
+        return None
+    fixed, x, y = fixes
+    return np.asarray(np.interp(at, fixed, x) + 1j * np.interp(at, fixed, y), np.complex128)
 
 
 def _accelerations(spans: Spans, measured: Mapping[str, Vector], *, by_path: bool) -> list[Finding]:

@@ -79,6 +79,34 @@ def test_accelerometers_that_are_turned_by_a_quarter_are_named(way: float) -> No
     assert found.remedy == "map what is a_x as a_y{}, and what is a_y as a_x{}".format(*signs)
 
 
+def fixes_at(latitude: float, longitude: float, **factors: float) -> dict[str, Stream]:
+    """Sensors of a drive at a place on earth, with fixes of 0.5 m."""
+    drive, rng, at = driven(), np.random.default_rng(3), slice(None, None, 4)
+    x, y = ((drive[name] + 0.5 * rng.standard_normal(len(drive)))[at] for name in ("x", "y"))
+    east = longitude + x / (111_320 * np.cos(np.radians(latitude)))
+    streams = {"latitude": latitude + y / 111_200, "longitude": east}
+    return sensors(False, **factors) | {name: Stream(drive.time[at], one) for name, one in streams.items()}
+
+
+@pytest.mark.parametrize("place", [(48.0, 11.0), (39.6, -86.3), (52.1, -1.0), (45.0, 44.0)])
+@pytest.mark.parametrize(
+    ("factors", "others"), [({}, []), ({"v_x": 3.6}, ["speed_scale"]), ({"omega": -1.0}, ["gyro_sign"])]
+)
+def test_latitudes_that_are_longitudes_are_told_and_nothing_else(
+    place: tuple[float, float], factors: dict[str, float], others: list[str]
+) -> None:
+    right = fixes_at(*place, **factors)
+    assert [each.what for each in sensor_findings(right, DEFAULT)] == others
+    wrong = {**right, "latitude": right["longitude"], "longitude": right["latitude"]}
+    assert [each.what for each in sensor_findings(wrong, DEFAULT)] == ["fix_axes", *others]
+
+
+def test_near_the_equator_and_greenwich_nothing_tells_latitudes_from_longitudes() -> None:
+    right = fixes_at(5.0, -2.0)
+    wrong = {**right, "latitude": right["longitude"], "longitude": right["latitude"]}
+    assert {"fix_axes"}.isdisjoint(each.what for each in sensor_findings(wrong, DEFAULT))
+
+
 def beside(drive: Recording, **factors: float) -> dict[str, Stream]:
     """Velocities and poses that are measured, with accelerometers and wheels that slip beside them."""
     rng, T_s = np.random.default_rng(1), drive.T_s
