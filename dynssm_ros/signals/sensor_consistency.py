@@ -27,7 +27,7 @@ from dynssm_ros.signals.motion import (
 )
 from dynssm_ros.signals.resampling import Stamps, Stream
 from dynssm_ros.signals.signal_map import COMPARED, UNITS, SignalMap
-from dynssm_ros.signals.spans import SIGMAS, Drive, Fitted, Spans, fitted, varies
+from dynssm_ros.signals.spans import SIGMAS, Complex, Drive, Fitted, Spans, fitted, varies
 
 _AXES = "acceleration_axes"
 BESIDE = ("a_x_scale", "a_y_scale", "a_x_sign", "a_y_sign", _AXES, "wheel_speed_scale", "wheel_speed_sign")
@@ -145,7 +145,7 @@ def _drive(
     return drive, {name: sampled(streams[name]) for name in sensed}, at
 
 
-def _position(streams: Mapping[str, Stream], at: Stamps) -> Vector | None:
+def _position(streams: Mapping[str, Stream], at: Stamps) -> Complex | None:
     """Where the car is at some stamps, ``x + iy`` (m) ``(N,)``; ``None`` where nothing tells."""
     fixes = positions_of({name: (one.stamps, one.values) for name, one in streams.items()})
     if fixes is None or not len(fixes[0]):

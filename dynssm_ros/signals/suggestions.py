@@ -11,6 +11,7 @@ from dynssm_ros.arrays import Vector
 from dynssm_ros.signals.columns import heading
 from dynssm_ros.signals.contents import ODOMETRY, POSES, TWISTS, TopicContent, pose_fields, spread, twist_fields
 from dynssm_ros.signals.decoding import LOG_TIME
+from dynssm_ros.signals.heading_units import FITTING, QUANTITY_OF, is_unknown
 from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.sensor_topics import COLUMNS, of_use, sensors
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals, set_point_of, yaw_of
@@ -39,12 +40,6 @@ _NOT_MOTION = re.compile(
     r"wheel|whl|(^|_)(rad|wind|soll|eng)_|longitude|cmd|command|target|desired|setpoint|engine|motor|std|cov|sigma|acc|rpm|_ref|steer|lenk|error",
     re.IGNORECASE,
 )
-_QUANTITIES = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "x": "m", "y": "m", "theta": "rad"}
-_FITTING = {
-    "m/s": ("m/s", "km/h", "mph", "kt", "ft/s"), "rad/s": ("rad/s", "deg/s"), "m": ("m", "cm", "mm", "km", "ft"),
-    "rad": ("rad", "deg"), "1": ("1", "%"),
-    "m/s^2": ("m/s^2", "g"),
-}  # fmt: skip
 _WORDS = {
     "steering": re.compile(r"steer|strg|delta|servo|lenk", re.IGNORECASE),
     "throttle": re.compile(
@@ -118,13 +113,13 @@ def _motion(columns: dict[str, TopicContent], notes: list[str]) -> dict[str, Sug
         ]
         if fitting:
             best = max(fitting, key=lambda name: (spread(columns[name].values[name]) > 0, -fitting.index(name)))
-            found[signal] = _with_unit(Suggestion(columns[best], best), _QUANTITIES[signal])
+            found[signal] = _with_unit(Suggestion(columns[best], best), QUANTITY_OF[signal])
             others = [name for name in fitting if name != best and not re.search(patterns[0], names[best])]
             if others:
                 found[signal] = replace(found[signal], note=f"or {', '.join(dict.fromkeys(others))}")
     if "v_x" not in found:
         taken = {one.field for one in found.values()}
-        by_unit = [name for name in names if columns[name].unit in _FITTING["m/s"] and name not in taken]
+        by_unit = [name for name in names if columns[name].unit in FITTING["m/s"] and name not in taken]
         if by_unit:
             best = max(by_unit, key=lambda name: spread(columns[name].values[name]))
             found["v_x"] = replace(
@@ -174,7 +169,7 @@ def _sensor_columns(columns: dict[str, TopicContent], found: dict[str, Suggestio
             if one.values and re.search(pattern, _plain(heading(name).bare)) and spread(one.values[name]) > 0
         ]
         if fitting and signal not in found:
-            quantity = {"v_x": "m/s", "a_x": "m/s^2", "a_y": "m/s^2"}.get(signal)
+            quantity = QUANTITY_OF.get(signal)
             sensed[signal] = _with_unit(fitting[0], quantity) if quantity else fitting[0]
     return of_use(sensed, found)
 
@@ -201,13 +196,15 @@ def _plain(name: str) -> str:
 
 def _may_be(column: TopicContent, signal: str) -> bool:
     """Whether the unit of a column, if it has one, is one of that signal."""
-    return column.unit not in UNITS or column.unit in _FITTING[_QUANTITIES[signal]]
+    return column.unit not in UNITS or column.unit in FITTING[QUANTITY_OF[signal]]
 
 
 def _with_unit(suggestion: Suggestion, quantity: str) -> Suggestion:
     """The source with the unit of its column, if that is one of the ``quantity``, a unit of the SI."""
     unit = suggestion.topic.unit
-    return replace(suggestion, unit=unit) if unit in _FITTING[quantity] and unit != quantity else suggestion
+    if is_unknown(unit):
+        return replace(suggestion, note=f"in {unit} by its heading: scale it to {quantity}")
+    return replace(suggestion, unit=unit) if unit in FITTING[quantity] and unit != quantity else suggestion
 
 
 def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Suggestion]:
