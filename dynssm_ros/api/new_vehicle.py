@@ -13,6 +13,8 @@ from dynssm_ros.vehicle.draft import TYRES, MeasuredCar, Tyre, as_commented_file
 from dynssm_ros.vehicle.single_track import SetPoint
 
 NEEDED = ("mass", "front_mass", "wheelbase")
+_LEAST_SHARE = 0.1
+"""Of the mass on an axle."""
 
 
 class NewVehicleSettings(VerbSettings):
@@ -83,8 +85,15 @@ def new_vehicle(name: str, *, settings: NewVehicleSettings) -> VehicleDraft:
     if s.mass is None or s.front_mass is None or s.wheelbase is None:
         lacking = next(each for each in NEEDED if getattr(s, each) is None)
         raise SettingError(f"{lacking} is missing; expected what a scale or a ruler tells", lacking)
-    if not s.front_mass < s.mass:
-        raise SettingError(f"front_mass {s.front_mass:g}: expected less than the mass of {s.mass:g} kg", "front_mass")
+    if not _LEAST_SHARE * s.mass <= s.front_mass <= (1 - _LEAST_SHARE) * s.mass:
+        share = next(
+            (each for each in (s.front_mass, s.front_mass / 100) if _LEAST_SHARE <= each <= 1 - _LEAST_SHARE), None
+        )
+        hint = f"; {100 * share:g} % of it are {share * s.mass:g} kg" if share else ""
+        raise SettingError(
+            f"front_mass {s.front_mass:g}: expected {_LEAST_SHARE * s.mass:g} to {(1 - _LEAST_SHARE) * s.mass:g} kg, of the "
+            f"{s.mass:g} kg of the car{hint}", "front_mass",
+        )  # fmt: skip
     like = vehicle_of(s.like)
     T_s = None if s.rate is None else 1 / s.rate
     measured = MeasuredCar(s.mass, s.front_mass, s.wheelbase, s.height, s.acceleration, s.steering, T_s)

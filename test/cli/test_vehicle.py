@@ -48,7 +48,12 @@ def test_a_file_that_somebody_may_have_edited_is_replaced_by_force_alone(dynssm:
     ("words", "said"),
     [
         (("--mass", 3.2, "--front-mass", 1.7), "--wheelbase is missing; expected what a scale or a ruler tells"),
-        ((*MEASURED, "--front-mass", 4), "--front-mass 4: expected less than the mass of 3.2 kg"),
+        ((*MEASURED, "--front-mass", 4), "--front-mass 4: expected 0.32 to 2.88 kg, of the 3.2 kg of the car"),
+        (
+            (*MEASURED, "--front-mass", 55),
+            "--front-mass 55: expected 0.32 to 2.88 kg, of the 3.2 kg of the car; 55 % of it are 1.76 kg",
+        ),
+        ((*MEASURED, "--front-mass", 0.3), "of the 3.2 kg of the car; 30 % of it are 0.96 kg"),
         ((*MEASURED, "--like", "bicycle"), "'bicycle' is neither a file nor a shipped name"),
         ((*MEASURED, "--tyre", "wood"), "--tyre"),
         (("--mass", 3200, "--front-mass", 1700, "--wheelbase", 0.32), "constants.m: 3200: in g?"),
