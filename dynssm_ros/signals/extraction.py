@@ -17,7 +17,6 @@ from dynssm_ros.signals.consistency import checked
 from dynssm_ros.signals.decoding import LOG_TIME, decoders, frames_told, header_stamp_ns, stamped_by, to_si
 from dynssm_ros.signals.estimation import MEASURED, estimated, noise_notes, require_degrees
 from dynssm_ros.signals.findings import Finding
-from dynssm_ros.signals.heading_units import unit_notes
 from dynssm_ros.signals.logs import open_log
 from dynssm_ros.signals.recording import V_Y_DEVIATION, Recording, RecordingInfo, concatenate
 from dynssm_ros.signals.resampling import SLOW, Stamps, Stream, resample, without_repeats
@@ -44,6 +43,7 @@ from dynssm_ros.signals.stamps import (
     log_time_note,
     publishers_note,
 )
+from dynssm_ros.signals.stated_units import unit_notes
 from dynssm_ros.signals.table_clock import clock_of
 from dynssm_ros.signals.tables import LogTable
 from dynssm_ros.signals.velocities import velocities_along
@@ -262,10 +262,9 @@ def read_streams(
     compared = _compared(log, signal_map)
     if isinstance(log, LogTable):
         found = _table_streams(log, signal_map, compared, drop_bad)
-        told = unit_notes(log, signal_map.active_signals() | compared)
     else:
         found, stamped, told, findings = _bag_streams(log, signal_map, compared, progress)
-    notes = [*log.notes, *told]
+    notes = [*log.notes, *told, *unit_notes(log, signal_map.active_signals() | compared)]
     streams: dict[str, Stream] = {}
     for name, source in (signal_map.active_signals() | compared).items():
         place = f"column '{source.column}'" if source.column else f"topic {source.recorded}"

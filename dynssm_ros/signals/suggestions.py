@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from dynssm_ros.arrays import Vector
-from dynssm_ros.signals.columns import heading
+from dynssm_ros.signals.columns import heading, known_unit
 from dynssm_ros.signals.contents import ODOMETRY, POSES, TWISTS, TopicContent, pose_fields, spread, twist_fields
 from dynssm_ros.signals.decoding import LOG_TIME
-from dynssm_ros.signals.heading_units import FITTING, QUANTITY_OF, is_unknown
 from dynssm_ros.signals.rest_value import rest_value
 from dynssm_ros.signals.sensor_topics import COLUMNS, of_use, sensors
 from dynssm_ros.signals.signal_map import STATE_SIGNALS, UNITS, command_signals, set_point_of, yaw_of
 from dynssm_ros.signals.stamps import clock_notes, frames_note, log_time_note
+from dynssm_ros.signals.stated_units import FITTING, QUANTITY_OF, is_unknown, unit_of_field
 from dynssm_ros.signals.steering_scale import TOO_FAST, TOO_LARGE, Suggestion, scaled_steering
 
 _MOTION = {
@@ -169,8 +169,7 @@ def _sensor_columns(columns: dict[str, TopicContent], found: dict[str, Suggestio
             if one.values and re.search(pattern, _plain(heading(name).bare)) and spread(one.values[name]) > 0
         ]
         if fitting and signal not in found:
-            quantity = QUANTITY_OF.get(signal)
-            sensed[signal] = _with_unit(fitting[0], quantity) if quantity else fitting[0]
+            sensed[signal] = _with_unit(fitting[0], QUANTITY_OF.get(signal))
     return of_use(sensed, found)
 
 
@@ -199,12 +198,16 @@ def _may_be(column: TopicContent, signal: str) -> bool:
     return column.unit not in UNITS or column.unit in FITTING[QUANTITY_OF[signal]]
 
 
-def _with_unit(suggestion: Suggestion, quantity: str) -> Suggestion:
-    """The source with the unit of its column, if that is one of the ``quantity``, a unit of the SI."""
-    unit = suggestion.topic.unit
+def _with_unit(suggestion: Suggestion, quantity: str | None) -> Suggestion:
+    """The source with the unit that its name states, if that is one of the ``quantity``, a unit of the SI."""
+    topic = suggestion.topic
+    written = topic.unit or unit_of_field(topic.name, suggestion.field)
+    unit = known_unit(written) or written
+    if quantity is None or unit == quantity:
+        return suggestion
     if is_unknown(unit):
-        return replace(suggestion, note=f"in {unit} by its heading: scale it to {quantity}")
-    return replace(suggestion, unit=unit) if unit in FITTING[quantity] and unit != quantity else suggestion
+        return replace(suggestion, note=f"in {unit} by its name: scale it to {quantity}")
+    return replace(suggestion, unit=unit) if unit in FITTING[quantity] else suggestion
 
 
 def _odometry(topics: dict[str, TopicContent], notes: list[str]) -> dict[str, Suggestion]:
@@ -278,7 +281,7 @@ def _without_velocities(topics: dict[str, TopicContent], notes: list[str]) -> di
         f"nothing measures v_y; it is estimated from {', '.join(found)} (estimation: give rear_axle, m from the "
         f"centre of gravity){lack}"
     )
-    return {signal: Suggestion(*place) for signal, place in found.items()}
+    return {signal: _with_unit(Suggestion(*place), QUANTITY_OF.get(signal)) for signal, place in found.items()}
 
 
 def _fields(topic: TopicContent, fields: dict[str, str]) -> dict[str, Suggestion]:
