@@ -87,7 +87,8 @@ def _check_fixes(drive: Drive, streams: Mapping[str, Stream], at: Stamps) -> Che
         return [], drive
     exchanged = {**streams, "latitude": streams["longitude"], "longitude": streams["latitude"]}
     other = drive.changed(position=_position(exchanged, at))
-    misfits = [_stretch(one) for one in (drive, other)]
+    spans = course_spans(drive)
+    misfits = [_misfit(one.position, spans) for one in (drive, other)]
     if misfits[0] is None or misfits[1] is None:
         return [], drive
     worse = misfits[0] - misfits[1]
@@ -102,10 +103,9 @@ def _check_fixes(drive: Drive, streams: Mapping[str, Stream], at: Stamps) -> Che
     return [found], other
 
 
-def _stretch(drive: Drive) -> Vector | None:
-    """How far the path is from what ``v_x`` makes of it, mean square of each block of a drive as a share of the way's."""
-    spans = course_spans(drive)
-    way, moved = spans.integral(drive.speed), np.abs(spans.change(drive.position))
+def _misfit(position: Complex | None, spans: Spans) -> Vector | None:
+    """How far a path is from what ``v_x`` makes of it, mean square of each block of a drive as a share of the way's."""
+    way, moved = spans.integral(spans.drive.speed), np.abs(spans.change(position))
     fit = ratio_of(moved, way, spans)
     if fit is None:
         return None
