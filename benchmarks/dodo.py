@@ -48,7 +48,7 @@ from benchmarks.paper.plan import Plan, load_plan
 from benchmarks.paper.race_document import write_races
 from benchmarks.paper.results import read_results
 from benchmarks.paper.schedule import steps_of
-from benchmarks.tasks import doit_config, split_available, task, tasks
+from benchmarks.tasks import days, doit_config, split_available, task, tasks
 from dynssm_ros import __version__
 from dynssm_ros.errors import UserError
 from dynssm_ros.files import write_json
@@ -120,7 +120,8 @@ class Paper:
 
     def write(self) -> None:
         path = Path(get_var("results", str(PAGES / "results.md")))
-        results = read_results(self.plan, OUT, self.steps, f"Page written: {origin()}", self.quick)
+        made = f"Page written: {origin()}; trained and scored: {days(self.steps, OUT)}"
+        results = read_results(self.plan, OUT, self.steps, made, self.quick)
         write(results, path)
         if self.plan.races:
             write_races(results, OUT, path.with_name(f"{path.stem}_race.md"))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,13 @@ class NotingDB(JsonDB):  # type: ignore[misc]
 def output(step: Step, root: Path) -> Path:
     """The file by which a step is known to be done."""
     return root / step.key / step.marker
+
+
+def days(steps: Iterable[Step], root: Path) -> str:
+    """The day on which what is there was made (UTC), or the first and the last one; empty where nothing is."""
+    there = (path for path in (output(step, root) for step in steps) if path.exists())
+    made = sorted({datetime.fromtimestamp(path.stat().st_mtime, timezone.utc).date().isoformat() for path in there})
+    return " to ".join(dict.fromkeys([made[0], made[-1]])) if made else ""
 
 
 def split_available(steps: Sequence[Step]) -> tuple[list[Step], dict[str, str], dict[str, str]]:

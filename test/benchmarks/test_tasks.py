@@ -8,8 +8,11 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from benchmarks.tasks import days
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DODO = """
@@ -107,3 +110,17 @@ def test_a_kill_costs_the_task_under_way(doit):
     assert made == ["a", "b"]
     assert doit()[1] == ["b", "c", "other"]
     assert os.getpid() > 0
+
+
+def test_the_days_on_which_steps_were_made_are_told(tmp_path):
+    steps = [
+        SimpleNamespace(key=key, marker=marker) for key, marker in (("a", ""), ("b", "model.yaml"), ("absent", ""))
+    ]
+    assert days(steps, tmp_path) == ""
+    (tmp_path / "a").touch()
+    os.utime(tmp_path / "a", (1_764_547_200, 1_764_547_200))
+    assert days(steps, tmp_path) == "2025-12-01"
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "model.yaml").touch()
+    os.utime(tmp_path / "b" / "model.yaml", (1_764_460_800, 1_764_460_800))
+    assert days(steps, tmp_path) == "2025-11-30 to 2025-12-01"
