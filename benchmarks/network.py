@@ -110,21 +110,30 @@ def _cell(cell: Cell) -> Fold:
 
 
 def further_folds(data: Path, test: bool) -> dict[str, Callable[[], Fold]]:
-    """Measured folds, all simulated cells with the usual noise, and the other logs of the 1:10 car's season."""
+    """Measured folds, all simulated cells with the usual noise, and the logs of the 1:10 car's season.
+
+    ``season`` logs follow a training with four logs, ``alone`` logs one with free driving alone, which never coasts.
+    """
     cells = [cell for cell in simulated_cells() if cell.is_test == test and "-usual-" in cell.name]
-    known = {Path(bag).name for bag in _DART.values()}
-    logs = [log.name for log in season_logs(data, test) if log.name not in known]
+    logs = [log.name for log in season_logs(data, test)]
+    trainings = {"season": tuple(_DART.values()), "alone": (_DART["free"],)}
     laps = {name: fold for name, fold in folds(data).items() if name.startswith(("putnam", "dart"))} if not test else {}
     simulated = {
         f"{'same' if cell.change == 'none' else 'changed'}_{cell.name}": partial(_cell, cell) for cell in cells
     }
-    return {**laps, **simulated, **{f"season_{name}": partial(_season_log, name, data) for name in logs}}
+    season = {
+        f"{training}_{name}": partial(_season_log, name, training, bags, data)
+        for training, bags in trainings.items()
+        for name in logs
+        if f"dart_season/{name}" not in bags
+    }
+    return {**laps, **simulated, **season}
 
 
-def _season_log(name: str, data: Path) -> Fold:
-    logs = [_extracted(data / bag, "default", 50.0) for bag in _DART.values()]
+def _season_log(name: str, training: str, bags: tuple[str, ...], data: Path) -> Fold:
+    logs = [_extracted(data / bag, "default", 50.0) for bag in bags]
     log = _extracted(data / "dart_season" / name, "default", 50.0)
-    return Fold(f"season_{name}", RACER, concatenate(logs), log, "season")
+    return Fold(f"{training}_{name}", RACER, concatenate(logs), log, training)
 
 
 @cache

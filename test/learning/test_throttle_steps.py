@@ -27,8 +27,9 @@ from dynssm_ros.vehicle.kinematics import SCALAR
 NOISE = (0.001, 0.001, 0.01)
 
 
-def bent(vehicle: Vehicle, rows: int, seed: int) -> Recording:
-    """A drive whose throttle goes in steps between three values; it is told as a pedal that bends between them."""
+def bent(vehicle: Vehicle, rows: int, seed: int, *, least: float = 0.0) -> Recording:
+    """A drive whose throttle goes in steps between three values; it is told as a pedal from ``least`` on that bends between
+    them."""
     rng = np.random.default_rng(seed)
     throttle = np.repeat(rng.choice([0.25, 0.34, 0.40], rows), rng.integers(5, 25, rows))[: rows + 1]
     steering = np.convolve(rng.standard_normal(rows + 40), np.ones(40) / 40)[40 : rows + 41] * 0.3
@@ -38,7 +39,7 @@ def bent(vehicle: Vehicle, rows: int, seed: int) -> Recording:
     for k in range(rows - 1):
         moved, _ = car.step(State(*states[k].tolist()), Applied(throttle[k + 1], steering[k + 1]), theta)
         states[k + 1] = moved + rng.standard_normal(3) * NOISE
-    pedal = np.interp(throttle, [0.25, 0.34, 0.40], [0.0, 0.02, 0.3])
+    pedal = least + np.interp(throttle, [0.25, 0.34, 0.40], [0.0, 0.02, 0.3])
     matrix = np.column_stack([states, pedal[:-1], steering[:-1], np.diff(pedal), np.diff(steering)])
     info = RecordingInfo(sampling_time=vehicle.sampling_time, commands="topics", source=(f"bent {seed}",))
     time = 10**18 + np.round(np.arange(rows) * vehicle.sampling_time * 1e9).astype(np.int64)
@@ -64,6 +65,14 @@ def test_a_force_that_bends_is_followed_on_another_drive(orca: Vehicle, tmp_path
     np.testing.assert_array_equal(scores["earned"].rmse, scores["with"].rmse)
     gains = {name: json.loads((tmp_path / name / "metrics.json").read_text())["throttle_gain"] for name in known}
     assert (gains["with"], gains["without"], gains["earned"] > 0.1) == (None, None, True)
+
+
+def test_laps_that_never_coast_say_nothing_of_a_bend_about_zero(orca: Vehicle, tmp_path: Path) -> None:
+    known = models(bent(orca, 2000, 0, least=0.1), orca, tmp_path)
+    scores = evaluate(bent(orca, 1000, 1, least=0.1), known, calls=1).scores
+    np.testing.assert_array_equal(scores["earned"].rmse, scores["without"].rmse)
+    assert json.loads((tmp_path / "earned" / "metrics.json").read_text())["throttle_gain"] is None
+    assert scores["with"].rmse[0] < 0.9 * scores["without"].rmse[0]  # on these laps they would have earned it
 
 
 def test_where_no_force_bends_they_cost_little(drive: Any, orca: Vehicle, tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ class OnlineConfig(StrictModel):
     throttle_steps: bool | None = Field(
         default=None,
         description="also smooth steps of the throttle about twelve fractions, for forces that bend there: engine, brakes; "
-        "null: where they take 3 % off the error on left-out stretches of the laps",
+        "null: in laps that coast, where they take 3 % off the error on left-out stretches",
     )
     error_average: float = Field(default=0.6, gt=0, description="the physics' mean error is that over so long (s)")
     memory: float = Field(
