@@ -24,6 +24,7 @@ import numpy as np
 import torch
 
 from benchmarks.drawn_cars import CLASSES, CarClass, drives
+from benchmarks.logs import add_data_option
 from benchmarks.network import Fold, Study, further_folds
 from benchmarks.page import table
 from dynssm_ros.arrays import Indices, Vector
@@ -305,7 +306,7 @@ def main() -> None:
     """Draws cars, writes the models, and prints a table for each class."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/any_car"))
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    add_data_option(parser)
     parser.add_argument("--only", default="", choices=["", *CLASSES], help="class of cars")
     parser.add_argument(
         "--vehicle", default="", help="vehicle file: writes a model for cars like this one, scores nothing"

@@ -40,6 +40,7 @@ from benchmarks.hidden_causes.cases import TRUTHS, cases
 from benchmarks.hidden_causes.outcomes import matrix, rates
 from benchmarks.hidden_causes.page import confusion, hidden_causes_page
 from benchmarks.hidden_causes.run import outcome_file, read_outcome, run_case
+from benchmarks.logs import log_folder
 from benchmarks.matrix import raced_cells, races, races_page, scored_cells, scores, scores_page
 from benchmarks.matrix.ablations import ablations_page
 from benchmarks.page import save_figure, save_page
@@ -60,7 +61,7 @@ GROUP = get_var("group", "")
 OUT = Path(get_var("out", f"out/{GROUP}"))
 PAGES = Path(get_var("page", str(OUT)))
 DATA = get_var("data", os.environ.get("DYNSSM_DATA", ""))
-LOGS = Path(DATA or "../shared/data")
+LOGS = Path(DATA) if DATA else log_folder()
 
 
 class Variables:

@@ -26,6 +26,7 @@ import torch
 from torch import nn
 
 from benchmarks.fold_tables import HORIZONS_S, by_group, tables
+from benchmarks.logs import add_data_option
 from benchmarks.matrix.scored_cells import RACER, Cell, season_logs, simulated_cells, test_drive, training_drive
 from dynssm_ros.arrays import Indices, Vector
 from dynssm_ros.files import write_json
@@ -408,7 +409,7 @@ def main() -> None:
     """Scores the folds and prints the tables; what is done is kept in ``--out``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/network"))
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    add_data_option(parser)
     parser.add_argument("--only", default="", help="folds whose names begin so")
     parser.add_argument("--steps", action="store_true", help="the throttle's steps alone, on further cells and logs")
     parser.add_argument("--test", action="store_true", help="with --steps: on what is for publishing only")

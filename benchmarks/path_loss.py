@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from benchmarks.fold_tables import tables
+from benchmarks.logs import add_data_option
 from benchmarks.network import (
     Look,
     Stretches,
@@ -123,7 +124,7 @@ def main() -> None:
     """Scores the folds of measured logs and prints the tables; what is done is kept in ``--out``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/network"))
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    add_data_option(parser)
     parser.add_argument("--only", default="", help="folds whose names begin so")
     arguments = parser.parse_args()
     torch.set_num_threads(1)

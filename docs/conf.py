@@ -22,7 +22,6 @@ html_theme_options = {"sidebar_hide_name": False}
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_type_aliases = {"PathLike": "str | Path", "Log": "Recording | str | Path", "Progress": "Callable"}
-exclude_patterns = ["README.md"]
 
 
 def link_repository_files(app: Sphinx, name: str, source: list[str]) -> None:

@@ -5,7 +5,7 @@ python -m examples.readme_picture PUTNAM_PARK_BAG docs/_static/diagnosis.png
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,6 +73,10 @@ def draw(found: Diagnosis) -> Figure:
 
 
 if __name__ == "__main__":
-    diagnosis = main(Path(sys.argv[1]), Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("bag", type=Path)
+    parser.add_argument("picture", type=Path)
+    arguments = parser.parse_args()
+    diagnosis = main(arguments.bag, arguments.picture)
     for cause in diagnosis.found:
         print(cause.kind, cause.effect, cause.values, cause.std)

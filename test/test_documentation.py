@@ -132,8 +132,24 @@ def test_links_lead_somewhere() -> None:
 
 
 def assert_links_lead_somewhere(page: str, text: str, folder: Path) -> None:
-    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
-        assert "://" in target or (folder / target).exists(), f"{page}: {target}"
+    for target, anchor in re.findall(r"\]\(([^)#]+)(?:#([^)]*))?\)", text):
+        if "://" in target:
+            continue
+        assert (folder / target).exists(), f"{page}: {target}"
+        if anchor:
+            assert anchor in anchors((folder / target).read_text(encoding="utf-8")), f"{page}: {target}#{anchor}"
+
+
+def anchors(text: str) -> set[str]:
+    """What links within a page lead to: its headings in lower case, with hyphens for spaces and without punctuation."""
+    headings = re.findall(r"(?m)^#+ (.+)$", text)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_anchors_are_those_of_the_headings() -> None:
+    assert anchors("# Suspect figures, of the `paper`\n\ntext #no\n## T_s: 0.5 s") == {
+        "suspect-figures-of-the-paper", "t_s-05-s",
+    }  # fmt: skip
 
 
 @pytest.mark.slow

@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
 import numpy as np
 
-from dynssm_ros.errors import RecordingError, UserError
+from dynssm_ros.errors import RecordingError
 from dynssm_ros.signals.recording import Recording, RecordingInfo
 
 _ROWS = {"states": 6, "dstates": 8, "inputs": 2}
@@ -52,15 +53,12 @@ def published_drive(path: Path) -> Recording:
 
 
 def main(arguments: list[str]) -> None:
-    """Converts one file.
-
-    Raises:
-        UserError: not two arguments.
-    """
-    if len(arguments) != 2:
-        raise UserError("python -m benchmarks.paper.published DRIVE.npz R.parquet: expected both files")
-    drive, out = map(Path, arguments)
-    recording = published_drive(drive)
+    """Converts one file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("drive", type=Path, metavar="DRIVE.npz")
+    parser.add_argument("out", type=Path, metavar="R.parquet")
+    found = parser.parse_args(arguments)
+    out, recording = found.out, published_drive(found.drive)
     recording.save(out)
     print(f"{out}: {len(recording)} rows at {1 / recording.T_s:g} Hz")
 

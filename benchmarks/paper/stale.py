@@ -6,6 +6,7 @@ the mark off; a test of the documentation asks for it.
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 from pathlib import Path
@@ -52,10 +53,12 @@ def marked(text: str, plan: Plan) -> str:
     return f"{title}\n\n{NOTE}\n\n{rest}"
 
 
-def main(pages: list[str]) -> None:
+def main(arguments: list[str]) -> None:
     """Marks pages in place."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pages", nargs="+", type=Path, metavar="PAGE")
     plan = load_plan()
-    for page in map(Path, pages):
+    for page in parser.parse_args(arguments).pages:
         text = marked(page.read_text(encoding="utf-8"), plan)
         with replacing(page) as aside:
             aside.write_text(text, encoding="utf-8")

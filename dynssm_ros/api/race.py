@@ -33,7 +33,7 @@ class RaceSettings(VerbSettings):
     objective: Literal["tracking", "progress"] = setting(
         "tracking",
         "tracking: follow the line at its own speed, as in the literature; progress: get as far as possible between "
-        "the borders, and end each horizon no faster than the line is there.",
+        "the borders, and end each horizon no faster than corners and brakes ahead allow.",
     )
     laps: int = setting(1, "Laps to drive.", ge=1)
     line: str = setting("racing", "Line to follow: centre, racing, or a file s_m,x_m,y_m,v_mps with its own speed.")

@@ -1,8 +1,8 @@
 """The live predictor: ``ros2 run dynssm_ros predictor --ros-args -p model:=DIR``.
 
 Every odometry message gets a prediction of the next state once the window is full; topics and parameters are those of
-the README. All thinking is in :mod:`dynssm_ros.runtime`; this node converts, calls and publishes. Until it is activated
-it already predicts and learns, but publishes only its diagnostics: a stand-by takes over with its window full.
+``docs/use/predictor.md``. All thinking is in :mod:`dynssm_ros.runtime`; this node converts, calls and publishes. Until it
+is activated it already predicts and learns, but publishes only its diagnostics: a stand-by takes over with its window full.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def _cars(races: Sequence[Race], axes: Axes, changed: Mask) -> list[Show]:
     extent = np.ptp(np.concatenate([track.left_border, track.right_border]), axis=0)
     if changed.any() and not changed.all():
         x, y = np.where(changed[:, None], track.centre.position(track.centre.s), np.nan).T
-        axes.plot(x, y, color=MEASURED, alpha=0.2, lw=8, solid_capstyle="butt", label="the car is another here")
+        axes.plot(x, y, color=MEASURED, alpha=0.2, lw=8, solid_capstyle="butt", label="the car is changed here")
     wheelbase = course.vehicle.constants.wheelbase
     size = max(_LENGTH * wheelbase, _SMALLEST * float(np.max(extent)))
     cars = [_car(race, axes, size, style) for race, style in race_lines(races)]
