@@ -20,6 +20,11 @@ _FROZEN_S = 1.0
 """Time at a stretch for which no odometry of a driving car repeats itself; slow ones are interpolated between samples."""
 _DEAD_S = 5.0
 """Likewise of a single signal while the car turns to both sides, or its speed swings: on circles and straights it may."""
+_DROP, _DROP_EDGE_S, _DROPS, _DROPS_S = 0.25, 0.1, 3, 1.0
+"""A signal drops out where it is exactly 0 though so long before and after (s) it is this far to the same side, as a share of its
+usual range; how many make a finding, or how long they last in all (s)."""
+_DROP_STEERED_S, _STILL_TURNS = 0.5, 0.5
+"""A steering may be let go: how long it is 0 at least (s), and what is left of the rate of turning meanwhile."""
 _STEP = 0.3
 """Step of a signal in units of its standard deviation, from which on it is coarse."""
 _SPIKE, _SPIKE_SHARE = 15.0, 0.05
@@ -34,9 +39,10 @@ _SPIKES, _SPIKES_SHARE = 5, 0.01
 
 def check_liveness(drive: Drive) -> list[Finding]:
     """Constants, clipping, coarse steps and spikes."""
-    found = [*_constants(drive), *_frozen(drive)]
+    lost = _drops_out(drive)
+    found = [*_constants(drive), *_frozen(drive), *lost]
     found += [] if found else _dies(drive)
-    dead = _names(found)
+    dead = _names(found) | {each.what.removesuffix("_frozen") for each in lost}
     for name, values in (("v_x", drive.velocity.real), ("v_y", drive.velocity.imag), ("omega", drive.omega)):
         if name not in dead and varies(values):
             found += _coarse(name, values) or _clipped(name, values, drive) or _spikes(name, values, drive)
@@ -170,6 +176,47 @@ def _dies(drive: Drive) -> list[Finding]:
                 )
             )  # fmt: skip
     return found
+
+
+def _drops_out(drive: Drive) -> list[Finding]:
+    """A signal that is exactly 0 for rows, and before and after as if nothing had been: a driver that has no value writes 0."""
+    signals = {"v_x": drive.velocity.real, "omega": drive.omega, "steering": drive.steering}
+    found = []
+    for name, values in signals.items():
+        runs = [run for run in _zeros(values, drive) if name != "steering" or _turns_on(drive, *run)]
+        seconds = sum(last - first for first, last in runs) * drive.T_s
+        if len(runs) < _DROPS and seconds < _DROPS_S:
+            continue
+        stretches = "1 stretch" if len(runs) == 1 else f"{len(runs)} stretches"
+        told = f"{name} is exactly 0 in {stretches} of {seconds:.3g} s in all, between values far from it"
+        found.append(
+            Finding(
+                what=f"{name}_frozen", told=told, size=seconds, low=seconds, high=seconds, unit="s",
+                expected="a signal that lives", remedy="find why it drops out (plug, network, driver), or leave those rows out",
+            )
+        )  # fmt: skip
+    return found
+
+
+def _zeros(values: Vector, drive: Drive) -> list[tuple[int, int]]:
+    """Runs of exact zeros, first row and the row after, that lie between values far to the same side."""
+    edge = max(1, round(_DROP_EDGE_S / drive.T_s))
+    least = _DROP * float(np.ptp(np.percentile(values, [2.0, 98.0])))
+    starts, ends = np.flatnonzero(np.diff((values == 0.0).astype(int), prepend=0, append=0)).reshape(-1, 2).T
+    inside = (starts >= edge) & (ends + edge <= len(values))
+    starts, ends = starts[inside], ends[inside]
+    before, after = starts - edge, ends + edge - 1
+    far = np.minimum(np.abs(values[before]), np.abs(values[after])) > least
+    same = (np.sign(values[before]) == np.sign(values[after])) & (drive.segment[before] == drive.segment[after])
+    return list(zip(starts[far & same].tolist(), ends[far & same].tolist(), strict=True))
+
+
+def _turns_on(drive: Drive, first: int, last: int) -> bool:
+    """Whether the car turns between two rows as it did before them and does after."""
+    if (last - first) * drive.T_s < _DROP_STEERED_S:
+        return False
+    turn = np.abs(_turn_rate(drive))
+    return bool(turn[first:last].mean() > _STILL_TURNS * max(turn[first - 1], turn[last], _TURNS_RAD_S))
 
 
 def _repeats(drive: Drive, *signals: Vector) -> Mask:

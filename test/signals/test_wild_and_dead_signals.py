@@ -83,6 +83,18 @@ def test_a_signal_that_stops_is_the_only_fault(column: str, name: str) -> None:
     assert list(found_in(changed(**{column: values}))) == [f"{name}_frozen"]
 
 
+@pytest.mark.parametrize("seconds", [0.6, 1.5])
+@pytest.mark.parametrize(("column", "name"), [("delta_fb", "steering"), ("omega", "omega"), ("v_x", "v_x")])
+def test_a_signal_that_drops_to_zero_again_and_again_is_the_only_fault(column: str, name: str, seconds: float) -> None:
+    values, rows = driven()[column].copy(), round(seconds / driven().T_s)
+    turns = np.flatnonzero(np.abs(driven()["omega"]) > np.percentile(np.abs(driven()["omega"]), 60))
+    for first in turns[turns < len(values) - 2 * rows][:: len(turns) // 10]:
+        values[first : first + rows] = 0.0
+    found = found_in(changed(**{column: values}))
+    assert list(found) == [f"{name}_frozen"]
+    assert "exactly 0" in found[f"{name}_frozen"].told
+
+
 def test_a_throttle_that_stops_is_found() -> None:
     values = driven()["r_fb"].copy()
     values[len(values) // 5 :] = values[len(values) // 5]
