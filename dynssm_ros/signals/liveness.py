@@ -21,8 +21,8 @@ _FROZEN_S = 1.0
 _DEAD_S = 5.0
 """Likewise of a single signal while the car turns to both sides, or its speed swings: on circles and straights it may."""
 _DROP, _DROP_EDGE_S, _DROPS, _DROPS_S = 0.25, 0.1, 3, 1.0
-"""A signal drops out where it is exactly 0 though so long before and after (s) it is this far to the same side, as a share of its
-usual range; how many make a finding, or how long they last in all (s)."""
+"""A signal drops out where it is exactly 0 though so long before and after (s) it is this far to the same side, as a share of
+its usual range; how many make a finding, or how long they last in all (s)."""
 _DROP_STEERED_S, _STILL_TURNS = 0.5, 0.5
 """A steering may be let go: how long it is 0 at least (s), and what is left of the rate of turning meanwhile."""
 _STEP = 0.3
@@ -179,7 +179,7 @@ def _dies(drive: Drive) -> list[Finding]:
 
 
 def _drops_out(drive: Drive) -> list[Finding]:
-    """A signal that is exactly 0 for rows, and before and after as if nothing had been: a driver that has no value writes 0."""
+    """A signal that is exactly 0 for rows, and before and after as if nothing had been: what has no value is written as 0."""
     signals = {"v_x": drive.velocity.real, "omega": drive.omega, "steering": drive.steering}
     found = []
     for name, values in signals.items():
@@ -192,7 +192,8 @@ def _drops_out(drive: Drive) -> list[Finding]:
         found.append(
             Finding(
                 what=f"{name}_frozen", told=told, size=seconds, low=seconds, high=seconds, unit="s",
-                expected="a signal that lives", remedy="find why it drops out (plug, network, driver), or leave those rows out",
+                expected="a signal that lives",
+                remedy="find why it drops out (plug, network, driver), or leave those rows out",
             )
         )  # fmt: skip
     return found
