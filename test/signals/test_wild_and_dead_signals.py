@@ -83,8 +83,9 @@ def test_a_signal_that_stops_is_the_only_fault(column: str, name: str) -> None:
     assert list(found_in(changed(**{column: values}))) == [f"{name}_frozen"]
 
 
-@pytest.mark.parametrize("seconds", [0.6, 1.5])
-@pytest.mark.parametrize(("column", "name"), [("delta_fb", "steering"), ("omega", "omega"), ("v_x", "v_x")])
+@pytest.mark.parametrize(
+    ("column", "name", "seconds"), [("delta_fb", "steering", 0.6), ("omega", "omega", 1.5), ("v_x", "v_x", 1.5)]
+)
 def test_a_signal_that_drops_to_zero_again_and_again_is_the_only_fault(column: str, name: str, seconds: float) -> None:
     values, rows = driven()[column].copy(), round(seconds / driven().T_s)
     turns = np.flatnonzero(np.abs(driven()["omega"]) > np.percentile(np.abs(driven()["omega"]), 60))
