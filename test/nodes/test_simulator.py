@@ -96,6 +96,7 @@ def start_pit() -> Iterator[StartPit]:
         yield lambda *parameters: Pit(stack, *parameters)
 
 
+@pytest.mark.slow
 def test_it_drives_what_simulate_drives_in_real_time(start_pit: StartPit) -> None:
     pit = start_pit("seed:=3")
     assert pit.wait_for(lambda: bool(pit.odometry and pit.feedback and pit.command))  # topics match one by one
