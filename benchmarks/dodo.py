@@ -61,7 +61,7 @@ GROUP = get_var("group", "")
 OUT = Path(get_var("out", f"out/{GROUP}"))
 PAGES = Path(get_var("page", str(OUT)))
 DATA = get_var("data", os.environ.get("DYNSSM_DATA", ""))
-LOGS = Path(DATA) if DATA else log_folder()
+LOGS = Path(DATA or log_folder())
 
 
 class Variables:

@@ -32,7 +32,7 @@ cells of the generalisation matrix, gains of 1 to 2 % on left-out laps did not c
 _FEWEST_ROWS = 3  # of a window
 _STRETCHES = 4  # of the laps, for a layer without a network, and for steps of the throttle
 _STARTS = 400  # rollouts in a part, at most
-_COASTING = 0.03
+_LEAST_UNDRIVEN = 0.03
 """Share of the rows without drive that steps of the throttle need: they are about zero throttle, which laps that never coast
 do not show. With 0.9 % they took 6 % off left-out stretches of their log, and cost 6 % of the path on 15 other logs;
 with 5.6 to 15 % they carried over."""
@@ -133,7 +133,7 @@ def _with_steps(
     plain = base.features(False)
     without = base.fitted(plain, stretches)
     asked = base.config.throttle_steps is None and base.vehicle.inputs.set_point == "throttle"
-    if not asked or _coasting(base, laps) < _COASTING or not any(len(base.starts(part)) for _, part in stretches):
+    if not asked or _undriven(base, laps) < _LEAST_UNDRIVEN or not any(len(base.starts(part)) for _, part in stretches):
         return base, plain, without.layer, None
     bent = base._replace(config=base.config.model_copy(update={"throttle_steps": True}))
     steps = bent.features(False)
@@ -142,10 +142,10 @@ def _with_steps(
     return (bent, steps, with_steps.layer, gain) if gain >= GAIN_WANTED else (base, plain, without.layer, gain)
 
 
-def _coasting(base: LayerBase, laps: Recording) -> float:
+def _undriven(base: LayerBase, laps: Recording) -> float:
     """Share of the rows at the vehicle's minimum speed or more without drive: coasting, or braking."""
     rows = laps.window_ends(1, min_speed=base.vehicle.minimum_speed)
-    throttle = applied_inputs(laps.windows(rows, 1)[:, 0].T).r
+    throttle = applied_inputs(laps.rows(rows).T).r
     return float(np.mean(throttle <= 0.0)) if len(rows) else 0.0
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dynssm_ros.arrays import Mask, Vector
+from dynssm_ros.arrays import Indices, Mask, Vector
 from dynssm_ros.signals.actuation import LARGE_RAD
 from dynssm_ros.signals.findings import Finding, number
 from dynssm_ros.signals.motion import WITHOUT_V_Y, Checked
@@ -181,9 +181,14 @@ def _dies(drive: Drive) -> list[Finding]:
 def _drops_out(drive: Drive) -> list[Finding]:
     """A signal that is exactly 0 for rows, and before and after as if nothing had been: what has no value is written as 0."""
     signals = {"v_x": drive.velocity.real, "omega": drive.omega, "steering": drive.steering}
+    turn, least_rows = np.abs(_turn_rate(drive)), _DROP_STEERED_S / drive.T_s
     found = []
     for name, values in signals.items():
-        runs = [run for run in _zeros(values, drive) if name != "steering" or _turns_on(drive, *run)]
+        runs = _zeros(values, drive)
+        if name == "steering":
+            runs = [
+                (first, last) for first, last in runs if last - first >= least_rows and _turns_on(turn, first, last)
+            ]
         seconds = sum(last - first for first, last in runs) * drive.T_s
         if len(runs) < _DROPS and seconds < _DROPS_S:
             continue
@@ -203,7 +208,7 @@ def _zeros(values: Vector, drive: Drive) -> list[tuple[int, int]]:
     """Runs of exact zeros, first row and the row after, that lie between values far to the same side."""
     edge = max(1, round(_DROP_EDGE_S / drive.T_s))
     least = _DROP * float(np.ptp(np.percentile(values, [2.0, 98.0])))
-    starts, ends = np.flatnonzero(np.diff((values == 0.0).astype(int), prepend=0, append=0)).reshape(-1, 2).T
+    starts, ends = _runs(values == 0.0)
     inside = (starts >= edge) & (ends + edge <= len(values))
     starts, ends = starts[inside], ends[inside]
     before, after = starts - edge, ends + edge - 1
@@ -212,11 +217,8 @@ def _zeros(values: Vector, drive: Drive) -> list[tuple[int, int]]:
     return list(zip(starts[far & same].tolist(), ends[far & same].tolist(), strict=True))
 
 
-def _turns_on(drive: Drive, first: int, last: int) -> bool:
-    """Whether the car turns between two rows as it did before them and does after."""
-    if (last - first) * drive.T_s < _DROP_STEERED_S:
-        return False
-    turn = np.abs(_turn_rate(drive))
+def _turns_on(turn: Vector, first: int, last: int) -> bool:
+    """Whether a car that turns so fast (rad/s) goes on doing so between two rows as before them and after."""
     return bool(turn[first:last].mean() > _STILL_TURNS * max(turn[first - 1], turn[last], _TURNS_RAD_S))
 
 
@@ -256,7 +258,7 @@ def _clipped(name: str, values: Vector, drive: Drive) -> list[Finding]:
     for end in (float(values.max()), float(values.min())):
         at = (values == end) & (np.abs(values) > 0.5 * np.abs(values).max())
         stays = _longest_run(at) * drive.T_s
-        if at.mean() > _CLIPPED_SHARE and stays >= _CLIPPED_S and _runs(at) > 1:
+        if at.mean() > _CLIPPED_SHARE and stays >= _CLIPPED_S and len(_runs(at)[0]) > 1:
             told = f"{name} is exactly {number(end)} in {100 * at.mean():.2g} % of the rows, up to {stays:.2g} s at a stretch"
             return [
                 Finding(
@@ -267,8 +269,10 @@ def _clipped(name: str, values: Vector, drive: Drive) -> list[Finding]:
     return []
 
 
-def _runs(at: Mask) -> int:
-    return int((np.diff(at.astype(int), prepend=0) > 0).sum())
+def _runs(at: Mask) -> tuple[Indices, Indices]:
+    """First rows of the runs, and the rows after their last."""
+    first, last = np.flatnonzero(np.diff(at.astype(int), prepend=0, append=0)).reshape(-1, 2).T
+    return first, last
 
 
 def _longest_run(at: Mask) -> int:
@@ -280,7 +284,7 @@ def _longest_at(at: Mask) -> tuple[int, int]:
     """First row of the longest run, and the row after it."""
     if not at.any():
         return 0, 0
-    first, last = np.flatnonzero(np.diff(at.astype(int), prepend=0, append=0)).reshape(-1, 2).T
+    first, last = _runs(at)
     longest = np.argmax(last - first)
     return int(first[longest]), int(last[longest])
 
@@ -311,7 +315,7 @@ def _spikes(name: str, values: Vector, drive: Drive) -> list[Finding]:
     usual = float(np.ptp(np.percentile(values, [2.0, 98.0])))
     spread = 1.4826 * float(np.median(np.abs(off[off != 0.0]))) if (off != 0.0).any() else 0.0
     at = np.abs(off) > max(_SPIKE * spread, _SPIKE_SHARE * usual)
-    count, minutes = _runs(at), len(values) * drive.T_s / 60.0
+    count, minutes = len(_runs(at)[0]), len(values) * drive.T_s / 60.0
     if count < _SPIKES or count > _SPIKES_SHARE * len(values):
         return []
     rate, half, size = count / minutes, SIGMAS * float(np.sqrt(count)) / minutes, float(np.median(np.abs(off[at])))
